@@ -1,0 +1,1 @@
+"""The pure core of Tricap: photogrammetry of a moving person. No bpy, no printing, no global state."""

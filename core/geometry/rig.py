@@ -1,0 +1,116 @@
+"""The camera rig and its file, rig.toml: the layout of Anipose, Pose2Sim and caliscope, in metres."""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import store
+from ..errors import InputError
+from ..settings import nearest_name
+from .camera import Camera
+from .rotation import rotation_from_vector, vector_from_rotation
+
+UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Rig:
+    """Calibrated cameras, found by name. `metadata` is what the calibration said of itself."""
+
+    cameras: tuple[Camera, ...]
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Camera:
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        raise InputError(f"The rig has no camera “{name}”.{nearest_name(name, [c.name for c in self.cameras])}"
+                         " Name the views in take.toml as the cameras in rig.toml.")
+
+
+def read_rig(path: Path) -> Rig:
+    """Read rig.toml.
+
+    Raises:
+        InputError: the file is missing, is no TOML, or a camera in it is incomplete or impossible.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"Cannot read the rig {path}: {error.strerror or error}. Calibrate first, or mend `rig` in take.toml.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"The rig {path} is not a TOML file: {error}.") from error
+    metadata = table.get("metadata", {})
+    unit = metadata.get("unit", "m") if isinstance(metadata, dict) else None
+    if unit not in UNITS_M:
+        raise InputError(f"The rig {path} is in an unknown unit {unit!r}; write one of {', '.join(UNITS_M)} under [metadata].")
+    cameras = tuple(_camera(key, entry, path, UNITS_M[unit]) for key, entry in table.items() if key.startswith("cam"))
+    if not cameras:
+        raise InputError(f"The rig {path} has no cameras; it needs tables [cam_0], [cam_1], …")
+    names = [c.name for c in cameras]
+    if len(set(names)) < len(names):
+        raise InputError(f"The rig {path} names two cameras alike ({', '.join(names)}); give each its own name.")
+    return Rig(cameras=cameras, metadata=metadata)
+
+
+def write_rig(path: Path, rig: Rig) -> None:
+    """Write rig.toml so that `read_rig` gives the same cameras, to the last bit."""
+    lines: list[str] = []
+    for i, camera in enumerate(rig.cameras):
+        lines += [f"[cam_{i}]", f"name = {_text(camera.name)}", f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
+                  f"matrix = {_numbers(camera.matrix)}", f"distortions = {_numbers(camera.distortions)}",
+                  f"rotation = {_numbers(vector_from_rotation(camera.R_cam_world))}", f"translation = {_numbers(camera.t_cam_world_m)}"]
+        if np.any(camera.affinity):
+            lines.append(f"affinity = {_numbers(camera.affinity)}")
+        lines.append("")
+    lines += ["[metadata]", 'unit = "m"']
+    lines += [f"{k} = {_text(v) if isinstance(v, str) else repr(v)}" for k, v in rig.metadata.items()
+              if k != "unit" and isinstance(v, (str, int, float)) and not isinstance(v, bool)]
+    store.write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
+    if not isinstance(entry, dict):
+        raise InputError(f"[{key}] of the rig {path} is not a table.")
+    name = entry.get("name", key)
+    label = f"Camera “{name}” of the rig {path}"
+    size = _array(entry, "size", (2,), label)
+    matrix = _array(entry, "matrix", (3, 3), label)
+    distortions = np.zeros(5)
+    given = _array(entry, "distortions", None, label) if "distortions" in entry else distortions
+    if given.ndim != 1 or len(given) > 5:
+        raise InputError(f"{label} has {given.size} distortions; this model has k1, k2, p1, p2, k3.")
+    distortions[: len(given)] = given
+    if entry.get("fisheye", False):
+        raise InputError(f"{label} is a fisheye camera, which is not supported; calibrate it with k1, k2, p1, p2, k3.")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or min(size) < 8:
+        raise InputError(f"{label} has an impossible matrix or size; calibrate it again.")
+    affinity = _array(entry, "affinity", (2,), label) if "affinity" in entry else np.zeros(2)
+    return Camera(name=str(name), size_px=(int(size[0]), int(size[1])), matrix=matrix, distortions=distortions, affinity=affinity,
+                  R_cam_world=rotation_from_vector(_array(entry, "rotation", (3,), label)),
+                  t_cam_world_m=_array(entry, "translation", (3,), label) * unit_m)
+
+
+def _array(entry: Mapping[str, Any], key: str, shape: tuple[int, ...] | None, label: str) -> np.ndarray:
+    if key not in entry:
+        raise InputError(f"{label} lacks “{key}”.")
+    try:
+        array = np.array(entry[key], dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(math.nan)
+    if (shape is not None and array.shape != shape) or not np.isfinite(array).all():
+        raise InputError(f"“{key}” of {label[0].lower() + label[1:]} must be {'x'.join(map(str, shape or ('n',)))} finite numbers.")
+    return array
+
+
+def _numbers(array: np.ndarray) -> str:
+    return repr(np.asarray(array).tolist())
+
+
+def _text(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

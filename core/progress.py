@@ -1,0 +1,39 @@
+"""Progress and cancelling: one object, given to every function that can take longer than a blink."""
+
+import threading
+from collections.abc import Callable
+
+
+class Cancelled(Exception):
+    """The user asked to stop. What was finished is kept; the message says what that is."""
+
+
+class Monitor:
+    """Reports how far a stage is, and raises `Cancelled` as soon as somebody has asked to stop.
+
+    `report(stage, done, total)` is called from the thread that computes; `cancel()` may be called from any thread.
+    """
+
+    def __init__(self, report: Callable[[str, float, float], None] | None = None) -> None:
+        self._report = report
+        self._cancel = threading.Event()
+
+    def step(self, stage: str, done: float, total: float) -> None:
+        """Say that `done` of `total` parts of `stage` are finished.
+
+        Raises:
+            Cancelled: `cancel()` was called.
+        """
+        if self._cancel.is_set():
+            raise Cancelled(f"Stopped during {stage}, {done:g} of {total:g} done.")
+        if self._report is not None:
+            self._report(stage, done, total)
+
+    def cancel(self) -> None:
+        """Ask the computation to stop at its next step."""
+        self._cancel.set()
+
+    @property
+    def cancelled(self) -> bool:
+        """True once `cancel()` was called."""
+        return self._cancel.is_set()

@@ -1,0 +1,67 @@
+"""Settings: one definition per knob, in a frozen dataclass at the head of the stage that uses it.
+
+A knob is a dataclass field made by `knob`: default, range, unit and one sentence. take.toml's tables, the command's `--set`
+and the add-on's properties are all made from these definitions, so a knob has the same name and limits everywhere.
+"""
+
+import dataclasses
+import difflib
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from .errors import InputError
+
+T = TypeVar("T")
+
+
+def knob(default: Any, about: str, *, unit: str = "", low: float | None = None, high: float | None = None,
+         choices: tuple[str, ...] = ()) -> Any:
+    """A dataclass field that describes itself: `about` is one sentence, `low`/`high` are inclusive limits in `unit`."""
+    return dataclasses.field(default=default, metadata=dict(about=about, unit=unit, low=low, high=high, choices=choices))
+
+
+def nearest_name(name: str, known: "list[str] | tuple[str, ...]") -> str:
+    """A hint " (did you mean “x”?)" for a misspelt name, or the list of what is known."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" Did you mean “{close[0]}”?" if close else f" Known are: {', '.join(known)}."
+
+
+def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """Settings of class `cls` from a table of a file or of the command line.
+
+    Raises:
+        InputError: an unknown name (the nearest known one is named), a value of the wrong kind or outside its limits.
+    """
+    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for name, value in table.items():
+        if name not in fields:
+            raise InputError(f"{where} has no setting “{name}”.{nearest_name(name, list(fields))}")
+        values[name] = _checked(value, fields[name], where)
+    return cls(**values)
+
+
+def _checked(value: Any, field: "dataclasses.Field[Any]", where: str) -> Any:
+    default, meta = field.default, field.metadata
+    label = f"Setting “{field.name}” of {where}"
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise InputError(f"{label} is {value!r}; write true or false.")
+        return value
+    if isinstance(default, str):
+        if not isinstance(value, str) or (meta.get("choices") and value not in meta["choices"]):
+            raise InputError(f"{label} is {value!r}; choose one of: {', '.join(meta.get('choices') or ('a text',))}.")
+        return value
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
+        raise InputError(f"{label} is {value!r}; a number{' in ' + meta['unit'] if meta.get('unit') else ''} is needed.")
+    if isinstance(default, int) and value != int(value):
+        raise InputError(f"{label} is {value!r}; a whole number is needed.")
+    low, high = meta.get("low"), meta.get("high")
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise InputError(f"{label} is {value:g} {meta.get('unit', '')}; it must lie between {low} and {high}.".replace(" ;", ";"))
+    return type(default)(value)
+
+
+def to_table(settings: Any) -> dict[str, Any]:
+    """The settings as a plain table of names and values, for a file."""
+    return dataclasses.asdict(settings)

@@ -1,0 +1,105 @@
+"""Results on disk: numpy arrays and a JSON header in one .npz, written atomically, read without pickle.
+
+A file appears under its name only when it is complete: everything is written beside it first and then moved over.
+"""
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import InputError
+
+HEADER = "header_json"
+STORE_VERSION = 1
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file so that it is either there in full or not at all.
+
+    Raises:
+        InputError: the folder cannot be written to, or the disk is full.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(name, 0o644)
+            os.replace(name, path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise InputError(f"Cannot write {path}: {error.strerror or error}. Choose another folder or free some space.") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """`write_bytes` of UTF-8 text."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """`write_bytes` of readable JSON."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """The value in a JSON file.
+
+    Raises:
+        InputError: the file cannot be read or is no JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a JSON file ({error}); remove it and run again.") from error
+
+
+def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+    """Arrays and a JSON header into one .npz (no pickle)."""
+    text = json.dumps({"store_version": STORE_VERSION, **header}, sort_keys=True, allow_nan=False)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
+    write_bytes(path, buffer.getvalue())
+
+
+def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and header of a file written by `save`.
+
+    Raises:
+        InputError: it is missing, damaged, of a newer version, or was not written by Tricap.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        header = json.loads(str(arrays.pop(HEADER)))
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is missing; run the stage that writes it.") from error
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is not a result of Tricap or is damaged; remove it and run again.") from error
+    if not isinstance(header, dict) or header.get("store_version") != STORE_VERSION:
+        raise InputError(f"{path} was written by another version of Tricap; remove it and run again.")
+    return arrays, header
+
+
+def digest(*parts: bytes | str | Path) -> str:
+    """A short SHA-256 over bytes, texts and the contents of files."""
+    total = hashlib.sha256()
+    for part in parts:
+        data = part.read_bytes() if isinstance(part, Path) else part.encode() if isinstance(part, str) else part
+        total.update(len(data).to_bytes(8, "little") + data)
+    return total.hexdigest()[:16]
