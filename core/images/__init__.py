@@ -1,0 +1,1 @@
+"""Image sequences, video fields, contrast enhancement and sub-pixel sampling."""

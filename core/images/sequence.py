@@ -1,0 +1,181 @@
+"""Reading a camera's sequence: image files or a movie, grey values as float32 in the range 0…255.
+
+Files are read when they are needed, so a long sequence costs no more memory than a short one.
+"""
+
+import re
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from ..errors import InputError
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
+MAX_PIXELS = 64_000_000
+
+
+class Sequence(Protocol):
+    """Frames of one camera, counted from 0."""
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+
+    @property
+    def source(self) -> str:
+        """Where the frames come from, for messages."""
+
+    def read(self, index: int) -> np.ndarray:
+        """Grey values (h, w) float32 of frame `index`."""
+
+    def files(self) -> tuple[Path, ...]:
+        """The files behind the frames."""
+
+
+class ImageFiles:
+    """Numbered image files in natural order (2 before 10)."""
+
+    def __init__(self, paths: tuple[Path, ...], source: str) -> None:
+        self._paths, self._source = paths, source
+
+    @property
+    def count(self) -> int:
+        """Number of files."""
+        return len(self._paths)
+
+    @property
+    def source(self) -> str:
+        """The pattern that found the files."""
+        return self._source
+
+    def files(self) -> tuple[Path, ...]:
+        """The image files in order."""
+        return self._paths
+
+    def read(self, index: int) -> np.ndarray:
+        """Grey values (h, w) float32 of file `index`.
+
+        Raises:
+            InputError: the file is gone or is not an image.
+        """
+        return read_image(self._paths[index])
+
+
+class Movie:
+    """A movie file, decoded frame by frame; reading in order is quick, going back starts again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._capture = cv2.VideoCapture(str(path))
+        self._next = 0
+        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
+        if count < 1:
+            raise InputError(f"{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files.")
+        self._count = count
+
+    @property
+    def count(self) -> int:
+        """Number of frames that the movie's header promises."""
+        return self._count
+
+    @property
+    def source(self) -> str:
+        """The movie's path."""
+        return str(self._path)
+
+    def files(self) -> tuple[Path, ...]:
+        """The movie file."""
+        return (self._path,)
+
+    def read(self, index: int) -> np.ndarray:
+        """Grey values (h, w) float32 of frame `index`.
+
+        Raises:
+            InputError: the movie ends before that frame.
+        """
+        if index < self._next:
+            self._capture.release()
+            self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
+        image = None
+        while self._next <= index:
+            ok = self._capture.grab() if self._next < index else None
+            if ok is None:
+                ok, image = self._capture.read()
+            if not ok:
+                raise InputError(f"Frame {index} of {self._path} cannot be decoded; it promises {self._count} frames. "
+                                 "Set `frames` in take.toml to leave the end out, or convert the movie again.")
+            self._next += 1
+        return grey(image)
+
+
+def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: str) -> Sequence:
+    """The sequence of one view of the take in `folder`.
+
+    Raises:
+        InputError: nothing is found, or a path leaves the folder.
+    """
+    pattern = images if images is not None else movie or ""
+    if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
+        raise InputError(f"View {view} reads “{pattern}”, which lies outside the take {folder}; move or link the footage into the take.")
+    if movie is not None:
+        path = folder / movie
+        if not path.is_file():
+            raise InputError(f"The movie {path} of view {view} is missing; mend `movie` in take.toml.")
+        return Movie(path)
+    paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS), key=_natural))
+    if not paths:
+        raise InputError(f"View {view} has no images: nothing in {folder} agrees with “{pattern}”. Mend `images` in take.toml.")
+    _check_numbering(paths, view)
+    return ImageFiles(paths, pattern)
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour.
+
+    Raises:
+        InputError: the file is missing, is not an image, or is larger than 64 megapixels.
+    """
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
+    if image.shape[0] * image.shape[1] > MAX_PIXELS:
+        raise InputError(f"{path} has {image.shape[1]}×{image.shape[0]} pixels, more than can be measured; scale the footage down.")
+    return grey(image)
+
+
+def grey(image: np.ndarray) -> np.ndarray:
+    """Grey values (h, w) float32 0…255 of an image of 8 or 16 bits or float 0…1, grey, BGR or BGRA."""
+    if image.ndim == 3:
+        image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY) if image.shape[2] >= 3 else image[:, :, 0]
+    if image.dtype == np.uint16:
+        return (image / np.float32(257.0)).astype(np.float32)
+    if image.dtype.kind == "f":
+        return np.ascontiguousarray(np.nan_to_num(image, nan=0.0) * 255.0, dtype=np.float32)
+    return image.astype(np.float32)
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
+
+
+def _check_numbering(paths: tuple[Path, ...], view: str) -> None:
+    """A gap in the numbers is a missing image, where the numbers otherwise count by one."""
+    numbers = [re.findall(r"\d+", p.stem) for p in paths]
+    if len(paths) < 3 or not all(numbers):
+        return
+    last = [int(n[-1]) for n in numbers]
+    steps = np.diff(last)
+    usual = int(np.median(steps))
+    gaps = np.flatnonzero(steps != usual)
+    if usual > 0 and 0 < len(gaps) <= max(1, len(paths) // 10) and steps[gaps[0]] > usual:
+        raise InputError(f"View {view} lacks the image(s) between {paths[gaps[0]].name} and {paths[gaps[0] + 1].name}; "
+                         "restore them, or renumber the files of all views alike.")

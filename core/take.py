@@ -1,0 +1,261 @@
+"""A take: one recording of a person and what the user said about it. take.toml, in the folder that holds the footage.
+
+Joint and view names, and every key, are checked when the file is read; the images are not touched.
+"""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import InputError
+from .geometry.rig import Rig, read_rig
+from .images.fields import INTERLACE, RowGrid, row_grid
+from .images.sequence import Sequence, open_sequence
+from .settings import nearest_name
+
+FORMAT, VERSION = "tricap-take", 1
+SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
+JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
+KEYS = ("format", "version", "fps", "interlaced", "rig", "reference_view", "frames", "views", "body", "seeds", "settings")
+
+Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class View:
+    """One camera's footage: image files (a pattern) or a movie. Its image of take frame t is number t + offset_frames."""
+
+    name: str
+    images: str | None = None
+    movie: str | None = None
+    offset_frames: int = 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Seeds:
+    """What the user clicked, in full-frame pixels: surface points and joints, in one frame."""
+
+    frame: int = 0
+    surface: tuple[Clicks, ...] = ()
+    joints: Mapping[str, Clicks] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Take:
+    """A recording. `folder` holds take.toml and the footage; `frames` is half-open, None means all."""
+
+    folder: Path
+    fps: float
+    views: tuple[View, ...]
+    rig_path: Path
+    interlaced: str = "none"
+    reference_view: str = ""
+    frames: tuple[int, int] | None = None
+    body_model: str | None = None
+    seeds: Seeds = field(default_factory=Seeds)
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def rows(self) -> RowGrid:
+        """The rows of the frame that are measured."""
+        return row_grid(self.interlaced)
+
+    @property
+    def reference(self) -> int:
+        """Index of the reference view."""
+        return [v.name for v in self.views].index(self.reference_view)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Footage:
+    """An opened take: its cameras in the order of the views, and their sequences."""
+
+    take: Take
+    rig: Rig
+    sequences: tuple[Sequence, ...]
+    frames: range
+
+    def read(self, frame: int) -> list[np.ndarray]:
+        """The grey images (h, w) float32 of all views at one frame of the take.
+
+        Raises:
+            InputError: an image is missing, damaged, or of another size than its camera.
+        """
+        images = [s.read(frame + v.offset_frames) for s, v in zip(self.sequences, self.take.views)]
+        for image, camera, view in zip(images, self.rig.cameras, self.take.views):
+            if image.shape[::-1] != camera.size_px:
+                raise InputError(f"Frame {frame} of view {view.name} has {image.shape[1]}×{image.shape[0]} pixels, but its camera in "
+                                 f"{self.take.rig_path.name} has {camera.size_px[0]}×{camera.size_px[1]}; use the footage as it was calibrated.")
+        return images
+
+    def files(self, frame: int) -> list[Path]:
+        """The files behind one frame, a movie standing for all of its frames."""
+        return [f[frame + v.offset_frames] if len(f := s.files()) > 1 or s.count == 1 else f[0]
+                for s, v in zip(self.sequences, self.take.views)]
+
+
+def read_take(folder: Path) -> Take:
+    """Read FOLDER/take.toml.
+
+    Raises:
+        InputError: the file is missing or broken, has an unknown key, or a value that cannot be.
+    """
+    folder = Path(folder)
+    path = folder / "take.toml" if folder.name != "take.toml" else folder
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). "
+                         "Make one with `tricap new`.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a TOML file: {error}.") from error
+    return _take(table, path.parent.resolve(), str(path))
+
+
+def open_take(take: Take) -> Footage:
+    """Open the footage and the rig of a take and check that they belong together.
+
+    Raises:
+        InputError: a view without camera or images, views of unequal length, frames or seeds outside the footage.
+    """
+    rig = read_rig(take.rig_path)
+    cameras = tuple(rig[v.name] for v in take.views)
+    sequences = tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
+    footage = Footage(take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=_frames(take, sequences))
+    _check_seeds(footage)
+    return footage
+
+
+def _frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
+    counts = [s.count - v.offset_frames for s, v in zip(sequences, take.views)]
+    first = max(0, *(-v.offset_frames for v in take.views))
+    if take.frames is None:
+        if len(set(counts)) > 1:
+            said = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
+            raise InputError(f"The views of {take.folder.name} are not equally long: {said} frames. "
+                             "Trim them, or set `offset_frames` or `frames` in take.toml.")
+        return range(first, counts[0])
+    start, stop = take.frames
+    if start < first or stop > min(counts):
+        raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but the footage has frames {first} to {min(counts)} (half-open); "
+                         "mend it in take.toml.")
+    return range(start, stop)
+
+
+def _check_seeds(footage: Footage) -> None:
+    seeds, take = footage.take.seeds, footage.take
+    clicks = [(f"joint “{name}”", at) for name, at in seeds.joints.items()]
+    clicks += [(f"surface seed {i + 1}", at) for i, at in enumerate(seeds.surface)]
+    for label, at in clicks:
+        for view, xy in at.items():
+            if not footage.rig[view].sees(xy):
+                w, h = footage.rig[view].size_px
+                raise InputError(f"The {label} in view {view} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels; click it again.")
+    if clicks and seeds.frame not in footage.frames:
+        raise InputError(f"The seeds of {take.folder.name} belong to frame {seeds.frame}, which is not among the frames "
+                         f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` under [seeds].")
+
+
+def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
+    _known(table, KEYS, where)
+    if table.get("format") != FORMAT or table.get("version") != VERSION:
+        raise InputError(f"{where} must say format = \"{FORMAT}\" and version = {VERSION}; it says "
+                         f"{table.get('format')!r} and {table.get('version')!r}.")
+    views = _views(table.get("views"), where)
+    names = tuple(v.name for v in views)
+    reference = table.get("reference_view", names[len(names) // 2])
+    if reference not in names:
+        raise InputError(f"`reference_view` of {where} is {reference!r}.{nearest_name(str(reference), names)}")
+    interlaced = table.get("interlaced", "none")
+    if interlaced not in INTERLACE:
+        raise InputError(f"`interlaced` of {where} is {interlaced!r}; write one of: {', '.join(INTERLACE)}.")
+    fps = table.get("fps")
+    if not _is_number(fps) or not 0.1 <= float(fps) <= 10_000:
+        raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
+    body = _table(table, "body", where)
+    _known(body, ("model",), f"[body] of {where}")
+    return Take(folder=folder, fps=float(fps), views=views, rig_path=_inside(folder, table.get("rig", "rig.toml"), where),
+                interlaced=interlaced, reference_view=reference, frames=_range(table.get("frames"), where),
+                body_model=body.get("model"), seeds=_seeds(_table(table, "seeds", where), names, where),
+                settings=_settings(_table(table, "settings", where), where))
+
+
+def _views(entries: Any, where: str) -> tuple[View, ...]:
+    if not isinstance(entries, list) or len(entries) < 2 or not all(isinstance(e, dict) for e in entries):
+        raise InputError(f"{where} needs at least two [[views]], in the order in which the cameras stand.")
+    views = []
+    for entry in entries:
+        label = f"view {entry.get('name')!r} of {where}"
+        _known(entry, ("name", "images", "movie", "offset_frames"), label)
+        offset = entry.get("offset_frames", 0)
+        if not isinstance(entry.get("name"), str) or not entry["name"] or not isinstance(offset, int):
+            raise InputError(f"A {label} needs a name (text); `offset_frames` is a whole number.")
+        if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
+            raise InputError(f"The {label} needs either `images` (a pattern such as \"{entry['name']}/*.png\") or `movie` (a file).")
+        views.append(View(name=entry["name"], images=entry.get("images"), movie=entry.get("movie"), offset_frames=offset))
+    if len({v.name for v in views}) < len(views):
+        raise InputError(f"Two views of {where} have the same name; give each its own.")
+    return tuple(views)
+
+
+def _seeds(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Seeds:
+    _known(table, ("frame", "surface", "joints"), f"[seeds] of {where}")
+    frame, surface, joints = table.get("frame", 0), table.get("surface", []), table.get("joints", {})
+    if not isinstance(frame, int) or not isinstance(surface, list) or not isinstance(joints, dict):
+        raise InputError(f"[seeds] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
+    _known(joints, JOINTS, f"[seeds.joints] of {where}")
+    return Seeds(frame=frame, surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),
+                 joints={name: _clicks(at, views, f"joint “{name}” of {where}") for name, at in joints.items()})
+
+
+def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
+    if not isinstance(at, dict):
+        raise InputError(f"The {label} must name views and pixels, such as {{ {views[0]} = [312.0, 180.5] }}.")
+    _known(at, views, label)
+    for view, xy in at.items():
+        if not isinstance(xy, list) or len(xy) != 2 or not all(_is_number(v) for v in xy):
+            raise InputError(f"The {label} in view {view} is {xy!r}; write two pixel coordinates [x, y].")
+    return {view: np.array(xy, dtype=np.float64) for view, xy in at.items()}
+
+
+def _settings(table: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str, Any]]:
+    for name, group in table.items():
+        if not isinstance(group, dict):
+            raise InputError(f"[settings] of {where} holds tables such as [settings.matching]; “{name}” is none.")
+    return table
+
+
+def _range(value: Any, where: str) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, int) for v in value) or not 0 <= value[0] < value[1]:
+        raise InputError(f"`frames` of {where} is {value!r}; write [first, one after the last].")
+    return value[0], value[1]
+
+
+def _inside(folder: Path, name: Any, where: str) -> Path:
+    if not isinstance(name, str) or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"`rig` of {where} is {name!r}; it must be a file inside the take's folder. Copy it there.")
+    return folder / name
+
+
+def _table(table: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise InputError(f"[{key}] of {where} must be a table.")
+    return value
+
+
+def _known(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
+    for key in table:
+        if key not in known:
+            raise InputError(f"{where} has an unknown key “{key}”.{nearest_name(str(key), known)}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
