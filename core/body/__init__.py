@@ -1,0 +1,1 @@
+"""The body: skeleton, metaballs and the skin around them."""

@@ -1,0 +1,126 @@
+"""Body models are data files (models/*.toml): bones, DOFs with limits, default lengths and radii. A user can write another one.
+
+A file with `mirror_of` is the mirror image (x → −x) of another: names change side, limits about y and z change sign.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..settings import nearest_name
+from ..values import frozen
+from .skeleton import Bone, Dof, Skeleton
+
+MODELS = Path(__file__).with_name("models")
+MIRROR = np.array([-1.0, 1.0, 1.0])
+OTHER_SIDE = {".R": ".L", ".L": ".R"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BodyModel:
+    """A kind of body before any measurement: skeleton with nominal lengths, default radii, and which part of a bone shows its own surface."""
+
+    name: str
+    skeleton: Skeleton
+    visible_radii_m: np.ndarray  # (B, 3, 2) seen cross radii at the stations in x and z; NaN for bones without balls
+    surface: np.ndarray  # (B, 2) fractions of the bone between which a measured surface is the bone's own
+
+    def __post_init__(self) -> None:
+        b = len(self.skeleton.bones)
+        object.__setattr__(self, "visible_radii_m", frozen(self.visible_radii_m, (b, 3, 2), name="visible_radii_m"))
+        object.__setattr__(self, "surface", frozen(self.surface, (b, 2), name="surface"))
+
+
+def model_names() -> tuple[str, ...]:
+    """The models that come with Tricap."""
+    return tuple(sorted(path.name.removesuffix(".toml") for path in MODELS.glob("*.toml")))
+
+
+def read_model(name: str | Path) -> BodyModel:
+    """The model of that name, or of that .toml file.
+
+    Raises:
+        InputError: there is no such model, or its file is faulty.
+    """
+    path = Path(name) if str(name).endswith(".toml") else MODELS / f"{name}.toml"
+    if path.parent == MODELS and path.name.removesuffix(".toml") not in model_names():
+        raise InputError(f"There is no body model “{name}”.{nearest_name(str(name), model_names())}")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"The body model {path} cannot be read: {error}.") from error
+    if "mirror_of" in table:
+        return mirrored(read_model(str(table["mirror_of"])), str(table.get("name", name)))
+    return _model(table, path)
+
+
+def mirrored(model: BodyModel, name: str) -> BodyModel:
+    """The mirror image of a model: equal radii and lengths, the other side's names, angles about y and z with opposite sign."""
+    old = model.skeleton
+    bones = tuple(_mirrored_bone(bone) for bone in old.bones)
+    base = tuple(Dof(name=other_side(d.name), axis=d.axis, limits=d.limits, prior_sigma=d.prior_sigma) for d in old.base_dofs)
+    return BodyModel(name=name, skeleton=Skeleton(name=name, bones=bones, base_dofs=base),
+                     visible_radii_m=model.visible_radii_m, surface=model.surface)
+
+
+def other_side(name: str) -> str:
+    """The name of the same thing on the body's other side: “elbow.R flexion” ↔ “elbow.L flexion”."""
+    word, space, rest = name.partition(" ")
+    return word[:-2] + OTHER_SIDE[word[-2:]] + space + rest if word[-2:] in OTHER_SIDE else name
+
+
+def _mirrored_bone(bone: Bone) -> Bone:
+    dofs = []
+    for d in bone.dofs:
+        sign = 1.0 if d.axis == "x" else -1.0
+        low, high = sorted((sign * d.limits[0], sign * d.limits[1]))
+        dofs.append(Dof(name=other_side(d.name), axis=d.axis, limits=(low, high), prior_mean=sign * d.prior_mean, prior_sigma=d.prior_sigma))
+    R = MIRROR[:, None] * bone.R_rest * MIRROR  # x changes sign twice: the frame stays right-handed
+    return Bone(name=other_side(bone.name), parent=None if bone.parent is None else other_side(bone.parent),
+                head_joint=other_side(bone.head_joint), tail_joint=other_side(bone.tail_joint),
+                nominal_length_m=bone.nominal_length_m, R_rest=R, rotation_mode=bone.rotation_mode, dofs=tuple(dofs))
+
+
+def rest_frame(y: Any, z: Any) -> np.ndarray:
+    """A rest frame (3, 3) from the bone's direction y and a direction z across it, which is made orthogonal."""
+    y, z = np.asarray(y, dtype=np.float64), np.asarray(z, dtype=np.float64)
+    y = y / np.linalg.norm(y)
+    z = z - y * (y @ z)
+    z = z / np.linalg.norm(z)
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def dof_from_table(table: Mapping[str, Any]) -> Dof:
+    """A rotational DOF from its table in a model or body file."""
+    low, high = table.get("limits_deg", (-inf, inf))
+    return Dof(name=str(table["name"]), axis=str(table["axis"]), limits=(radians(low), radians(high)),
+               prior_mean=radians(table.get("prior_deg", 0.0)), prior_sigma=radians(table.get("prior_sigma_deg", inf)))
+
+
+def base_dofs(joint: str) -> tuple[Dof, Dof, Dof]:
+    """The base DOFs: the world position of a joint."""
+    x, y, z = (Dof(name=f"{joint} {axis}", axis=axis) for axis in "xyz")
+    return x, y, z
+
+
+def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
+    if table.get("format") != "tricap-model" or table.get("version") != 1:
+        raise InputError(f"{path} is no body model of this version of Tricap; begin it with format = \"tricap-model\" and version = 1.")
+    try:
+        stature = float(table["stature_m"])
+        bones = tuple(Bone(name=str(t["name"]), parent=t.get("parent"), head_joint=str(t["head"]), tail_joint=str(t["tail"]),
+                           nominal_length_m=stature * float(t["length_per_stature"]), R_rest=rest_frame(t["y"], t["z"]),
+                           rotation_mode=str(t.get("rotation_mode", "YZX")), dofs=tuple(map(dof_from_table, t.get("dofs", ()))))
+                      for t in table["bones"])
+        radii = [np.broadcast_to(np.array(t.get("radii_m", [np.nan] * 3), dtype=float).reshape(3, -1), (3, 2)) for t in table["bones"]]
+        surface = [t.get("surface", (0.0, 1.0)) for t in table["bones"]]
+        skeleton = Skeleton(name=str(table["name"]), bones=bones, base_dofs=base_dofs(str(table["base"])))
+        return BodyModel(name=skeleton.name, skeleton=skeleton, visible_radii_m=np.array(radii), surface=np.array(surface))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"The body model {path} lacks something or holds a wrong value: {error}.") from error

@@ -1,0 +1,1 @@
+"""Fitting the body to what was measured."""

@@ -1,0 +1,1 @@
+"""Motion as files, and its way to other bodies."""
