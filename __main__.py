@@ -1,0 +1,14 @@
+"""`python -m tricap …`, and the console script `tricap`: the commands of the core joined with those that need Blender."""
+
+import sys
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command of the `tricap` command line; its exit code (see docs/formats.md)."""
+    from .core import commands
+
+    return commands.main(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
