@@ -1,0 +1,205 @@
+"""The plan of the house, checked by reading every module's syntax tree: who may import whom, and what no module may do.
+
+Each rule is a function of (file name, source) that returns the faults it found; beside it stand samples it must reject and one that
+it must let pass.
+"""
+
+import ast
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+# Lowest first: a module of core imports only from its left. Sub-packages count as one.
+LAYERS = (
+    "errors progress settings values store geometry images matching calibration surface tracking "
+    "body fitting motion take report pipeline commands"
+).split()
+SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}
+THIRD_PARTY = {"numpy", "scipy", "cv2"}
+NETWORK = {"socket", "ssl", "http", "urllib", "ftplib", "smtplib", "xmlrpc", "requests", "asyncio"}
+SERIALIZERS = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "joblib"}
+LONGEST_FILE = 400
+
+Imported = tuple[int, bool, tuple[str, ...]]  # line, relative or not, the module's dotted name (relative ones from the root)
+
+
+def imported(name: str, source: str) -> Iterator[Imported]:
+    """Every import of a module, at its head or inside a function."""
+    package = Path(name).parent.parts
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, False, tuple(alias.name.split("."))
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = (*base, *(node.module.split(".") if node.module else ()))
+            for alias in node.names:
+                yield node.lineno, bool(node.level), (*module, alias.name)
+
+
+def calls(source: str) -> Iterator[tuple[int, str]]:
+    """Every call by name: line and the dotted name that is called, e.g. "np.load"."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            yield node.lineno, ast.unparse(node.func)
+
+
+def layer_order(name: str, source: str) -> list[str]:
+    """Core imports only from its left; synthetic is used by the commands alone; core knows nothing of the add-on."""
+    mine = Path(name).with_suffix("").parts[1] if name.startswith("core/") else "__init__"
+    if mine == "__init__":
+        return []
+    if mine != "synthetic" and mine not in LAYERS:
+        return [f"{name}: “{mine}” has no place in the layer order; give it one in LAYERS"]
+    lower = SYNTHETIC_USES if mine == "synthetic" else set(LAYERS[: LAYERS.index(mine)])
+    allowed = lower | {mine} | ({"synthetic"} if mine == "commands" else set())
+    return [
+        f"{name}:{line} imports {'.'.join(module)}, which is not below {mine}"
+        for line, relative, module in imported(name, source)
+        if relative and (module[0] != "core" or module[1] not in allowed)
+    ]
+
+
+def core_is_pure(name: str, source: str) -> list[str]:
+    """Core uses the standard library, numpy, scipy and cv2: no bpy, no mathutils."""
+    known = THIRD_PARTY | set(sys.stdlib_module_names)
+    return [
+        f"{name}:{line} imports {module[0]}"
+        for line, relative, module in imported(name, source)
+        if name.startswith("core/") and not relative and module[0] not in known
+    ]
+
+
+def bpy_stays_in_the_addon(name: str, source: str) -> list[str]:
+    """The root modules load without Blender: at their head stands no import of bpy or of the add-on."""
+    if "/" in name:
+        return []
+    head = "\n".join(ast.unparse(node) for node in ast.parse(source).body if isinstance(node, (ast.Import, ast.ImportFrom)))
+    return [f"{name} imports {'.'.join(module)} at its head" for _, _, module in imported(name, head) if module[0] in ("bpy", "addon")]
+
+
+def imports_are_relative(name: str, source: str) -> list[str]:
+    """In Blender the package is not called `tricap`, so modules of ours are imported relatively only."""
+    return [
+        f"{name}:{line} imports {'.'.join(module)} by an absolute name"
+        for line, relative, module in imported(name, source)
+        if not relative and module[0] in ("tricap", "core", "addon", "bl_ext", "tests")
+    ]
+
+
+def core_does_not_print(name: str, source: str) -> list[str]:
+    """Only a command's own output is printed."""
+    if not name.startswith("core/") or Path(name).with_suffix("").parts[1] == "commands":
+        return []
+    printing = ("print", "sys.stdout.write", "sys.stderr.write")
+    return [f"{name}:{line} calls {called}" for line, called in calls(source) if called in printing]
+
+
+def files_carry_no_code(name: str, source: str) -> list[str]:
+    """A file from a stranger cannot run code: no pickle, no eval."""
+    faults = [f"{name}:{line} imports {module[0]}" for line, _, module in imported(name, source) if module[0] in SERIALIZERS]
+    faults += [f"{name}:{line} calls {called}" for line, called in calls(source) if called in ("eval", "exec", "__import__")]
+    allowed = [node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.keyword) and node.arg == "allow_pickle"]
+    return faults + [
+        f"{name}:{value.lineno} allows pickle" for value in allowed if not (isinstance(value, ast.Constant) and value.value is False)
+    ]
+
+
+def no_network(name: str, source: str) -> list[str]:
+    """Nothing leaves the computer."""
+    absolute = [(line, module[0]) for line, relative, module in imported(name, source) if not relative]
+    return [f"{name}:{line} imports {module}" for line, module in absolute if module in NETWORK]
+
+
+def no_silent_except(name: str, source: str) -> list[str]:
+    """An error is mended, told or passed on; it does not vanish."""
+    return [
+        f"{name}:{node.lineno} swallows {'everything' if node.type is None else ast.unparse(node.type)}"
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.ExceptHandler) and (node.type is None or all(isinstance(part, ast.Pass) for part in node.body))
+    ]
+
+
+def files_stay_small(name: str, source: str) -> list[str]:
+    """A file that outgrows 400 lines holds two ideas."""
+    length = len(source.splitlines())
+    return [f"{name} has {length} lines, more than {LONGEST_FILE}"] if length > LONGEST_FILE else []
+
+
+Rule = Callable[[str, str], list[str]]
+REJECTED: list[tuple[Rule, str, str]] = [
+    (layer_order, "core/geometry/camera.py", "from ..matching.seeds import grow"),
+    (layer_order, "core/errors.py", "from . import settings"),
+    (layer_order, "core/body/skin.py", "def f():\n    from ..fitting import solver"),
+    (layer_order, "core/pipeline.py", "from .synthetic.arm import make_arm_take"),
+    (layer_order, "core/synthetic/arm.py", "from ..pipeline import run"),
+    (layer_order, "core/take.py", "from ..addon import jobs"),
+    (layer_order, "core/helpers.py", ""),
+    (core_is_pure, "core/body/skin.py", "import bpy"),
+    (core_is_pure, "core/body/skin.py", "from mathutils import Vector"),
+    (core_is_pure, "core/report.py", "def draw():\n    import matplotlib.pyplot"),
+    (bpy_stays_in_the_addon, "__init__.py", "import bpy"),
+    (bpy_stays_in_the_addon, "__init__.py", "from . import addon"),
+    (imports_are_relative, "core/take.py", "from tricap.core.errors import InputError"),
+    (imports_are_relative, "addon/jobs.py", "import core.pipeline"),
+    (core_does_not_print, "core/surface/cloud.py", "print('done')"),
+    (core_does_not_print, "core/surface/cloud.py", "import sys\nsys.stdout.write('done')"),
+    (files_carry_no_code, "core/store.py", "import pickle"),
+    (files_carry_no_code, "core/store.py", "from pickle import loads"),
+    (files_carry_no_code, "addon/presets.py", "eval(text)"),
+    (files_carry_no_code, "core/store.py", "np.load(path, allow_pickle=True)"),
+    (no_network, "core/commands.py", "from urllib.request import urlopen"),
+    (no_silent_except, "core/store.py", "try:\n    f()\nexcept OSError:\n    pass"),
+    (no_silent_except, "core/store.py", "try:\n    f()\nexcept:\n    g()"),
+    (files_stay_small, "core/take.py", "x = 1\n" * (LONGEST_FILE + 1)),
+]
+ACCEPTED: list[tuple[Rule, str, str]] = [
+    (layer_order, "core/matching/seeds.py", "from ..geometry.rig import Rig\nfrom ..errors import InputError\nfrom .filters import sift"),
+    (layer_order, "core/commands.py", "from .synthetic import arm\nfrom . import pipeline"),
+    (layer_order, "addon/jobs.py", "from ..core import pipeline"),
+    (core_is_pure, "core/images/sampling.py", "import json\nimport cv2\nimport numpy as np\nfrom scipy import ndimage"),
+    (bpy_stays_in_the_addon, "__init__.py", "def register():\n    from . import addon"),
+    (imports_are_relative, "addon/jobs.py", "import bpy\nfrom ..core import pipeline"),
+    (core_does_not_print, "core/commands.py", "print('done')"),
+    (files_carry_no_code, "core/store.py", "np.load(path, allow_pickle=False)"),
+    (no_network, "core/commands.py", "import json"),
+    (no_silent_except, "core/store.py", "try:\n    f()\nexcept OSError as error:\n    raise InputError('x') from error"),
+    (files_stay_small, "core/take.py", "x = 1\n" * LONGEST_FILE),
+]
+RULES = tuple(dict.fromkeys(rule for rule, _, _ in REJECTED))
+
+
+def our_modules() -> dict[str, str]:
+    """Name and source of every module that is shipped."""
+    paths = [ROOT / "__init__.py", ROOT / "__main__.py", *sorted((ROOT / "core").rglob("*.py")), *sorted((ROOT / "addon").rglob("*.py"))]
+    return {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in paths}
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_the_house_keeps_the_rule(rule: Rule) -> None:
+    faults = [fault for name, source in our_modules().items() for fault in rule(name, source)]
+    assert not faults, f"{rule.__doc__}\n" + "\n".join(faults)
+
+
+@pytest.mark.parametrize(("rule", "name", "source"), REJECTED)
+def test_the_rule_rejects_what_it_is_for(rule: Rule, name: str, source: str) -> None:
+    assert rule(name, source)
+
+
+@pytest.mark.parametrize(("rule", "name", "source"), ACCEPTED)
+def test_the_rule_lets_good_code_pass(rule: Rule, name: str, source: str) -> None:
+    assert rule(name, source) == []
+
+
+def test_every_rule_has_samples_of_both_kinds() -> None:
+    functions = [value for value in globals().values() if callable(value)]
+    defined = {function for function in functions if getattr(function, "__annotations__", {}).get("return") == list[str]}
+    assert defined == set(RULES) == {rule for rule, _, _ in ACCEPTED}
+
+
+def test_all_modules_are_read() -> None:
+    names = our_modules()
+    assert {"__init__.py", "core/errors.py", "core/geometry/camera.py"} <= set(names)
