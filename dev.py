@@ -10,6 +10,7 @@ import argparse
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -121,7 +122,7 @@ def link_source() -> None:
     if WINDOWS:
         write_if_changed(venv_folder() / "Scripts" / "tricap.cmd", '@"%~dp0python.exe" -m tricap %*\n')
     else:
-        script = f"#!/bin/sh\nexec '{venv_program('python')}' -m tricap \"$@\"\n"
+        script = f"#!/bin/sh\nexec {shlex.quote(str(venv_program('python')))} -m tricap \"$@\"\n"
         write_if_changed(venv_program("tricap"), script)
         venv_program("tricap").chmod(0o755)
 
@@ -161,7 +162,8 @@ def run(*command: object) -> int:
 
 def lint() -> int:
     """Style of everything, types of the core."""
-    return run(venv_program("ruff"), "check", ".") or run(venv_program("mypy"))
+    python = venv_program("python")
+    return run(python, "-m", "ruff", "check", ".") or run(python, "-m", "mypy")
 
 
 def demo(out: str) -> int:
