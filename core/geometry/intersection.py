@@ -1,0 +1,94 @@
+"""Forward intersection: the point in space that the rays of its images agree on best, with its covariance.
+
+    Σ_k (x_k − F_k(X))ᵀ K_k⁻¹ (x_k − F_k(X)) → min                             (1)   F_k: camera k (collinearity)
+    N = Σ J_kᵀ K_k⁻¹ J_k ,   X ← X + N⁻¹ Σ J_kᵀ K_k⁻¹ v_k ,   K_X = N⁻¹         (2)
+    σ0² = vᵀ P v / (2 K − 3)                                                   (3)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .camera import Camera
+
+STEPS = 4
+CONVERGED_M = 1e-7
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Intersection:
+    """N points in space. A point that fewer than two rays meet is NaN."""
+
+    xyz_m: np.ndarray  # (N, 3) world
+    covariance_m2: np.ndarray  # (N, 3, 3) from the a priori covariances of the image points
+    residual_px: np.ndarray  # (N, K, 2) image point − projection; NaN where not observed
+    sigma0: np.ndarray  # (N,) root of (3)
+    rays: np.ndarray  # (N,) number of rays
+
+    @property
+    def rms_residual_px(self) -> np.ndarray:
+        """(N,) root mean square over the rays of the distance between image point and projection; NaN where there is no point."""
+        square = np.nansum(self.residual_px**2, axis=(1, 2))
+        return np.where(np.isfinite(self.xyz_m[:, 0]), np.sqrt(square / np.maximum(self.rays, 1)), np.nan)
+
+
+def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covariance_px2: np.ndarray) -> Intersection:
+    """Intersect the rays of N points in K cameras.
+
+    `xy_px` (N, K, 2) full-frame pixels, NaN where a camera does not see the point; `covariance_px2` (N, K, 2, 2).
+    """
+    n = len(xy_px)
+    seen = np.isfinite(xy_px).all(axis=2)
+    rays = seen.sum(axis=1)
+    P = np.zeros((n, len(cameras), 2, 2))
+    P[seen] = np.linalg.inv(covariance_px2[seen])
+    X = np.full((n, 3), np.nan)
+    good = rays >= 2
+    X[good] = _meeting_points(cameras, xy_px[good], seen[good])
+    for _ in range(STEPS):
+        N, rhs, _ = _normal_equations(cameras, X, xy_px, P, seen)
+        step = _solve(N, rhs)
+        X += step
+        if np.nanmax(np.abs(step), initial=0.0) < CONVERGED_M:
+            break
+    N, _, v = _normal_equations(cameras, X, xy_px, P, seen)
+    K = np.full((n, 3, 3), np.nan)
+    usable = np.isfinite(N).all(axis=(1, 2)) & good
+    K[usable] = np.linalg.inv(N[usable] + np.eye(3) * 1e-9)
+    X[~usable] = np.nan
+    vPv = np.einsum("nki,nkij,nkj->n", np.nan_to_num(v), P, np.nan_to_num(v))
+    return Intersection(xyz_m=X, covariance_m2=K, residual_px=np.where(usable[:, None, None], v, np.nan),
+                        sigma0=np.sqrt(vPv / np.maximum(2 * rays - 3, 1)), rays=rays)
+
+
+def _meeting_points(cameras: Sequence[Camera], xy: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Where the rays pass each other closest (N, 3): Σ (I − d dᵀ)(X − C) = 0."""
+    A, b = np.zeros((len(xy), 3, 3)), np.zeros((len(xy), 3))
+    for k, camera in enumerate(cameras):
+        d = camera.rays(np.where(seen[:, k, None], xy[:, k], 0.0))
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * seen[:, k, None, None]
+        A += across
+        b += across @ camera.centre_m
+    return _solve(A + np.eye(3) * 1e-12, b)
+
+
+def _normal_equations(cameras: Sequence[Camera], X: np.ndarray, xy: np.ndarray, P: np.ndarray,
+                      seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    N, rhs, v = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3)), np.full(xy.shape, np.nan)
+    for k, camera in enumerate(cameras):
+        image, J = camera.project_with_jacobian(X)
+        v[:, k] = np.where(seen[:, k, None], xy[:, k] - image, np.nan)
+        JP = np.where(seen[:, k, None, None], J.transpose(0, 2, 1) @ P[:, k], 0.0)
+        N += JP @ np.where(seen[:, k, None, None], J, 0.0)
+        rhs += np.einsum("nij,nj->ni", JP, np.where(seen[:, k, None], v[:, k], 0.0))
+    return N, rhs, v  # (2)
+
+
+def _solve(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+    """x of N x = rhs for many 3×3 systems; NaN where it cannot be solved."""
+    x = np.full(rhs.shape, np.nan)
+    fine = np.isfinite(N).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.where(np.isfinite(N), N, 0.0))) > 0)
+    x[fine] = np.linalg.solve(N[fine], rhs[fine][..., None])[..., 0]
+    return x

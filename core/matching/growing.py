@@ -1,0 +1,200 @@
+"""Dense matching: from seeds to a field of triplets, whole fronts of points at a time.
+
+As published (D'Apuzzo et al. 2000, §2.2) the centre image is the template, a point's start is its matched neighbour shifted with the neighbour's
+shape, and what fails is tried again from other neighbours. Here the neighbours of all points that were just accepted form one array, and a point
+is accepted only when it is found in every view, its rays meet, and its depth continues that of its neighbour:
+
+    start_k(p + δ) = x_k(p) + A_k(p) δ                                                    (1)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..geometry.intersection import Intersection, forward_intersection
+from ..images.sampling import SplineImage
+from ..progress import Monitor
+from ..settings import knob
+from .grid import TemplateGrid
+from .least_squares import Matches, MatchingSettings, match_patches
+from .seeds import Approximations
+
+NEIGHBOURS = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
+TEMPLATE_SIGMA_PX = 0.02  # of the template point itself, so that it may move along with the adjustment
+NOISE_SIGMAS = 4.0
+PATCH_STEP_PX = 4
+SEED_MEDIANS, MAX_LIMIT_PX = 3.0, 2.5
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GrowingSettings:
+    """How the surface is covered with points."""
+
+    spacing_px: int = knob(4, "Distance between measured points in the reference image.", unit="px", low=1, high=32)
+    seed_spacing_px: int = knob(24, "Distance between the points at which seeds are looked for.", unit="px", low=4, high=128)
+    attempts: int = knob(3, "How often a point is tried from different neighbours.", low=1, high=8)
+    bigger_patches: int = knob(1, "Rounds in which what failed is tried again with a patch 4 px larger each time.", low=0, high=5)
+    max_residual_px: float = knob(0.7, "Largest distance by which rays may miss; if half of the seeds miss by more, three times their median.",
+                                  unit="px", low=0.05, high=10.0)
+    max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across.", low=0.5, high=20.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class TripletField:
+    """The points that were matched in all K views: one row per accepted cell of the grid. Rows' pixels, metres."""
+
+    grid: TemplateGrid
+    cell: np.ndarray  # (N,) flat cell numbers, ascending
+    xy: np.ndarray  # (N, K, 2)
+    shape: np.ndarray  # (N, K, 2, 2)
+    covariance: np.ndarray  # (N, K, 2, 2)
+    correlation: np.ndarray  # (N,) the smallest over the views
+    xyz_m: np.ndarray  # (N, 3)
+    covariance_m2: np.ndarray  # (N, 3, 3)
+    residual_px: np.ndarray  # (N,) rms distance of the image points to the meeting point's projections
+    sigma0: np.ndarray  # (N,) of the intersection
+    patch_px: np.ndarray  # (N,) side of the patch that was matched, full-frame pixels
+    tried: int  # how many cells were tried
+    limit_px: float  # the residual that was allowed
+
+    def select(self, rows: np.ndarray) -> "TripletField":
+        """The field with only these rows (a mask or indices)."""
+        names = [n for n in TripletField.__dataclass_fields__ if n not in ("grid", "tried", "limit_px")]
+        return TripletField(grid=self.grid, tried=self.tried, limit_px=self.limit_px, **{n: getattr(self, n)[rows] for n in names})
+
+
+class _State:
+    """What is known of every cell while the field grows."""
+
+    def __init__(self, cells: int, views: int) -> None:
+        self.xy = np.zeros((cells, views, 2))
+        self.shape = np.zeros((cells, views, 2, 2))
+        self.covariance = np.zeros((cells, views, 2, 2))
+        self.correlation, self.residual, self.sigma0 = np.zeros(cells), np.zeros(cells), np.zeros(cells)
+        self.patch = np.zeros(cells, dtype=np.int16)
+        self.xyz, self.covariance_m2 = np.zeros((cells, 3)), np.zeros((cells, 3, 3))
+        self.accepted, self.attempts = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=np.int16)
+
+
+def grow(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, seeds: Approximations,
+         matching: MatchingSettings, growing: GrowingSettings, *, depth_range_m: tuple[float, float], monitor: Monitor) -> TripletField:
+    """Grow the field of triplets from the seeds until no neighbour can be matched any more.
+
+    Only depths within `depth_range_m` (in the reference camera) are accepted.
+    """
+    n_cells = grid.shape[0] * grid.shape[1]
+    state = _State(n_cells, len(cameras))
+    camera = cameras[reference]
+    cells, start, shape, parent_depth = _seed_front(grid, seeds, reference)
+    limit_px = _residual_limit(_measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching)[1], growing)
+    for enlarged in range(growing.bigger_patches + 1):
+        settings = replace(matching, patch_px=matching.patch_px + PATCH_STEP_PX * enlarged)
+        if enlarged:
+            state.attempts[:] = 0
+            cells, start, shape, parent_depth = _front_from(state, np.flatnonzero(state.accepted), grid, growing.attempts, camera)
+        while len(cells):
+            monitor.step("surface", int(state.accepted.sum()), n_cells)
+            state.attempts[cells] += 1
+            xy = grid.xy(cells)
+            matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings)
+            good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, depth_range_m)
+            _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], reference)
+            state.patch[cells[good]] = settings.patch_px
+            cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
+    return _field(state, grid, limit_px)
+
+
+def _residual_limit(seeds: Intersection, growing: GrowingSettings) -> float:
+    """What the calibration allows: a rig whose rays miss each other by 0.6 px everywhere must not lose its points for that."""
+    residual = seeds.rms_residual_px[np.isfinite(seeds.rms_residual_px)]
+    typical = float(np.median(residual)) if len(residual) else 0.0
+    return max(growing.max_residual_px, min(SEED_MEDIANS * typical, MAX_LIMIT_PX))
+
+
+def _front_from(state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts: int,
+                camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The next cells to try, their starts and shapes in every view, and the depth that they should continue."""
+    cells, parents = _next_front(state, fresh, grid, attempts)
+    step = grid.xy(cells) - grid.xy(parents)
+    start = state.xy[parents] + np.einsum("nkij,nj->nki", state.shape[parents], step)  # (1)
+    return cells, start, state.shape[parents], camera.to_camera(state.xyz[parents])[:, 2]
+
+
+def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The seeds moved to their nearest cells, one per cell; their depth is not yet bound to anything (NaN)."""
+    cells = grid.nearest(seeds.xy[:, reference])
+    cells, first = np.unique(cells, return_index=True)
+    step = grid.xy(cells) - seeds.xy[first, reference]
+    start = seeds.xy[first] + np.einsum("nkij,nj->nki", seeds.shape[first], step)
+    return cells, start, seeds.shape[first], np.full(len(cells), np.nan)
+
+
+def _measure(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, xy: np.ndarray, start: np.ndarray,
+             shape: np.ndarray, matching: MatchingSettings) -> tuple[list[Matches], Intersection, np.ndarray]:
+    views = [k for k in range(len(cameras)) if k != reference]
+    matched = match_patches(images[reference], xy, [images[k] for k in views], [start[:, k] for k in views], [shape[:, k] for k in views],
+                            matching, row_step=grid.rows.step)
+    image_xy = np.full((len(xy), len(cameras), 2), np.nan)
+    K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2, (len(xy), len(cameras), 1, 1))
+    image_xy[:, reference] = xy
+    every = np.all([m.ok for m in matched], axis=0)
+    for k, m in zip(views, matched):
+        image_xy[every, k] = m.xy[every]
+        K[every, k] = m.covariance[every]
+    image_xy[~every] = np.nan
+    point = forward_intersection(cameras, grid.rows.to_frame(image_xy), grid.rows.covariance_to_frame(K))
+    return matched, point, cameras[reference].to_camera(point.xyz_m)[:, 2]
+
+
+def _acceptable(matched: Sequence[Matches], point: Intersection, depth: np.ndarray, parent_depth: np.ndarray, grid: TemplateGrid,
+                camera: Camera, growing: GrowingSettings, limit_px: float, depth_range_m: tuple[float, float]) -> np.ndarray:
+    near, far = depth_range_m
+    sigma = np.sqrt(np.nan_to_num(np.trace(point.covariance_m2, axis1=1, axis2=2), nan=0.0))
+    across = depth * grid.spacing_px * np.sqrt(2) / camera.focal_px
+    with np.errstate(invalid="ignore"):
+        continues = ~(np.abs(depth - parent_depth) > growing.max_slope * across + NOISE_SIGMAS * sigma)  # NaN parents bind nothing
+        return (np.all([m.ok for m in matched], axis=0) & (point.rms_residual_px <= limit_px)
+                & (depth >= near) & (depth <= far) & continues)
+
+
+def _rows(m: Matches, rows: np.ndarray) -> Matches:
+    return Matches(**{name: getattr(m, name)[rows] for name in Matches.__dataclass_fields__})
+
+
+def _store(state: _State, cells: np.ndarray, matched: Sequence[Matches], point: Intersection, good: np.ndarray, xy: np.ndarray,
+           reference: int) -> None:
+    views = [k for k in range(state.xy.shape[1]) if k != reference]
+    state.accepted[cells] = True
+    state.xy[cells, reference], state.shape[cells, reference] = xy, np.eye(2)
+    state.covariance[cells, reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
+    for k, m in zip(views, matched):
+        state.xy[cells, k], state.shape[cells, k], state.covariance[cells, k] = m.xy, m.shape, m.covariance
+    state.correlation[cells] = np.min([m.correlation for m in matched], axis=0)
+    state.xyz[cells], state.covariance_m2[cells] = point.xyz_m[good], point.covariance_m2[good]
+    state.residual[cells], state.sigma0[cells] = point.rms_residual_px[good], point.sigma0[good]
+
+
+def _next_front(state: _State, fresh: np.ndarray, grid: TemplateGrid, attempts: int) -> tuple[np.ndarray, np.ndarray]:
+    """The untaken neighbours of the fresh cells, each with its best fresh parent (smallest variance)."""
+    gh, gw = grid.shape
+    i = (fresh % gw)[:, None] + NEIGHBOURS[:, 0]
+    j = (fresh // gw)[:, None] + NEIGHBOURS[:, 1]
+    cells, parents = (j * gw + i).ravel(), np.repeat(fresh, len(NEIGHBOURS))
+    usable = ((i >= 0) & (i < gw) & (j >= 0) & (j < gh)).ravel()
+    cells, parents = cells[usable], parents[usable]
+    open_ = ~state.accepted[cells] & (state.attempts[cells] < attempts)
+    cells, parents = cells[open_], parents[open_]
+    quality = np.trace(state.covariance[parents].sum(axis=1), axis1=1, axis2=2)
+    order = np.lexsort((parents, quality, cells))
+    cells, first = np.unique(cells[order], return_index=True)
+    return cells, parents[order][first]
+
+
+def _field(state: _State, grid: TemplateGrid, limit_px: float) -> TripletField:
+    cell = np.flatnonzero(state.accepted)
+    return TripletField(grid=grid, cell=cell, xy=state.xy[cell], shape=state.shape[cell], covariance=state.covariance[cell],
+                        correlation=state.correlation[cell], xyz_m=state.xyz[cell], covariance_m2=state.covariance_m2[cell],
+                        residual_px=state.residual[cell], sigma0=state.sigma0[cell],
+                        patch_px=state.patch[cell], limit_px=limit_px, tried=int((state.attempts > 0).sum()))

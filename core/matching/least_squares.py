@@ -1,0 +1,251 @@
+"""Adaptive least squares matching of many patches at once (Gruen 1985), in the inverse-compositional form (Baker & Matthews 2004).
+
+A patch f of the template image about a point is found in a search image g, moved, sheared and scaled, with another brightness:
+
+    f(u) + e = r0 + r1 g(c + A u) ,   u in the patch                                    (1)
+
+Unknowns: the position c (2), the shape A (2×2) and the radiometry r0, r1. With f̃, g̃ free of their means, f̂ = f̃ / |f̃|, and the design matrix
+J = [fx, fx u, fx v, fy, fy u, fy v] of the template's gradients, r0 and r1 are eliminated by M = I − 1 1ᵀ/n − f̂ f̂ᵀ:
+
+    H = Jᵀ M J ,   r1 = |f̃| (g̃·f̂) / (g̃·g̃) ,   Δp = H⁻¹ r1 (Jᵀ g̃ − Jᵀf̂ (g̃·f̂))           (2)
+    u → A (I + B)⁻¹ (u − d) + c   with Δp = (d1, B11, B12, d2, B21, B22)                 (3)
+    σ0² = |f̃|² (1 − ρ²) / (n − 8) ,   ρ = g̃·f̂ / |g̃| ,   K_c = σ0² A H⁻¹[d] Aᵀ             (4)
+
+H belongs to the template alone, so it is built once; all patches of a chunk are arrays (N, n), and what has converged leaves the arrays.
+Coordinates are pixels of the images given (a field's rows count as rows).
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from ..images.sampling import SplineImage
+from ..progress import Monitor
+from ..settings import knob
+
+CHUNK = 512
+THREADS = 2
+MAX_STEP_PX = 2.0
+CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
+MIN_CONDITION = 1e-6
+PARAMETERS = 8
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MatchingSettings:
+    """Least squares matching and its quality limits (SCIENCE §4: the five indicators of D'Apuzzo et al. 2000)."""
+
+    patch_px: int = knob(13, "Side of the square patch that is compared.", unit="px", low=5, high=51)
+    max_iterations: int = knob(20, "Iterations before a patch is given up.", low=2, high=100)
+    converged_px: float = knob(0.01, "A patch has converged when it moves by less than this, or by a small part of its sigma.", unit="px",
+                               low=1e-4, high=0.5)
+    max_shift_px: float = knob(3.0, "Largest distance of the result from its start.", unit="px", low=0.5, high=20.0)
+    max_sigma_px: float = knob(0.25, "Largest standard deviation of a matched position.", unit="px", low=0.01, high=2.0)
+    min_correlation: float = knob(0.75, "Smallest correlation of the matched patches.", low=0.0, high=0.999)
+    max_sigma0: float = knob(35.0, "Largest sigma0, in grey values of a patch whose contrast is set to 50.", low=1.0, high=100.0)
+    max_shear: float = knob(0.75, "Largest change of the patch's shape from its start.", low=0.1, high=3.0)
+
+
+class MatchStatus(IntEnum):
+    """Why a match is good or not; a point that failed keeps its row."""
+
+    OK = 0
+    OUT_OF_IMAGE = 1
+    NO_TEXTURE = 2
+    NOT_CONVERGED = 3
+    SHIFT_TOO_LARGE = 4
+    SHAPE_TOO_LARGE = 5
+    LOW_CORRELATION = 6
+    SIGMA_TOO_LARGE = 7
+    SIGMA0_TOO_LARGE = 8
+    NOT_TRIED = 9
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Matches:
+    """N patches found (or not) in one search image. Pixels of that image."""
+
+    xy: np.ndarray  # (N, 2) position of the template point
+    shape: np.ndarray  # (N, 2, 2) the affine shape A
+    covariance: np.ndarray  # (N, 2, 2) of xy [px²]
+    sigma0: np.ndarray  # (N,) grey values of a patch whose contrast is 50
+    correlation: np.ndarray  # (N,)
+    iterations: np.ndarray  # (N,)
+    status: np.ndarray  # (N,) MatchStatus
+
+    @property
+    def ok(self) -> np.ndarray:
+        """(N,) which patches passed all limits."""
+        return self.status == MatchStatus.OK
+
+
+def patch_offsets(patch_px: int, row_step: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Patch coordinates u, v (n,) float32 about the centre, and the half size; `row_step` 2 halves the rows (a field)."""
+    half_w, half_h = patch_px // 2, max(2, round((patch_px / row_step - 1) / 2))
+    v, u = np.mgrid[-half_h : half_h + 1, -half_w : half_w + 1].astype(np.float32)
+    return u.ravel(), v.ravel(), (half_w, half_h)
+
+
+def match_patches(template: SplineImage, xy: np.ndarray, searches: Sequence[SplineImage], starts: Sequence[np.ndarray],
+                  shapes: Sequence[np.ndarray], settings: MatchingSettings, *, row_step: int = 1,
+                  template_shape: np.ndarray | None = None, monitor: Monitor | None = None) -> list[Matches]:
+    """Find the patches about `xy` (N, 2) of the template image in each search image.
+
+    `starts` are the approximate positions (N, 2) and `shapes` the approximate affine shapes (N, 2, 2), one of each per search image.
+    `template_shape` (N, 2, 2) warps the patch in the template itself (a patch that was itself matched). NaN starts are OUT_OF_IMAGE.
+    Cost: about 10 µs per patch of 13×13 and search image.
+    """
+    n = len(xy)
+    spans = [slice(i, min(i + CHUNK, n)) for i in range(0, n, CHUNK)]
+
+    def work(span: slice) -> list[Matches]:
+        if monitor is not None and monitor.cancelled:
+            monitor.step("matching", span.start, n)
+        patches = _Templates(template, xy[span], settings, row_step, None if template_shape is None else template_shape[span])
+        return [patches.find(g, s[span], A[span]) for g, s, A in zip(searches, starts, shapes)]
+
+    if len(spans) > 1:
+        with ThreadPoolExecutor(THREADS) as pool:
+            parts = list(pool.map(work, spans))
+    else:
+        parts = [work(span) for span in spans] or [[_empty() for _ in searches]]
+    return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
+
+
+def join_matches(parts: Sequence[Matches]) -> Matches:
+    """One after the other, rows kept in order."""
+    names = Matches.__dataclass_fields__
+    return Matches(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+
+class _Templates:
+    """The template side of a chunk: patches, gradients, and the inverse of the reduced normal matrix."""
+
+    def __init__(self, image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int, shape: np.ndarray | None) -> None:
+        self._settings = settings
+        self._u, self._v, self._half = patch_offsets(settings.patch_px, row_step)
+        self.n_pixels = len(self._u)
+        self._monomials = np.stack([np.ones_like(self._u), self._u, self._v], axis=1)  # (n, 3)
+        self.inside = image.inside(xy, np.array(self._half) + 1.0)
+        f, fx, fy = self._sample(image, np.where(self.inside[:, None], xy, 0.0), shape)
+        f = f - f.mean(axis=1, keepdims=True)
+        self.contrast = np.sqrt(np.einsum("ij,ij->i", f, f))
+        self.f = f / np.maximum(self.contrast, 1e-6)[:, None]
+        self.fx, self.fy = fx, fy
+        self.q = self._project(self.f)  # Jᵀ f̂
+        H = self._normal_matrix()
+        scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
+        eye = np.eye(6) * MIN_CONDITION
+        self.inverse = np.linalg.inv(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
+        self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
+
+    def _sample(self, image: SplineImage, xy: np.ndarray, shape: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Patch and its gradients by fourth-order central differences, all in one look-up with a border of two."""
+        w, h = self._half
+        v, u = np.mgrid[-h - 2 : h + 3, -w - 2 : w + 3].astype(np.float32)
+        A = np.broadcast_to(np.eye(2), (len(xy), 2, 2)) if shape is None else shape
+        x, y = _warp(xy, A, u.ravel(), v.ravel())
+        P = image.sample(x, y).reshape(len(xy), 2 * h + 5, 2 * w + 5)
+        fx = (8 * (P[:, 2:-2, 3:-1] - P[:, 2:-2, 1:-3]) - (P[:, 2:-2, 4:] - P[:, 2:-2, :-4])) / 12
+        fy = (8 * (P[:, 3:-1, 2:-2] - P[:, 1:-3, 2:-2]) - (P[:, 4:, 2:-2] - P[:, :-4, 2:-2])) / 12
+        flat = (len(xy), self.n_pixels)
+        return P[:, 2:-2, 2:-2].reshape(flat), fx.reshape(flat), fy.reshape(flat)
+
+    def _project(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Jᵀ g (m, 6)."""
+        return np.concatenate([(self.fx[rows] * g) @ self._monomials, (self.fy[rows] * g) @ self._monomials], axis=1)
+
+    def _normal_matrix(self) -> np.ndarray:
+        """H = Jᵀ M J (m, 6, 6), from products of the gradients with the monomials up to second order.  (2)"""
+        m = self._monomials
+        second = (m[:, :, None] * m[:, None, :]).reshape(self.n_pixels, 9)
+        xx, xy, yy = ((a * b @ second).reshape(-1, 3, 3) for a, b in ((self.fx, self.fx), (self.fx, self.fy), (self.fy, self.fy)))
+        H = np.concatenate([np.concatenate([xx, xy], 2), np.concatenate([xy, yy], 2)], 1).astype(np.float64)
+        mean = np.concatenate([self.fx @ m, self.fy @ m], axis=1).astype(np.float64)
+        q = self.q.astype(np.float64)
+        return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
+
+    def find(self, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
+        """Iterate (2) and (3) for all patches, then judge them."""
+        s, n = self._settings, len(start)
+        c, A = np.array(start, dtype=np.float64), np.array(shape, dtype=np.float64)
+        status = np.full(n, MatchStatus.NOT_CONVERGED, dtype=np.int8)
+        status[~self.textured] = MatchStatus.NO_TEXTURE
+        status[~(self.inside & image.inside(c, 0.0))] = MatchStatus.OUT_OF_IMAGE
+        correlation, iterations = np.zeros(n), np.zeros(n, dtype=np.int16)
+        active = np.flatnonzero(status == MatchStatus.NOT_CONVERGED)
+        for iteration in range(1, s.max_iterations + 1):
+            if not len(active):
+                break
+            step, rho = self._step(image, c[active], A[active], active)
+            correlation[active], iterations[active] = rho, iteration
+            c[active], A[active], moved = _compose(c[active], A[active], step)
+            gone = (np.abs(c[active] - start[active]).max(axis=1) > 2 * s.max_shift_px) | ~np.isfinite(moved)
+            done = moved < np.maximum(s.converged_px, CONVERGED_SIGMAS * self._sigma(rho, active))
+            status[active[done]] = MatchStatus.OK
+            status[active[gone]] = MatchStatus.SHIFT_TOO_LARGE
+            active = active[~(done | gone)]
+        return self._judge(image, start, shape, c, A, status, correlation, iterations)
+
+    def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = _warp(c, A, self._u, self._v)
+        g = image.sample(x, y)
+        g -= g.mean(axis=1, keepdims=True)
+        power = np.maximum(np.einsum("ij,ij->i", g, g), 1e-6)
+        along = np.einsum("ij,ij->i", g, self.f[rows])
+        gain = self.contrast[rows] * along / power  # r1
+        rhs = (self._project(g, rows) - self.q[rows] * along[:, None]) * gain[:, None]
+        return np.einsum("nij,nj->ni", self.inverse[rows], rhs.astype(np.float64)), along / np.sqrt(power)  # (2)
+
+    def _sigma(self, rho: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
+        variance = self.contrast[rows].astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / max(1, self.n_pixels - PARAMETERS)
+        return np.sqrt(variance * np.maximum(self.inverse[rows, 0, 0], self.inverse[rows, 3, 3]))
+
+    def _judge(self, image: SplineImage, start: np.ndarray, start_shape: np.ndarray, c: np.ndarray, A: np.ndarray, status: np.ndarray,
+               correlation: np.ndarray, iterations: np.ndarray) -> Matches:
+        s = self._settings
+        dof = max(1, self.n_pixels - PARAMETERS)
+        lost = np.clip(1 - correlation**2, 0, 1)
+        variance = self.contrast.astype(np.float64) ** 2 * lost / dof  # (4)
+        K = variance[:, None, None] * (A @ self.inverse[:, ::3, ::3] @ A.transpose(0, 2, 1))
+        sigma0 = 50 * np.sqrt(lost * self.n_pixels / dof)
+        sigma = np.sqrt(np.maximum(K[:, [0, 1], [0, 1]], 0)).max(axis=1)
+        for bad, why in ((np.abs(c - start).max(axis=1) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
+                         (~image.inside(c, np.array(self._half) * 0.5), MatchStatus.OUT_OF_IMAGE),
+                         (np.abs(A - start_shape).max(axis=(1, 2)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
+                         (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
+                         (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE), (sigma0 > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE)):
+            status[(status == MatchStatus.OK) & bad] = why
+        return Matches(xy=c, shape=A, covariance=K, sigma0=sigma0, correlation=correlation, iterations=iterations, status=status)
+
+
+def _warp(c: np.ndarray, A: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows (m, n) float32 of c + A u."""
+    c32, A32 = c.astype(np.float32), A.astype(np.float32)
+    return (c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v)
+
+
+def _compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The warp after the inverse of a step, and how far the centre moved [px].  (3)"""
+    d = step[:, [0, 3]]
+    length = np.linalg.norm(d, axis=1)
+    shrink = np.minimum(1.0, MAX_STEP_PX / np.maximum(length, 1e-9))
+    d = d * shrink[:, None]
+    B = np.eye(2) + step[:, [1, 2, 4, 5]].reshape(-1, 2, 2) * shrink[:, None, None]
+    det = B[:, 0, 0] * B[:, 1, 1] - B[:, 0, 1] * B[:, 1, 0]
+    adjugate = np.stack([B[:, 1, 1], -B[:, 0, 1], -B[:, 1, 0], B[:, 0, 0]], axis=1).reshape(-1, 2, 2)
+    A_new = A @ (adjugate / np.where(np.abs(det) < 0.1, np.nan, det)[:, None, None])
+    move = np.einsum("nij,nj->ni", A_new, d)
+    bad = ~np.isfinite(move).all(axis=1)
+    A_new[bad], moved = A[bad], np.linalg.norm(move, axis=1)
+    return c - np.where(bad[:, None], 0.0, move), A_new, moved
+
+
+def _empty() -> Matches:
+    z = np.zeros
+    return Matches(xy=z((0, 2)), shape=z((0, 2, 2)), covariance=z((0, 2, 2)), sigma0=z(0), correlation=z(0),
+                   iterations=z(0, np.int16), status=z(0, np.int8))

@@ -1,0 +1,142 @@
+"""Seeds: the first triplets, found without a click by sweeping along the rays of the reference view (Collins 1996).
+
+On a coarse grid of textured points of the reference image, each ray is sampled in inverse depth, so finely that the search images move by
+about a pixel; the patch, warped as a plane facing the reference camera would be, is compared in all other views:
+
+    score(w) = Σ_k ρ_k(w) / K ,   w = 1 / depth ,   best w taken if it is high, alone, and found in every view          (1)
+
+Least squares matching then refines the winners. Clicked surface seeds go straight to the refinement.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+
+from ..geometry.camera import Camera
+from ..images.fields import RowGrid
+from ..images.sampling import SplineImage
+from ..progress import Monitor
+from .grid import TemplateGrid
+from .least_squares import MatchingSettings, patch_offsets
+
+NEAREST_BASES, FARTHEST_BASES = 0.8, 40.0  # depth range to look in, in lengths of the longest base, when nothing else is known
+SWEEP_STEP_PX = 1.0
+MIN_SCORE, MIN_LEAD = 0.80, 0.04
+MIN_CONTRAST = 2.0
+PATCH_STRIDE = 2
+MAX_SAMPLES = 1200
+LOOK_UP = 30_000_000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Approximations:
+    """Starts of M points: where they lie in every view and how a patch of the reference view is warped there. Rows' pixels."""
+
+    xy: np.ndarray  # (M, K, 2)
+    shape: np.ndarray  # (M, K, 2, 2)
+    depth_m: np.ndarray  # (M,) in the reference camera
+
+
+def approximations_at_depth(cameras: Sequence[Camera], reference: int, rows: RowGrid, xy: np.ndarray, depth_m: np.ndarray) -> Approximations:
+    """The plane-induced starts of points `xy` (M, 2) (rows' pixels of the reference) at depth (M,), for a plane that faces the reference camera."""
+    base = cameras[reference]
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    X = base.points_at_depth(rows.to_frame(xy[:, None, :] + corners), np.asarray(depth_m)[:, None])  # (M, 3, 3)
+    image = np.stack([rows.from_frame(camera.project(X)) for camera in cameras], axis=1)  # (M, K, 3, 2)
+    shape = np.stack([image[:, :, 1] - image[:, :, 0], image[:, :, 2] - image[:, :, 0]], axis=-1)
+    return Approximations(xy=image[:, :, 0], shape=shape, depth_m=np.asarray(depth_m, dtype=np.float64))
+
+
+def sweep_seeds(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, settings: MatchingSettings, *,
+                spacing_px: int, depth_range_m: tuple[float, float] | None, monitor: Monitor) -> Approximations:
+    """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
+
+    `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig.
+    """
+    rows = grid.rows
+    xy = _textured(images[reference], settings, rows, grid.every(max(1, round(spacing_px / grid.spacing_px))))
+    near, far = depth_range_m or _default_range(cameras)
+    inverse = _inverse_depths(cameras, reference, near, far)
+    block = max(1, LOOK_UP // max(1, len(inverse) * settings.patch_px**2 * len(cameras)))
+    depth, good = np.zeros(len(xy)), np.zeros(len(xy), dtype=bool)
+    for i in range(0, len(xy), block):
+        monitor.step("seeds", i, len(xy))
+        part = slice(i, i + block)
+        score = _sweep_scores(images, cameras, reference, rows, settings, xy[part], inverse)
+        depth[part], good[part] = _peaks(score, inverse)
+    return approximations_at_depth(cameras, reference, rows, xy[good], depth[good])
+
+
+def _textured(image: SplineImage, settings: MatchingSettings, rows: RowGrid, xy: np.ndarray) -> np.ndarray:
+    u, v, half = patch_offsets(settings.patch_px, rows.step)
+    xy = xy[image.inside(xy, np.array(half) + 3.0)]
+    patch = image.sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32))
+    return xy[patch.std(axis=1) > MIN_CONTRAST]
+
+
+def _default_range(cameras: Sequence[Camera]) -> tuple[float, float]:
+    centres = np.stack([c.centre_m for c in cameras])
+    base = max(float(np.linalg.norm(a - b)) for a in centres for b in centres)
+    return NEAREST_BASES * base, FARTHEST_BASES * base
+
+
+def _inverse_depths(cameras: Sequence[Camera], reference: int, near: float, far: float) -> np.ndarray:
+    """Inverse depths from far to near, so that the fastest search image moves by about SWEEP_STEP_PX."""
+    centres = np.stack([c.centre_m for c in cameras])
+    speed = np.linalg.norm(centres - centres[reference], axis=1).max() * cameras[reference].focal_px
+    count = int(np.clip(speed * (1 / near - 1 / far) / SWEEP_STEP_PX, 8, MAX_SAMPLES))
+    return np.linspace(1 / far, 1 / near, count)
+
+
+def _sweep_scores(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, rows: RowGrid, settings: MatchingSettings,
+                  xy: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Smallest correlation over the search views (m, D), −1 where a view does not see the point.  (1)"""
+    m, D = len(xy), len(inverse)
+    u, v, half = patch_offsets(settings.patch_px, rows.step)
+    keep = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > 9 else np.ones(len(u), dtype=bool)
+    u, v = u[keep], v[keep]
+    f = _normalised(images[reference].sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
+    at = approximations_at_depth(cameras, reference, rows, np.repeat(xy, D, axis=0), np.tile(1 / inverse, m))
+    total, views = np.zeros((m, D)), 0
+    seen_by_all = np.ones((m, D), dtype=bool)
+    for k in range(len(cameras)):
+        if k == reference:
+            continue
+        inside = images[k].inside(at.xy[:, k], np.array(half))
+        rho = np.full(m * D, -1.0)
+        rho[inside] = _correlations(images[k], at.xy[inside, k], at.shape[inside, k], f, np.repeat(np.arange(m), D)[inside], u, v)
+        total += rho.reshape(m, D)
+        seen_by_all &= inside.reshape(m, D)
+        views += 1
+    return np.where(seen_by_all, total / views, -1.0)
+
+
+def _correlations(image: SplineImage, c: np.ndarray, A: np.ndarray, f: np.ndarray, owner: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    rho = np.empty(len(c))
+    for i in range(0, len(c), 16_384):
+        s = slice(i, i + 16_384)
+        c32, A32 = c[s].astype(np.float32), A[s].astype(np.float32)
+        g = _normalised(image.sample(c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v))
+        rho[s] = np.einsum("ij,ij->i", g, f[owner[s]])
+    return rho
+
+
+def _normalised(patch: np.ndarray) -> np.ndarray:
+    patch = patch - patch.mean(axis=1, keepdims=True)
+    return patch / np.maximum(np.linalg.norm(patch, axis=1, keepdims=True), 1e-3)
+
+
+def _peaks(score: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the best sample of each row, refined by a parabola, and whether it is high and leads the second-best peak."""
+    rows, best = np.arange(len(score)), score.argmax(axis=1)
+    top = score[rows, best]
+    peaks = (score == maximum_filter1d(score, size=9, axis=1)) & (np.abs(np.arange(score.shape[1]) - best[:, None]) > 8)
+    second = np.where(peaks, score, -1.0).max(axis=1)
+    i = np.clip(best, 1, score.shape[1] - 2)
+    a, b, c = score[rows, i - 1], score[rows, i], score[rows, i + 1]
+    bend = a - 2 * b + c
+    offset = np.clip(np.where(bend < -1e-9, 0.5 * (a - c) / np.where(bend < -1e-9, bend, -1.0), 0.0), -0.5, 0.5)
+    w = inverse[i] + offset * (inverse[1] - inverse[0])
+    return 1 / w, (top >= MIN_SCORE) & (top - second >= MIN_LEAD)

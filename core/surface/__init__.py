@@ -1,0 +1,1 @@
+"""The measured surface: clouds of points with normals and covariances."""

@@ -1,0 +1,91 @@
+"""From triplets to a clean cloud: filters, the correction for curvature, normals and covariances.
+
+Filters (D'Apuzzo et al. 2000, §2.3): a point must agree with its neighbours and must not stand alone. The sigma of a point contains the ray
+intersection's covariance and half of the curvature correction, for what remains of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import label
+
+from ..geometry.camera import Camera
+from ..matching.growing import TripletField
+from ..settings import knob
+from ..values import frozen
+from .local_surface import LocalSurface, local_surface
+
+REMAINING_BIAS = 0.5  # of the curvature correction
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SurfaceSettings:
+    """What is kept of the measured surface."""
+
+    min_island: int = knob(20, "Groups of fewer connected points than this are removed.", low=1, high=10_000)
+    max_deviation: float = knob(4.0, "Largest distance from the neighbours' surface, in units of their scatter.", low=1.0, high=20.0)
+    correct_curvature: bool = knob(True, "Correct the flattening of round surfaces by the patch.")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PointCloud:
+    """The surface of one frame. World metres, full-frame pixels; normals point towards the cameras."""
+
+    frame: int
+    xyz_m: np.ndarray  # (N, 3)
+    covariance_m2: np.ndarray  # (N, 3, 3)
+    normals: np.ndarray  # (N, 3)
+    intensity: np.ndarray  # (N,) grey value in the reference view
+    xy_px: np.ndarray  # (N, K, 2) where it was matched
+    residual_px: np.ndarray  # (N,) rms by which the rays miss
+
+    def __post_init__(self) -> None:
+        n, k = len(self.xyz_m), self.xy_px.shape[1]
+        for name, shape in dict(xyz_m=(n, 3), covariance_m2=(n, 3, 3), normals=(n, 3), intensity=(n,), xy_px=(n, k, 2), residual_px=(n,)).items():
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+
+    @property
+    def sigma_m(self) -> np.ndarray:
+        """(N,) root of the trace of the covariance: the mean error of position."""
+        return np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
+
+
+def clean_field(field: TripletField, camera: Camera, reference: int, settings: SurfaceSettings) -> TripletField:
+    """The field without the points that disagree with their neighbours and without small islands."""
+    if not len(field.cell):
+        return field
+    surface = local_surface(field, camera, reference)
+    spacing_m = field.grid.spacing_px * surface.depth_m / camera.focal_px
+    limit = settings.max_deviation * np.maximum(surface.scatter_m, 0.5 * spacing_m)
+    agrees = (np.abs(surface.depth_m - surface.fitted_m) <= limit) & (surface.neighbours >= 3)
+    return _without_islands(field.select(agrees), settings.min_island)
+
+
+def point_cloud(field: TripletField, grey: np.ndarray, camera: Camera, reference: int, frame: int, settings: SurfaceSettings) -> PointCloud:
+    """The cloud of a cleaned field. `grey` (h', w) is the reference image in rows."""
+    n, k = field.xy.shape[:2]
+    xyz, K, normal = field.xyz_m, field.covariance_m2, np.zeros((0, 3))
+    if n:
+        surface = local_surface(field, camera, reference)
+        normal = surface.normal
+        if settings.correct_curvature:
+            xyz, K = _corrected(field, surface, camera, reference)
+    pixel = np.rint(field.xy[:, reference]).astype(int)
+    return PointCloud(frame=frame, xyz_m=xyz, covariance_m2=K, normals=normal, intensity=grey[pixel[:, 1], pixel[:, 0]],
+                      xy_px=field.grid.rows.to_frame(field.xy).reshape(n, k, 2), residual_px=field.residual_px)
+
+
+def _corrected(field: TripletField, surface: LocalSurface, camera: Camera, reference: int) -> tuple[np.ndarray, np.ndarray]:
+    rays = camera.rays(field.grid.rows.to_frame(field.xy[:, reference]))
+    limit = 0.25 * field.patch_px * surface.depth_m / camera.focal_px  # steeper than a body: the quadric follows noise there
+    shift = np.clip(surface.flattening_m, -limit, limit)
+    along = rays * (REMAINING_BIAS * shift)[:, None]
+    return field.xyz_m + rays * shift[:, None], field.covariance_m2 + along[:, :, None] * along[:, None, :]
+
+
+def _without_islands(field: TripletField, smallest: int) -> TripletField:
+    taken = np.zeros(field.grid.shape, dtype=bool)
+    taken.ravel()[field.cell] = True
+    islands, _ = label(taken, structure=np.ones((3, 3)))
+    size = np.bincount(islands.ravel())
+    return field.select(size[islands.ravel()[field.cell]] >= smallest)

@@ -1,0 +1,97 @@
+"""The surface about each measured point: a quadric of its depth over the neighbouring cells, fitted robustly.
+
+    D(a, b) = D0 + Da a + Db b + ½ Daa a² + Dab a b + ½ Dbb b² ,   a, b in full-frame pixels of the reference image        (1)
+
+It gives the normal, tells points that disagree with their neighbours, and the curvature that an affine patch averages away: the matched depth of a
+patch of w × h pixels is that of (1) averaged over the patch, so a round body is measured too flat, by                          (2)
+
+    D0 − D̄ = −½ (Daa (w² − 1)/12 + Dbb (h² − 1)/12)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..matching.growing import TripletField
+
+RADIUS_CELLS = 3
+MIN_NEIGHBOURS = 8
+ROBUST_STEPS = 3
+TUKEY = 4.685
+MIN_SCALE = 0.15  # of the spacing on the surface: finer scatter than this is not told from the surface's own shape
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class LocalSurface:
+    """N points' neighbourhoods. Depths along the reference camera's axis."""
+
+    depth_m: np.ndarray  # (N,) as measured
+    fitted_m: np.ndarray  # (N,) D0 of (1)
+    scatter_m: np.ndarray  # (N,) robust scatter of the neighbours about (1)
+    neighbours: np.ndarray  # (N,) how many cells support the fit
+    flattening_m: np.ndarray  # (N,) correction (2) of the depth
+    normal: np.ndarray  # (N, 3) unit, towards the reference camera
+
+
+def local_surface(field: TripletField, camera: Camera, reference: int) -> LocalSurface:
+    """Fit (1) about every point of the field, from the cells within RADIUS_CELLS."""
+    depth = camera.to_camera(field.xyz_m)[:, 2]
+    neighbour, a, b = _neighbourhoods(field)
+    valid = neighbour >= 0
+    D = np.where(valid, depth[neighbour], 0.0)
+    spacing_m = field.grid.spacing_px * depth / camera.focal_px
+    weight = valid & (np.abs(D - depth[:, None]) < 3.0 * spacing_m[:, None] * np.hypot(a, b) / field.grid.spacing_px + spacing_m[:, None])
+    coefficients, scatter = _robust_quadric(a, b, D - depth[:, None], weight.astype(np.float64), MIN_SCALE * spacing_m)
+    step = field.grid.rows.step
+    across = np.stack([(field.patch_px**2 - 1) / 12, (field.patch_px**2 - step**2) / 12], axis=1)
+    return LocalSurface(depth_m=depth, fitted_m=depth + coefficients[:, 0], scatter_m=scatter, neighbours=weight.sum(axis=1) - 1,
+                        flattening_m=-0.5 * (coefficients[:, 3] * across[:, 0] + coefficients[:, 5] * across[:, 1]),  # (2)
+                        normal=_normals(field, camera, reference, depth, coefficients))
+
+
+def _neighbourhoods(field: TripletField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of the neighbouring points (N, m), −1 where there is none, and their offsets a, b (m,) in full-frame pixels."""
+    gh, gw = field.grid.shape
+    r = RADIUS_CELLS
+    row_of = np.full((gh + 2 * r, gw + 2 * r), -1, dtype=np.int64)
+    j, i = field.cell // gw + r, field.cell % gw + r
+    row_of[j, i] = np.arange(len(field.cell))
+    dj, di = (d.ravel() for d in np.mgrid[-r : r + 1, -r : r + 1])
+    offset = field.grid.step * (1, field.grid.rows.step)
+    return row_of[j[:, None] + dj, i[:, None] + di], di * offset[0], dj * offset[1]
+
+
+def _robust_quadric(a: np.ndarray, b: np.ndarray, D: np.ndarray, weight: np.ndarray, min_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (N, 6) of (1) and the scatter (N,), by iteratively reweighted least squares (Tukey)."""
+    unit = np.abs(a).max()
+    basis = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=1) / np.array([1, unit, unit, unit**2, unit**2, unit**2])
+    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(a), 36)
+    ridge = np.diag([1e-9, 1e-3, 1e-3, 3e-2, 3e-2, 3e-2])  # a thin neighbourhood falls back to a plane
+    robust = weight
+    for _ in range(ROBUST_STEPS):
+        N = (robust @ products).reshape(-1, 6, 6) + ridge
+        c = np.linalg.solve(N, ((robust * D) @ basis)[..., None])[..., 0]
+        residual = D - c @ basis.T
+        scatter = 1.4826 * _masked_median(np.abs(residual), weight > 0)
+        ratio = residual / (TUKEY * np.maximum(scatter, min_scale))[:, None]
+        robust = weight * np.clip(1 - ratio**2, 0, 1) ** 2
+    return c / np.array([1, unit, unit, unit**2, unit**2, unit**2]), scatter
+
+
+def _masked_median(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Median of each row over its mask; zero for empty rows."""
+    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
+    middle = np.maximum(mask.sum(axis=1) - 1, 0) // 2
+    return np.where(mask.any(axis=1), ordered[np.arange(len(values)), middle], 0.0)
+
+
+def _normals(field: TripletField, camera: Camera, reference: int, depth: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Unit normals from the tangents ∂X/∂a, ∂X/∂b of the fitted depth, turned towards the camera."""
+    xy = field.grid.rows.to_frame(field.xy[:, reference])
+    rays, along_a, along_b = camera.rays(xy), camera.rays(xy + (1.0, 0.0)), camera.rays(xy + (0.0, 1.0))
+    tangent_a = coefficients[:, 1:2] * rays + depth[:, None] * (along_a - rays)
+    tangent_b = coefficients[:, 2:3] * rays + depth[:, None] * (along_b - rays)
+    normal = np.cross(tangent_a, tangent_b)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return np.where(np.einsum("ni,ni->n", normal, rays)[:, None] > 0, -normal, normal)
