@@ -1,0 +1,21 @@
+"""The Blender side of Tricap: the only package that imports bpy or mathutils, and only once it is registered."""
+
+from types import ModuleType
+
+
+def _modules() -> tuple[ModuleType, ...]:
+    from . import command, jobs, operators, panels, properties
+
+    return jobs, properties, operators, panels, command
+
+
+def register() -> None:
+    """Add everything to Blender, in order."""
+    for module in _modules():
+        module.register()
+
+
+def unregister() -> None:
+    """Take everything away again, in reverse order."""
+    for module in reversed(_modules()):
+        module.unregister()

@@ -1,0 +1,54 @@
+"""Which folders a user means: the take's and the output's, from the panel or from an operator's arguments."""
+
+import os
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import InputError
+
+
+def take_folder(given: str, scene: bpy.types.Scene) -> Path:
+    """The folder of the take: `given`, or the panel's.
+
+    Raises:
+        InputError: none was chosen, or it is no folder.
+    """
+    chosen = given or scene.tricap.take
+    if not chosen:
+        raise InputError("Choose the take first: the folder of a recording, with take.toml in it.")
+    folder = _absolute(chosen)
+    if not folder.is_dir():
+        raise InputError(f"The take {folder} is no folder; choose the folder that holds take.toml.")
+    return folder
+
+
+def output_folder(given: str, scene: bpy.types.Scene, take: str = "") -> Path:
+    """The output folder: `given`, or the panel's, or one named after the take beside the .blend (if it is saved) or the take.
+
+    Raises:
+        InputError: it is relative to a .blend that was never saved.
+    """
+    chosen = given or scene.tricap.out
+    if chosen:
+        return _absolute(chosen)
+    folder = take_folder(take, scene)
+    beside = Path(bpy.data.filepath).parent if bpy.data.filepath else folder.parent
+    return beside / f"{folder.name}_tricap"
+
+
+def check_writable(folder: Path) -> None:
+    """See that `folder` can be written to, or be made.
+
+    Raises:
+        InputError: it cannot.
+    """
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise InputError(f"Cannot write into {existing}; choose another output folder.")
+
+
+def _absolute(path: str) -> Path:
+    if path.startswith("//") and not bpy.data.filepath:
+        raise InputError(f"The folder {path} is relative to the Blender file, which was never saved; save it or choose a full path.")
+    return Path(bpy.path.abspath(path)).resolve()

@@ -1,0 +1,224 @@
+"""Long work: one job, two drivers.
+
+A job is a function of a `Monitor` that knows nothing of Blender. `Job.run()` computes it here and now (scripts, background);
+`Job.start()` computes it on a worker thread while a modal operator watches. Whatever ends the session (Esc, another file, quitting,
+disabling the add-on) cancels the job AND waits for its thread.
+
+`JobOperator` gives an operator three moves: `snapshot` (main thread: read what is needed from Blender) → the function it returns
+(any thread, no bpy) → `finish` (main thread: write the result into the scene).
+"""
+
+import atexit
+import logging
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import bpy
+
+from ..core.errors import InputError
+from ..core.progress import Cancelled, Monitor
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.1
+BUG = "Tricap made a mistake ({error}); the console shows where. Please report it with that text."
+
+
+class Job:
+    """One computation with its progress, and afterwards its `result` or `error` (with `trace`, the traceback as text)."""
+
+    def __init__(self, compute: Callable[[Monitor], Any]) -> None:
+        self._compute = compute
+        self._thread: threading.Thread | None = None
+        self.monitor = Monitor(self._note)
+        self.stage, self.done, self.total = "", 0.0, 0.0
+        self.began = time.monotonic()
+        self.result: Any = None
+        self.error: BaseException | None = None
+        self.trace = ""
+
+    def run(self) -> None:
+        """Compute here and now; never raises: look at `error`."""
+        try:
+            self.result = self._compute(self.monitor)
+        except BaseException as error:  # the edge of the thread: whatever happens is told by the operator
+            self.error, self.trace = error, traceback.format_exc()
+
+    def start(self) -> None:
+        """Compute on a worker thread."""
+        self._thread = threading.Thread(target=self.run, name="tricap job", daemon=True)
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """True while the worker thread computes."""
+        return self._thread is not None and self._thread.is_alive()
+
+    @property
+    def fraction(self) -> float:
+        """How far the present stage is, 0…1."""
+        return min(max(self.done / self.total, 0.0), 1.0) if self.total > 0 else 0.0
+
+    def cancel_and_join(self) -> None:
+        """Ask to stop and wait until the thread has stopped."""
+        self.monitor.cancel()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _note(self, stage: str, done: float, total: float) -> None:
+        self.stage, self.done, self.total = stage, done, total
+
+
+class JobState(bpy.types.PropertyGroup):
+    """What the panel shows of the running job; lives in the WindowManager, so it is neither saved nor undone."""
+
+    running: bpy.props.BoolProperty(name="Running", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    progress: bpy.props.FloatProperty(name="Progress", min=0.0, max=1.0, options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    stage: bpy.props.StringProperty(name="Stage", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+
+
+_current: list[Job] = []  # the one job that runs, or nothing
+
+
+def current() -> Job | None:
+    """The job that runs on the worker thread, if any."""
+    return _current[0] if _current else None
+
+
+def stop_current(*_: Any) -> None:
+    """Cancel the running job and wait for it; the watching operator then ends by itself."""
+    for job in list(_current):
+        job.cancel_and_join()
+    _current.clear()
+
+
+@bpy.app.handlers.persistent
+def _stop_before_load(*_: Any) -> None:
+    stop_current()
+
+
+class JobOperator:
+    """Mix-in for operators: `execute` computes here and now, `invoke` on a worker thread with progress and Esc."""
+
+    job: Job
+    timer: Any = None
+    last_words: ClassVar[str] = "Stopped. What was finished is kept."
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
+        """Main thread: read everything from Blender and return the computation."""
+        raise NotImplementedError
+
+    def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
+        """Main thread: write the result into the scene; returns the operator's result."""
+        raise NotImplementedError
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Blocking driver, for scripts and background."""
+        job = self._prepare(context)
+        if job is None:
+            return {"CANCELLED"}
+        job.run()
+        return self._conclude(context, job)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Modal driver: starts the thread and watches it."""
+        if current() is not None:
+            self.report({"ERROR"}, "Another Tricap job is running; wait for it or press Esc.")  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        job = self._prepare(context)
+        if job is None:
+            return {"CANCELLED"}
+        self.job = job
+        _current[:] = [job]
+        wm = context.window_manager
+        wm.tricap.running, wm.tricap.progress, wm.tricap.stage = True, 0.0, "Starting"
+        self.timer = wm.event_timer_add(TICK_S, window=context.window)
+        wm.modal_handler_add(self)
+        job.start()
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Shows the progress; Esc cancels."""
+        if event.type == "ESC" and event.value == "PRESS":
+            self.job.cancel_and_join()
+        elif event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        if self.job.alive:
+            self._show(context)
+            return {"RUNNING_MODAL" if event.type == "ESC" else "PASS_THROUGH"}
+        self._clear(context)
+        return self._conclude(context, self.job)
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Blender ends the operator (another file, quitting)."""
+        self.job.cancel_and_join()
+        self._clear(context)
+
+    def _prepare(self, context: bpy.types.Context) -> Job | None:
+        try:
+            return Job(self.snapshot(context))
+        except InputError as error:
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+            return None
+
+    def _conclude(self, context: bpy.types.Context, job: Job) -> set[str]:
+        error = job.error
+        if error is None:
+            try:
+                return self.finish(context, job.result)
+            except InputError as mistake:
+                error = mistake
+        if isinstance(error, InputError):
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+        elif isinstance(error, (Cancelled, KeyboardInterrupt)):
+            self.report({"WARNING"}, f"{error} {self.last_words}".strip())  # type: ignore[attr-defined]
+        else:
+            log.error("A Tricap job failed.\n%s", job.trace)
+            self.report({"ERROR"}, BUG.format(error=f"{type(error).__name__}: {error}"))  # type: ignore[attr-defined]
+        return {"CANCELLED"}
+
+    def _show(self, context: bpy.types.Context) -> None:
+        state = context.window_manager.tricap
+        state.progress, state.stage = self.job.fraction, self.job.stage
+        if context.workspace is not None:
+            context.workspace.status_text_set(f"Tricap: {self.job.stage} {self.job.fraction:.0%}  (Esc stops)")
+        _redraw(context)
+
+    def _clear(self, context: bpy.types.Context) -> None:
+        wm = context.window_manager
+        if self.timer is not None:
+            wm.event_timer_remove(self.timer)
+            self.timer = None
+        if self.job in _current:
+            _current.remove(self.job)
+        wm.tricap.running, wm.tricap.progress, wm.tricap.stage = False, 0.0, ""
+        if context.workspace is not None:
+            context.workspace.status_text_set(None)
+        _redraw(context)
+
+
+def _redraw(context: bpy.types.Context) -> None:
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+def register() -> None:
+    """Add the state to the WindowManager and stop jobs before another file is loaded and at the end."""
+    bpy.utils.register_class(JobState)
+    bpy.types.WindowManager.tricap = bpy.props.PointerProperty(type=JobState)
+    bpy.app.handlers.load_pre.append(_stop_before_load)
+    atexit.register(stop_current)
+
+
+def unregister() -> None:
+    """Stop what runs, and take everything away again."""
+    stop_current()
+    atexit.unregister(stop_current)
+    bpy.app.handlers.load_pre.remove(_stop_before_load)
+    del bpy.types.WindowManager.tricap
+    bpy.utils.unregister_class(JobState)

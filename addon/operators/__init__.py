@@ -1,0 +1,21 @@
+"""The steps of the workflow as operators, one file each; every one can be called from a script with all its arguments."""
+
+import bpy
+
+from .. import jobs
+from . import build_scene, cancel, run
+
+CLASSES = (run.Run, build_scene.BuildScene, cancel.Cancel)
+
+
+def register() -> None:
+    """Register the operators."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    """Stop a running job and unregister the operators."""
+    jobs.stop_current()
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,24 @@
+"""bpy.ops.tricap.cancel()"""
+
+import bpy
+
+from .. import jobs
+
+
+class Cancel(bpy.types.Operator):
+    """Stop the running job; what was finished is kept"""
+
+    bl_idname = "tricap.cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only while a job runs."""
+        return jobs.current() is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Ask the job to stop; the operator that watches it ends it."""
+        job = jobs.current()
+        if job is not None:
+            job.monitor.cancel()
+        return {"FINISHED"}

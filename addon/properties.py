@@ -1,0 +1,102 @@
+"""Properties of the scene: the take, the output folder, and the knobs of every stage.
+
+The knobs are made from core's settings dataclasses: name, default, limits, unit and tooltip have one definition. Only what a user
+has touched in Blender is handed on, so that the take's own [settings] and the defaults keep their say.
+"""
+
+import dataclasses
+import importlib.util
+from collections.abc import Mapping
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..core import settings as knobs
+
+GROUPS: list[type] = []  # the PropertyGroup classes, in order of registration
+
+
+def property_of(field: "dataclasses.Field[Any]") -> Any:
+    """The bpy property of one knob.
+
+    Raises:
+        TypeError: the knob is of a kind that Blender has no property for.
+    """
+    meta, default = field.metadata, field.default
+    name = field.name.replace("_", " ")
+    words: dict[str, Any] = dict(name=f"{name} [{meta['unit']}]" if meta.get("unit") else name, description=meta.get("about", "").rstrip("."))
+    if isinstance(default, bool):
+        return bpy.props.BoolProperty(default=default, **words)
+    if isinstance(default, str) and meta.get("choices"):
+        return bpy.props.EnumProperty(default=default, items=[(choice, choice, "") for choice in meta["choices"]], **words)
+    if isinstance(default, str):
+        return bpy.props.StringProperty(default=default, **words)
+    limits = {key: meta[bound] for key, bound in (("min", "low"), ("max", "high")) if meta.get(bound) is not None}
+    if isinstance(default, int):
+        return bpy.props.IntProperty(default=default, **limits, **words)
+    if isinstance(default, float):
+        return bpy.props.FloatProperty(default=default, precision=4, **limits, **words)
+    raise TypeError(f"Knob {field.name} is a {type(default).__name__}, for which there is no property")
+
+
+def group_class(name: str, settings: type) -> type:
+    """A PropertyGroup class with one property per knob of the frozen dataclass `settings`."""
+    annotations = {field.name: property_of(field) for field in dataclasses.fields(settings)}
+    return type(f"Tricap_{name}", (bpy.types.PropertyGroup,), {"__annotations__": annotations, "__doc__": settings.__doc__ or name})
+
+
+def touched(group: bpy.types.PropertyGroup, settings: type) -> dict[str, Any]:
+    """The knobs that were set in Blender, as a plain table for `core.settings.from_table`."""
+    return {field.name: _exact(getattr(group, field.name), field.default)
+            for field in dataclasses.fields(settings) if group.is_property_set(field.name)}
+
+
+def snapshot(group: bpy.types.PropertyGroup, settings: type) -> Any:
+    """The frozen settings that the group shows: what was touched, and defaults."""
+    return knobs.from_table(settings, touched(group, settings), f"The panel “{settings.__name__}”")
+
+
+def overrides(scene: bpy.types.Scene) -> dict[str, dict[str, Any]]:
+    """What was touched in every stage: {"matching": {"patch_px": 17}}, the form of take.toml's [settings]."""
+    tables = {name: touched(getattr(scene.tricap, name), settings) for name, settings in stages().items()}
+    return {name: table for name, table in tables.items() if table}
+
+
+def stages() -> Mapping[str, type]:
+    """Settings class of every stage, by the name it has in take.toml."""
+    if importlib.util.find_spec("..core.pipeline", __package__) is None:
+        return {}
+    from ..core import pipeline
+
+    return pipeline.SETTINGS
+
+
+def _exact(value: Any, default: Any) -> Any:
+    """Blender keeps floats in single precision; the shortest decimal that is stored alike is what the user typed."""
+    return float(str(np.float32(value))) if isinstance(default, float) else value
+
+
+def register() -> None:
+    """Make the classes of all stages and hang them onto the scene as `scene.tricap`."""
+    groups = {name: group_class(name, settings) for name, settings in stages().items()}
+    annotations: dict[str, Any] = {
+        "take": bpy.props.StringProperty(name="Take", subtype="DIR_PATH", description="Folder of the recording; it holds take.toml"),
+        "out": bpy.props.StringProperty(name="Output", subtype="DIR_PATH",
+                                        description="Folder for the results; empty: beside the .blend, or beside the take"),
+        "last": bpy.props.StringProperty(name="Result", description="What the last run found"),
+    }
+    annotations |= {name: bpy.props.PointerProperty(type=group) for name, group in groups.items()}
+    scene_group = type("TricapScene", (bpy.types.PropertyGroup,), {"__annotations__": annotations, "__doc__": "Tricap's part of the scene."})
+    GROUPS[:] = [*groups.values(), scene_group]
+    for group in GROUPS:
+        bpy.utils.register_class(group)
+    bpy.types.Scene.tricap = bpy.props.PointerProperty(type=scene_group)
+
+
+def unregister() -> None:
+    """Take the properties away again."""
+    del bpy.types.Scene.tricap
+    for group in reversed(GROUPS):
+        bpy.utils.unregister_class(group)
+    GROUPS.clear()

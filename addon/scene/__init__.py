@@ -1,0 +1,1 @@
+"""A run's results as native Blender data: cameras, footage, cloud, trajectories, armature, action and metaballs."""

@@ -1,0 +1,62 @@
+"""The motion as an action: one curve per DOF, one per DOF's sigma, keyed in every frame, in bulk.
+
+The sigma of a DOF is a custom property of the bone that carries it ("sigma elbow.R flexion"), in the unit of its channel:
+radians, or metres for the base.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import pi
+
+import bpy
+import numpy as np
+
+from ...core.body.shape import BodyShape
+from ...core.body.skeleton import Bone
+from . import armature
+
+NAME = "Measured motion"
+LIMITS_TOLERANCE_RAD = 1e-6
+
+
+def add_action(armature_object: bpy.types.Object, shape: BodyShape, frames: np.ndarray, dof_names: Sequence[str],
+               values: np.ndarray, sigma: np.ndarray) -> bpy.types.Action:
+    """Key the armature with the motion: frames (T,), values and sigma (T, D) in rad and metres. NaN gives no key."""
+    action = bpy.data.actions.new(NAME)
+    armature_object.animation_data_create().action = action
+    channels = armature.channel_of(shape)
+    for column, name in enumerate(dof_names):
+        bone_name, channel, index = channels[name]
+        pose_bone = armature_object.pose.bones[bone_name]
+        path = pose_bone.path_from_id()
+        _key(action, armature_object, f"{path}.{channel}", index, frames, values[:, column])
+        pose_bone[f"sigma {name}"] = 0.0
+        _key(action, armature_object, f'{path}["sigma {name}"]', 0, frames, sigma[:, column])
+    motion = {name: values[:, column] for column, name in enumerate(dof_names)}
+    for bone in shape.skeleton.bones:
+        _mute_limits_that_bind(armature_object.pose.bones[bone.name], bone, motion)
+    return action
+
+
+def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, index: int, frames: np.ndarray, values: np.ndarray) -> None:
+    known = np.isfinite(values)
+    curve = action.fcurve_ensure_for_datablock(owner, path, index=index)
+    points = curve.keyframe_points
+    points.add(int(known.sum()))
+    points.foreach_set("co", np.stack([frames[known], values[known]], axis=-1).astype(np.float32).ravel())
+    linear = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
+    points.foreach_set("interpolation", np.full(len(points), linear, dtype=np.int32))
+    curve.update()
+
+
+def _mute_limits_that_bind(pose_bone: bpy.types.PoseBone, bone: Bone, motion: Mapping[str, np.ndarray]) -> None:
+    """What is played is what was measured: limits that the motion oversteps must not bend it.
+
+    The constraint decomposes the pose again, which gives the same angles only below 90° about the middle axis and 180° about the others.
+    """
+    constraint = pose_bone.constraints["Joint limits"]
+    for dof in bone.dofs:
+        angles = motion.get(dof.name, np.zeros(1))
+        reach = pi / 2 if dof.axis == bone.rotation_mode[1].lower() else pi
+        low, high = max(dof.limits[0], -reach), min(dof.limits[1], reach)
+        if np.nanmin(angles, initial=0.0) < low - LIMITS_TOLERANCE_RAD or np.nanmax(angles, initial=0.0) > high + LIMITS_TOLERANCE_RAD:
+            constraint.mute = True

@@ -1,0 +1,64 @@
+"""Blender cameras that see what the calibrated cameras saw."""
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...core.geometry.camera import Camera
+from ...core.geometry.rig import Rig
+from . import axes
+
+DISPLAY_SIZE = 0.2  # of the camera's frame in the viewport, metres
+ASPECT_TOLERANCE_PX = 0.05
+
+
+def add_camera(collection: bpy.types.Collection, camera: Camera) -> bpy.types.Object:
+    """A Blender camera at the place, in the direction and with the lens of `camera`; distortion belongs to its clip."""
+    lens = axes.lens(camera)
+    data = bpy.data.cameras.new(f"Camera {camera.name}")
+    data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", lens.sensor_width_mm, lens.lens_mm
+    data.sensor_height = lens.sensor_width_mm * camera.size_px[1] / camera.size_px[0]
+    data.shift_x, data.shift_y = lens.shift_x, lens.shift_y
+    data.clip_start, data.clip_end, data.display_size = 0.01, 1000.0, DISPLAY_SIZE
+    data.show_passepartout = True
+    camera_object = bpy.data.objects.new(data.name, data)
+    camera_object.matrix_world = Matrix(axes.camera_to_world(camera))
+    camera_object["tricap_view"] = camera.name
+    camera_object["tricap_size_px"] = list(camera.size_px)
+    camera_object.lock_location = camera_object.lock_rotation = camera_object.lock_scale = (True, True, True)
+    collection.objects.link(camera_object)
+    return camera_object
+
+
+def frame_render(scene: bpy.types.Scene, reference: Camera) -> None:
+    """Render size and pixel aspect of the scene as the reference camera's picture."""
+    scene.render.resolution_x, scene.render.resolution_y = reference.size_px
+    scene.render.resolution_percentage = 100
+    aspect = axes.lens(reference).pixel_aspect_y
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(1.0, 1.0 / aspect), max(1.0, aspect)
+
+
+def frame_faults(rig: Rig, reference: Camera) -> list[str]:
+    """Where other cameras' pictures cannot be shown exactly, because a Blender scene has one render size and pixel aspect."""
+    faults = []
+    w, h = reference.size_px
+    for camera in rig.cameras:
+        if camera.size_px[0] * h != camera.size_px[1] * w:
+            faults.append(f"Camera {camera.name} has pictures of another shape than {reference.name};"
+                          " set the scene's resolution to its own to look through it.")
+            continue
+        off_px = abs(axes.lens(camera).pixel_aspect_y / axes.lens(reference).pixel_aspect_y - 1.0) * camera.size_px[1] / 2
+        if off_px > ASPECT_TOLERANCE_PX:
+            faults.append(f"Camera {camera.name} has another pixel aspect than {reference.name}: up to {off_px:.1f} px off at the rim.")
+        if abs(camera.affinity[1]) * camera.size_px[1] / 2 > ASPECT_TOLERANCE_PX:
+            faults.append(f"Camera {camera.name} has a shear that a Blender camera cannot show.")
+    return faults
+
+
+def seen_from(scene: bpy.types.Scene, camera_object: bpy.types.Object, xyz_m: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Pixels (N, 2) of world points (N, 3) as the Blender camera itself projects them (without distortion)."""
+    from bpy_extras.object_utils import world_to_camera_view
+    from mathutils import Vector
+
+    uv = np.array([world_to_camera_view(scene, camera_object, Vector(point))[:2] for point in np.asarray(xyz_m)])
+    return axes.pixel_from_uv(uv, size_px)

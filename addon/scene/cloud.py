@@ -1,0 +1,73 @@
+"""The point clouds of all frames as ONE mesh object of points; geometry nodes show the current frame's.
+
+Named attributes on the points: frame (int), sigma [m] and intensity (float), normal (vector).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from . import nodes, paint
+
+NAME = "Cloud"
+POINT_RADIUS_M = 0.0015
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudPoints:
+    """The points of one frame: xyz_m (N, 3), sigma_m (N,), normals (N, 3), intensity (N,)."""
+
+    frame: int
+    xyz_m: np.ndarray
+    sigma_m: np.ndarray
+    normals: np.ndarray
+    intensity: np.ndarray
+
+
+def add_cloud(collection: bpy.types.Collection, clouds: Sequence[CloudPoints]) -> bpy.types.Object:
+    """One object with the points of all `clouds`, of which the scene shows those of its current frame."""
+    mesh = bpy.data.meshes.new(NAME)
+    mesh.vertices.add(sum(len(cloud.xyz_m) for cloud in clouds))
+    write(mesh, "position", "FLOAT_VECTOR", np.concatenate([cloud.xyz_m for cloud in clouds]))
+    write(mesh, "normal", "FLOAT_VECTOR", np.concatenate([cloud.normals for cloud in clouds]))
+    write(mesh, "sigma", "FLOAT", np.concatenate([cloud.sigma_m for cloud in clouds]))
+    write(mesh, "intensity", "FLOAT", np.concatenate([cloud.intensity for cloud in clouds]))
+    write(mesh, "frame", "INT", np.concatenate([np.full(len(cloud.xyz_m), cloud.frame) for cloud in clouds]))
+    material = paint.attribute_material(NAME, "intensity", 1.0 / _white(clouds))
+    mesh.materials.append(material)
+    cloud_object = bpy.data.objects.new(NAME, mesh)
+    collection.objects.link(cloud_object)
+    modifier = cloud_object.modifiers.new("Current frame", "NODES")
+    modifier.node_group = current_frame_group(material)
+    return cloud_object
+
+
+def write(mesh: bpy.types.Mesh, name: str, data_type: str, values: np.ndarray, domain: str = "POINT") -> None:
+    """A named attribute in one go; `values` has one row per point (or edge, by `domain`)."""
+    attribute = mesh.attributes.get(name) or mesh.attributes.new(name, data_type, domain)
+    key = "vector" if data_type == "FLOAT_VECTOR" else "value"
+    attribute.data.foreach_set(key, np.ascontiguousarray(values, dtype=np.int32 if data_type == "INT" else np.float32).ravel())
+
+
+def current_frame_group(material: bpy.types.Material) -> bpy.types.NodeTree:
+    """Geometry nodes: keep the points whose attribute `frame` is the scene's frame, and show them as little balls."""
+    group, group_input, group_output = nodes.new_group("Tricap current frame")
+    time = nodes.add(group, "GeometryNodeInputSceneTime")
+    selection = nodes.compare(group, "EQUAL", nodes.attribute(group, "frame", "INT"), time.outputs["Frame"])
+    points = nodes.add(group, "GeometryNodeMeshToPoints")
+    points.inputs["Radius"].default_value = POINT_RADIUS_M
+    paint_node = nodes.add(group, "GeometryNodeSetMaterial")
+    paint_node.inputs["Material"].default_value = material
+    group.links.new(group_input.outputs[0], points.inputs["Mesh"])
+    group.links.new(selection, points.inputs["Selection"])
+    group.links.new(points.outputs["Points"], paint_node.inputs["Geometry"])
+    group.links.new(paint_node.outputs["Geometry"], group_output.inputs[0])
+    nodes.arrange(group)
+    return group
+
+
+def _white(clouds: Sequence[CloudPoints]) -> float:
+    brightest = max((float(cloud.intensity.max(initial=0.0)) for cloud in clouds), default=0.0)
+    return brightest or 1.0

@@ -1,0 +1,66 @@
+"""Small helpers of grammar for geometry nodes: make a node, join sockets by name."""
+
+from typing import Any
+
+import bpy
+
+
+def new_group(name: str) -> tuple[bpy.types.NodeTree, bpy.types.Node, bpy.types.Node]:
+    """A geometry-nodes group with one geometry in and one out: (group, input node, output node)."""
+    group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    group.is_modifier = True
+    group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    return group, group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+
+
+def add(group: bpy.types.NodeTree, kind: str, **properties: Any) -> bpy.types.Node:
+    """A node of class `kind` with its properties set."""
+    node = group.nodes.new(kind)
+    for name, value in properties.items():
+        setattr(node, name, value)
+    return node
+
+
+def attribute(group: bpy.types.NodeTree, name: str, data_type: str) -> bpy.types.NodeSocket:
+    """The output socket of a named attribute."""
+    node = add(group, "GeometryNodeInputNamedAttribute", data_type=data_type)
+    node.inputs["Name"].default_value = name
+    return active(node.outputs, "Attribute")
+
+
+def compare(group: bpy.types.NodeTree, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
+    """The Boolean socket of a ∘ b as floats; `a` and `b` are sockets or numbers."""
+    node = add(group, "FunctionNodeCompare", data_type="FLOAT", operation=operation)
+    feed(group, active(node.inputs, "A"), a)
+    feed(group, active(node.inputs, "B"), b)
+    if operation == "EQUAL":
+        active(node.inputs, "Epsilon").default_value = 0.25
+    return node.outputs["Result"]
+
+
+def math(group: bpy.types.NodeTree, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
+    """The float socket of a ∘ b; `a` and `b` are sockets or numbers."""
+    node = add(group, "ShaderNodeMath", operation=operation)
+    feed(group, node.inputs[0], a)
+    feed(group, node.inputs[1], b)
+    return node.outputs["Value"]
+
+
+def feed(group: bpy.types.NodeTree, socket: bpy.types.NodeSocket, value: Any) -> None:
+    """Link another socket to this one, or set its value."""
+    if isinstance(value, bpy.types.NodeSocket):
+        group.links.new(value, socket)
+    else:
+        socket.default_value = value
+
+
+def active(sockets: Any, name: str) -> bpy.types.NodeSocket:
+    """The socket called `name` that is in use (Blender keeps one per data type, the others disabled)."""
+    return next(socket for socket in sockets if socket.name == name and socket.enabled)
+
+
+def arrange(group: bpy.types.NodeTree) -> None:
+    """Put the nodes side by side, so that a person who opens the group can read it."""
+    for i, node in enumerate(group.nodes):
+        node.location = (220.0 * (i % 6), -260.0 * (i // 6))

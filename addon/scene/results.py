@@ -1,0 +1,113 @@
+"""What a run left in its output folder, read for the scene. No Blender in here: it may be read on a worker thread.
+
+A part that is missing, because its stage did not run or its files were moved, is None or empty, and `warnings` says so.
+A part that is there but damaged is an InputError.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core import store
+from ...core.body.shape import BodyShape, read_body
+from ...core.errors import InputError
+from ...core.motion import tables
+from ...core.motion.ply import Ply, read_ply
+from ...core.progress import Monitor
+from ...core.take import Footage, open_take, read_take
+
+DEFAULT_FPS = 25.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Results:
+    """The parts of OUT. `clouds` by frame; `trajectories` as in trajectories.npz; `motion` in radians and metres."""
+
+    out: Path
+    run: Mapping[str, Any]
+    footage: Footage | None = None
+    clouds: Mapping[int, Ply] = field(default_factory=dict)
+    trajectories: Mapping[str, np.ndarray] | None = None
+    shape: BodyShape | None = None
+    motion: Any = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def fps(self) -> float:
+        """The take's frame rate."""
+        return self.footage.take.fps if self.footage else DEFAULT_FPS
+
+    @property
+    def frames(self) -> tuple[int, int]:
+        """First and last frame that anything was measured in, by the take's own numbers."""
+        known = [*self.clouds, *(self.motion.frames if self.motion else ()), *(self.trajectories["frames"] if self.trajectories else ())]
+        if not known and self.footage:
+            known = [self.footage.frames.start, self.footage.frames.stop - 1]
+        return (int(min(known)), int(max(known))) if known else (0, 0)
+
+
+def read_results(out: Path, monitor: Monitor) -> Results:
+    """Read the folder OUT of a run, and the take it was made from.
+
+    Raises:
+        InputError: OUT is no folder of results, or a file in it is damaged.
+        Cancelled: the monitor was cancelled.
+    """
+    out = Path(out)
+    if not (out / "run.json").is_file():
+        raise InputError(f"{out} holds no results of Tricap (no run.json); choose the output folder of a run.")
+    run = store.read_json(out / "run.json")
+    if not isinstance(run, dict):
+        raise InputError(f"{out / 'run.json'} is not a report of Tricap; run the take again.")
+    warnings: list[str] = []
+    footage = _footage(run, out, warnings)
+    clouds = _clouds(out / "clouds", monitor, warnings)
+    monitor.step("reading results", 1, 3)
+    trajectories = _optional(out / "trajectories.npz", "trajectories", _arrays, warnings)
+    monitor.step("reading results", 2, 3)
+    shape = _optional(out / "body.toml", "armature and metaballs", read_body, warnings)
+    motion = _optional(out / "motion.csv", "action", tables.read_motion, warnings)
+    monitor.step("reading results", 3, 3)
+    return Results(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
+                   warnings=tuple(warnings))
+
+
+def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage | None:
+    try:
+        folder = run.get("take")
+        if not isinstance(folder, str):
+            raise InputError(f"{out / 'run.json'} does not say which take was run.")
+        return open_take(read_take(Path(folder)))
+    except InputError as error:
+        warnings.append(f"No cameras and footage in the scene, and {DEFAULT_FPS:g} frames per second: {error}")
+        return None
+
+
+def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Ply]:
+    files = {int(path.stem): path for path in sorted(folder.glob("*.ply")) if path.stem.isdigit()}
+    if not files:
+        warnings.append(f"No point cloud in the scene: {folder} holds no clouds.")
+    clouds = {}
+    for i, (frame, path) in enumerate(sorted(files.items())):
+        monitor.step("reading clouds", i, len(files))
+        clouds[frame] = read_ply(path)
+    return clouds
+
+
+def _optional(path: Path, what: str, read: Callable[[Path], Any], warnings: list[str]) -> Any:
+    if path.is_file():
+        return read(path)
+    warnings.append(f"No {what} in the scene: {path.name} is not in {path.parent}.")
+    return None
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    needed = ("frames", "xyz_m", "velocity_m_s", "sigma_m")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return {name: data[name] for name in needed}
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"{path} is not a file of trajectories or is damaged ({error}); run the tracking again.") from error

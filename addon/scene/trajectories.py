@@ -1,0 +1,73 @@
+"""The trajectories of all tracked points as ONE mesh of edges; geometry nodes show the trail behind the current frame.
+
+A point that was seen in two successive frames gives an edge. Named attributes on the points: frame and track (int),
+sigma [m] and speed [m/s] (float).
+"""
+
+from collections.abc import Mapping
+
+import bpy
+import numpy as np
+
+from . import nodes, paint
+from .cloud import write
+
+NAME = "Trajectories"
+TRAIL_FRAMES = 10
+TRAIL_RADIUS_M = 0.0006
+RESTING_COLOUR_SPEED_M_S = 2.0  # the speed that is painted brightest
+
+
+def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
+    """One object from the arrays of trajectories.npz: frames (T,), xyz_m (T, N, 3) with NaN = not seen, velocity_m_s, sigma_m (T, N)."""
+    xyz, frames = arrays["xyz_m"], arrays["frames"]
+    seen = np.isfinite(xyz).all(axis=-1)  # (T, N)
+    row, track = np.nonzero(seen)
+    index = np.full(seen.shape, -1)
+    index[row, track] = np.arange(len(row))
+    joined = seen[:-1] & seen[1:] & (np.diff(frames) == 1)[:, None]
+    edges = np.stack([index[:-1][joined], index[1:][joined]], axis=-1)
+    mesh = bpy.data.meshes.new(NAME)
+    mesh.vertices.add(len(row))
+    mesh.edges.add(len(edges))
+    mesh.edges.foreach_set("vertices", np.ascontiguousarray(edges, dtype=np.int32).ravel())
+    write(mesh, "position", "FLOAT_VECTOR", xyz[seen])
+    write(mesh, "frame", "INT", frames[row])
+    write(mesh, "track", "INT", track)
+    write(mesh, "sigma", "FLOAT", np.nan_to_num(arrays["sigma_m"][seen]))
+    write(mesh, "speed", "FLOAT", np.nan_to_num(np.linalg.norm(arrays["velocity_m_s"][seen], axis=-1)))
+    mesh.update()
+    material = paint.attribute_material(NAME, "speed", 1.0 / RESTING_COLOUR_SPEED_M_S)
+    mesh.materials.append(material)
+    trail_object = bpy.data.objects.new(NAME, mesh)
+    collection.objects.link(trail_object)
+    trail_object.modifiers.new("Trail", "NODES").node_group = trail_group(material)
+    return trail_object
+
+
+def trail_group(material: bpy.types.Material) -> bpy.types.NodeTree:
+    """Geometry nodes: keep what lies up to `Trail` frames behind the scene's frame, as thin threads."""
+    group, group_input, group_output = nodes.new_group("Tricap trail")
+    trail = group.interface.new_socket("Trail", in_out="INPUT", socket_type="NodeSocketInt")
+    trail.default_value, trail.min_value = TRAIL_FRAMES, 1
+    now = nodes.add(group, "GeometryNodeInputSceneTime").outputs["Frame"]
+    frame = nodes.attribute(group, "frame", "INT")
+    begin = nodes.math(group, "SUBTRACT", now, group_input.outputs["Trail"])
+    both = nodes.add(group, "FunctionNodeBooleanMath", operation="AND")
+    group.links.new(nodes.compare(group, "LESS_EQUAL", frame, now), both.inputs[0])
+    group.links.new(nodes.compare(group, "GREATER_EQUAL", frame, begin), both.inputs[1])
+    keep = nodes.add(group, "GeometryNodeSeparateGeometry", domain="POINT")
+    curve = nodes.add(group, "GeometryNodeMeshToCurve")
+    profile = nodes.add(group, "GeometryNodeCurvePrimitiveCircle")
+    profile.inputs["Resolution"].default_value = 3
+    nodes.active(profile.inputs, "Radius").default_value = TRAIL_RADIUS_M
+    thread = nodes.add(group, "GeometryNodeCurveToMesh")
+    paint_node = nodes.add(group, "GeometryNodeSetMaterial")
+    paint_node.inputs["Material"].default_value = material
+    for source, target in ((group_input.outputs[0], keep.inputs["Geometry"]), (both.outputs[0], keep.inputs["Selection"]),
+                           (keep.outputs["Selection"], curve.inputs["Mesh"]), (curve.outputs["Curve"], thread.inputs["Curve"]),
+                           (profile.outputs["Curve"], thread.inputs["Profile Curve"]), (thread.outputs["Mesh"], paint_node.inputs["Geometry"]),
+                           (paint_node.outputs["Geometry"], group_output.inputs[0])):
+        group.links.new(source, target)
+    nodes.arrange(group)
+    return group
