@@ -1,0 +1,67 @@
+"""What the fit takes from a cloud: finite points, thinned to one per voxel, with a sigma along the surface normal."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+
+class Cloud(Protocol):
+    """The fields of a measured cloud that the fit reads."""
+
+    @property
+    def frame(self) -> int:
+        """Frame number of the take."""
+
+    @property
+    def xyz_m(self) -> np.ndarray:
+        """(N, 3) world."""
+
+    @property
+    def covariance_m2(self) -> np.ndarray:
+        """(N, 3, 3)."""
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(N, 3) unit vectors, pointing to the cameras; NaN or zero where unknown."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CloudPoints:
+    """P points of one frame, ready for the fit. A normal of zeros is unknown."""
+
+    frame: int
+    xyz_m: np.ndarray  # (P, 3)
+    normals: np.ndarray  # (P, 3)
+    sigma_m: np.ndarray  # (P,) along the normal
+
+    def take(self, rows: np.ndarray) -> "CloudPoints":
+        """Some of the points."""
+        return CloudPoints(frame=self.frame, xyz_m=self.xyz_m[rows], normals=self.normals[rows], sigma_m=self.sigma_m[rows])
+
+
+def thinned(cloud: Cloud, voxel_m: float) -> CloudPoints:
+    """The centre of gravity of the points in every voxel, in the order of the voxels; points that are not finite are left out.
+
+    The sigma is that of one point: neighbours share their errors.
+    """
+    xyz, normals = np.asarray(cloud.xyz_m, dtype=np.float64).reshape(-1, 3), np.asarray(cloud.normals, dtype=np.float64).reshape(-1, 3)
+    covariance = np.asarray(cloud.covariance_m2, dtype=np.float64).reshape(-1, 3, 3)
+    good = np.isfinite(xyz).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    xyz, normals, covariance = xyz[good], np.nan_to_num(normals[good]), covariance[good]
+    sigma = _sigma_along(normals, covariance)
+    cells = np.floor(xyz / voxel_m).astype(np.int64)
+    if not len(cells):
+        return CloudPoints(frame=int(cloud.frame), xyz_m=xyz, normals=normals, sigma_m=sigma)
+    _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    which = which.ravel()
+    mean = [np.stack([np.bincount(which, column) for column in table.T], axis=1) / count[:, None]
+            for table in (xyz, normals, sigma[:, None])]
+    length = np.linalg.norm(mean[1], axis=1, keepdims=True)
+    return CloudPoints(frame=int(cloud.frame), xyz_m=mean[0], normals=mean[1] / np.where(length > 0.3, length, np.inf), sigma_m=mean[2][:, 0])
+
+
+def _sigma_along(normals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    along = np.einsum("ni,nij,nj->n", normals, covariance, normals)
+    mean = np.trace(covariance, axis1=1, axis2=2) / 3
+    return np.sqrt(np.maximum(np.where(np.linalg.norm(normals, axis=1) > 0.5, along, mean), 0.0))

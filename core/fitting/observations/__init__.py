@@ -1,0 +1,31 @@
+"""Observations: one error term, one small file. Each gives residuals of unit weight and their analytic Jacobian."""
+
+from typing import Protocol
+
+import numpy as np
+
+from ..state import BodyState
+from .clicked_joint import ClickedJoints
+from .equal_radii import EqualRadii
+from .gaussian_prior import MotionPrior, ShapePrior
+from .joint_limit import JointLimits
+from .joint_position import JointPositions
+from .material_point import MaterialPoints
+from .surface_point import SurfacePoints
+
+__all__ = ["ClickedJoints", "EqualRadii", "JointLimits", "JointPositions", "MaterialPoints", "MotionPrior", "Observation", "ShapePrior",
+           "SurfacePoints"]
+
+
+class Observation(Protocol):
+    """One kind of observation of one body state."""
+
+    @property
+    def robust(self) -> bool:
+        """Whether the residuals may hold gross errors, and are to be weighted down by their size."""
+
+    def residual(self, state: BodyState) -> np.ndarray:
+        """Residuals (n,), divided by their sigmas."""
+
+    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
+        """Derivative (n, D + S) of the residuals to motion and shape; (n, D) without shape."""

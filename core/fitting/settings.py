@@ -1,0 +1,32 @@
+"""The knobs of the fit."""
+
+from dataclasses import dataclass
+
+from ..settings import knob
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FitSettings:
+    """How the body is fitted to clouds and clicks."""
+
+    method: str = knob("joint", "At the click frame: pose and radii together, or in turns as published.", choices=("joint", "alternating"))
+    residual: str = knob("metric", "Surface residual: metric (root of the logarithm) or the paper's field difference.",
+                         choices=("metric", "paper"))
+    robust: str = knob("geman-mcclure", "How gross points lose their weight.", choices=("geman-mcclure", "huber"))
+    robust_width: float = knob(3.0, "Residual, in robust standard deviations, at which a point loses half its pull.", low=1.0, high=20.0)
+    voxel_m: float = knob(0.008, "Points are averaged in voxels of this size.", unit="m", low=0.001, high=0.1)
+    model_sigma_m: float = knob(0.002, "What a real body differs from its metaballs.", unit="m", low=0.0, high=0.05)
+    gate_m: float = knob(0.035, "A point further than this from a limb's surface is not the limb's.", unit="m", low=0.005, high=0.3)
+    click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)
+    length_sigma: float = knob(0.15, "Relative sigma of the model's bone lengths.", low=0.001, high=1.0)
+    radius_sigma: float = knob(0.3, "Relative sigma of the model's radii.", low=0.001, high=1.0)
+    roundness_sigma: float = knob(0.10, "Relative sigma of the difference of a ball's two cross radii.", low=0.001, high=1.0)
+    limit_sigma_deg: float = knob(2.0, "How softly joint limits hold.", unit="deg", low=0.1, high=30.0)
+    prediction_sigma_deg: float = knob(15.0, "Sigma of an angle predicted from the frames before.", unit="deg", low=0.5, high=90.0)
+    prediction_sigma_m: float = knob(0.03, "Sigma of a position predicted from the frames before.", unit="m", low=0.001, high=1.0)
+    acceleration_deg_s2: float = knob(6000.0, "Typical angular acceleration, for the adjustment over time.", unit="deg/s²",
+                                      low=1.0, high=1e6)
+    acceleration_m_s2: float = knob(5.0, "Typical acceleration of the base, for the adjustment over time.", unit="m/s²", low=0.01, high=1e4)
+    frame_steps: int = knob(6, "Most steps of the adjustment of one frame.", low=1, high=100)
+    sequence_steps: int = knob(12, "Most steps of the adjustment over the whole sequence.", low=0, high=200)
+    min_points: int = knob(25, "A bone with fewer points in a frame counts as not seen.", low=1, high=10000)

@@ -1,0 +1,126 @@
+"""The state vector of the fit, [S_motion, S_skel] of the papers: who stands where, and the body that a vector means.
+
+One frame's motion (D,) [rad, m] is followed by the shape (S,), which all frames share: ln of the bone lengths (B,), then ln of the cross
+radii l_x and l_z of every ball (M, 2). Logarithms keep lengths positive and make their sigmas relative. A ball's centre and its radius along
+the bone scale with the bone.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..body.metaballs import Metaballs
+from ..body.shape import BodyShape
+from ..body.skeleton import Layout, Skeleton, frames_and_axes
+
+CROSS = [0, 2]  # the two axes across a bone
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BodyState:
+    """A body in one posture. Cheap to make; everything derived is computed once."""
+
+    skeleton: Skeleton
+    lengths_m: np.ndarray  # (B,)
+    balls: Metaballs
+    motion: np.ndarray  # (D,)
+
+    @cached_property
+    def _forward(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return frames_and_axes(self.skeleton, self.lengths_m, self.motion)
+
+    @property
+    def R(self) -> np.ndarray:
+        """Bone frames (B, 3, 3)."""
+        return self._forward[0]
+
+    @property
+    def head_m(self) -> np.ndarray:
+        """Bone heads (B, 3) in the world."""
+        return self._forward[1]
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Axes of the DOFs in the world (D, 3)."""
+        return self._forward[2]
+
+    @property
+    def n_motion(self) -> int:
+        """D."""
+        return len(self.motion)
+
+    @property
+    def n_shape(self) -> int:
+        """S."""
+        return len(self.lengths_m) + 2 * len(self.balls.weight)
+
+    @cached_property
+    def joint_jacobian(self) -> tuple[np.ndarray, np.ndarray]:
+        """Joint positions (J, 3) and their derivative (J, 3, D + S) to motion and shape."""
+        sk, L = self.skeleton, self.lengths_m
+        where = sk.joint_bones
+        bones = np.array([b for b, _ in where])
+        at_tail = np.array([tail for _, tail in where])
+        direction = self.R[:, :, 1]
+        X = self.head_m[bones] + np.where(at_tail[:, None], L[bones, None] * direction[bones], 0.0)
+        jacobian = np.zeros((len(where), 3, self.n_motion + self.n_shape))
+        turns = np.cross(self.axes, X[:, None] - self.head_m[sk.dof_bone])
+        turns[:, : len(sk.base_dofs)] = np.eye(3)
+        jacobian[:, :, : self.n_motion] = np.where(sk.moved_by[bones][..., None], turns, 0.0).transpose(0, 2, 1)
+        stretched = sk.offset_by[bones].copy()
+        stretched[np.flatnonzero(at_tail), bones[at_tail]] = True
+        jacobian[:, :, self.n_motion : self.n_motion + len(L)] = (stretched[..., None] * (L[:, None] * direction)).transpose(0, 2, 1)
+        return X, jacobian
+
+
+class ShapeParameters:
+    """The owner of the shape vector (S,): names, sets ("lengths", "radii", "shape"), and the way from vectors to bodies and back."""
+
+    def __init__(self, template: BodyShape) -> None:
+        self.template = template
+        self.skeleton = template.skeleton
+        self.n_lengths = len(template.lengths_m)
+        self.layout = Layout(_names(template), _sets(self.n_lengths, len(template.metaballs.weight)))
+
+    def vector(self, shape: BodyShape | None = None) -> np.ndarray:
+        """The shape vector (S,) of a body (default: the template)."""
+        shape = self.template if shape is None else shape
+        return np.log(np.concatenate([shape.lengths_m, shape.metaballs.radii_m[:, CROSS].ravel()]))
+
+    def body(self, vector: np.ndarray) -> tuple[np.ndarray, Metaballs]:
+        """Lengths (B,) [m] and balls of a shape vector; what is not estimated comes from the template."""
+        balls, old = self.template.metaballs, self.template.lengths_m
+        lengths, radii = np.exp(vector[: self.n_lengths]), balls.radii_m.copy()
+        radii[:, 1] *= (lengths / old)[balls.bone_index]
+        radii[:, CROSS] = np.exp(vector[self.n_lengths :]).reshape(-1, 2)
+        return lengths, Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=radii, weight=balls.weight)
+
+    def state(self, motion: np.ndarray, vector: np.ndarray) -> BodyState:
+        """The body of a shape vector (S,) in the posture of a motion vector (D,)."""
+        lengths, balls = self.body(vector)
+        return BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=motion)
+
+    def shape(self, vector: np.ndarray, sigma: np.ndarray) -> BodyShape:
+        """The body's shape with sigmas, from the vector (S,) and the sigma of its logarithms (S,)."""
+        lengths, balls = self.body(vector)
+        n = self.n_lengths
+        length_sigma, radius_sigma = sigma[:n] * lengths, np.empty_like(balls.radii_m)
+        radius_sigma[:, CROSS] = sigma[n:].reshape(-1, 2) * balls.radii_m[:, CROSS]
+        radius_sigma[:, 1] = sigma[balls.bone_index] * balls.radii_m[:, 1]
+        return BodyShape(model=self.template.model, skeleton=self.skeleton, lengths_m=lengths, metaballs=balls,
+                         length_sigma_m=length_sigma, radius_sigma_m=radius_sigma)
+
+
+def _names(shape: BodyShape) -> list[str]:
+    bones = shape.skeleton.bones
+    names, count = [f"length {bone.name}" for bone in bones], [0] * len(bones)
+    for b in shape.metaballs.bone_index.tolist():
+        count[b] += 1
+        names += [f"radius {bones[b].name} {count[b]} {axis}" for axis in "xz"]
+    return names
+
+
+def _sets(n_lengths: int, n_balls: int) -> dict[str, list[int]]:
+    n = n_lengths + 2 * n_balls
+    return dict(lengths=list(range(n_lengths)), radii=list(range(n_lengths, n)), shape=list(range(n)))
