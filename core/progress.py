@@ -29,6 +29,10 @@ class Monitor:
         if self._report is not None:
             self._report(stage, done, total)
 
+    def part(self, stage: str, index: int, total: int) -> "Monitor":
+        """A monitor for part `index` of `total`: what it reports counts as a fraction of that part, and it is cancelled with this one."""
+        return _Part(self, stage, index, total)
+
     def cancel(self) -> None:
         """Ask the computation to stop at its next step."""
         self._cancel.set()
@@ -37,3 +41,19 @@ class Monitor:
     def cancelled(self) -> bool:
         """True once `cancel()` was called."""
         return self._cancel.is_set()
+
+
+class _Part(Monitor):
+    def __init__(self, whole: Monitor, stage: str, index: int, total: int) -> None:
+        super().__init__()
+        self._whole, self._stage, self._index, self._total = whole, stage, index, total
+
+    def step(self, stage: str, done: float, total: float) -> None:
+        self._whole.step(self._stage, self._index + min(1.0, done / total if total else 1.0), self._total)
+
+    def cancel(self) -> None:
+        self._whole.cancel()
+
+    @property
+    def cancelled(self) -> bool:
+        return self._whole.cancelled

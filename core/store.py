@@ -69,11 +69,12 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path} is not a JSON file ({error}); remove it and run again.") from error
 
 
-def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
-    """Arrays and a JSON header into one .npz (no pickle)."""
+def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, compress: bool = True) -> None:
+    """Arrays and a JSON header into one .npz (no pickle). Checkpoints are not compressed: that takes longer than computing some."""
     text = json.dumps({"store_version": STORE_VERSION, **header}, sort_keys=True, allow_nan=False)
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
+    write = np.savez_compressed if compress else np.savez
+    write(buffer, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
 
 

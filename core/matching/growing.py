@@ -17,6 +17,7 @@ from ..geometry.intersection import Intersection, forward_intersection
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from ..settings import knob
+from .foreground import Foreground
 from .grid import TemplateGrid
 from .least_squares import Matches, MatchingSettings, match_patches
 from .seeds import Approximations
@@ -79,10 +80,10 @@ class _State:
 
 
 def grow(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, seeds: Approximations,
-         matching: MatchingSettings, growing: GrowingSettings, *, depth_range_m: tuple[float, float], monitor: Monitor) -> TripletField:
+         matching: MatchingSettings, growing: GrowingSettings, *, foreground: Foreground, monitor: Monitor) -> TripletField:
     """Grow the field of triplets from the seeds until no neighbour can be matched any more.
 
-    Only depths within `depth_range_m` (in the reference camera) are accepted.
+    Only points that the foreground allows are accepted.
     """
     n_cells = grid.shape[0] * grid.shape[1]
     state = _State(n_cells, len(cameras))
@@ -99,7 +100,7 @@ def grow(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: in
             state.attempts[cells] += 1
             xy = grid.xy(cells)
             matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings)
-            good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, depth_range_m)
+            good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, foreground)
             _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], reference)
             state.patch[cells[good]] = settings.patch_px
             cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
@@ -149,14 +150,14 @@ def _measure(images: Sequence[SplineImage], cameras: Sequence[Camera], reference
 
 
 def _acceptable(matched: Sequence[Matches], point: Intersection, depth: np.ndarray, parent_depth: np.ndarray, grid: TemplateGrid,
-                camera: Camera, growing: GrowingSettings, limit_px: float, depth_range_m: tuple[float, float]) -> np.ndarray:
-    near, far = depth_range_m
+                camera: Camera, growing: GrowingSettings, limit_px: float, foreground: Foreground) -> np.ndarray:
+    near, far = foreground.depth_range_m
     sigma = np.sqrt(np.nan_to_num(np.trace(point.covariance_m2, axis1=1, axis2=2), nan=0.0))
     across = depth * grid.spacing_px * np.sqrt(2) / camera.focal_px
     with np.errstate(invalid="ignore"):
         continues = ~(np.abs(depth - parent_depth) > growing.max_slope * across + NOISE_SIGMAS * sigma)  # NaN parents bind nothing
         return (np.all([m.ok for m in matched], axis=0) & (point.rms_residual_px <= limit_px)
-                & (depth >= near) & (depth <= far) & continues)
+                & (depth >= near) & (depth <= far) & continues & ~foreground.excludes(point.xyz_m))
 
 
 def _rows(m: Matches, rows: np.ndarray) -> Matches:

@@ -1,0 +1,99 @@
+"""The folder of a run (OUT): where each result lies, the checkpoints, and run.json, which says what was done.
+
+A checkpoint carries the digest of everything that it depends on; one that does not agree is computed again. Files: docs/formats.md.
+"""
+
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import store
+from .errors import InputError
+from .motion.ply import write_cloud
+from .surface.cloud import PointCloud
+from .tracking.trajectories import Trajectories
+
+FORMAT, VERSION = "tricap-run", 1
+
+
+class Results:
+    """An OUT folder. Creating the object makes sure that it can be written to."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder).resolve()
+        if self.folder.exists() and not self.folder.is_dir():
+            raise InputError(f"{folder} is a file; choose a folder for the results.")
+        foreign = self.folder.is_dir() and any(self.folder.iterdir()) and not (self.folder / "run.json").exists()
+        if foreign and not (self.folder / "cache").is_dir():
+            raise InputError(f"{folder} holds other files and no run of Tricap; choose an empty or a new folder for the results.")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"Cannot make the folder {folder}: {error.strerror or error}. Choose another place for the results.") from error
+        if not os.access(self.folder, os.W_OK):
+            raise InputError(f"The folder {folder} is read-only; choose another place for the results.")
+
+    def path(self, *names: str) -> Path:
+        """A file or folder inside OUT."""
+        return self.folder.joinpath(*names)
+
+    def cloud_path(self, frame: int) -> Path:
+        """clouds/NNNN.ply"""
+        return self.path("clouds", f"{frame:04d}.ply")
+
+    def load_checkpoint(self, stage: str, name: str, key: str) -> dict[str, np.ndarray] | None:
+        """The arrays of a checkpoint, or None when it is missing, damaged, or made from something else."""
+        path = self.path("cache", stage, f"{name}.npz")
+        if not path.exists():
+            return None
+        try:
+            arrays, header = store.load(path)
+        except InputError:
+            return None  # a damaged checkpoint is computed again
+        return arrays if header.get("key") == key else None
+
+    def save_checkpoint(self, stage: str, name: str, key: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a checkpoint."""
+        store.save(self.path("cache", stage, f"{name}.npz"), arrays, {"key": key}, compress=False)
+
+    def remove(self, *names: str) -> None:
+        """Remove a result of an earlier run, a file or a folder, if it is there."""
+        for name in names:
+            path = self.path(name)
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def write_cloud(self, cloud: PointCloud) -> None:
+        """clouds/NNNN.ply"""
+        write_cloud(self.cloud_path(cloud.frame), xyz_m=cloud.xyz_m, sigma_m=cloud.sigma_m, normals=cloud.normals, intensity=cloud.intensity)
+
+    def write_trajectories(self, trajectories: Trajectories, header: Mapping[str, Any]) -> None:
+        """trajectories.npz"""
+        names = ("frames", "time_s", "xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status")
+        arrays = {name: getattr(trajectories, name) for name in names}
+        small = {n: a.astype(np.float32) if n in ("xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m") else a for n, a in arrays.items()}
+        store.save(self.path("trajectories.npz"), small, header)
+
+    def read_run(self) -> dict[str, Any]:
+        """run.json, or an empty table where there is none yet.
+
+        Raises:
+            InputError: it is damaged, or of a newer version.
+        """
+        path = self.path("run.json")
+        if not path.exists():
+            return {}
+        run = store.read_json(path)
+        if not isinstance(run, dict) or run.get("format") != FORMAT or run.get("version") != VERSION:
+            raise InputError(f"{path} was not written by this version of Tricap; choose another folder, or --restart.")
+        return run
+
+    def write_run(self, run: Mapping[str, Any]) -> None:
+        """run.json"""
+        store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})

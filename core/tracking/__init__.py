@@ -1,0 +1,1 @@
+"""Tracking surface points through the sequence (LSMTA: D'Apuzzo, Plänkers & Fua 2000)."""
