@@ -16,7 +16,8 @@ _handles: list[Any] = []
 
 def add_commands(subparsers: Any) -> None:
     """Add the sub-command `scene` to an argparse sub-parsers object; its `run(args, monitor)` returns lines to print."""
-    parser: argparse.ArgumentParser = subparsers.add_parser("scene", help="a Blender file with armature, action, skin, cameras, footage, cloud")
+    about = "a Blender file with armature, action, skins, cameras, footage, cloud and trajectories"
+    parser: argparse.ArgumentParser = subparsers.add_parser("scene", help=about, description=about)
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run")
     parser.add_argument("--blend", metavar="FILE.blend", type=Path, required=True, help="the file to write")
     parser.set_defaults(run=scene)

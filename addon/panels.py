@@ -15,7 +15,7 @@ class TricapPanel:
     bl_category = "Tricap"
 
 
-class VIEW3D_PT_tricap(TricapPanel, bpy.types.Panel):
+class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
     """From a take to a moving armature."""
 
     bl_label = "Tricap"
@@ -45,11 +45,11 @@ class VIEW3D_PT_tricap(TricapPanel, bpy.types.Panel):
             layout.label(text=line)
 
 
-class VIEW3D_PT_tricap_advanced(TricapPanel, bpy.types.Panel):
+class TRICAP_PT_advanced(TricapPanel, bpy.types.Panel):
     """The knobs of every stage."""
 
     bl_label = "Advanced"
-    bl_parent_id = "VIEW3D_PT_tricap"
+    bl_parent_id = "TRICAP_PT_main"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -66,7 +66,7 @@ class VIEW3D_PT_tricap_advanced(TricapPanel, bpy.types.Panel):
                     body.prop(group, field.name)
 
 
-CLASSES = (VIEW3D_PT_tricap, VIEW3D_PT_tricap_advanced)
+CLASSES = (TRICAP_PT_main, TRICAP_PT_advanced)
 
 
 def register() -> None:

@@ -24,8 +24,8 @@ def property_of(field: "dataclasses.Field[Any]") -> Any:
         TypeError: the knob is of a kind that Blender has no property for.
     """
     meta, default = field.metadata, field.default
-    name = field.name.replace("_", " ")
-    words: dict[str, Any] = dict(name=f"{name} [{meta['unit']}]" if meta.get("unit") else name, description=meta.get("about", "").rstrip("."))
+    unit = f" [{meta['unit']}]" if meta.get("unit") else ""
+    words: dict[str, Any] = dict(name=field.name.replace("_", " ") + unit, description=meta.get("about", "").rstrip("."))
     if isinstance(default, bool):
         return bpy.props.BoolProperty(default=default, **words)
     if isinstance(default, str) and meta.get("choices"):
@@ -87,7 +87,8 @@ def register() -> None:
         "last": bpy.props.StringProperty(name="Result", description="What the last run found"),
     }
     annotations |= {name: bpy.props.PointerProperty(type=group) for name, group in groups.items()}
-    scene_group = type("TricapScene", (bpy.types.PropertyGroup,), {"__annotations__": annotations, "__doc__": "Tricap's part of the scene."})
+    body = {"__annotations__": annotations, "__doc__": "Tricap's part of the scene."}
+    scene_group = type("Tricap_scene", (bpy.types.PropertyGroup,), body)
     GROUPS[:] = [*groups.values(), scene_group]
     for group in GROUPS:
         bpy.utils.register_class(group)

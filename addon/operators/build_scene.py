@@ -9,7 +9,7 @@ from ...core.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
 from ..scene.build import SceneReport, write_scene
-from ..scene.results import Results, read_results
+from ..scene.contents import Contents, read_contents
 
 
 class BuildScene(JobOperator, bpy.types.Operator):
@@ -19,17 +19,17 @@ class BuildScene(JobOperator, bpy.types.Operator):
     bl_label = "Build Scene"
     bl_options = {"UNDO"}
 
-    out: bpy.props.StringProperty(name="Results", subtype="DIR_PATH",  # type: ignore[valid-type]
+    out: bpy.props.StringProperty(name="Contents", subtype="DIR_PATH",  # type: ignore[valid-type]
                                   description="Folder of a run; empty: the panel's output folder")
     blend: bpy.props.StringProperty(name="Save As", subtype="FILE_PATH",  # type: ignore[valid-type]
                                     description="Also save a copy of the file under this name; empty: do not save")
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Results]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Contents]:
         """Which folder is meant."""
         out = folders.output_folder(self.out, context.scene)
-        return lambda monitor: read_results(out, monitor)
+        return lambda monitor: read_contents(out, monitor)
 
-    def finish(self, context: bpy.types.Context, result: Results) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: Contents) -> set[str]:
         """Build the scene from what was read."""
         report = write_scene(result, Path(bpy.path.abspath(self.blend)) if self.blend else None)
         tell(self, report)

@@ -10,7 +10,7 @@ from ...core.progress import Monitor
 from .. import folders, properties
 from ..jobs import JobOperator
 from ..scene.build import write_scene
-from ..scene.results import Results, read_results
+from ..scene.contents import Contents, read_contents
 from .build_scene import tell
 
 
@@ -28,7 +28,7 @@ class Run(JobOperator, bpy.types.Operator):
     build: bpy.props.BoolProperty(name="Build Scene", default=True,  # type: ignore[valid-type]
                                   description="Put the results into this scene afterwards")
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Any, Results | None]]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Any, Contents | None]]:
         """Folders and settings as they are now."""
         take = folders.take_folder(self.take, context.scene)
         out = folders.output_folder(self.out, context.scene, str(take))
@@ -36,7 +36,7 @@ class Run(JobOperator, bpy.types.Operator):
         overrides, build = properties.overrides(context.scene), self.build
         return lambda monitor: measure(take, out, overrides, build, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[Any, Results | None]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: tuple[Any, Contents | None]) -> set[str]:
         """Tell what was found and build the scene."""
         report, results = result
         context.scene.tricap.last = str(report)
@@ -46,9 +46,9 @@ class Run(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def measure(take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor) -> tuple[Any, Results | None]:
+def measure(take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor) -> tuple[Any, Contents | None]:
     """The computation, free of bpy: the whole run, and its results read back for the scene."""
     from ...core import pipeline
 
     report = pipeline.run(take, out, overrides, monitor)
-    return report, read_results(out, monitor) if build else None
+    return report, read_contents(out, monitor) if build else None

@@ -1,6 +1,6 @@
 """Building the scene of a run: everything that was measured, in one collection, in the take's own frame numbers.
 
-    read_results (any thread) → write_scene (main thread) → save_blend
+    read_contents (any thread) → write_scene (main thread) → save_blend
 """
 
 import math
@@ -14,9 +14,9 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
-from . import action, armature, cameras, clips, metaballs
+from . import action, armature, cameras, clips, metaballs, skin
 from .cloud import CloudPoints, add_cloud
-from .results import Results, read_results
+from .contents import Contents, read_contents
 from .trajectories import add_trajectories
 
 COLLECTION = "Tricap"
@@ -43,26 +43,26 @@ def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = 
         InputError: OUT is no folder of results or damaged, or the file cannot be written.
         Cancelled: the monitor was cancelled; the scene is unchanged.
     """
-    return write_scene(read_results(Path(out), monitor or Monitor()), blend)
+    return write_scene(read_contents(Path(out), monitor or Monitor()), blend)
 
 
-def write_scene(results: Results, blend: Path | None = None) -> SceneReport:
+def write_scene(contents: Contents, blend: Path | None = None) -> SceneReport:
     """The second half of `build_scene`: main thread only."""
     scene = bpy.context.scene
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
     remove_earlier()
     collection = bpy.data.collections.new(COLLECTION)
-    collection[OUT_KEY] = str(results.out)
+    collection[OUT_KEY] = str(contents.out)
     scene.collection.children.link(collection)
-    set_time(scene, results)
-    warnings, counts = list(results.warnings), {}
-    counts["cameras"] = _add_cameras(scene, collection, results, warnings)
-    counts["cloud points"] = _add_cloud(collection, results)
-    if results.trajectories is not None:
-        add_trajectories(collection, results.trajectories)
-        counts["trajectories"] = results.trajectories["xyz_m"].shape[1]
-    counts |= _add_body(collection, results)
+    set_time(scene, contents)
+    warnings, counts = list(contents.warnings), {}
+    counts["cameras"] = _add_cameras(scene, collection, contents, warnings)
+    counts["cloud points"] = _add_cloud(collection, contents)
+    if contents.trajectories is not None:
+        add_trajectories(collection, contents.trajectories)
+        counts["trajectories"] = contents.trajectories["xyz_m"].shape[1]
+    counts |= _add_body(collection, contents, warnings)
     scene.frame_set(scene.frame_start)
     if blend is not None:
         save_blend(Path(blend))
@@ -86,11 +86,11 @@ def remove_earlier() -> None:
             bpy.data.batch_remove(free)
 
 
-def set_time(scene: bpy.types.Scene, results: Results) -> None:
+def set_time(scene: bpy.types.Scene, contents: Contents) -> None:
     """The scene's frames are the take's frames, at the take's rate."""
-    whole = max(1, math.ceil(results.fps - 1e-6))
-    scene.render.fps, scene.render.fps_base = whole, whole / results.fps
-    scene.frame_start, scene.frame_end = results.frames
+    whole = max(1, math.ceil(contents.fps - 1e-6))
+    scene.render.fps, scene.render.fps_base = whole, whole / contents.fps
+    scene.frame_start, scene.frame_end = contents.frames
 
 
 def save_blend(path: Path) -> None:
@@ -113,8 +113,8 @@ def save_blend(path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, results: Results, warnings: list[str]) -> int:
-    footage = results.footage
+def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, contents: Contents, warnings: list[str]) -> int:
+    footage = contents.footage
     if footage is None:
         return 0
     take = footage.take
@@ -130,12 +130,12 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, resul
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
         if camera is reference:
-            scene.camera = camera_object
+            scene.camera, scene.active_clip = camera_object, clip
     return len(take.views)
 
 
-def _add_cloud(collection: bpy.types.Collection, results: Results) -> int:
-    clouds = [_cloud_points(frame, ply) for frame, ply in results.clouds.items()]
+def _add_cloud(collection: bpy.types.Collection, contents: Contents) -> int:
+    clouds = [_cloud_points(frame, ply) for frame, ply in contents.clouds.items()]
     if clouds:
         add_cloud(collection, clouds)
     return sum(len(cloud.xyz_m) for cloud in clouds)
@@ -143,19 +143,27 @@ def _add_cloud(collection: bpy.types.Collection, results: Results) -> int:
 
 def _cloud_points(frame: int, ply: Ply) -> CloudPoints:
     xyz = ply.xyz_m
-    zeros = np.zeros(len(xyz))
-    normals = np.stack([ply.vertex.get(name, zeros) for name in ("nx", "ny", "nz")], axis=-1)
-    return CloudPoints(frame=frame, xyz_m=xyz, sigma_m=ply.vertex.get("sigma", zeros), normals=normals, intensity=ply.vertex.get("intensity", zeros))
+    column = {name: ply.vertex.get(name, np.zeros(len(xyz))) for name in ("sigma", "nx", "ny", "nz", "intensity")}
+    normals = np.stack([column[name] for name in ("nx", "ny", "nz")], axis=-1)
+    return CloudPoints(frame=frame, xyz_m=xyz, sigma_m=column["sigma"], normals=normals, intensity=column["intensity"])
 
 
-def _add_body(collection: bpy.types.Collection, results: Results) -> dict[str, int]:
-    if results.shape is None:
+def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: list[str]) -> dict[str, int]:
+    if contents.shape is None:
         return {}
-    armature_object = armature.add_armature(collection, results.shape)
-    flesh = metaballs.add_metaballs(collection, armature_object, results.shape)
-    counts = {"bones": len(results.shape.skeleton.bones), "metaball parts": len(flesh)}
-    if results.motion is not None:
-        motion = results.motion
-        action.add_action(armature_object, results.shape, motion.frames, motion.dof_names, motion.values, motion.sigma)
+    armature_object = armature.add_armature(collection, contents.shape)
+    flesh = metaballs.add_metaballs(collection, armature_object, contents.shape)
+    counts = {"bones": len(contents.shape.skeleton.bones), "metaball parts": len(flesh)}
+    try:
+        skin_object = skin.add_skin(collection, armature_object, contents.shape)
+    except InputError as error:
+        warnings.append(f"No polygonal skin in the scene: {error}")
+    else:
+        skin_object.hide_set(True)  # it lies in the metaballs' surface
+        skin_object.hide_render = True
+        counts["skin faces"] = len(skin_object.data.polygons)
+    if contents.motion is not None:
+        motion = contents.motion
+        action.add_action(armature_object, contents.shape, motion.frames, motion.dof_names, motion.values, motion.sigma)
         counts["frames of motion"] = len(motion.frames)
     return counts

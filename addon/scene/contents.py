@@ -14,7 +14,6 @@ import numpy as np
 from ...core import store
 from ...core.body.shape import BodyShape, read_body
 from ...core.errors import InputError
-from ...core.motion import tables
 from ...core.motion.ply import Ply, read_ply
 from ...core.progress import Monitor
 from ...core.take import Footage, open_take, read_take
@@ -23,7 +22,7 @@ DEFAULT_FPS = 25.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Results:
+class Contents:
     """The parts of OUT. `clouds` by frame; `trajectories` as in trajectories.npz; `motion` in radians and metres."""
 
     out: Path
@@ -49,13 +48,15 @@ class Results:
         return (int(min(known)), int(max(known))) if known else (0, 0)
 
 
-def read_results(out: Path, monitor: Monitor) -> Results:
+def read_contents(out: Path, monitor: Monitor) -> Contents:
     """Read the folder OUT of a run, and the take it was made from.
 
     Raises:
         InputError: OUT is no folder of results, or a file in it is damaged.
         Cancelled: the monitor was cancelled.
     """
+    from ...core.motion import tables
+
     out = Path(out)
     if not (out / "run.json").is_file():
         raise InputError(f"{out} holds no results of Tricap (no run.json); choose the output folder of a run.")
@@ -71,7 +72,7 @@ def read_results(out: Path, monitor: Monitor) -> Results:
     shape = _optional(out / "body.toml", "armature and metaballs", read_body, warnings)
     motion = _optional(out / "motion.csv", "action", tables.read_motion, warnings)
     monitor.step("reading results", 3, 3)
-    return Results(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
+    return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
                    warnings=tuple(warnings))
 
 

@@ -1,0 +1,119 @@
+"""An empty Blender file for every test of the scene, and a small run's results written with core's own writers."""
+
+import importlib.util
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core import store
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import BodyShape, default_shape, write_body
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.geometry.camera import Camera
+from tricap.core.geometry.rig import Rig, write_rig
+from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.motion.ply import write_cloud
+
+if importlib.util.find_spec("bpy"):
+    import bpy  # noqa: F401  Blender's own modules, such as addon_utils, are found only after it
+
+SIZE = (192, 144)
+FRAMES = range(2, 8)
+FPS = 29.97
+TAKE = """format = "tricap-take"
+version = 1
+fps = {fps}
+interlaced = "odd"
+frames = [{start}, {stop}]
+views = [ {views} ]
+[body]
+model = "arm.R"
+"""
+
+
+@pytest.fixture
+def empty() -> Iterator[ModuleType]:
+    """bpy with an empty file open."""
+    bpy = pytest.importorskip("bpy")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    yield bpy
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+
+
+def small_rig() -> Rig:
+    """Three cameras in a row that look along +y at an arm near the origin; distorted, principal points off the centre."""
+    cameras = []
+    for name, x in (("L", -0.4), ("C", 0.0), ("R", 0.4)):
+        matrix = np.array([[390.0, 0, 97.3 + 10 * x], [0, 390.0, 68.9], [0, 0, 1]])
+        R = rotation_from_vector(np.array([0.0, 0.15 * x / 0.4, 0.0])) @ rotation_from_vector(np.array([np.pi / 2, 0, 0]))
+        centre = np.array([x - 0.2, -2.2, 0.0])
+        cameras.append(Camera(name=name, size_px=SIZE, matrix=matrix, distortions=np.array([-0.12, 0.05, 6e-4, -4e-4, 0.01]),
+                              R_cam_world=R, t_cam_world_m=-R @ centre))
+    return Rig(cameras=tuple(cameras), metadata={})
+
+
+def arm() -> tuple[BodyShape, np.ndarray, np.ndarray]:
+    """The default right arm, a motion (T, D) [rad, m] through most of its range, and its sigmas."""
+    shape = default_shape(read_model("arm.R"))
+    phase = np.linspace(0, 1, len(FRAMES))[:, None]
+    first = np.array([0.05, 0.02, 0.1, -0.4, -1.1, -0.5, 0.1, -1.2])
+    last = np.array([-0.02, 0.12, 0.2, 1.9, 0.9, 0.9, 2.4, 1.1])
+    motion = first + (last - first) * phase
+    return shape, motion, np.linspace(0.001, 0.01, motion.size).reshape(motion.shape)
+
+
+@dataclass
+class SmallRun:
+    """An OUT folder and what is in it."""
+
+    out: Path
+    take: Path
+    rig: Rig
+    shape: BodyShape
+    motion: np.ndarray
+    sigma: np.ndarray
+    joints_m: dict[str, np.ndarray]
+
+
+@pytest.fixture
+def small_run(tmp_path: Path) -> SmallRun:
+    """A take of eight images a view, of which frames 2…7 were run, and the results of that run."""
+    take, out = tmp_path / "swing", tmp_path / "out"
+    rig = small_rig()
+    write_take(take, rig)
+    shape, motion, sigma = arm()
+    joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
+    store.write_json(out / "run.json", {"take": str(take)})
+    write_body(out / "body.toml", shape)
+    write_motion(out, shape, motion, sigma, joints)
+    random = np.random.default_rng(7)
+    for i, frame in enumerate(FRAMES):
+        n = 40 + i
+        xyz = joints["elbow.R"][i] + random.normal(0, 0.03, (n, 3))
+        write_cloud(out / "clouds" / f"{frame:04d}.ply", xyz_m=xyz, sigma_m=np.full(n, 1e-3), normals=np.tile([0.0, -1.0, 0.0], (n, 1)),
+                    intensity=random.uniform(0, 255, n))
+    xyz = np.stack([joints["elbow.R"], joints["wrist.R"]], axis=1)
+    xyz[0, 1] = np.nan
+    np.savez(out / "trajectories.npz", frames=np.array(FRAMES), time_s=np.array(FRAMES) / FPS, xyz_m=xyz,
+             velocity_m_s=np.gradient(xyz, axis=0) * FPS, acceleration_m_s2=np.zeros_like(xyz), sigma_m=np.full(xyz.shape[:2], 1e-3),
+             status=np.zeros(xyz.shape[:2], dtype=np.int8))
+    return SmallRun(out=out, take=take, rig=rig, shape=shape, motion=motion, sigma=sigma, joints_m=joints)
+
+
+def write_take(folder: Path, rig: Rig) -> None:
+    """take.toml, rig.toml and noise for footage, whose brightness tells the frame."""
+    folder.mkdir(parents=True)
+    random = np.random.default_rng(0)
+    for camera in rig.cameras:
+        (folder / camera.name).mkdir()
+        for frame in range(FRAMES.stop):
+            image = random.integers(0, 30, SIZE[::-1]) + 20 * frame
+            cv2.imwrite(str(folder / camera.name / f"{frame:04d}.png"), image.astype(np.uint8))
+    write_rig(folder / "rig.toml", rig)
+    views = ", ".join(f'{{ name = "{c.name}", images = "{c.name}/*.png" }}' for c in rig.cameras)
+    (folder / "take.toml").write_text(TAKE.format(fps=FPS, start=FRAMES.start, stop=FRAMES.stop, views=views), encoding="utf-8")

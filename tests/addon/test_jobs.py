@@ -1,0 +1,116 @@
+"""Jobs: the blocking driver, the worker thread, and everything that must stop it. The modal driver needs a window: tests/gui."""
+
+import importlib
+import threading
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+STOP_S = 1.0
+
+
+@pytest.fixture
+def jobs(blender: ModuleType) -> ModuleType:
+    """The add-on's own module, as Blender has it."""
+    module = importlib.import_module("bl_ext.user_default.tricap.addon.jobs")
+    yield module
+    module.stop_current()
+
+
+def endless(monitor: object) -> None:
+    """A job that ends only when it is stopped."""
+    for i in range(10**9):
+        monitor.step("spinning", i % 100, 100)
+        time.sleep(0.01)
+
+
+def running(jobs: ModuleType) -> object:
+    """An endless job on its thread, known to the module as the present one."""
+    job = jobs.Job(endless)
+    jobs._current[:] = [job]
+    job.start()
+    deadline = time.monotonic() + STOP_S
+    while not job.stage and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert job.alive and job.stage == "spinning" and 0 <= job.fraction <= 1
+    return job
+
+
+def test_here_and_on_a_thread_give_the_same(jobs: ModuleType) -> None:
+    def compute(monitor: object) -> tuple[int, bool]:
+        monitor.step("adding", 1, 2)
+        return sum(range(1000)), threading.current_thread() is threading.main_thread()
+
+    here, there = jobs.Job(compute), jobs.Job(compute)
+    here.run()
+    there.start()
+    there._thread.join()
+    assert here.result == (499500, True) and there.result == (499500, False)
+    assert here.fraction == there.fraction == 0.5
+
+
+def test_cancelling_joins_within_a_second(jobs: ModuleType) -> None:
+    job = running(jobs)
+    began = time.monotonic()
+    job.cancel_and_join()
+    assert time.monotonic() - began < STOP_S
+    assert not job.alive and "Stopped during spinning" in str(job.error)
+
+
+def test_another_file_stops_the_job(jobs: ModuleType, blender: ModuleType) -> None:
+    job = running(jobs)
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    assert not job.alive and jobs.current() is None
+
+
+def test_the_cancel_operator_is_there_only_while_a_job_runs(jobs: ModuleType, blender: ModuleType) -> None:
+    assert not blender.ops.tricap.cancel.poll()
+    job = running(jobs)
+    assert blender.ops.tricap.cancel.poll()
+    assert blender.ops.tricap.cancel() == {"FINISHED"}
+    job._thread.join(STOP_S)
+    assert not job.alive
+
+
+def test_disabling_the_extension_stops_the_job(blender: ModuleType) -> None:
+    import addon_utils
+
+    name = "bl_ext.user_default.tricap"
+    job = running(importlib.import_module(f"{name}.addon.jobs"))
+    try:
+        addon_utils.disable(name)
+        assert not job.alive
+        assert not hasattr(blender.types.Scene, "tricap") and not hasattr(blender.types.WindowManager, "tricap")
+    finally:
+        addon_utils.enable(name)
+
+
+def test_wrong_input_is_one_sentence(jobs: ModuleType, blender: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    with pytest.raises(RuntimeError, match=r"holds no results of Tricap \(no run.json\)"):
+        blender.ops.tricap.build_scene(out=str(tmp_path))
+    with pytest.raises(RuntimeError, match="Choose the take first"):
+        blender.ops.tricap.run()
+    with pytest.raises(RuntimeError, match="is no folder; choose the folder that holds take.toml"):
+        blender.ops.tricap.run(take=str(tmp_path / "nowhere"))
+    with pytest.raises(RuntimeError, match="relative to the Blender file, which was never saved"):
+        blender.ops.tricap.build_scene(out="//results")
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_a_bug_is_told_with_its_traceback(jobs: ModuleType, blender: ModuleType, caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(jobs.JobOperator, blender.types.Operator):
+        bl_idname = "tricap.broken"
+        bl_label = "Broken"
+
+        def snapshot(self, context: object) -> object:
+            return lambda monitor: 1 // 0
+
+    blender.utils.register_class(Broken)
+    try:
+        with pytest.raises(RuntimeError, match="Tricap made a mistake .ZeroDivisionError"):
+            blender.ops.tricap.broken()
+    finally:
+        blender.utils.unregister_class(Broken)
+    assert "1 // 0" in caplog.text

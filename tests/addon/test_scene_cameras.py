@@ -1,0 +1,120 @@
+"""Cameras and footage: Blender sees what the calibrated cameras saw."""
+
+import dataclasses
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from tricap.core.geometry.camera import Camera
+
+from .conftest import SIZE, small_rig, write_take
+
+PROJECTION_PX = 2e-3  # measured 3e-4 on 768×576: the single precision of Blender's matrices
+UNDISTORTION_PX = 0.02  # measured 0.005 on these cameras (inverse of Brown's model by iteration in single precision)
+
+
+def without_distortion(camera: Camera) -> Camera:
+    """The ideal camera."""
+    return dataclasses.replace(camera, distortions=np.zeros(5))
+
+
+@pytest.mark.parametrize("fy_over_fx", [1.0, 1.08, 0.9])
+def test_blender_cameras_project_like_the_rig(empty: ModuleType, fy_over_fx: float) -> None:
+    from tricap.addon.scene import cameras
+
+    random = np.random.default_rng(3)
+    scene = empty.context.scene
+    for camera in small_rig().cameras:
+        matrix = camera.matrix * np.array([[1.0], [fy_over_fx], [1.0]])
+        matrix[1, 2] = camera.matrix[1, 2]
+        ideal = dataclasses.replace(without_distortion(camera), matrix=matrix, affinity=np.array([0.01, 0.0]))
+        cameras.frame_render(scene, ideal)
+        seen = cameras.add_camera(scene.collection, ideal)
+        empty.context.view_layer.update()
+        xy = random.uniform((-20, -20), np.array(SIZE) + 20, (40, 2))
+        xyz = ideal.points_at_depth(xy, random.uniform(0.5, 6, 40))
+        np.testing.assert_allclose(cameras.seen_from(scene, seen, xyz, SIZE), xy, atol=PROJECTION_PX)
+
+
+def test_axes_go_there_and_back() -> None:
+    pytest.importorskip("bpy")
+    from tricap.addon.scene import axes
+
+    for camera in small_rig().cameras:
+        R, t = axes.camera_from_world(axes.camera_to_world(camera))
+        np.testing.assert_allclose(R, camera.R_cam_world, atol=1e-12)
+        np.testing.assert_allclose(t, camera.t_cam_world_m, atol=1e-12)
+    np.testing.assert_allclose(axes.uv_from_pixel(np.array([-0.5, SIZE[1] - 0.5]), SIZE), [0, 0], atol=1e-15)
+    xy = np.array([[3.25, 100.5], [0.0, 0.0]])
+    np.testing.assert_allclose(axes.pixel_from_uv(axes.uv_from_pixel(xy, SIZE), SIZE), xy, atol=1e-12)
+
+
+def test_the_clip_undistorts_like_the_camera(empty: ModuleType, tmp_path: Path) -> None:
+    """Blender's own undistortion of a tracked point, by a Follow Track constraint with and without it, against the camera's."""
+    from tricap.addon.scene import axes, cameras, clips
+
+    write_take(tmp_path / "take", small_rig())
+    camera = small_rig()["R"]
+    scene = empty.context.scene
+    seen = cameras.add_camera(scene.collection, camera)
+    clip = clips.load_clip("R", tmp_path / "take" / "R" / "0000.png", camera)
+    cameras.frame_render(scene, camera)
+    empty.context.view_layer.update()
+    random = np.random.default_rng(1)
+    xy = random.uniform((3, 3), np.array(SIZE) - 3, (20, 2))
+    ideal, shift = without_distortion(camera), []
+    for i, point in enumerate(axes.uv_from_pixel(xy, SIZE)):
+        track = clip.tracking.tracks.new(name=f"track {i}", frame=1)
+        track.markers.find_frame(1).co = point
+        pair = [follower(empty, clip, track, seen, undistorted) for undistorted in (True, False)]
+        scene.frame_set(1)
+        graph = empty.context.evaluated_depsgraph_get()
+        places = np.array([follow.evaluated_get(graph).matrix_world.translation for follow in pair])
+        shift.append(np.subtract(*ideal.project(places)))
+    expected = ideal.project(camera.points_at_depth(xy, 2.0)) - xy
+    assert np.linalg.norm(expected, axis=1).max() > 0.5
+    np.testing.assert_allclose(shift, expected, atol=UNDISTORTION_PX)
+
+
+def follower(bpy: ModuleType, clip: object, track: object, camera_object: object, undistorted: bool) -> object:
+    """An empty, two metres before the camera, on the ray of a track."""
+    from mathutils import Vector
+
+    follow = bpy.data.objects.new("follower", None)
+    bpy.context.scene.collection.objects.link(follow)
+    follow.location = camera_object.matrix_world @ Vector((0, 0, -2))
+    constraint = follow.constraints.new("FOLLOW_TRACK")
+    constraint.clip, constraint.track, constraint.camera = clip, track.name, camera_object
+    constraint.use_active_clip = False
+    constraint.use_undistorted_position, constraint.frame_method = undistorted, "STRETCH"
+    return follow
+
+
+def test_footage_stands_behind_the_cameras_in_the_takes_frames(empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.addon.scene import cameras, clips
+
+    write_take(tmp_path / "take", small_rig())
+    camera = small_rig()["C"]
+    files = sorted((tmp_path / "take" / "C").glob("*.png"))
+    seen = cameras.add_camera(empty.context.scene.collection, camera)
+    clip = clips.load_clip("C", files[0], camera)
+    clips.show_behind(seen.data, clip)
+    assert (clip.source, clip.frame_duration, clip.frame_start) == ("SEQUENCE", len(files), 0)
+    assert clips.clip_faults(clip, camera, files, "view C") == []
+    background = seen.data.background_images[0]
+    assert background.clip == clip and background.clip_user.use_render_undistorted
+
+
+def test_footage_that_blender_cannot_show_is_told(empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.addon.scene import clips
+
+    write_take(tmp_path / "take", small_rig())
+    camera = small_rig()["C"]
+    files = sorted((tmp_path / "take" / "C").glob("*.png"))
+    files[3].unlink()
+    clip = clips.load_clip("C", files[0], dataclasses.replace(camera, size_px=(100, 50)))
+    size, gap = clips.clip_faults(clip, dataclasses.replace(camera, size_px=(100, 50)), files, "view C")
+    assert "192×144" in size and "100×50" in size
+    assert "only 3 of the 8" in gap
