@@ -1,5 +1,5 @@
-"""The skin of a limb: contours across the bones, each point cast from the axis to the implicit surface (Shen & Thalmann 1995; D'Apuzzo
-et al. 1999). The deformation needs no weights: the metaballs move with the bones and the surface is found anew.
+"""The skin of a limb: contours across the bones, each point cast from the axis to the implicit surface (Thalmann, Shen & Chauvineau
+1996; D'Apuzzo et al. 1999). The deformation needs no weights: the metaballs move with the bones and the surface is found anew.
 
 The rays of a contour start at a point of the bone's axis, in the direction
 

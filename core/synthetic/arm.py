@@ -1,0 +1,199 @@
+"""A recording with known truth: a person's right arm in a patterned sleeve swings before three cameras in a row.
+
+The folder holds a complete take (FORMATS: take.toml with clicks, rig.toml, L/ C/ R/) and truth.npz beside it:
+
+    vertices_m (T, V, 3) f4, triangles (F, 3) i4, textured (V,) bool (cloth), visible (T, ⌈V/8⌉) u1 packed bits: seen by all three
+    cameras, joints_m (T, J, 3), joint_names, time_s (T,), and what the body model knows: dof_names, motion_values (T, D) rad and m,
+    bone_names, lengths_m (B,), radii_m (M, 3), ball_bone (M,)
+
+all at the instants of the rows that take.toml keeps; the other field is exposed half a frame later.
+"""
+
+import io
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .. import store
+from ..body.metaballs import three_balls
+from ..body.model_file import read_model
+from ..body.shape import BodyShape
+from ..body.skeleton import joint_positions
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..geometry.raster import vertex_normals
+from ..geometry.rig import Rig, write_rig
+from ..geometry.rotation import axis_rotation
+from ..images.fields import row_grid
+from ..progress import Monitor
+from ..settings import knob
+from .figure import Part, joined, moving_parts, standing_parts, wall
+from .film import Layer, Sensor, digitize, expose, paint, seen_vertices
+from .texture import SolidNoise, solid_noise
+
+STAGE = "sample recording"
+SHOULDER_M = np.array([-0.185, -0.010, 1.450])
+LENGTHS_M = np.array([0.272, 0.248])  # upper arm, forearm
+SEEN_RADII_M = np.array([[[0.053, 0.050], [0.047, 0.045], [0.043, 0.041]], [[0.044, 0.041], [0.039, 0.036], [0.032, 0.029]]])  # x, z
+TARGET_M = np.array([-0.34, -0.06, 1.35])  # where the cameras look
+WALL_Y_M = 1.20
+SWING_S = 1.36  # there and back
+VIEWS = ("L", "C", "R")
+TRUE_NAMES = {"shoulder.R": "RightArm", "elbow.R": "RightForeArm", "wrist.R": "RightHand"}  # truth.npz names joints as mocap files do
+MARK = "synthetic arm"  # in rig.toml's metadata
+SENSORS = dict(L=Sensor(gain=1.06, offset=-4.0), C=Sensor(), R=Sensor(gain=0.94, offset=7.0))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ArmTakeSettings:
+    """The synthetic recording."""
+
+    frames: int = knob(16, "Frames of the recording.", low=2, high=1000)
+    fps: float = knob(25.0, "Frame rate.", unit="1/s", low=1.0, high=1000.0)
+    width_px: int = knob(768, "Width of the pictures; the height is three quarters of it.", unit="px", low=96, high=4096)
+    interlaced: str = knob("odd", "Lines that take.toml keeps; the others are exposed half a frame later.", choices=("none", "odd", "even"))
+    noise: float = knob(1.0, "Multiplies the sensors' noise.", low=0.0, high=20.0)
+    click_error_px: float = knob(4.0, "Clicks on the joints are wrong by up to this much, in x and in y.", unit="px", low=0.0, high=100.0)
+    seed: int = knob(1, "Another seed: other textures, noise and clicks.", low=0, high=2**31 - 1)
+
+
+def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor: Monitor | None = None) -> None:
+    """Make the recording in `folder`: a take and truth.npz. The same settings give the same pictures and truth. About 12 s for
+    16 frames.
+
+    take.toml is written last: as long as it is missing, the recording is not complete.
+
+    Raises:
+        InputError: the folder holds something that was not made by this function, or cannot be written.
+        Cancelled: the monitor was cancelled; the folder then holds no take.
+    """
+    settings, monitor, folder = settings or ArmTakeSettings(), monitor or Monitor(), Path(folder)
+    _clear(folder)
+    rig, shape, noise = arm_rig(settings.width_px), arm_shape(), solid_noise(settings.seed)
+    still = (*standing_parts(SHOULDER_M), wall(WALL_Y_M))
+    layers = [paint(camera, still, noise) for camera in rig.cameras]
+    write_rig(folder / "rig.toml", rig)
+    visible = []
+    for frame in range(settings.frames):
+        monitor.step(STAGE, frame, settings.frames)
+        visible.append(_film_frame(folder, settings, frame, rig, shape, noise, layers))
+    store.write_bytes(folder / "truth.npz", _truth(settings, shape, np.array(visible)))
+    store.write_text(folder / "take.toml", _take_toml(settings, rig, shape))
+    monitor.step(STAGE, settings.frames, settings.frames)
+
+
+def arm_shape() -> BodyShape:
+    """The person's true arm."""
+    model = read_model("arm.R")
+    balls = three_balls(np.array([0, 1]), LENGTHS_M, SEEN_RADII_M)
+    return BodyShape(model=model.name, skeleton=model.skeleton, lengths_m=LENGTHS_M, metaballs=balls, length_sigma_m=np.zeros(2),
+                     radius_sigma_m=np.zeros((len(balls.weight), 3)))
+
+
+def arm_motion(time_s: np.ndarray | float) -> np.ndarray:
+    """True values (…, D) of the degrees of freedom [m, rad]: half a swing takes 0.68 s, the wrist reaches 0.95 m/s."""
+    time = np.asarray(time_s, dtype=np.float64)
+    swing = 0.5 - 0.5 * np.cos(2 * np.pi * time / SWING_S)  # 0 … 1 … 0
+    late = 0.5 - 0.5 * np.cos(2 * np.pi * (time - 0.10) / SWING_S)
+    columns = {"shoulder.R x": SHOULDER_M[0] - 0.010 * swing, "shoulder.R y": SHOULDER_M[1] - 0.008 * late,
+               "shoulder.R z": SHOULDER_M[2] + 0.012 * swing,
+               "shoulder.R flexion": np.radians(14 + 18 * swing), "shoulder.R abduction": np.radians(-14 - 12 * late),
+               "shoulder.R twist": np.radians(34 + 10 * late), "elbow.R flexion": np.radians(24 + 56 * swing),
+               "elbow.R twist": np.radians(-10 + 20 * late)}
+    return np.stack([columns[name] + 0 * time for name in arm_shape().skeleton.dof_names], axis=-1)
+
+
+def arm_rig(width_px: int) -> Rig:
+    """Three cameras in a row, 1.9 m before the arm and 0.35 m apart, turned inwards, each with a distortion of its own."""
+    scale = width_px / 768
+    cameras = []
+    for name, x, y, z, roll, focal, cx, cy, k1, p1, p2 in (
+            ("L", -0.352, 0.035, 0.012, 0.012, 1503.2, 386.1, 284.9, -0.112, 5e-4, -3e-4),
+            ("C", 0.0, 0.0, 0.025, -0.006, 1498.7, 381.7, 290.3, -0.118, 4e-4, -4e-4),
+            ("R", 0.345, 0.028, 0.004, 0.009, 1507.9, 384.6, 282.2, -0.107, 6e-4, -2e-4)):
+        centre = TARGET_M + np.array([x, y - 1.9, z])
+        ahead = (TARGET_M - centre) / np.linalg.norm(TARGET_M - centre)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        R = axis_rotation("z", roll) @ np.stack([right, np.cross(ahead, right), ahead])
+        matrix = np.array([[focal * scale, 0, (cx + 0.5) * scale - 0.5], [0, focal * scale, (cy + 0.5) * scale - 0.5], [0, 0, 1]])
+        cameras.append(Camera(name=name, size_px=(width_px, width_px * 3 // 4), matrix=matrix,
+                              distortions=np.array([k1, 0.05, p1, p2, 0.0]), R_cam_world=R, t_cam_world_m=-R @ centre))
+    return Rig(cameras=tuple(cameras), metadata=dict(source=MARK))
+
+
+def _clear(folder: Path) -> None:
+    """Make way for a new recording. Only a recording of ours is removed; rig.toml, which marks it, stays until it is replaced."""
+    rig = folder / "rig.toml"
+    try:
+        ours = rig.exists() and MARK in rig.read_text(encoding="utf-8", errors="replace")
+        if folder.exists() and not ours and any(folder.iterdir()):
+            raise InputError(f"{folder} is not empty and holds no sample recording; choose a new folder for it.")
+        for name in ("take.toml", "truth.npz"):
+            (folder / name).unlink(missing_ok=True)
+        for view in VIEWS:
+            if (folder / view).exists():
+                shutil.rmtree(folder / view)
+    except OSError as error:
+        raise InputError(f"Cannot make room for a recording in {folder}: {error.strerror or error}; choose another folder.") from error
+
+
+def _film_frame(folder: Path, settings: ArmTakeSettings, frame: int, rig: Rig, shape: BodyShape, noise: SolidNoise,
+                still: list[Layer]) -> np.ndarray:
+    """Write one frame of all views; return which vertices (V,) all of them see in the rows that are kept."""
+    kept = row_grid(settings.interlaced)
+    rest = moving_parts(shape, np.zeros(len(shape.skeleton.dof_names)))
+    instants = [frame / settings.fps] + ([(frame + 0.5) / settings.fps] if kept.step == 2 else [])
+    fields = [moving_parts(shape, arm_motion(time), rest) for time in instants]
+    body = (*fields[0], *standing_parts(SHOULDER_M))
+    vertices = joined(body)[0]
+    normals = np.concatenate([vertex_normals(p.vertices_m, p.triangles) for p in body])
+    seen = np.ones(len(vertices), dtype=bool)
+    for i, camera in enumerate(rig.cameras):
+        sensor = SENSORS[camera.name]
+        layers = [paint(camera, parts, noise, still[i]) for parts in fields]
+        seen &= seen_vertices(camera, vertices, normals, layers[0])
+        picture = expose(layers[0], sensor)
+        if kept.step == 2:
+            picture[1 - kept.offset::2] = expose(layers[1], sensor)[1 - kept.offset::2]
+        rng = np.random.default_rng([settings.seed, frame, i])
+        _write_png(folder / camera.name / f"{frame:04d}.png", digitize(picture, sensor, settings.noise, rng))
+    return seen
+
+
+def _write_png(path: Path, picture: np.ndarray) -> None:
+    store.write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
+
+
+def _truth(settings: ArmTakeSettings, shape: BodyShape, visible: np.ndarray) -> bytes:
+    time = np.arange(settings.frames) / settings.fps
+    motion = arm_motion(time)
+    bodies: list[tuple[Part, ...]] = [(*moving_parts(shape, values), *standing_parts(SHOULDER_M)) for values in motion]
+    joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
+    textured = np.concatenate([np.full(len(p.vertices_m), p.material.textured) for p in bodies[0]])
+    arrays = dict(
+        vertices_m=np.array([joined(body)[0] for body in bodies], dtype=np.float32), triangles=joined(bodies[0])[1].astype(np.int32),
+        textured=textured, visible=np.packbits(visible, axis=1), joints_m=np.stack([joints[name] for name in TRUE_NAMES], axis=1),
+        joint_names=np.array(list(TRUE_NAMES.values())), time_s=time, motion_values=motion, dof_names=np.array(shape.skeleton.dof_names),
+        bone_names=np.array([bone.name for bone in shape.skeleton.bones]), lengths_m=shape.lengths_m,
+        radii_m=shape.metaballs.radii_m, ball_bone=shape.metaballs.bone_index)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def _take_toml(settings: ArmTakeSettings, rig: Rig, shape: BodyShape) -> str:
+    rng = np.random.default_rng([settings.seed, 77])
+    joints = joint_positions(shape.skeleton, shape.lengths_m, arm_motion(0.0))
+    lines = ['format = "tricap-take"', "version = 1", f"fps = {settings.fps!r}", f'interlaced = "{settings.interlaced}"',
+             'rig = "rig.toml"', ""]
+    for camera in rig.cameras:
+        lines += ["[[views]]", f'name = "{camera.name}"', f'images = "{camera.name}/*.png"', ""]
+    lines += ["[body]", f'model = "{shape.model}"', "", "[seeds]", "frame = 0", "[seeds.joints]"]
+    for name in TRUE_NAMES:
+        clicks = [camera.project(joints[name]) + rng.uniform(-1, 1, 2) * settings.click_error_px for camera in rig.cameras]
+        lines.append(f'"{name}" = {{ ' + ", ".join(f"{c.name} = [{x:.1f}, {y:.1f}]" for c, (x, y) in zip(rig.cameras, clicks)) + " }")
+    return "\n".join(lines) + "\n"
