@@ -48,15 +48,15 @@ class TripletField:
 
     grid: TemplateGrid
     cell: np.ndarray  # (N,) flat cell numbers, ascending
-    xy: np.ndarray  # (N, K, 2)
+    xy: np.ndarray  # (N, K, 2) the texture's centre of gravity in every view
     shape: np.ndarray  # (N, K, 2, 2)
-    covariance: np.ndarray  # (N, K, 2, 2)
+    covariance: np.ndarray  # (N, K, 2, 2) of xy
     correlation: np.ndarray  # (N,) the smallest over the views
     xyz_m: np.ndarray  # (N, 3)
     covariance_m2: np.ndarray  # (N, 3, 3)
     residual_px: np.ndarray  # (N,) rms distance of the image points to the meeting point's projections
     sigma0: np.ndarray  # (N,) of the intersection
-    patch_px: np.ndarray  # (N,) side of the patch that was matched, full-frame pixels
+    spread: np.ndarray  # (N, 2) variance of the texture's energy in the patch of the reference view
     tried: int  # how many cells were tried
     limit_px: float  # the residual that was allowed
 
@@ -70,11 +70,12 @@ class _State:
     """What is known of every cell while the field grows."""
 
     def __init__(self, cells: int, views: int) -> None:
+        self.middle = np.zeros((cells, views, 2))  # of the patches: what the growth goes on from
         self.xy = np.zeros((cells, views, 2))
         self.shape = np.zeros((cells, views, 2, 2))
         self.covariance = np.zeros((cells, views, 2, 2))
         self.correlation, self.residual, self.sigma0 = np.zeros(cells), np.zeros(cells), np.zeros(cells)
-        self.patch = np.zeros(cells, dtype=np.int16)
+        self.spread = np.zeros((cells, 2))
         self.xyz, self.covariance_m2 = np.zeros((cells, 3)), np.zeros((cells, 3, 3))
         self.accepted, self.attempts = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=np.int16)
 
@@ -102,7 +103,6 @@ def grow(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: in
             matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings)
             good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, foreground)
             _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], reference)
-            state.patch[cells[good]] = settings.patch_px
             cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
     return _field(state, grid, limit_px)
 
@@ -119,7 +119,7 @@ def _front_from(state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts
     """The next cells to try, their starts and shapes in every view, and the depth that they should continue."""
     cells, parents = _next_front(state, fresh, grid, attempts)
     step = grid.xy(cells) - grid.xy(parents)
-    start = state.xy[parents] + np.einsum("nkij,nj->nki", state.shape[parents], step)  # (1)
+    start = state.middle[parents] + np.einsum("nkij,nj->nki", state.shape[parents], step)  # (1)
     return cells, start, state.shape[parents], camera.to_camera(state.xyz[parents])[:, 2]
 
 
@@ -139,11 +139,11 @@ def _measure(images: Sequence[SplineImage], cameras: Sequence[Camera], reference
                             matching, row_step=grid.rows.step)
     image_xy = np.full((len(xy), len(cameras), 2), np.nan)
     K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2, (len(xy), len(cameras), 1, 1))
-    image_xy[:, reference] = xy
+    image_xy[:, reference] = xy + matched[0].offset
     every = np.all([m.ok for m in matched], axis=0)
     for k, m in zip(views, matched):
-        image_xy[every, k] = m.xy[every]
-        K[every, k] = m.covariance[every]
+        image_xy[every, k] = m.transfer_xy[every]
+        K[every, k] = m.transfer_covariance[every]
     image_xy[~every] = np.nan
     point = forward_intersection(cameras, grid.rows.to_frame(image_xy), grid.rows.covariance_to_frame(K))
     return matched, point, cameras[reference].to_camera(point.xyz_m)[:, 2]
@@ -168,10 +168,12 @@ def _store(state: _State, cells: np.ndarray, matched: Sequence[Matches], point: 
            reference: int) -> None:
     views = [k for k in range(state.xy.shape[1]) if k != reference]
     state.accepted[cells] = True
-    state.xy[cells, reference], state.shape[cells, reference] = xy, np.eye(2)
+    state.middle[cells, reference], state.xy[cells, reference] = xy, xy + matched[0].offset
+    state.shape[cells, reference], state.spread[cells] = np.eye(2), matched[0].spread
     state.covariance[cells, reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
     for k, m in zip(views, matched):
-        state.xy[cells, k], state.shape[cells, k], state.covariance[cells, k] = m.xy, m.shape, m.covariance
+        state.middle[cells, k], state.xy[cells, k] = m.xy, m.transfer_xy
+        state.shape[cells, k], state.covariance[cells, k] = m.shape, m.transfer_covariance
     state.correlation[cells] = np.min([m.correlation for m in matched], axis=0)
     state.xyz[cells], state.covariance_m2[cells] = point.xyz_m[good], point.covariance_m2[good]
     state.residual[cells], state.sigma0[cells] = point.rms_residual_px[good], point.sigma0[good]
@@ -198,4 +200,4 @@ def _field(state: _State, grid: TemplateGrid, limit_px: float) -> TripletField:
     return TripletField(grid=grid, cell=cell, xy=state.xy[cell], shape=state.shape[cell], covariance=state.covariance[cell],
                         correlation=state.correlation[cell], xyz_m=state.xyz[cell], covariance_m2=state.covariance_m2[cell],
                         residual_px=state.residual[cell], sigma0=state.sigma0[cell],
-                        patch_px=state.patch[cell], limit_px=limit_px, tried=int((state.attempts > 0).sum()))
+                        spread=state.spread[cell], limit_px=limit_px, tried=int((state.attempts > 0).sum()))

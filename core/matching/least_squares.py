@@ -10,6 +10,10 @@ J = [fx, fx u, fx v, fy, fy u, fy v] of the template's gradients, r0 and r1 are 
     H = Jᵀ M J ,   r1 = |f̃| (g̃·f̂) / (g̃·g̃) ,   Δp = H⁻¹ r1 (Jᵀ g̃ − Jᵀf̂ (g̃·f̂))           (2)
     u → A (I + B)⁻¹ (u − d) + c   with Δp = (d1, B11, B12, d2, B21, B22)                 (3)
     σ0² = |f̃|² (1 − ρ²) / (n − 8) ,   ρ = g̃·f̂ / |g̃| ,   K_c = σ0² A H⁻¹[d] Aᵀ             (4)
+    o = Σ u |∇f|² / Σ |∇f|² ,   x_o = c + A o ,   K_o = σ0² A E H⁻¹ Eᵀ Aᵀ , E = [1 o] ⊗ I   (5)
+
+What was matched is the texture, so the point that is transferred with least bias is the gradients' centre of gravity o of the patch (Förstner 1984),
+not its middle: at the outline of a body it lies on the body, where the middle may lie on the background.
 
 H belongs to the template alone, so it is built once; all patches of a chunk are arrays (N, n), and what has converged leaves the arrays.
 Coordinates are pixels of the images given (a field's rows count as rows).
@@ -32,6 +36,7 @@ MAX_STEP_PX = 2.0
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
 MIN_CONDITION = 1e-6
 PARAMETERS = 8
+NOISE_ENERGY = 4.0  # of a gradient [grey values² / px²]: less is noise, not texture
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -68,13 +73,21 @@ class MatchStatus(IntEnum):
 class Matches:
     """N patches found (or not) in one search image. Pixels of that image."""
 
-    xy: np.ndarray  # (N, 2) position of the template point
+    xy: np.ndarray  # (N, 2) position of the patch's middle
     shape: np.ndarray  # (N, 2, 2) the affine shape A
     covariance: np.ndarray  # (N, 2, 2) of xy [px²]
+    offset: np.ndarray  # (N, 2) o of (5), from the patch's middle, in the template
+    spread: np.ndarray  # (N, 2) variance of the gradients' energy about o [px²]
+    transfer_covariance: np.ndarray  # (N, 2, 2) of transfer_xy [px²]
     sigma0: np.ndarray  # (N,) grey values of a patch whose contrast is 50
     correlation: np.ndarray  # (N,)
     iterations: np.ndarray  # (N,)
     status: np.ndarray  # (N,) MatchStatus
+
+    @property
+    def transfer_xy(self) -> np.ndarray:
+        """(N, 2) position of the texture's centre of gravity, x_o of (5)."""
+        return self.xy + np.einsum("nij,nj->ni", self.shape, self.offset)
 
     @property
     def ok(self) -> np.ndarray:
@@ -140,6 +153,7 @@ class _Templates:
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
         eye = np.eye(6) * MIN_CONDITION
         self.inverse = np.linalg.inv(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
+        self.offset, self.spread = self._centre_of_gravity()
         self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
 
     def _sample(self, image: SplineImage, xy: np.ndarray, shape: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -153,6 +167,15 @@ class _Templates:
         fy = (8 * (P[:, 3:-1, 2:-2] - P[:, 1:-3, 2:-2]) - (P[:, 4:, 2:-2] - P[:, :-4, 2:-2])) / 12
         flat = (len(xy), self.n_pixels)
         return P[:, 2:-2, 2:-2].reshape(flat), fx.reshape(flat), fy.reshape(flat)
+
+    def _centre_of_gravity(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and variance (m, 2) of the patch coordinates, weighted by the energy of the gradients above their noise.  (5)"""
+        energy = self.fx**2 + self.fy**2
+        energy = np.maximum(energy - NOISE_ENERGY, 1e-3)
+        total = energy.sum(axis=1, keepdims=True)
+        uv = np.stack([self._u, self._v, self._u**2, self._v**2], axis=1)
+        moment = (energy @ uv / total).astype(np.float64)
+        return moment[:, :2], moment[:, 2:] - moment[:, :2] ** 2
 
     def _project(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Jᵀ g (m, 6)."""
@@ -212,6 +235,9 @@ class _Templates:
         lost = np.clip(1 - correlation**2, 0, 1)
         variance = self.contrast.astype(np.float64) ** 2 * lost / dof  # (4)
         K = variance[:, None, None] * (A @ self.inverse[:, ::3, ::3] @ A.transpose(0, 2, 1))
+        E = np.concatenate([np.ones((len(c), 1)), self.offset], axis=1)
+        transferred = np.einsum("ni,naibj,nj->nab", E, self.inverse.reshape(-1, 2, 3, 2, 3), E)  # (5)
+        K_o = variance[:, None, None] * (A @ transferred @ A.transpose(0, 2, 1))
         sigma0 = 50 * np.sqrt(lost * self.n_pixels / dof)
         sigma = np.sqrt(np.maximum(K[:, [0, 1], [0, 1]], 0)).max(axis=1)
         for bad, why in ((np.abs(c - start).max(axis=1) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
@@ -220,7 +246,7 @@ class _Templates:
                          (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
                          (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE), (sigma0 > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE)):
             status[(status == MatchStatus.OK) & bad] = why
-        return Matches(xy=c, shape=A, covariance=K, sigma0=sigma0, correlation=correlation, iterations=iterations, status=status)
+        return Matches(xy=c, shape=A, covariance=K, offset=self.offset, spread=self.spread, transfer_covariance=K_o, sigma0=sigma0, correlation=correlation, iterations=iterations, status=status)
 
 
 def _warp(c: np.ndarray, A: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -247,5 +273,5 @@ def _compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray
 
 def _empty() -> Matches:
     z = np.zeros
-    return Matches(xy=z((0, 2)), shape=z((0, 2, 2)), covariance=z((0, 2, 2)), sigma0=z(0), correlation=z(0),
-                   iterations=z(0, np.int16), status=z(0, np.int8))
+    return Matches(xy=z((0, 2)), shape=z((0, 2, 2)), covariance=z((0, 2, 2)), offset=z((0, 2)), spread=z((0, 2)),
+                   transfer_covariance=z((0, 2, 2)), sigma0=z(0), correlation=z(0), iterations=z(0, np.int16), status=z(0, np.int8))

@@ -16,6 +16,7 @@ from ..values import frozen
 from .local_surface import LocalSurface, local_surface
 
 REMAINING_BIAS = 0.5  # of the curvature correction
+MAX_CORRECTION_PX = 3.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -77,7 +78,7 @@ def point_cloud(field: TripletField, grey: np.ndarray, camera: Camera, reference
 
 def _corrected(field: TripletField, surface: LocalSurface, camera: Camera, reference: int) -> tuple[np.ndarray, np.ndarray]:
     rays = camera.rays(field.grid.rows.to_frame(field.xy[:, reference]))
-    limit = 0.25 * field.patch_px * surface.depth_m / camera.focal_px  # steeper than a body: the quadric follows noise there
+    limit = MAX_CORRECTION_PX * surface.depth_m / camera.focal_px  # rounder than a body: the quadric follows noise there
     shift = np.clip(surface.flattening_m, -limit, limit)
     along = rays * (REMAINING_BIAS * shift)[:, None]
     return field.xyz_m + rays * shift[:, None], field.covariance_m2 + along[:, :, None] * along[:, None, :]

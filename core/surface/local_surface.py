@@ -2,10 +2,10 @@
 
     D(a, b) = D0 + Da a + Db b + ½ Daa a² + Dab a b + ½ Dbb b² ,   a, b in full-frame pixels of the reference image        (1)
 
-It gives the normal, tells points that disagree with their neighbours, and the curvature that an affine patch averages away: the matched depth of a
-patch of w × h pixels is that of (1) averaged over the patch, so a round body is measured too flat, by                          (2)
+It gives the normal, tells points that disagree with their neighbours, and the curvature that an affine patch averages away: a patch is matched at
+the mean of (1) over its texture, so a round body is measured too flat; with the variances s_a², s_b² of the texture's energy in the patch
 
-    D0 − D̄ = −½ (Daa (w² − 1)/12 + Dbb (h² − 1)/12)
+    D0 − D̄ = −½ (Daa s_a² + Dbb s_b²)                                                                                       (2)
 """
 
 from dataclasses import dataclass
@@ -37,46 +37,47 @@ class LocalSurface:
 def local_surface(field: TripletField, camera: Camera, reference: int) -> LocalSurface:
     """Fit (1) about every point of the field, from the cells within RADIUS_CELLS."""
     depth = camera.to_camera(field.xyz_m)[:, 2]
-    neighbour, a, b = _neighbourhoods(field)
+    neighbour = _neighbourhoods(field)
     valid = neighbour >= 0
+    at = field.grid.rows.to_frame(field.xy[:, reference])
+    a, b = np.moveaxis(np.where(valid[..., None], at[neighbour] - at[:, None], 0.0), -1, 0)
     D = np.where(valid, depth[neighbour], 0.0)
     spacing_m = field.grid.spacing_px * depth / camera.focal_px
     weight = valid & (np.abs(D - depth[:, None]) < 3.0 * spacing_m[:, None] * np.hypot(a, b) / field.grid.spacing_px + spacing_m[:, None])
-    coefficients, scatter = _robust_quadric(a, b, D - depth[:, None], weight.astype(np.float64), MIN_SCALE * spacing_m)
+    coefficients, scatter = _robust_quadric(a, b, RADIUS_CELLS * field.grid.spacing_px, D - depth[:, None], weight.astype(np.float64), MIN_SCALE * spacing_m)
     step = field.grid.rows.step
-    across = np.stack([(field.patch_px**2 - 1) / 12, (field.patch_px**2 - step**2) / 12], axis=1)
+    across = field.spread * (1.0, step**2)
     return LocalSurface(depth_m=depth, fitted_m=depth + coefficients[:, 0], scatter_m=scatter, neighbours=weight.sum(axis=1) - 1,
                         flattening_m=-0.5 * (coefficients[:, 3] * across[:, 0] + coefficients[:, 5] * across[:, 1]),  # (2)
                         normal=_normals(field, camera, reference, depth, coefficients))
 
 
-def _neighbourhoods(field: TripletField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the neighbouring points (N, m), −1 where there is none, and their offsets a, b (m,) in full-frame pixels."""
+def _neighbourhoods(field: TripletField) -> np.ndarray:
+    """Rows of the points in the neighbouring cells (N, m), −1 where there is none."""
     gh, gw = field.grid.shape
     r = RADIUS_CELLS
     row_of = np.full((gh + 2 * r, gw + 2 * r), -1, dtype=np.int64)
     j, i = field.cell // gw + r, field.cell % gw + r
     row_of[j, i] = np.arange(len(field.cell))
     dj, di = (d.ravel() for d in np.mgrid[-r : r + 1, -r : r + 1])
-    offset = field.grid.step * (1, field.grid.rows.step)
-    return row_of[j[:, None] + dj, i[:, None] + di], di * offset[0], dj * offset[1]
+    return row_of[j[:, None] + dj, i[:, None] + di]
 
 
-def _robust_quadric(a: np.ndarray, b: np.ndarray, D: np.ndarray, weight: np.ndarray, min_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _robust_quadric(a: np.ndarray, b: np.ndarray, unit: float, D: np.ndarray, weight: np.ndarray,
+                    min_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (N, 6) of (1) and the scatter (N,), by iteratively reweighted least squares (Tukey)."""
-    unit = np.abs(a).max()
-    basis = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=1) / np.array([1, unit, unit, unit**2, unit**2, unit**2])
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(a), 36)
-    ridge = np.diag([1e-9, 1e-3, 1e-3, 3e-2, 3e-2, 3e-2])  # a thin neighbourhood falls back to a plane
+    scale = np.array([1, unit, unit, unit**2, unit**2, unit**2])
+    basis = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=2) / scale  # (N, m, 6)
+    ridge = np.diag([1e-9, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2])  # a thin neighbourhood falls back to a plane
     robust = weight
     for _ in range(ROBUST_STEPS):
-        N = (robust @ products).reshape(-1, 6, 6) + ridge
-        c = np.linalg.solve(N, ((robust * D) @ basis)[..., None])[..., 0]
-        residual = D - c @ basis.T
+        weighted = (robust[:, :, None] * basis).transpose(0, 2, 1)
+        c = np.linalg.solve(weighted @ basis + ridge, (weighted @ D[:, :, None]))[..., 0]
+        residual = D - np.einsum("nmi,ni->nm", basis, c)
         scatter = 1.4826 * _masked_median(np.abs(residual), weight > 0)
         ratio = residual / (TUKEY * np.maximum(scatter, min_scale))[:, None]
         robust = weight * np.clip(1 - ratio**2, 0, 1) ** 2
-    return c / np.array([1, unit, unit, unit**2, unit**2, unit**2]), scatter
+    return c / scale, scatter
 
 
 def _masked_median(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
