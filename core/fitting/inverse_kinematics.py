@@ -23,7 +23,7 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
     vector = parameters.vector()
     start = coarse_posture(parameters, clicks)
     sigma = np.full(len(vector), length_sigma)
-    problem = Problem(parameters=parameters, observe=lambda t, state, sigma0: [clicks.observation, *priors],
+    problem = Problem(parameters=parameters, observe=lambda t, state: [clicks.observation, *priors],
                       of_shape=[ShapePrior(mean=vector, sigma=sigma)], free_shape=parameters.layout.set("lengths"))
     return solve(problem, start[None], vector, steps=STEPS)
 
@@ -74,8 +74,8 @@ def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> l
     mean, sigma = np.array([(dof.prior_mean, dof.prior_sigma) for dof in skeleton.dofs]).T
     base = skeleton.layout.set("base")
     free = ~np.isfinite(sigma)
-    middle = np.where(np.isfinite(low + high), (low + high) / 2, 0.0)
-    mean[free], sigma[free] = middle[free], np.pi
+    mean[free] = np.clip(0.0, low, high)[free]
+    sigma[free] = np.pi
     mean[base], sigma[base] = about_m, 10.0
     return [JointLimits(low=low, high=high, sigma=limit_sigma), MotionPrior(mean=mean, sigma=sigma)]
 

@@ -12,7 +12,7 @@ from .cloud_points import CloudPoints
 from .state import CROSS, BodyState
 
 RADIUS_OF_SUM = 1 / 1.534  # limb radius / l of three balls a segment
-FACING = 0.2  # least cosine between a point's normal and its direction from the bone
+FACING = 0.6  # least cosine between a point's normal and its direction from the bone
 
 
 def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: float) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,15 +16,18 @@ from ..body.shape import default_shape
 from ..errors import InputError
 from ..geometry.rig import Rig
 from ..progress import Monitor
+from .acceleration import Acceleration
 from .body_motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from .clicks import Clicks, read_clicks
 from .cloud_points import Cloud, CloudPoints, thinned
 from .inverse_kinematics import dof_priors, inverse_kinematics, other_postures
+from .material_tracks import MaterialTracks, Trajectories
 from .observations import EqualRadii, MotionPrior, Observation, ShapePrior, SurfacePoints
 from .robust import robust_scale, robust_weights
 from .segmentation import crop, segment
 from .settings import FitSettings
-from .solver import Acceleration, Problem, Solution, final_equations, solve
+from .problem import Problem, linearise, variance_factors
+from .solver import Solution, solve
 from .state import BodyState, ShapeParameters
 
 __all__ = ["BodyFit", "BodyMotion", "FitSettings", "fit_sequence"]
@@ -53,8 +56,11 @@ class _Fit:
     def surface(self, points: CloudPoints, state: BodyState, wide: float = 1.0) -> list[Observation]:
         """The surface points near a state, as observations."""
         rows, bone = segment(points, state, self.model.surface, self.settings.gate_m * wide)
-        sigma = np.hypot(points.sigma_m[rows], self.settings.model_sigma_m)
-        return [SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=sigma, form=self.settings.residual).scaled(state)]
+        own, model = points.sigma_m[rows] ** 2, self.settings.model_sigma_m**2
+        share = max(1.0, (self.settings.model_patch_m / self.settings.voxel_m) ** 2)
+        crowding = (own + share * model) / (own + model + 1e-12)
+        return [SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=np.sqrt(own + model + 1e-12), crowding=crowding,
+                              form=self.settings.residual).scaled(state)]
 
     def of_shape(self) -> list[Observation]:
         """What is believed about the shape."""
@@ -79,7 +85,7 @@ class _Fit:
 
 
 def fit_sequence(rig: Rig, model_name: str, clouds: Sequence[Cloud], joints: Mapping[str, Mapping[str, Sequence[float]]],
-                 click_frame: int, time_s: np.ndarray, trajectories: object | None = None, settings: FitSettings | None = None,
+                 click_frame: int, time_s: np.ndarray, trajectories: Trajectories | None = None, settings: FitSettings | None = None,
                  monitor: Monitor | None = None) -> BodyFit:
     """Shape and motion of the person from the clouds of a sequence and the joints clicked in one of its frames.
 
@@ -98,7 +104,7 @@ def fit_sequence(rig: Rig, model_name: str, clouds: Sequence[Cloud], joints: Map
         points.append(thinned(cloud, settings.voxel_m))
     first = _fit_click_frame(fit, points[fit.click], monitor)
     motion, points = _follow(fit, points, np.asarray(time_s, dtype=np.float64), first, monitor)
-    solution, problem = _adjust_all(fit, points, np.asarray(time_s, dtype=np.float64), motion, first.vector, monitor)
+    solution, problem = _adjust_all(fit, points, np.asarray(time_s, dtype=np.float64), motion, first.vector, trajectories, monitor)
     return _result(fit, points, np.asarray(time_s, dtype=np.float64), solution, problem)
 
 
@@ -141,16 +147,16 @@ def _fit_shape_and_posture(fit: _Fit, points: CloudPoints, motion: np.ndarray, v
     near = crop(points, fit.parameters.state(motion, vector), 2 * REACH_M)
 
     def observe(wide: float) -> object:
-        return lambda t, state, sigma0: [*fit.surface(near, state, wide), fit.clicks.observation, *fit.priors]
+        return lambda t, state: [*fit.surface(near, state, wide), fit.clicks.observation, *fit.priors]
 
-    solution = solve(fit.problem(observe(2.0), None), motion[None], vector, steps=fit.settings.frame_steps)
+    solution = solve(fit.problem(observe(1.5), None), motion[None], vector, steps=fit.settings.frame_steps)
     if fit.settings.method == "joint":
-        for wide in (2.0, 1.0):
-            solution = solve(fit.problem(observe(wide), "shape"), solution.motion, solution.vector, steps=START_STEPS, sigma0=solution.sigma0)
+        for wide in (1.5, 1.0):
+            solution = solve(fit.problem(observe(wide), "shape"), solution.motion, solution.vector, steps=START_STEPS, scales=solution.scales)
         return solution
     for _ in range(ALTERNATIONS):
         for free in ("radii", None):
-            solution = solve(fit.problem(observe(1.0), free), solution.motion, solution.vector, steps=5, sigma0=solution.sigma0)
+            solution = solve(fit.problem(observe(1.0), free), solution.motion, solution.vector, steps=5, scales=solution.scales)
     return solution
 
 
@@ -192,8 +198,8 @@ def _next_frame(fit: _Fit, points: CloudPoints, predictions: list[np.ndarray], f
     best, best_support = predictions[0], 0.0
     for start in predictions:
         prior = MotionPrior(mean=start, sigma=sigma)
-        problem = fit.problem(lambda t, state, sigma0, prior=prior: [*fit.surface(points, state), prior, *fit.priors], None)
-        solution = solve(problem, start[None], first.vector, steps=s.frame_steps, sigma0=first.sigma0)
+        problem = fit.problem(lambda t, state, prior=prior: [*fit.surface(points, state), prior, *fit.priors], None)
+        solution = solve(problem, start[None], first.vector, steps=s.frame_steps, scales=first.scales)
         support = fit.support(points, solution.motion[0], first.vector)
         if support > best_support:
             best, best_support = solution.motion[0], support
@@ -205,24 +211,29 @@ def _next_frame(fit: _Fit, points: CloudPoints, predictions: list[np.ndarray], f
 
 
 def _adjust_all(fit: _Fit, points: list[CloudPoints], time_s: np.ndarray, motion: np.ndarray, vector: np.ndarray,
-                monitor: Monitor) -> tuple[Solution, Problem]:
+                trajectories: Trajectories | None, monitor: Monitor) -> tuple[Solution, Problem]:
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
     sigma[skeleton.layout.set("base")] = s.acceleration_m_s2
+    weight = min(float(len(points)), s.shared_frames)
+    clicked = replace(fit.clicks.observation, sigma_px=s.click_sigma_px / weight**0.5)
 
-    def observe(t: int, state: BodyState, sigma0: float) -> list[Observation]:
-        clicked: list[Observation] = [fit.clicks.observation] if t == fit.click else []
-        return [*fit.surface(points[t], state), *clicked, *fit.priors]
+    def observe(t: int, state: BodyState) -> list[Observation]:
+        return [*fit.surface(points[t], state), *([clicked] if t == fit.click else []), *fit.priors]
 
-    problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
-    solution = solve(problem, motion, vector, steps=s.sequence_steps, monitor=monitor, stage="adjust the sequence")
-    return solution, problem
+    tracks = None
+    if trajectories is not None and s.use_trajectories:
+        tracks = MaterialTracks(trajectories, [p.frame for p in points], fit.model.surface, s)
+    problem = replace(fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma)), of_shape_weight=weight,
+                      observe_step=None if tracks is None else tracks.steps)
+    return solve(problem, motion, vector, steps=s.sequence_steps, monitor=monitor, stage="adjust the sequence"), problem
 
 
 def _result(fit: _Fit, points: list[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem) -> BodyFit:
     parameters, skeleton = fit.parameters, fit.model.skeleton
-    _, equations = final_equations(problem, solution)
-    pose, mixed, shape = equations.covariance()
+    lin = linearise(problem, solution.motion, solution.vector, solution.scales)
+    understated = variance_factors(problem, lin, solution.scales)
+    pose, mixed, shape = linearise(problem, solution.motion, solution.vector, solution.scales, understated).equations.covariance()
     T, D = solution.motion.shape
     joints, joint_sigma, sigma0 = np.empty((T, len(skeleton.joint_names), 3)), np.empty((T, len(skeleton.joint_names))), np.full(T, np.nan)
     counts = np.zeros((T, len(skeleton.bones)), dtype=np.int64)

@@ -1,4 +1,7 @@
-"""Observations: one error term, one small file. Each gives residuals of unit weight and their analytic Jacobian."""
+"""Observations: one error term, one small file. Each gives residuals of unit weight and their analytic Jacobian.
+
+Most look at one frame; `MaterialSteps` ties two.
+"""
 
 from typing import Protocol
 
@@ -10,10 +13,10 @@ from .equal_radii import EqualRadii
 from .gaussian_prior import MotionPrior, ShapePrior
 from .joint_limit import JointLimits
 from .joint_position import JointPositions
-from .material_point import MaterialPoints
+from .material_step import MaterialSteps
 from .surface_point import SurfacePoints
 
-__all__ = ["ClickedJoints", "EqualRadii", "JointLimits", "JointPositions", "MaterialPoints", "MotionPrior", "Observation", "ShapePrior",
+__all__ = ["ClickedJoints", "EqualRadii", "JointLimits", "JointPositions", "MaterialSteps", "MotionPrior", "Observation", "ShapePrior",
            "SurfacePoints"]
 
 
@@ -23,6 +26,10 @@ class Observation(Protocol):
     @property
     def robust(self) -> bool:
         """Whether the residuals may hold gross errors, and are to be weighted down by their size."""
+
+    @property
+    def crowding(self) -> np.ndarray | float:
+        """Divides the weights of robust observations: > 1 where neighbouring residuals share their errors."""
 
     def residual(self, state: BodyState) -> np.ndarray:
         """Residuals (n,), divided by their sigmas."""

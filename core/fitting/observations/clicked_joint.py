@@ -17,6 +17,7 @@ class ClickedJoints:
     xy_px: np.ndarray  # (K, 2) full-frame pixels
     sigma_px: float
     robust: bool = False
+    crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(2K,)"""

@@ -13,6 +13,7 @@ class EqualRadii:
 
     sigma: float
     robust: bool = False
+    crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(M,)"""

@@ -15,6 +15,7 @@ class MotionPrior:
     mean: np.ndarray
     sigma: np.ndarray
     robust: bool = False
+    crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(D,)"""
@@ -34,6 +35,7 @@ class ShapePrior:
     mean: np.ndarray
     sigma: np.ndarray
     robust: bool = False
+    crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(S,)"""

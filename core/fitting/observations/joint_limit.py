@@ -15,6 +15,7 @@ class JointLimits:
     high: np.ndarray
     sigma: float
     robust: bool = False
+    crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(D,)"""

@@ -14,6 +14,7 @@ class JointPositions:
     xyz_m: np.ndarray  # (J, 3) in the order of Skeleton.joint_names
     sigma_m: float | np.ndarray
     robust: bool = False
+    crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(3J,)"""

@@ -27,7 +27,8 @@ class SurfacePoints:
 
     xyz_m: np.ndarray  # (N, 3) world
     bone: np.ndarray  # (N,) index of the bone
-    sigma_m: np.ndarray  # (N,) along the normal
+    sigma_m: np.ndarray  # (N,) of one residual, along the normal
+    crowding: np.ndarray | float = 1.0  # (N,) how many times less a point tells than if its error were its own
     form: str = "metric"  # or "paper"
     scale: np.ndarray | None = None  # (N,) |∇D| or |∇F| at the state of `scaled`, 1/m
     robust: bool = True

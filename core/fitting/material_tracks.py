@@ -1,0 +1,66 @@
+"""Trajectories as the fit sees them: for each pair of successive frames the points that were seen in both, thinned, on their limbs."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from .cloud_points import CloudPoints
+from .observations import MaterialSteps
+from .segmentation import segment
+from .settings import FitSettings
+from .state import BodyState
+
+SPACING_M = 0.012  # one tracked point in a cube of this size is enough
+
+
+class Trajectories(Protocol):
+    """The fields of trajectories that the fit reads."""
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(T,) frame numbers of the take."""
+
+    @property
+    def xyz_m(self) -> np.ndarray:
+        """(T, N, 3) world; NaN: not seen."""
+
+    @property
+    def sigma_m(self) -> np.ndarray:
+        """(T, N)."""
+
+
+class MaterialTracks:
+    """Tracked points in the order of the fit's frames."""
+
+    def __init__(self, trajectories: Trajectories, frames: Sequence[int], surface: np.ndarray, settings: FitSettings) -> None:
+        where = {int(f): i for i, f in enumerate(trajectories.frames)}
+        xyz, sigma = np.asarray(trajectories.xyz_m, dtype=np.float64), np.asarray(trajectories.sigma_m, dtype=np.float64)
+        self._xyz = [xyz[where[f]] if f in where else np.full(xyz.shape[1:], np.nan) for f in frames]
+        self._sigma = [sigma[where[f]] if f in where else np.full(xyz.shape[1], np.nan) for f in frames]
+        self._surface, self._settings = surface, settings
+        self._pairs = [self._pair(t) for t in range(len(frames) - 1)]
+
+    def steps(self, t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
+        """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`)."""
+        rows, sigma = self._pairs[t]
+        start, end = (CloudPoints(frame=t, xyz_m=self._xyz[i][rows], normals=np.zeros((len(rows), 3)), sigma_m=sigma) for i in (t, t + 1))
+        (at_a, bone_a), (at_b, bone_b) = (segment(p, s, self._surface, self._settings.gate_m) for p, s in ((start, a), (end, b)))
+        _, ia, ib = np.intersect1d(at_a, at_b, assume_unique=True, return_indices=True)
+        same = bone_a[ia] == bone_b[ib]
+        keep = at_a[ia][same]
+        if not len(keep):
+            return None
+        skin = self._settings.track_sigma_m
+        share = max(1.0, (self._settings.model_patch_m / SPACING_M) ** 2)
+        crowding = (sigma[keep] ** 2 + share * skin**2) / (sigma[keep] ** 2 + skin**2 + 1e-12)
+        return MaterialSteps(from_m=start.xyz_m[keep], to_m=end.xyz_m[keep], bone=bone_a[ia][same],
+                             sigma_m=np.sqrt(sigma[keep] ** 2 + skin**2 + 1e-12), crowding=np.repeat(crowding, 3))
+
+    def _pair(self, t: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points seen in frames t and t + 1, the first in each cell, and the sigma of their steps."""
+        seen = np.flatnonzero(np.isfinite(self._xyz[t]).all(axis=1) & np.isfinite(self._xyz[t + 1]).all(axis=1))
+        cells = np.floor(self._xyz[t][seen] / SPACING_M).astype(np.int64)
+        first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+        rows = seen[first]
+        return rows, np.nan_to_num(np.hypot(self._sigma[t][rows], self._sigma[t + 1][rows]), nan=0.002)

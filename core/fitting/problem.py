@@ -1,0 +1,163 @@
+"""What is adjusted: observations of frames, of pairs of frames, of the shape and of smoothness, and their normal equations.
+
+    Σ_t Σ_i w_i (r_i(θ_t, s) / σ0)² + Σ_t Σ_i w_i (r_i(θ_t, θ_{t+1}, s) / σ1)² + Σ_j r_j(s)² + Σ_t |θ̈_t / σ_a|²  →  min          (1)
+
+r are residuals of unit weight (D'Apuzzo et al. 1999, Eqs. 9–12). Measured points and tracked points carry robust weights w and scales σ0, σ1
+that are estimated from them. Which limb a point belongs to is decided anew at every linearisation. Holding the shape while the pose is
+solved is choosing an empty set of free shape parameters.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .acceleration import Acceleration
+from .block_band import NormalEquations
+from .observations import MaterialSteps, Observation
+from .robust import robust_scale, robust_weights, variance_factor
+from .state import BodyState, ShapeParameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Robust standard deviations of unit-weight residuals: of measured points (sigma0) and of tracked points."""
+
+    points: float = 1.0
+    steps: float = 1.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem:
+    """An adjustment. `observe(t, state)` gives frame t's observations, `observe_step(t, a, b)` those from frame t to t + 1."""
+
+    parameters: ShapeParameters
+    observe: Callable[[int, BodyState], list[Observation]]
+    observe_step: Callable[[int, BodyState, BodyState], MaterialSteps | None] | None = None
+    of_shape: Sequence[Observation] = ()
+    of_shape_weight: float = 1.0
+    free_shape: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    smoothness: Acceleration | None = None
+    robust: str = "geman-mcclure"
+    robust_width: float = 3.0
+
+    def weights(self, residuals: np.ndarray, scale: float, crowding: np.ndarray | float) -> np.ndarray:
+        """Weights of robust observations in (1)."""
+        return robust_weights(residuals / scale, self.robust, self.robust_width) / (scale**2 * crowding)
+
+
+@dataclass(eq=False, kw_only=True)
+class Linearised:
+    """Observations with the weights that they have at one motion and shape; the cost and the normal equations there."""
+
+    observations: list[list[tuple[Observation, np.ndarray | float]]]
+    steps: list[tuple[MaterialSteps, np.ndarray] | None]
+    equations: NormalEquations
+    cost: float = 0.0
+    point_residuals: list[np.ndarray] = field(default_factory=list)
+    step_residuals: list[np.ndarray] = field(default_factory=list)
+
+    def scales(self, before: Scales) -> Scales:
+        """The scales of the residuals here."""
+        return Scales(points=_scale(self.point_residuals, before.points), steps=_scale(self.step_residuals, before.steps))
+
+
+def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: Scales, understated: Scales | None = None) -> Linearised:
+    """Weights, cost and normal equations at a motion (T, D) and shape vector (S,).
+
+    `understated`: factors by which the variances of points and steps are understated (`variance_factors`); for covariances only.
+    """
+    factor = understated or Scales()
+    T, D = motion.shape
+    lin = Linearised(observations=[], steps=[], equations=NormalEquations.empty(T, D, len(problem.free_shape)))
+    states = [problem.parameters.state(m, vector) for m in motion]
+    for t, state in enumerate(states):
+        _add_frame(problem, lin, t, state, scales.points, factor.points)
+    for t in range(T - 1):
+        _add_step(problem, lin, t, states[t], states[t + 1], scales.steps, factor.steps)
+    for o in problem.of_shape if len(problem.free_shape) else ():
+        r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, D + problem.free_shape], problem.of_shape_weight
+        lin.equations.corner += w * J.T @ J
+        lin.equations.h -= w * J.T @ r
+        lin.cost += w * float(r @ r)
+    if problem.smoothness is not None:
+        problem.smoothness.add_to(lin.equations, motion)
+        lin.cost += problem.smoothness.cost(motion)
+    return lin
+
+
+def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarray) -> float:
+    """(1) at another motion and shape, with the observations and weights of `lin`."""
+    states = [problem.parameters.state(m, vector) for m in motion]
+    total = sum(float(np.sum(w * o.residual(state) ** 2)) for state, frame in zip(states, lin.observations) for o, w in frame)
+    total += sum(float(np.sum(step[1] * step[0].residual(a, b) ** 2)) for a, b, step in zip(states, states[1:], lin.steps) if step)
+    if len(problem.free_shape):
+        total += problem.of_shape_weight * sum(float(np.sum(o.residual(states[0]) ** 2)) for o in problem.of_shape)
+    return total + (problem.smoothness.cost(motion) if problem.smoothness is not None else 0.0)
+
+
+def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scales:
+    """By how much the weights understate variances (`robust.variance_factor`)."""
+    both = [variance_factor(np.concatenate(r) / scale, problem.robust, problem.robust_width) if r else 1.0
+            for r, scale in ((lin.point_residuals, scales.points), (lin.step_residuals, scales.steps))]
+    return Scales(points=both[0], steps=both[1])
+
+
+def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, before: Scales) -> Scales:
+    """The scales of the residuals before the first step."""
+    states = [problem.parameters.state(m, vector) for m in motion]
+    points = [o.residual(state) for t, state in enumerate(states) for o in problem.observe(t, state) if o.robust]
+    steps = []
+    if problem.observe_step is not None:
+        pairs = [(problem.observe_step(t, a, b), a, b) for t, (a, b) in enumerate(zip(states, states[1:]))]
+        steps = [s.residual(a, b) for s, a, b in pairs if s is not None]
+    return Scales(points=_scale(points, before.points), steps=_scale(steps, before.steps))
+
+
+def _scale(residuals: list[np.ndarray], before: float) -> float:
+    return robust_scale(np.concatenate(residuals), before) if residuals else before
+
+
+def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scale: float, factor: float) -> None:
+    e, free, D, frame = lin.equations, problem.free_shape, state.n_motion, []
+    for o in problem.observe(t, state):
+        r, J = o.residual(state), o.jacobian(state, shape=len(free) > 0)
+        w: np.ndarray | float = 1.0
+        if o.robust:
+            lin.point_residuals.append(r)
+            w = problem.weights(r, scale, o.crowding) / factor
+        frame.append((o, w))
+        lin.cost += float(np.sum(w * r * r))
+        weighted = (J.T * w)[: D], J[:, :D]
+        e.diagonal[t] += weighted[0] @ weighted[1]
+        e.g[t] -= weighted[0] @ r
+        if len(free):
+            S = J[:, D + free]
+            e.border[t] += weighted[0] @ S
+            e.corner += (S.T * w) @ S
+            e.h -= (S.T * w) @ r
+    lin.observations.append(frame)
+
+
+def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodyState, scale: float, factor: float) -> None:
+    step = problem.observe_step(t, a, b) if problem.observe_step is not None else None
+    if step is None:
+        lin.steps.append(None)
+        return
+    e, free, D = lin.equations, problem.free_shape, a.n_motion
+    r, J = step.residual(a, b), step.jacobian(a, b)
+    w = problem.weights(r, scale, step.crowding) / factor
+    lin.steps.append((step, w))
+    lin.step_residuals.append(r)
+    lin.cost += float(np.sum(w * r * r))
+    A, B, S = J[:, :D], J[:, D : 2 * D], J[:, 2 * D + free]
+    Aw, Bw, Sw = A.T * w, B.T * w, S.T * w
+    e.diagonal[t] += Aw @ A
+    e.diagonal[t + 1] += Bw @ B
+    e.next1[t] += Bw @ A
+    e.g[t] -= Aw @ r
+    e.g[t + 1] -= Bw @ r
+    e.border[t] += Aw @ S
+    e.border[t + 1] += Bw @ S
+    e.corner += Sw @ S
+    e.h -= Sw @ r
