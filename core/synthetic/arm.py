@@ -3,8 +3,8 @@
 The folder holds a complete take (FORMATS: take.toml with clicks, rig.toml, L/ C/ R/) and truth.npz beside it:
 
     vertices_m (T, V, 3) f4, triangles (F, 3) i4, textured (V,) bool (cloth), visible (T, ⌈V/8⌉) u1 packed bits: seen by all three
-    cameras, joints_m (T, J, 3), joint_names, time_s (T,), and what the body model knows: dof_names, motion_values (T, D) rad and m,
-    bone_names, lengths_m (B,), radii_m (M, 3), ball_bone (M,)
+    cameras, joints_m (T, J, 3), joint_names (as motion capture files have them), time_s (T,), and what the body model knows:
+    dof_names, motion_values (T, D) rad and m, bone_names, lengths_m (B,), radii_m (M, 3), ball_bone (M,)
 
 all at the instants of the rows that take.toml keeps; the other field is exposed half a frame later.
 """
@@ -33,6 +33,7 @@ from ..settings import knob
 from .figure import Part, joined, moving_parts, standing_parts, wall
 from .film import Layer, Sensor, digitize, expose, paint, seen_vertices
 from .texture import SolidNoise, solid_noise
+from .truth import motion_capture_name
 
 STAGE = "sample recording"
 SHOULDER_M = np.array([-0.185, -0.010, 1.450])
@@ -42,7 +43,7 @@ TARGET_M = np.array([-0.34, -0.06, 1.35])  # where the cameras look
 WALL_Y_M = 1.20
 SWING_S = 1.36  # there and back
 VIEWS = ("L", "C", "R")
-TRUE_NAMES = {"shoulder.R": "RightArm", "elbow.R": "RightForeArm", "wrist.R": "RightHand"}  # truth.npz names joints as mocap files do
+JOINTS = ("shoulder.R", "elbow.R", "wrist.R")
 MARK = "synthetic arm"  # in rig.toml's metadata
 SENSORS = dict(L=Sensor(gain=1.06, offset=-4.0), C=Sensor(), R=Sensor(gain=0.94, offset=7.0))
 
@@ -176,8 +177,9 @@ def _truth(settings: ArmTakeSettings, shape: BodyShape, visible: np.ndarray) -> 
     textured = np.concatenate([np.full(len(p.vertices_m), p.material.textured) for p in bodies[0]])
     arrays = dict(
         vertices_m=np.array([joined(body)[0] for body in bodies], dtype=np.float32), triangles=joined(bodies[0])[1].astype(np.int32),
-        textured=textured, visible=np.packbits(visible, axis=1), joints_m=np.stack([joints[name] for name in TRUE_NAMES], axis=1),
-        joint_names=np.array(list(TRUE_NAMES.values())), time_s=time, motion_values=motion, dof_names=np.array(shape.skeleton.dof_names),
+        textured=textured, visible=np.packbits(visible, axis=1), joints_m=np.stack([joints[name] for name in JOINTS], axis=1),
+        joint_names=np.array([motion_capture_name(name) for name in JOINTS]), time_s=time, motion_values=motion,
+        dof_names=np.array(shape.skeleton.dof_names),
         bone_names=np.array([bone.name for bone in shape.skeleton.bones]), lengths_m=shape.lengths_m,
         radii_m=shape.metaballs.radii_m, ball_bone=shape.metaballs.bone_index)
     buffer = io.BytesIO()
@@ -193,7 +195,7 @@ def _take_toml(settings: ArmTakeSettings, rig: Rig, shape: BodyShape) -> str:
     for camera in rig.cameras:
         lines += ["[[views]]", f'name = "{camera.name}"', f'images = "{camera.name}/*.png"', ""]
     lines += ["[body]", f'model = "{shape.model}"', "", "[seeds]", "frame = 0", "[seeds.joints]"]
-    for name in TRUE_NAMES:
+    for name in JOINTS:
         clicks = [camera.project(joints[name]) + rng.uniform(-1, 1, 2) * settings.click_error_px for camera in rig.cameras]
         lines.append(f'"{name}" = {{ ' + ", ".join(f"{c.name} = [{x:.1f}, {y:.1f}]" for c, (x, y) in zip(rig.cameras, clicks)) + " }")
     return "\n".join(lines) + "\n"
