@@ -35,8 +35,10 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     import bpy
 
     from .scene.build import build_scene
+    from .scene.cameras import look_through
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    look_through()
     report = build_scene(args.out, args.blend, monitor)
     return [*report.warnings, f"{args.blend}: {report}"]
 

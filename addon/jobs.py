@@ -81,6 +81,7 @@ class JobState(bpy.types.PropertyGroup):
 
 
 _current: list[Job] = []  # the one job that runs, or nothing
+_watching: list["JobOperator"] = []  # the modal operator that watches it
 
 
 def current() -> Job | None:
@@ -93,6 +94,12 @@ def stop_current(*_: Any) -> None:
     for job in list(_current):
         job.cancel_and_join()
     _current.clear()
+
+
+def stop_watching() -> None:
+    """Take away the timer and the progress of an operator that Blender is about to forget (its class is unregistered)."""
+    for operator in list(_watching):
+        operator.clear(bpy.context)
 
 
 @bpy.app.handlers.persistent
@@ -132,7 +139,7 @@ class JobOperator:
         if job is None:
             return {"CANCELLED"}
         self.job = job
-        _current[:] = [job]
+        _current[:], _watching[:] = [job], [self]
         wm = context.window_manager
         wm.tricap.running, wm.tricap.progress, wm.tricap.stage = True, 0.0, "Starting"
         self.timer = wm.event_timer_add(TICK_S, window=context.window)
@@ -149,13 +156,13 @@ class JobOperator:
         if self.job.alive:
             self._show(context)
             return {"RUNNING_MODAL" if event.type == "ESC" else "PASS_THROUGH"}
-        self._clear(context)
+        self.clear(context)
         return self._conclude(context, self.job)
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender ends the operator (another file, quitting)."""
         self.job.cancel_and_join()
-        self._clear(context)
+        self.clear(context)
 
     def _prepare(self, context: bpy.types.Context) -> Job | None:
         try:
@@ -187,7 +194,9 @@ class JobOperator:
             context.workspace.status_text_set(f"Tricap: {self.job.stage} {self.job.fraction:.0%}  (Esc stops)")
         _redraw(context)
 
-    def _clear(self, context: bpy.types.Context) -> None:
+    def clear(self, context: bpy.types.Context) -> None:
+        """The watching is over: no timer, no progress."""
+        _watching.clear()
         wm = context.window_manager
         if self.timer is not None:
             wm.event_timer_remove(self.timer)

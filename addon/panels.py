@@ -26,7 +26,7 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         column = layout.column()
         column.enabled = not state.running
         column.prop(props, "take")
-        column.prop(props, "out", placeholder="beside the file")
+        column.prop(props, "out", placeholder="beside this file or the take")
         if state.running:
             layout.progress(factor=state.progress, text=f"{state.stage}  {state.progress:.0%}", type="BAR")
             layout.operator("tricap.cancel", icon="X", text="Cancel (Esc)")

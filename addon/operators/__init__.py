@@ -17,5 +17,6 @@ def register() -> None:
 def unregister() -> None:
     """Stop a running job and unregister the operators."""
     jobs.stop_current()
+    jobs.stop_watching()
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -55,6 +55,16 @@ def frame_faults(rig: Rig, reference: Camera) -> list[str]:
     return faults
 
 
+def look_through() -> None:
+    """Let every 3-D view look through the scene's camera, and show the materials' colours."""
+    for screen in bpy.data.screens:
+        for area in screen.areas:
+            if area.type == "VIEW_3D":
+                space = area.spaces.active
+                space.region_3d.view_perspective = "CAMERA"
+                space.shading.color_type = "MATERIAL"
+
+
 def seen_from(scene: bpy.types.Scene, camera_object: bpy.types.Object, xyz_m: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """Pixels (N, 2) of world points (N, 3) as the Blender camera itself projects them (without distortion)."""
     from bpy_extras.object_utils import world_to_camera_view

@@ -106,9 +106,8 @@ def _optional(path: Path, what: str, read: Callable[[Path], Any], warnings: list
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    needed = ("frames", "xyz_m", "velocity_m_s", "sigma_m")
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in needed}
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"{path} is not a file of trajectories or is damaged ({error}); run the tracking again.") from error
+    arrays, _ = store.load(path)
+    missing = [name for name in ("frames", "xyz_m", "velocity_m_s", "sigma_m") if name not in arrays]
+    if missing:
+        raise InputError(f"{path} holds no {missing[0]}; run the tracking again.")
+    return arrays

@@ -20,6 +20,7 @@ from . import paint
 NAME = "Flesh"
 KERNELS = ((0.2389, 0.9153), (0.5289, 1.3594), (0.2276, 1.8949))  # stiffness s_j, size a_j  (1)
 STIFFNESS_MAX = 10.0  # Blender's own limit
+SIZE_MAX = 16.0  # half axis / radius; the viewport draws circles of the radius, which large factors hide inside the flesh. Blender's limit: 20
 RESOLUTION_M, RENDER_RESOLUTION_M = 0.008, 0.005
 SKIN_COLOUR = (0.80, 0.52, 0.41)
 
@@ -65,7 +66,8 @@ def _data(name: str, balls: Metaballs, own: np.ndarray, lengths_m: np.ndarray, m
     for m in own:
         for stiffness, size in KERNELS:
             element = data.elements.new(type="ELLIPSOID")
-            element.co, element.radius = centres_m[m], 1.0
-            element.size_x, element.size_y, element.size_z = size * balls.radii_m[m]
+            half_axes = size * balls.radii_m[m]
+            element.co, element.radius = centres_m[m], half_axes.max() / SIZE_MAX
+            element.size_x, element.size_y, element.size_z = SIZE_MAX * half_axes / half_axes.max()
             element.stiffness = min(stiffness * float(balls.weight[m]), STIFFNESS_MAX)
     return data
