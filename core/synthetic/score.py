@@ -118,8 +118,8 @@ class Score:
     shape: ShapeScore | None
     skin: SkinScore | None
 
-    def table(self) -> str:
-        """The score as text, one line for each thing."""
+    def __str__(self) -> str:
+        """One line for each thing."""
         rows = [("clouds", self.clouds), ("trajectories", self.trajectories), ("joints", self.joints)]
         rows += [(f"{name} bend", score) for name, score in self.hinges.items()] + list(self.angles.items())  # type: ignore[arg-type]
         rows += [("body shape", self.shape), ("skin", self.skin)]  # type: ignore[list-item]

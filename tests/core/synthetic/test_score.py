@@ -125,10 +125,10 @@ def test_skin(take: Path, truth: Truth, tmp_path: Path) -> None:
 def test_nothing_to_score_and_the_table(take: Path, truth: Truth, tmp_path: Path) -> None:
     score = score_run(take, tmp_path)
     assert score.clouds is score.trajectories is score.joints is score.skin is score.shape is None
-    assert score.table().count("missing") == 5
+    assert str(score).count("missing") == 5
     put_cloud(tmp_path, truth, 0, 1.0)
     put_fit(tmp_path, arm_motion(np.arange(FRAMES) / 25), arm_shape())
-    table = score_run(take, tmp_path).table()
+    table = str(score_run(take, tmp_path))
     assert "median 1.00 mm" in table and "elbow.R bend" in table and "shoulder.R twist" in table and max(map(len, table.splitlines())) < 120
 
 
