@@ -1,0 +1,150 @@
+"""Motion as tables for people and other programs: joints.csv and motion.csv.
+
+joints.csv  one row per frame and joint: frame, time_s, joint, x, y, z [m, world], sigma [m, mean standard deviation of a coordinate].
+motion.csv  one row per frame: frame, time_s, one column per DOF (its name; degrees, base positions in metres), then one
+            `sigma <name>` column each in the same unit. Angles are those of the bones' pose channels, 0 in the rest pose.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .. import store
+from ..body.skeleton import Skeleton
+from ..errors import InputError
+from ..fitting.body_motion import BodyMotion
+from ..values import frozen
+
+JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MotionTable:
+    """What motion.csv holds. Radians, and metres for the base."""
+
+    frames: np.ndarray  # (T,)
+    time_s: np.ndarray  # (T,)
+    dof_names: tuple[str, ...]  # D
+    values: np.ndarray  # (T, D)
+    sigma: np.ndarray  # (T, D)
+
+    def __post_init__(self) -> None:
+        t, d = len(self.frames), len(self.dof_names)
+        object.__setattr__(self, "frames", frozen(self.frames, (t,), np.int64, "frames"))
+        for name, shape in dict(time_s=(t,), values=(t, d), sigma=(t, d)).items():
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class JointTable:
+    """What joints.csv holds: positions (T, 3) [m] and sigmas (T,) by joint; NaN where a frame lacks the joint."""
+
+    frames: np.ndarray  # (T,)
+    time_s: np.ndarray  # (T,)
+    joints_m: Mapping[str, np.ndarray]
+    sigma_m: Mapping[str, np.ndarray]
+
+
+def write_joints(path: Path, motion: BodyMotion) -> None:
+    """Write joints.csv.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rows = [[frame, f"{time:.6f}", joint, *(f"{c:.6f}" for c in X), f"{sigma:.6f}"]
+            for frame, time, places, sigmas in zip(motion.frames, motion.time_s, motion.joints_m, motion.joint_sigma_m)
+            for joint, X, sigma in zip(motion.joint_names, places, sigmas)]
+    _write(path, JOINT_COLUMNS, rows)
+
+
+def write_motion(path: Path, motion: BodyMotion, skeleton: Skeleton) -> None:
+    """Write motion.csv. `skeleton` tells which DOFs are angles.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    factor = _to_file(skeleton, motion.dof_names)
+    names = ["frame", "time_s", *motion.dof_names, *(f"sigma {name}" for name in motion.dof_names)]
+    rows = [[frame, f"{time:.6f}", *(f"{v:.6f}" for v in np.concatenate([values * factor, sigma * factor]))]
+            for frame, time, values, sigma in zip(motion.frames, motion.time_s, motion.values, motion.sigma)]
+    _write(path, names, rows)
+
+
+def read_motion(path: Path, skeleton: Skeleton) -> MotionTable:
+    """Read motion.csv in the order of the skeleton's DOFs, whatever the order of the columns.
+
+    Raises:
+        InputError: the file is missing, lacks a column, or holds something that is no number.
+    """
+    header, rows = _read(path)
+    names = skeleton.dof_names
+    columns = [_column(header, name, path) for name in ("frame", "time_s", *names, *(f"sigma {name}" for name in names))]
+    table = np.array([[_number(row[c], path, line) for c in columns] for line, row in enumerate(rows, 2)]).reshape(-1, len(columns))
+    d, factor = len(names), _to_file(skeleton, names)
+    return MotionTable(frames=table[:, 0], time_s=table[:, 1], dof_names=names, values=table[:, 2 : 2 + d] / factor,
+                       sigma=table[:, 2 + d :] / factor)
+
+
+def read_joints(path: Path) -> JointTable:
+    """Read joints.csv.
+
+    Raises:
+        InputError: the file is missing, lacks a column, or holds something that is no number.
+    """
+    header, rows = _read(path)
+    columns = {name: _column(header, name, path) for name in JOINT_COLUMNS}
+    times: dict[int, float] = {}
+    found: dict[str, dict[int, list[float]]] = {}
+    for line, row in enumerate(rows, 2):
+        frame = int(_number(row[columns["frame"]], path, line))
+        times[frame] = _number(row[columns["time_s"]], path, line)
+        found.setdefault(row[columns["joint"]], {})[frame] = [_number(row[columns[c]], path, line) for c in ("x", "y", "z", "sigma")]
+    frames = sorted(times)
+    tables = {joint: np.array([places.get(f, [np.nan] * 4) for f in frames]) for joint, places in found.items()}
+    return JointTable(frames=np.array(frames, dtype=np.int64), time_s=np.array([times[f] for f in frames]),
+                      joints_m={joint: t[:, :3] for joint, t in tables.items()}, sigma_m={joint: t[:, 3] for joint, t in tables.items()})
+
+
+def _to_file(skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:
+    base = {dof.name for dof in skeleton.base_dofs}
+    return np.array([1.0 if name in base else np.degrees(1.0) for name in names])
+
+
+def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    store.write_text(Path(path), text.getvalue())
+
+
+def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+    try:
+        lines = list(csv.reader(io.StringIO(Path(path).read_text(encoding="utf-8"))))
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"Cannot read the table {path}: {error}; run the fit again.") from error
+    if not lines:
+        raise InputError(f"The table {path} is empty; run the fit again.")
+    header, rows = lines[0], [row for row in lines[1:] if row]
+    for line, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise InputError(f"Row {line} of {path} has {len(row)} values, the header {len(header)}; run the fit again.")
+    return header, rows
+
+
+def _column(header: Sequence[str], name: str, path: Path) -> int:
+    if name not in header:
+        raise InputError(f"The table {path} has no column “{name}”; it belongs to another body, or run the fit again.")
+    return list(header).index(name)
+
+
+def _number(text: str, path: Path, line: int) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise InputError(f"Row {line} of {path} holds “{text[:40]}” where a number is needed; run the fit again.") from error
+    return value

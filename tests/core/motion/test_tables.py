@@ -1,0 +1,69 @@
+"""joints.csv and motion.csv: round trips, units, and what they refuse."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.errors import InputError
+from tricap.core.fitting.body_motion import BodyMotion
+from tricap.core.motion.tables import read_joints, read_motion, write_joints, write_motion
+
+
+def _motion() -> BodyMotion:
+    shape = default_shape(read_model("arm.R"))
+    rng = np.random.default_rng(0)
+    values = rng.normal(0, 0.5, (4, 8))
+    joints = joint_positions(shape.skeleton, shape.lengths_m, values)
+    return BodyMotion(frames=np.array([3, 4, 6, 7]), time_s=np.array([3, 4, 6, 7]) / 25, dof_names=shape.skeleton.dof_names, values=values,
+                      covariance=np.repeat(np.diag(np.arange(1, 9) * 1e-4)[None], 4, axis=0), joint_names=tuple(joints),
+                      joints_m=np.stack(list(joints.values()), axis=1), joint_sigma_m=np.full((4, 3), 0.002),
+                      status=("fitted", "partial", "bridged", "suspect"), sigma0=np.ones(4))
+
+
+def test_motion_comes_back_within_the_digits_written(tmp_path: Path) -> None:
+    skeleton, motion = read_model("arm.R").skeleton, _motion()
+    write_motion(tmp_path / "motion.csv", motion, skeleton)
+    table = read_motion(tmp_path / "motion.csv", skeleton)
+    assert np.array_equal(table.frames, motion.frames)
+    assert np.allclose(table.values, motion.values, atol=1e-6)
+    assert np.allclose(table.sigma, motion.sigma, atol=1e-6)
+
+
+def test_angles_are_degrees_and_the_base_is_metres(tmp_path: Path) -> None:
+    skeleton, motion = read_model("arm.R").skeleton, _motion()
+    write_motion(tmp_path / "motion.csv", motion, skeleton)
+    header, row = (line.split(",") for line in (tmp_path / "motion.csv").read_text().splitlines()[:2])
+    assert header[:3] == ["frame", "time_s", "shoulder.R x"]
+    assert float(row[header.index("shoulder.R x")]) == pytest.approx(motion.values[0, 0], abs=1e-6)
+    assert float(row[header.index("elbow.R flexion")]) == pytest.approx(np.degrees(motion.values[0, 6]), abs=1e-5)
+
+
+def test_joints_come_back_by_name_and_frame(tmp_path: Path) -> None:
+    motion = _motion()
+    write_joints(tmp_path / "joints.csv", motion)
+    table = read_joints(tmp_path / "joints.csv")
+    assert table.frames.tolist() == [3, 4, 6, 7]
+    assert np.allclose(table.joints_m["wrist.R"], motion.joints_m[:, 2], atol=1e-6)
+    assert np.allclose(table.sigma_m["elbow.R"], 0.002)
+
+
+@pytest.mark.parametrize(("text", "word"), [("", "empty"), ("frame,time_s\n0,0\n", "no column"), ("frame,time_s,shoulder.R x\n0,0\n", "values")])
+def test_faulty_tables_are_refused_in_a_sentence(tmp_path: Path, text: str, word: str) -> None:
+    (tmp_path / "motion.csv").write_text(text)
+    with pytest.raises(InputError, match=word):
+        read_motion(tmp_path / "motion.csv", read_model("arm.R").skeleton)
+
+
+def test_a_word_for_a_number_is_refused(tmp_path: Path) -> None:
+    skeleton = read_model("arm.R").skeleton
+    write_motion(tmp_path / "motion.csv", _motion(), skeleton)
+    text = (tmp_path / "motion.csv").read_text().replace("\n3,", "\nthree,")
+    (tmp_path / "motion.csv").write_text(text)
+    with pytest.raises(InputError, match="three"):
+        read_motion(tmp_path / "motion.csv", skeleton)
+    with pytest.raises(InputError, match="missing.csv"):
+        read_motion(tmp_path / "missing.csv", skeleton)
