@@ -5,9 +5,10 @@ import sys
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command of the `tricap` command line; its exit code (see docs/formats.md)."""
+    from .addon import command
     from .core import commands
 
-    return commands.main(argv)
+    return commands.main(argv, (command.add_commands,))
 
 
 if __name__ == "__main__":

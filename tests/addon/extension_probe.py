@@ -1,6 +1,8 @@
 """Run by test_extension.py in a process of its own: install a zip, enable, use, disable, uninstall; the findings as JSON.
 
-    python extension_probe.py ZIP JSON       with BLENDER_USER_RESOURCES set to an empty folder
+    python extension_probe.py ZIP JSON [FOLDER]      with BLENDER_USER_RESOURCES set to an empty folder
+
+With FOLDER it also makes a short sample recording there and runs the whole path on it, by the operator.
 """
 
 import gc
@@ -15,6 +17,7 @@ from pathlib import Path
 import bpy
 
 EXTENSION = "bl_ext.user_default.tricap"
+FRAMES = 4
 
 
 def drawn_by(cls: type) -> list[str]:
@@ -66,7 +69,21 @@ def use(core: types.ModuleType) -> dict[str, object]:
     return {"core": core.__file__, "scipy": scipy.__file__, "cv2": cv2.__file__, "numpy": numpy.__file__}
 
 
-def main(package: str, report: str) -> None:
+def run_the_path(folder: Path) -> dict[str, object]:
+    """A sample recording made by the installed core, measured by the operator, and what the scene then holds."""
+    arm = importlib.import_module(f"{EXTENSION}.core.synthetic.arm")
+    arm.make_arm_take(folder / "take", arm.ArmTakeSettings(frames=FRAMES))
+    ended = bpy.ops.tricap.run(take=str(folder / "take"), out=str(folder / "out"), build=True)
+    rigs = [item for item in bpy.data.objects if item.type == "ARMATURE"]
+    return {
+        "ended": sorted(ended),
+        "files": sorted(path.relative_to(folder / "out").as_posix() for path in (folder / "out").rglob("*") if path.is_file()),
+        "moving armatures": [item.name for item in rigs if item.animation_data and item.animation_data.action],
+        "kinds": sorted({item.type for item in bpy.data.objects}),
+    }
+
+
+def main(package: str, report: str, folder: str | None = None) -> None:
     before = traces()
     found: dict[str, object] = {}
     installed = bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True, overwrite=True)
@@ -74,6 +91,8 @@ def main(package: str, report: str) -> None:
     found["added"] = difference(traces(), before)
     found["classes"] = registered_classes()
     found["used"] = use(importlib.import_module(f"{EXTENSION}.core"))
+    if folder:
+        found["path"] = run_the_path(Path(folder))
     modules = own_modules()
     found["absolute"] = sorted(name for name in sys.modules if name.split(".")[0] in ("tricap", "core", "addon"))
     functions = [value for module in modules.values() for value in vars(module).values() if isinstance(value, types.FunctionType)]
@@ -93,6 +112,6 @@ def main(package: str, report: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2])
+    main(*sys.argv[1:])
     sys.stdout.flush()
     os._exit(0)  # Blender 4.5 as a module can hang in its own atexit

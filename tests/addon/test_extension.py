@@ -15,6 +15,7 @@ import pytest
 PROBE = Path(__file__).with_name("extension_probe.py")
 ROOT = PROBE.parents[2]
 PATIENCE_S = 600
+PROMISED = {"run.json", "clouds/0000.ply", "trajectories.npz", "joints.csv", "motion.csv", "body.toml", "skin/0000.ply"}
 LEAKY = """
 import threading
 import bpy
@@ -53,11 +54,11 @@ def unregister():
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is not installed for this Python")
 
 
-def probe(package: Path, folder: Path) -> dict[str, Any]:
+def probe(package: Path, folder: Path, *, run_the_path: bool = False) -> dict[str, Any]:
     """Install `package` into Blender in a process of its own, with the empty profile folder/profile; what it found."""
     (folder / "profile").mkdir()
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile"), "PYTHONDONTWRITEBYTECODE": "1"}
-    line = [sys.executable, str(PROBE), str(package), str(folder / "found.json")]
+    line = [sys.executable, str(PROBE), str(package), str(folder / "found.json"), *([str(folder)] if run_the_path else [])]
     done = subprocess.run(line, env=environment, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S)
     output = done.stdout + done.stderr
     assert done.returncode == 0 and "Traceback" not in output, output
@@ -118,9 +119,13 @@ def test_an_extension_that_leaves_things_behind_is_found_out(dev: ModuleType, tm
 
 
 @pytest.mark.slow
-def test_with_its_wheels_it_brings_scipy_and_opencv_but_not_numpy(full_extension_zip: Path, tmp_path: Path) -> None:
-    found = probe(full_extension_zip, tmp_path)
+def test_the_whole_path_runs_from_the_zip_with_its_own_wheels(full_extension_zip: Path, tmp_path: Path) -> None:
+    found = probe(full_extension_zip, tmp_path, run_the_path=True)
     own = (tmp_path / "profile" / "extensions" / ".local").as_posix()
     assert found["used"]["scipy"].startswith(own) and found["used"]["cv2"].startswith(own)
-    assert not found["used"]["numpy"].startswith(own)
+    assert not found["used"]["numpy"].startswith(own), "numpy is Blender's"
+    path = found["path"]
+    assert path["ended"] == ["FINISHED"]
+    assert PROMISED <= set(path["files"])
+    assert path["moving armatures"] and {"ARMATURE", "CAMERA", "META"} <= set(path["kinds"])
     assert_nothing_left(found)

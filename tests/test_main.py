@@ -1,0 +1,43 @@
+"""`python -m tricap`: one parser for the commands of the core and those of the add-on, without starting Blender for the former."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import tricap
+from tricap.__main__ import main
+
+
+def test_the_parser_joins_the_commands_of_core_and_addon(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert ended.value.code == 0
+    assert all(f"\n    {command} " in text for command in ("new", "measure", "track", "fit", "run", "demo", "scene"))
+
+
+def test_the_commands_of_core_do_not_start_blender(tmp_path: Path) -> None:
+    code = f"import sys; from tricap.__main__ import main; main(['measure', {str(tmp_path)!r}, '--out', 'x']); print('bpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.stdout.strip() == "False", done.stderr
+
+
+def test_it_runs_as_a_module_and_faults_of_the_input_end_with_2(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-m", "tricap", "run", str(tmp_path / "none"), "--out", str(tmp_path / "out")],
+                          capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("tricap: ") and done.stderr.count("\n") == 1, done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_wrong_command_ends_with_2(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-m", "tricap", "nonsense"], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and "nonsense" in done.stderr
+
+
+def test_importing_the_package_loads_nothing_of_blender() -> None:
+    done = subprocess.run([sys.executable, "-c", "import sys, tricap; print([m for m in ('bpy', 'tricap.addon') if m in sys.modules])"],
+                          capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+    assert callable(tricap.register) and callable(tricap.unregister)
