@@ -17,13 +17,25 @@ from .tracking.surface import regenerate, start_tracks
 ALGORITHM = "tracking 1"
 
 
-def track_frames(footage: Footage, measured: Sequence[MeasuredFrame], matching: MatchingSettings, tracking: TrackingSettings,
-                 results: Results, monitor: Monitor) -> Iterator[TrackedFrame]:
+def track_frames(
+    footage: Footage,
+    measured: Sequence[MeasuredFrame],
+    matching: MatchingSettings,
+    tracking: TrackingSettings,
+    results: Results,
+    monitor: Monitor,
+) -> Iterator[TrackedFrame]:
     """Follow the surface through the frames (in the order of time)."""
     base = store.digest(ALGORITHM, repr((matching, tracking)))
     limit_px = max(tracking.max_residual_px, float(np.median([m.field.limit_px for m in measured])))
-    view = TrackingView(cameras=footage.rig.cameras, reference=footage.take.reference, rows=footage.take.rows, matching=matching,
-                        tracking=tracking, limit_px=limit_px)
+    view = TrackingView(
+        cameras=footage.rig.cameras,
+        reference=footage.take.reference,
+        rows=footage.take.rows,
+        matching=matching,
+        tracking=tracking,
+        limit_px=limit_px,
+    )
     before: TrackedFrame | None = None
     current: TrackedFrame | None = None
     images: FrameImages | None = None
@@ -44,8 +56,17 @@ def track_frames(footage: Footage, measured: Sequence[MeasuredFrame], matching: 
         yield tracked
 
 
-def _advance(footage: Footage, view: TrackingView, before: TrackedFrame | None, current: TrackedFrame | None, images: FrameImages | None,
-             m: MeasuredFrame, born: int, index: int, monitor: Monitor) -> tuple[TrackedFrame, FrameImages]:
+def _advance(
+    footage: Footage,
+    view: TrackingView,
+    before: TrackedFrame | None,
+    current: TrackedFrame | None,
+    images: FrameImages | None,
+    m: MeasuredFrame,
+    born: int,
+    index: int,
+    monitor: Monitor,
+) -> tuple[TrackedFrame, FrameImages]:
     following = load_images(footage, m.frame)
     if current is None or images is None:
         return start_tracks(m.field, m.frame, view.tracking), following
@@ -64,4 +85,3 @@ def _checkpoint(results: Results, tracked: TrackedFrame, key: str) -> None:
 def _from_checkpoint(results: Results, frame: int, key: str) -> TrackedFrame | None:
     arrays = results.load_checkpoint("tracks", f"{frame:04d}", key)
     return None if arrays is None else TrackedFrame(frame=frame, **arrays)
-

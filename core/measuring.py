@@ -58,8 +58,9 @@ def load_images(footage: Footage, frame: int) -> FrameImages:
     return FrameImages(grey=grey, spline=[SplineImage(g) for g in grey])
 
 
-def measure_frames(footage: Footage, matching: MatchingSettings, growing: GrowingSettings, surface: SurfaceSettings, results: Results,
-                   monitor: Monitor) -> Iterator[MeasuredFrame]:
+def measure_frames(
+    footage: Footage, matching: MatchingSettings, growing: GrowingSettings, surface: SurfaceSettings, results: Results, monitor: Monitor
+) -> Iterator[MeasuredFrame]:
     """Measure all frames: from the frame of the clicks to the end, then from it to the beginning.
 
     Raises:
@@ -68,8 +69,13 @@ def measure_frames(footage: Footage, matching: MatchingSettings, growing: Growin
     take = footage.take
     first = take.seeds.frame if take.seeds.frame in footage.frames else footage.frames.start
     order = [*range(first, footage.frames.stop), *range(first - 1, footage.frames.start - 1, -1)]
-    base = store.digest(ALGORITHM, repr((matching, growing, surface)), take.rig_path, repr((take.interlaced, take.reference_view, _seed_table(footage))),
-                        repr([(v.name, v.offset_frames) for v in take.views]))
+    base = store.digest(
+        ALGORITHM,
+        repr((matching, growing, surface)),
+        take.rig_path,
+        repr((take.interlaced, take.reference_view, _seed_table(footage))),
+        repr([(v.name, v.offset_frames) for v in take.views]),
+    )
     start = before = None
     for done, frame in enumerate(order):
         part = monitor.part("surface", done, len(order))
@@ -92,8 +98,11 @@ def _image_digests(footage: Footage, frame: int) -> list[str]:
     for path in footage.files(frame):
         try:
             state = path.stat()
-            parts.append(store.digest(path) if path.suffix.lower() not in (".mp4", ".avi", ".mov", ".mkv", ".mpg", ".webm")
-                         else f"{state.st_size} {state.st_mtime_ns}")
+            parts.append(
+                store.digest(path)
+                if path.suffix.lower() not in (".mp4", ".avi", ".mov", ".mkv", ".mpg", ".webm")
+                else f"{state.st_size} {state.st_mtime_ns}"
+            )
         except OSError as error:
             raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
     return parts
@@ -105,8 +114,16 @@ def _seed_table(footage: Footage) -> list[tuple[str, list[tuple[str, list[float]
     return [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
 
 
-def _measure(footage: Footage, matching: MatchingSettings, growing: GrowingSettings, surface: SurfaceSettings, frame: int,
-             before: MeasuredFrame | None, key: str, monitor: Monitor) -> MeasuredFrame:
+def _measure(
+    footage: Footage,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    surface: SurfaceSettings,
+    frame: int,
+    before: MeasuredFrame | None,
+    key: str,
+    monitor: Monitor,
+) -> MeasuredFrame:
     take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
     images = load_images(footage, frame)
     grid = template_grid(images.spline[ref].shape, take.rows, growing.spacing_px)
@@ -114,22 +131,50 @@ def _measure(footage: Footage, matching: MatchingSettings, growing: GrowingSetti
         where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, monitor)
     else:
         where = fg.after(cameras[ref].to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
-        seeds = sweep_seeds(images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px,
-                            depth_range_m=where.depth_range_m, monitor=monitor)
+        seeds = sweep_seeds(
+            images.spline,
+            cameras,
+            ref,
+            grid,
+            matching,
+            spacing_px=growing.seed_spacing_px,
+            depth_range_m=where.depth_range_m,
+            monitor=monitor,
+        )
     field = grow(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
     field = clean_field(_single(field), cameras[ref], ref, surface)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):
-        raise InputError(f"No surface could be measured in frame {frame} of {take.folder.name}: no texture is found alike in all views. "
-                         "Check that rig.toml belongs to this footage and that the views are not swapped, or click surface seeds.")
+        raise InputError(
+            f"No surface could be measured in frame {frame} of {take.folder.name}: no texture is found alike in all views. "
+            "Check that rig.toml belongs to this footage and that the views are not swapped, or click surface seeds."
+        )
     return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key)
 
 
-def _first_foreground(footage: Footage, images: FrameImages, grid: TemplateGrid, matching: MatchingSettings, growing: GrowingSettings,
-                      frame: int, monitor: Monitor) -> tuple[fg.Foreground, Approximations]:
+def first_seeds(
+    footage: Footage, matching: MatchingSettings, growing: GrowingSettings, frame: int, monitor: Monitor
+) -> tuple[fg.Foreground, Approximations]:
+    """Where the person is in one frame, and the surface seeds there."""
+    images = load_images(footage, frame)
+    grid = template_grid(images.spline[0].shape, footage.take.rows, growing.spacing_px)
+    return _first_foreground(footage, images, grid, matching, growing, frame, monitor)
+
+
+def _first_foreground(
+    footage: Footage,
+    images: FrameImages,
+    grid: TemplateGrid,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    frame: int,
+    monitor: Monitor,
+) -> tuple[fg.Foreground, Approximations]:
     """Where the person is in the first frame, and the seeds there."""
     cameras, ref, take = footage.rig.cameras, footage.take.reference, footage.take
-    swept = sweep_seeds(images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=None, monitor=monitor)
+    swept = sweep_seeds(
+        images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=None, monitor=monitor
+    )
     clicks = [*take.seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface))]
     if clicks:
         depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
@@ -140,9 +185,11 @@ def _first_foreground(footage: Footage, images: FrameImages, grid: TemplateGrid,
         where = fg.Foreground(depth_range_m=(0.05, 1e3), method="everything")
     where = replace(where, planes=_room(footage, images, swept, frame))
     near, far = where.depth_range_m
-    seeds = sweep_seeds(images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=(near, far), monitor=monitor)
+    seeds = sweep_seeds(
+        images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=(near, far), monitor=monitor
+    )
     if take.seeds.surface:
-        seeds = _with_clicked(footage, seeds, depth[len(take.seeds.joints):])
+        seeds = _with_clicked(footage, seeds, depth[len(take.seeds.joints) :])
     return where, seeds
 
 
@@ -159,8 +206,10 @@ def clicked_depth(footage: Footage, name: str, at: Clicks) -> float:
     if not np.isfinite(depth) or depth <= 0:
         raise InputError(f"The click “{name}” is seen by {len(at)} view(s) and has no place in space; click it in two views at least.")
     if float(point.rms_residual_px[0]) > CLICK_MISS_PX:
-        raise InputError(f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px; click the same spot in every view, "
-                         "and check that rig.toml belongs to this footage.")
+        raise InputError(
+            f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px; click the same spot in every view, "
+            "and check that rig.toml belongs to this footage."
+        )
     return depth
 
 
@@ -172,7 +221,9 @@ def _with_clicked(footage: Footage, seeds: Approximations, depth_m: np.ndarray) 
     for at, depth in zip(take.seeds.surface, depth_m):
         known = [(c, at[c.name]) for c in cameras if c.name in at]
         camera, xy = next(((c, xy) for c, xy in known if c is base), known[0])
-        point = camera.points_at_depth(xy, float(camera.to_camera(base.points_at_depth(base.matrix[:2, 2], depth))[2]) if camera is not base else depth)
+        point = camera.points_at_depth(
+            xy, float(camera.to_camera(base.points_at_depth(base.matrix[:2, 2], depth))[2]) if camera is not base else depth
+        )
         rows.append(take.rows.from_frame(base.project(point)))
     clicked = approximations_at_depth(cameras, take.reference, take.rows, np.array(rows), depth_m)
     return Approximations(**{f.name: np.concatenate([getattr(seeds, f.name), getattr(clicked, f.name)]) for f in fields(Approximations)})
@@ -199,8 +250,13 @@ def _checkpoint(results: Results, m: MeasuredFrame) -> None:
     arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(TripletField) if f.name not in ("grid", "tried", "limit_px")}
     arrays = {k: v.astype(np.float32) if k.removeprefix("field_") in FIELD_SINGLE else v for k, v in arrays.items()}
     arrays |= {f"cloud_{f.name}": getattr(m.cloud, f.name) for f in fields(PointCloud) if f.name not in ("frame", "xy_px", "residual_px")}
-    arrays |= {"where": np.array(m.foreground.depth_range_m), "planes": m.foreground.planes, "method": np.array(m.foreground.method),
-               "grid": np.array([m.field.grid.spacing_px, *m.field.grid.shape, m.field.tried]), "limit_px": np.array(m.field.limit_px)}
+    arrays |= {
+        "where": np.array(m.foreground.depth_range_m),
+        "planes": m.foreground.planes,
+        "method": np.array(m.foreground.method),
+        "grid": np.array([m.field.grid.spacing_px, *m.field.grid.shape, m.field.tried]),
+        "limit_px": np.array(m.field.limit_px),
+    }
     results.save_checkpoint("surface", f"{m.frame:04d}", m.key, arrays)
 
 
@@ -210,9 +266,17 @@ def _from_checkpoint(footage: Footage, results: Results, frame: int, key: str) -
         return None
     spacing, gh, gw, tried = (int(v) for v in a["grid"])
     rows = footage.take.rows
-    values = {k.removeprefix("field_"): v.astype(np.float64) if v.dtype == np.float32 else v for k, v in a.items() if k.startswith("field_")}
-    field = TripletField(grid=TemplateGrid(spacing_px=spacing, rows=rows, shape=(gh, gw)), tried=tried, limit_px=float(a["limit_px"]), **values)
-    cloud = PointCloud(frame=frame, xy_px=rows.to_frame(field.xy), residual_px=field.residual_px,
-                       **{k.removeprefix("cloud_"): v for k, v in a.items() if k.startswith("cloud_")})
+    values = {
+        k.removeprefix("field_"): v.astype(np.float64) if v.dtype == np.float32 else v for k, v in a.items() if k.startswith("field_")
+    }
+    field = TripletField(
+        grid=TemplateGrid(spacing_px=spacing, rows=rows, shape=(gh, gw)), tried=tried, limit_px=float(a["limit_px"]), **values
+    )
+    cloud = PointCloud(
+        frame=frame,
+        xy_px=rows.to_frame(field.xy),
+        residual_px=field.residual_px,
+        **{k.removeprefix("cloud_"): v for k, v in a.items() if k.startswith("cloud_")},
+    )
     where = fg.Foreground(depth_range_m=(float(a["where"][0]), float(a["where"][1])), method=str(a["method"]), planes=a["planes"])
     return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key)

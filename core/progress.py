@@ -46,10 +46,11 @@ class Monitor:
 class _Part(Monitor):
     def __init__(self, whole: Monitor, stage: str, index: int, total: int) -> None:
         super().__init__()
-        self._whole, self._stage, self._index, self._total = whole, stage, index, total
+        self._whole, self._stage, self._index, self._total, self._reached = whole, stage, index, total, 0.0
 
     def step(self, stage: str, done: float, total: float) -> None:
-        self._whole.step(self._stage, self._index + min(1.0, done / total if total else 1.0), self._total)
+        self._reached = max(self._reached, min(1.0, done / total if total else 1.0))  # a part's own steps may begin anew
+        self._whole.step(self._stage, self._index + self._reached, self._total)
 
     def cancel(self) -> None:
         self._whole.cancel()

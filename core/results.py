@@ -33,7 +33,9 @@ class Results:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"Cannot make the folder {folder}: {error.strerror or error}. Choose another place for the results.") from error
+            raise InputError(
+                f"Cannot make the folder {folder}: {error.strerror or error}. Choose another place for the results."
+            ) from error
         if not os.access(self.folder, os.W_OK):
             raise InputError(f"The folder {folder} is read-only; choose another place for the results.")
 
@@ -71,13 +73,17 @@ class Results:
 
     def write_cloud(self, cloud: PointCloud) -> None:
         """clouds/NNNN.ply"""
-        write_cloud(self.cloud_path(cloud.frame), xyz_m=cloud.xyz_m, sigma_m=cloud.sigma_m, normals=cloud.normals, intensity=cloud.intensity)
+        write_cloud(
+            self.cloud_path(cloud.frame), xyz_m=cloud.xyz_m, sigma_m=cloud.sigma_m, normals=cloud.normals, intensity=cloud.intensity
+        )
 
     def write_trajectories(self, trajectories: Trajectories, header: Mapping[str, Any]) -> None:
         """trajectories.npz"""
         names = ("frames", "time_s", "xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status")
         arrays = {name: getattr(trajectories, name) for name in names}
-        small = {n: a.astype(np.float32) if n in ("xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m") else a for n, a in arrays.items()}
+        small = {
+            n: a.astype(np.float32) if n in ("xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m") else a for n, a in arrays.items()
+        }
         store.save(self.path("trajectories.npz"), small, header)
 
     def read_run(self) -> dict[str, Any]:

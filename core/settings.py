@@ -14,8 +14,9 @@ from .errors import InputError
 T = TypeVar("T")
 
 
-def knob(default: Any, about: str, *, unit: str = "", low: float | None = None, high: float | None = None,
-         choices: tuple[str, ...] = ()) -> Any:
+def knob(
+    default: Any, about: str, *, unit: str = "", low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()
+) -> Any:
     """A dataclass field that describes itself: `about` is one sentence, `low`/`high` are inclusive limits in `unit`."""
     return dataclasses.field(default=default, metadata=dict(about=about, unit=unit, low=low, high=high, choices=choices))
 
@@ -59,7 +60,7 @@ def _checked(value: Any, field: "dataclasses.Field[Any]", where: str) -> Any:
     low, high = meta.get("low"), meta.get("high")
     if (low is not None and value < low) or (high is not None and value > high):
         raise InputError(f"{label} is {value:g} {meta.get('unit', '')}; it must lie between {low} and {high}.".replace(" ;", ";"))
-    return type(default)(value)
+    return int(value) if isinstance(default, int) else float(value)
 
 
 def to_table(settings: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -89,14 +89,17 @@ class Footage:
         images = [s.read(frame + v.offset_frames) for s, v in zip(self.sequences, self.take.views)]
         for image, camera, view in zip(images, self.rig.cameras, self.take.views):
             if image.shape[::-1] != camera.size_px:
-                raise InputError(f"Frame {frame} of view {view.name} has {image.shape[1]}×{image.shape[0]} pixels, but its camera in "
-                                 f"{self.take.rig_path.name} has {camera.size_px[0]}×{camera.size_px[1]}; use the footage as it was calibrated.")
+                raise InputError(
+                    f"Frame {frame} of view {view.name} has {image.shape[1]}×{image.shape[0]} pixels, but its camera in "
+                    f"{self.take.rig_path.name} has {camera.size_px[0]}×{camera.size_px[1]}; use the footage as it was calibrated."
+                )
         return images
 
     def files(self, frame: int) -> list[Path]:
         """The files behind one frame, a movie standing for all of its frames."""
-        return [f[frame + v.offset_frames] if len(f := s.files()) > 1 or s.count == 1 else f[0]
-                for s, v in zip(self.sequences, self.take.views)]
+        return [
+            f[frame + v.offset_frames] if len(f := s.files()) > 1 or s.count == 1 else f[0] for s, v in zip(self.sequences, self.take.views)
+        ]
 
 
 def read_take(folder: Path) -> Take:
@@ -110,8 +113,9 @@ def read_take(folder: Path) -> Take:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). "
-                         "Make one with `tricap new`.") from error
+        raise InputError(
+            f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
+        ) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a TOML file: {error}.") from error
     return _take(table, path.parent.resolve(), str(path))
@@ -137,13 +141,17 @@ def _frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
     if take.frames is None:
         if len(set(counts)) > 1:
             said = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
-            raise InputError(f"The views of {take.folder.name} are not equally long: {said} frames. "
-                             "Trim them, or set `offset_frames` or `frames` in take.toml.")
+            raise InputError(
+                f"The views of {take.folder.name} are not equally long: {said} frames. "
+                "Trim them, or set `offset_frames` or `frames` in take.toml."
+            )
         return range(first, counts[0])
     start, stop = take.frames
     if start < first or stop > min(counts):
-        raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but the footage has frames {first} to {min(counts)} (half-open); "
-                         "mend it in take.toml.")
+        raise InputError(
+            f"`frames` of {take.folder.name} is [{start}, {stop}], but the footage has frames {first} to {min(counts)} (half-open); "
+            "mend it in take.toml."
+        )
     return range(start, stop)
 
 
@@ -155,17 +163,22 @@ def _check_seeds(footage: Footage) -> None:
         for view, xy in at.items():
             if not footage.rig[view].sees(xy):
                 w, h = footage.rig[view].size_px
-                raise InputError(f"The {label} in view {view} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels; click it again.")
+                raise InputError(
+                    f"The {label} in view {view} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels; click it again."
+                )
     if clicks and seeds.frame not in footage.frames:
-        raise InputError(f"The seeds of {take.folder.name} belong to frame {seeds.frame}, which is not among the frames "
-                         f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` under [seeds].")
+        raise InputError(
+            f"The seeds of {take.folder.name} belong to frame {seeds.frame}, which is not among the frames "
+            f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` under [seeds]."
+        )
 
 
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     _known(table, KEYS, where)
     if table.get("format") != FORMAT or table.get("version") != VERSION:
-        raise InputError(f"{where} must say format = \"{FORMAT}\" and version = {VERSION}; it says "
-                         f"{table.get('format')!r} and {table.get('version')!r}.")
+        raise InputError(
+            f'{where} must say format = "{FORMAT}" and version = {VERSION}; it says {table.get("format")!r} and {table.get("version")!r}.'
+        )
     views = _views(table.get("views"), where)
     names = tuple(v.name for v in views)
     reference = table.get("reference_view", names[len(names) // 2])
@@ -179,10 +192,18 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
     body = _table(table, "body", where)
     _known(body, ("model",), f"[body] of {where}")
-    return Take(folder=folder, fps=float(fps), views=views, rig_path=_inside(folder, table.get("rig", "rig.toml"), where),
-                interlaced=interlaced, reference_view=reference, frames=_range(table.get("frames"), where),
-                body_model=body.get("model"), seeds=_seeds(_table(table, "seeds", where), names, where),
-                settings=_settings(_table(table, "settings", where), where))
+    return Take(
+        folder=folder,
+        fps=float(fps),
+        views=views,
+        rig_path=_inside(folder, table.get("rig", "rig.toml"), where),
+        interlaced=interlaced,
+        reference_view=reference,
+        frames=_range(table.get("frames"), where),
+        body_model=body.get("model"),
+        seeds=_seeds(_table(table, "seeds", where), names, where),
+        settings=_settings(_table(table, "settings", where), where),
+    )
 
 
 def _views(entries: Any, where: str) -> tuple[View, ...]:
@@ -196,7 +217,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         if not isinstance(entry.get("name"), str) or not entry["name"] or not isinstance(offset, int):
             raise InputError(f"A {label} needs a name (text); `offset_frames` is a whole number.")
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
-            raise InputError(f"The {label} needs either `images` (a pattern such as \"{entry['name']}/*.png\") or `movie` (a file).")
+            raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         views.append(View(name=entry["name"], images=entry.get("images"), movie=entry.get("movie"), offset_frames=offset))
     if len({v.name for v in views}) < len(views):
         raise InputError(f"Two views of {where} have the same name; give each its own.")
@@ -209,8 +230,11 @@ def _seeds(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Seed
     if not isinstance(frame, int) or not isinstance(surface, list) or not isinstance(joints, dict):
         raise InputError(f"[seeds] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
     _known(joints, JOINTS, f"[seeds.joints] of {where}")
-    return Seeds(frame=frame, surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),
-                 joints={name: _clicks(at, views, f"joint “{name}” of {where}") for name, at in joints.items()})
+    return Seeds(
+        frame=frame,
+        surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),
+        joints={name: _clicks(at, views, f"joint “{name}” of {where}") for name, at in joints.items()},
+    )
 
 
 def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
@@ -257,5 +281,5 @@ def _known(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None
             raise InputError(f"{where} has an unknown key “{key}”.{nearest_name(str(key), known)}")
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

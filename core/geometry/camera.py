@@ -91,8 +91,12 @@ class Camera:
         xy = np.asarray(xy_px)
         w, h = self.size_px
         with np.errstate(invalid="ignore"):
-            return ((xy[..., 0] >= margin_px) & (xy[..., 1] >= margin_px)
-                    & (xy[..., 0] <= w - 1 - margin_px) & (xy[..., 1] <= h - 1 - margin_px))
+            return (
+                (xy[..., 0] >= margin_px)
+                & (xy[..., 1] >= margin_px)
+                & (xy[..., 0] <= w - 1 - margin_px)
+                & (xy[..., 1] <= h - 1 - margin_px)
+            )
 
     def _pixel_matrix(self) -> np.ndarray:
         fx, fy, (b1, b2) = self.matrix[0, 0], self.matrix[1, 1], self.affinity
@@ -105,8 +109,7 @@ class Camera:
         k1, k2, p1, p2, k3 = self.distortions
         r2 = a * a + b * b
         L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))  # (3)
-        return np.stack([a * L + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
-                         b * L + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b], axis=-1)  # (4)
+        return np.stack([a * L + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), b * L + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b], axis=-1)  # (4)
 
     def _distortion_jacobian(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         k1, k2, p1, p2, k3 = self.distortions

@@ -1,8 +1,8 @@
 """Forward intersection: the point in space that the rays of its images agree on best, with its covariance.
 
-    Σ_k (x_k − F_k(X))ᵀ K_k⁻¹ (x_k − F_k(X)) → min                             (1)   F_k: camera k (collinearity)
-    N = Σ J_kᵀ K_k⁻¹ J_k ,   X ← X + N⁻¹ Σ J_kᵀ K_k⁻¹ v_k ,   K_X = N⁻¹         (2)
-    σ0² = vᵀ P v / (2 K − 3)                                                   (3)
+Σ_k (x_k − F_k(X))ᵀ K_k⁻¹ (x_k − F_k(X)) → min                             (1)   F_k: camera k (collinearity)
+N = Σ J_kᵀ K_k⁻¹ J_k ,   X ← X + N⁻¹ Σ J_kᵀ K_k⁻¹ v_k ,   K_X = N⁻¹         (2)
+σ0² = vᵀ P v / (2 K − 3)                                                   (3)
 """
 
 from collections.abc import Sequence
@@ -58,8 +58,13 @@ def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covarianc
     K[usable] = np.linalg.inv(N[usable] + np.eye(3) * 1e-9)
     X[~usable] = np.nan
     vPv = np.einsum("nki,nkij,nkj->n", np.nan_to_num(v), P, np.nan_to_num(v))
-    return Intersection(xyz_m=X, covariance_m2=K, residual_px=np.where(usable[:, None, None], v, np.nan),
-                        sigma0=np.sqrt(vPv / np.maximum(2 * rays - 3, 1)), rays=rays)
+    return Intersection(
+        xyz_m=X,
+        covariance_m2=K,
+        residual_px=np.where(usable[:, None, None], v, np.nan),
+        sigma0=np.sqrt(vPv / np.maximum(2 * rays - 3, 1)),
+        rays=rays,
+    )
 
 
 def _meeting_points(cameras: Sequence[Camera], xy: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -74,8 +79,9 @@ def _meeting_points(cameras: Sequence[Camera], xy: np.ndarray, seen: np.ndarray)
     return _solve(A + np.eye(3) * 1e-12, b)
 
 
-def _normal_equations(cameras: Sequence[Camera], X: np.ndarray, xy: np.ndarray, P: np.ndarray,
-                      seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _normal_equations(
+    cameras: Sequence[Camera], X: np.ndarray, xy: np.ndarray, P: np.ndarray, seen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     N, rhs, v = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3)), np.full(xy.shape, np.nan)
     for k, camera in enumerate(cameras):
         image, J = camera.project_with_jacobian(X)

@@ -29,8 +29,10 @@ class Rig:
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        raise InputError(f"The rig has no camera “{name}”.{nearest_name(name, [c.name for c in self.cameras])}"
-                         " Name the views in take.toml as the cameras in rig.toml.")
+        raise InputError(
+            f"The rig has no camera “{name}”.{nearest_name(name, [c.name for c in self.cameras])}"
+            " Name the views in take.toml as the cameras in rig.toml."
+        )
 
 
 def read_rig(path: Path) -> Rig:
@@ -62,15 +64,24 @@ def write_rig(path: Path, rig: Rig) -> None:
     """Write rig.toml so that `read_rig` gives the same cameras, to the last bit."""
     lines: list[str] = []
     for i, camera in enumerate(rig.cameras):
-        lines += [f"[cam_{i}]", f"name = {_text(camera.name)}", f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
-                  f"matrix = {_numbers(camera.matrix)}", f"distortions = {_numbers(camera.distortions)}",
-                  f"rotation = {_numbers(vector_from_rotation(camera.R_cam_world))}", f"translation = {_numbers(camera.t_cam_world_m)}"]
+        lines += [
+            f"[cam_{i}]",
+            f"name = {_text(camera.name)}",
+            f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
+            f"matrix = {_numbers(camera.matrix)}",
+            f"distortions = {_numbers(camera.distortions)}",
+            f"rotation = {_numbers(vector_from_rotation(camera.R_cam_world))}",
+            f"translation = {_numbers(camera.t_cam_world_m)}",
+        ]
         if np.any(camera.affinity):
             lines.append(f"affinity = {_numbers(camera.affinity)}")
         lines.append("")
     lines += ["[metadata]", 'unit = "m"']
-    lines += [f"{k} = {_text(v) if isinstance(v, str) else repr(v)}" for k, v in rig.metadata.items()
-              if k != "unit" and isinstance(v, (str, int, float)) and not isinstance(v, bool)]
+    lines += [
+        f"{k} = {_text(v) if isinstance(v, str) else repr(v)}"
+        for k, v in rig.metadata.items()
+        if k != "unit" and isinstance(v, (str, int, float)) and not isinstance(v, bool)
+    ]
     store.write_text(Path(path), "\n".join(lines) + "\n")
 
 
@@ -91,9 +102,15 @@ def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or min(size) < 8:
         raise InputError(f"{label} has an impossible matrix or size; calibrate it again.")
     affinity = _array(entry, "affinity", (2,), label) if "affinity" in entry else np.zeros(2)
-    return Camera(name=str(name), size_px=(int(size[0]), int(size[1])), matrix=matrix, distortions=distortions, affinity=affinity,
-                  R_cam_world=rotation_from_vector(_array(entry, "rotation", (3,), label)),
-                  t_cam_world_m=_array(entry, "translation", (3,), label) * unit_m)
+    return Camera(
+        name=str(name),
+        size_px=(int(size[0]), int(size[1])),
+        matrix=matrix,
+        distortions=distortions,
+        affinity=affinity,
+        R_cam_world=rotation_from_vector(_array(entry, "rotation", (3,), label)),
+        t_cam_world_m=_array(entry, "translation", (3,), label) * unit_m,
+    )
 
 
 def _array(entry: Mapping[str, Any], key: str, shape: tuple[int, ...] | None, label: str) -> np.ndarray:

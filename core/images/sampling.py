@@ -24,7 +24,9 @@ class SplineImage:
 
         n and m stay below 32,767 (a limit of the look-up).
         """
-        return cv2.remap(self._fine, x * np.float32(FINENESS), y * np.float32(FINENESS), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        return cv2.remap(
+            self._fine, x * np.float32(FINENESS), y * np.float32(FINENESS), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+        )
 
     def inside(self, xy: np.ndarray, margin: np.ndarray | float) -> np.ndarray:
         """Whether points (…, 2) lie inside the image by at least `margin` pixels; NaN does not."""
@@ -45,8 +47,9 @@ def _refine(image: np.ndarray, axis: int) -> np.ndarray:
         t = phase / FINENESS
         weights = np.array([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], np.float32) / 6
         kernel = np.concatenate([[np.float32(0)], weights])  # taps at -2 … 2, the anchor is the middle
-        blurred = cv2.sepFilter2D(coefficients, cv2.CV_32F, *((kernel, one) if axis == 1 else (one, kernel)),
-                                  borderType=cv2.BORDER_REFLECT_101)
+        blurred = cv2.sepFilter2D(
+            coefficients, cv2.CV_32F, *((kernel, one) if axis == 1 else (one, kernel)), borderType=cv2.BORDER_REFLECT_101
+        )
         target = fine[:, phase::FINENESS] if axis == 1 else fine[phase::FINENESS]
         target[...] = blurred[:, : target.shape[1]] if axis == 1 else blurred[: target.shape[0]]
     return fine

@@ -98,14 +98,16 @@ class Movie:
         if index < self._next:
             self._capture.release()
             self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
-        image = None
+        image = np.zeros(0)
         while self._next <= index:
             ok = self._capture.grab() if self._next < index else None
             if ok is None:
                 ok, image = self._capture.read()
             if not ok:
-                raise InputError(f"Frame {index} of {self._path} cannot be decoded; it promises {self._count} frames. "
-                                 "Set `frames` in take.toml to leave the end out, or convert the movie again.")
+                raise InputError(
+                    f"Frame {index} of {self._path} cannot be decoded; it promises {self._count} frames. "
+                    "Set `frames` in take.toml to leave the end out, or convert the movie again."
+                )
             self._next += 1
         return grey(image)
 
@@ -177,5 +179,7 @@ def _check_numbering(paths: tuple[Path, ...], view: str) -> None:
     usual = int(np.median(steps))
     gaps = np.flatnonzero(steps != usual)
     if usual > 0 and 0 < len(gaps) <= max(1, len(paths) // 10) and steps[gaps[0]] > usual:
-        raise InputError(f"View {view} lacks the image(s) between {paths[gaps[0]].name} and {paths[gaps[0] + 1].name}; "
-                         "restore them, or renumber the files of all views alike.")
+        raise InputError(
+            f"View {view} lacks the image(s) between {paths[gaps[0]].name} and {paths[gaps[0] + 1].name}; "
+            "restore them, or renumber the files of all views alike."
+        )

@@ -1,8 +1,8 @@
 """The person, not the wall: in which depths to measure, and which planes of the room to leave out.
 
-The depth range comes from what the user clicked; without clicks, from the nearest surface that carries many seeds; later from the frame before.
-Floor and walls are planes of seeds that do not change over time and have nothing behind them; they are found once per take, and points on them
-are not measured. Which of these was used is said in `method`.
+The depth range comes from what the user clicked; without clicks, from the nearest surface that carries many seeds; later from the
+frame before. Floor and walls are planes of seeds that do not change over time and have nothing behind them; they are found once per
+take, and points on them are not measured. Which of these was used is said in `method`.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,9 @@ def nearest_surface(depth_m: np.ndarray) -> Foreground:
     density = (np.abs(position[:, None] - position[None, :]) < CLUSTER_WIDTH).sum(axis=1)
     nearest = position[np.argmax(density >= CLUSTER_SHARE * density.max())]
     members = depth_m[(np.log(depth_m) > nearest - CLUSTER_WIDTH) & (np.log(depth_m) < nearest + 2 * CLUSTER_WIDTH)]
-    return Foreground(depth_range_m=(float(members.min()) * (1 - CLUSTER_WIDTH), float(members.max()) * (1 + CLUSTER_WIDTH)), method="nearest surface")
+    return Foreground(
+        depth_range_m=(float(members.min()) * (1 - CLUSTER_WIDTH), float(members.max()) * (1 + CLUSTER_WIDTH)), method="nearest surface"
+    )
 
 
 def after(cloud_depth_m: np.ndarray, before: Foreground) -> Foreground:
@@ -64,7 +66,8 @@ def background_planes(static_xyz_m: np.ndarray, all_xyz_m: np.ndarray, cameras_m
 
     A plane must hold PLANE_SHARE of the static seeds that are left and have almost none of all seeds behind it. The trials are seeded.
     """
-    planes, rest = [], static_xyz_m
+    planes: list[np.ndarray] = []
+    rest = static_xyz_m
     random = np.random.default_rng(1999)
     eye = np.mean(np.stack(list(cameras_m)), axis=0)
     while len(rest) >= PLANE_MIN and len(planes) < MAX_PLANES:

@@ -38,4 +38,6 @@ class TemplateGrid:
 def template_grid(image_shape: tuple[int, int], rows: RowGrid, spacing_px: int) -> TemplateGrid:
     """The grid over an image of rows with shape (h', w)."""
     step_y = max(1, round(spacing_px / rows.step))
-    return TemplateGrid(spacing_px=spacing_px, rows=rows, shape=((image_shape[0] - 1) // step_y + 1, (image_shape[1] - 1) // spacing_px + 1))
+    return TemplateGrid(
+        spacing_px=spacing_px, rows=rows, shape=((image_shape[0] - 1) // step_y + 1, (image_shape[1] - 1) // spacing_px + 1)
+    )

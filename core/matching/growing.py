@@ -1,8 +1,8 @@
 """Dense matching: from seeds to a field of triplets, whole fronts of points at a time.
 
-As published (D'Apuzzo et al. 2000, §2.2) the centre image is the template, a point's start is its matched neighbour shifted with the neighbour's
-shape, and what fails is tried again from other neighbours. Here the neighbours of all points that were just accepted form one array, and a point
-is accepted only when it is found in every view, its rays meet, and its depth continues that of its neighbour:
+As published (D'Apuzzo et al. 2000, §2.2) the centre image is the template, a point's start is its matched neighbour shifted with the
+neighbour's shape, and what fails is tried again from other neighbours. Here the neighbours of all points that were just accepted form one
+array, and a point is accepted only when it is found in every view, its rays meet, and its depth continues that of its neighbour:
 
     start_k(p + δ) = x_k(p) + A_k(p) δ                                                    (1)
 """
@@ -37,8 +37,13 @@ class GrowingSettings:
     seed_spacing_px: int = knob(24, "Distance between the points at which seeds are looked for.", unit="px", low=4, high=128)
     attempts: int = knob(3, "How often a point is tried from different neighbours.", low=1, high=8)
     bigger_patches: int = knob(1, "Rounds in which what failed is tried again with a patch 4 px larger each time.", low=0, high=5)
-    max_residual_px: float = knob(0.7, "Largest distance by which rays may miss; if half of the seeds miss by more, three times their median.",
-                                  unit="px", low=0.05, high=10.0)
+    max_residual_px: float = knob(
+        0.7,
+        "Largest distance by which rays may miss; if half of the seeds miss by more, three times their median.",
+        unit="px",
+        low=0.05,
+        high=10.0,
+    )
     max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across.", low=0.5, high=20.0)
 
 
@@ -80,8 +85,18 @@ class _State:
         self.accepted, self.attempts = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=np.int16)
 
 
-def grow(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, seeds: Approximations,
-         matching: MatchingSettings, growing: GrowingSettings, *, foreground: Foreground, monitor: Monitor) -> TripletField:
+def grow(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    grid: TemplateGrid,
+    seeds: Approximations,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    *,
+    foreground: Foreground,
+    monitor: Monitor,
+) -> TripletField:
     """Grow the field of triplets from the seeds until no neighbour can be matched any more.
 
     Only points that the foreground allows are accepted.
@@ -114,8 +129,9 @@ def _residual_limit(seeds: Intersection, growing: GrowingSettings) -> float:
     return max(growing.max_residual_px, min(SEED_MEDIANS * typical, MAX_LIMIT_PX))
 
 
-def _front_from(state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts: int,
-                camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _front_from(
+    state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts: int, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The next cells to try, their starts and shapes in every view, and the depth that they should continue."""
     cells, parents = _next_front(state, fresh, grid, attempts)
     step = grid.xy(cells) - grid.xy(parents)
@@ -132,11 +148,26 @@ def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> tu
     return cells, start, seeds.shape[first], np.full(len(cells), np.nan)
 
 
-def _measure(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, xy: np.ndarray, start: np.ndarray,
-             shape: np.ndarray, matching: MatchingSettings) -> tuple[list[Matches], Intersection, np.ndarray]:
+def _measure(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    grid: TemplateGrid,
+    xy: np.ndarray,
+    start: np.ndarray,
+    shape: np.ndarray,
+    matching: MatchingSettings,
+) -> tuple[list[Matches], Intersection, np.ndarray]:
     views = [k for k in range(len(cameras)) if k != reference]
-    matched = match_patches(images[reference], xy, [images[k] for k in views], [start[:, k] for k in views], [shape[:, k] for k in views],
-                            matching, row_step=grid.rows.step)
+    matched = match_patches(
+        images[reference],
+        xy,
+        [images[k] for k in views],
+        [start[:, k] for k in views],
+        [shape[:, k] for k in views],
+        matching,
+        row_step=grid.rows.step,
+    )
     image_xy = np.full((len(xy), len(cameras), 2), np.nan)
     K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2, (len(xy), len(cameras), 1, 1))
     image_xy[:, reference] = xy + matched[0].offset
@@ -149,23 +180,39 @@ def _measure(images: Sequence[SplineImage], cameras: Sequence[Camera], reference
     return matched, point, cameras[reference].to_camera(point.xyz_m)[:, 2]
 
 
-def _acceptable(matched: Sequence[Matches], point: Intersection, depth: np.ndarray, parent_depth: np.ndarray, grid: TemplateGrid,
-                camera: Camera, growing: GrowingSettings, limit_px: float, foreground: Foreground) -> np.ndarray:
+def _acceptable(
+    matched: Sequence[Matches],
+    point: Intersection,
+    depth: np.ndarray,
+    parent_depth: np.ndarray,
+    grid: TemplateGrid,
+    camera: Camera,
+    growing: GrowingSettings,
+    limit_px: float,
+    foreground: Foreground,
+) -> np.ndarray:
     near, far = foreground.depth_range_m
     sigma = np.sqrt(np.nan_to_num(np.trace(point.covariance_m2, axis1=1, axis2=2), nan=0.0))
     across = depth * grid.spacing_px * np.sqrt(2) / camera.focal_px
     with np.errstate(invalid="ignore"):
         continues = ~(np.abs(depth - parent_depth) > growing.max_slope * across + NOISE_SIGMAS * sigma)  # NaN parents bind nothing
-        return (np.all([m.ok for m in matched], axis=0) & (point.rms_residual_px <= limit_px)
-                & (depth >= near) & (depth <= far) & continues & ~foreground.excludes(point.xyz_m))
+        return (
+            np.all([m.ok for m in matched], axis=0)
+            & (point.rms_residual_px <= limit_px)
+            & (depth >= near)
+            & (depth <= far)
+            & continues
+            & ~foreground.excludes(point.xyz_m)
+        )
 
 
 def _rows(m: Matches, rows: np.ndarray) -> Matches:
     return Matches(**{name: getattr(m, name)[rows] for name in Matches.__dataclass_fields__})
 
 
-def _store(state: _State, cells: np.ndarray, matched: Sequence[Matches], point: Intersection, good: np.ndarray, xy: np.ndarray,
-           reference: int) -> None:
+def _store(
+    state: _State, cells: np.ndarray, matched: Sequence[Matches], point: Intersection, good: np.ndarray, xy: np.ndarray, reference: int
+) -> None:
     views = [k for k in range(state.xy.shape[1]) if k != reference]
     state.accepted[cells] = True
     state.middle[cells, reference], state.xy[cells, reference] = xy, xy + matched[0].offset
@@ -197,7 +244,18 @@ def _next_front(state: _State, fresh: np.ndarray, grid: TemplateGrid, attempts: 
 
 def _field(state: _State, grid: TemplateGrid, limit_px: float) -> TripletField:
     cell = np.flatnonzero(state.accepted)
-    return TripletField(grid=grid, cell=cell, xy=state.xy[cell], shape=state.shape[cell], covariance=state.covariance[cell],
-                        correlation=state.correlation[cell], xyz_m=state.xyz[cell], covariance_m2=state.covariance_m2[cell],
-                        residual_px=state.residual[cell], sigma0=state.sigma0[cell],
-                        spread=state.spread[cell], limit_px=limit_px, tried=int((state.attempts > 0).sum()))
+    return TripletField(
+        grid=grid,
+        cell=cell,
+        xy=state.xy[cell],
+        shape=state.shape[cell],
+        covariance=state.covariance[cell],
+        correlation=state.correlation[cell],
+        xyz_m=state.xyz[cell],
+        covariance_m2=state.covariance_m2[cell],
+        residual_px=state.residual[cell],
+        sigma0=state.sigma0[cell],
+        spread=state.spread[cell],
+        limit_px=limit_px,
+        tried=int((state.attempts > 0).sum()),
+    )

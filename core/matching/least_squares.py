@@ -12,8 +12,8 @@ J = [fx, fx u, fx v, fy, fy u, fy v] of the template's gradients, r0 and r1 are 
     σ0² = |f̃|² (1 − ρ²) / (n − 8) ,   ρ = g̃·f̂ / |g̃| ,   K_c = σ0² A H⁻¹[d] Aᵀ             (4)
     o = Σ u |∇f|² / Σ |∇f|² ,   x_o = c + A o ,   K_o = σ0² A E H⁻¹ Eᵀ Aᵀ , E = [1 o] ⊗ I   (5)
 
-What was matched is the texture, so the point that is transferred with least bias is the gradients' centre of gravity o of the patch (Förstner 1984),
-not its middle: at the outline of a body it lies on the body, where the middle may lie on the background.
+What was matched is the texture, so the point that is transferred with least bias is the gradients' centre of gravity o of the patch
+(Förstner 1984), not its middle: at the outline of a body it lies on the body, where the middle may lie on the background.
 
 H belongs to the template alone, so it is built once; all patches of a chunk are arrays (N, n), and what has converged leaves the arrays.
 Coordinates are pixels of the images given (a field's rows count as rows).
@@ -45,8 +45,9 @@ class MatchingSettings:
 
     patch_px: int = knob(13, "Side of the square patch that is compared.", unit="px", low=5, high=51)
     max_iterations: int = knob(20, "Iterations before a patch is given up.", low=2, high=100)
-    converged_px: float = knob(0.01, "A patch has converged when it moves by less than this, or by a small part of its sigma.", unit="px",
-                               low=1e-4, high=0.5)
+    converged_px: float = knob(
+        0.01, "A patch has converged when it moves by less than this, or by a small part of its sigma.", unit="px", low=1e-4, high=0.5
+    )
     max_shift_px: float = knob(3.0, "Largest distance of the result from its start.", unit="px", low=0.5, high=20.0)
     max_sigma_px: float = knob(0.25, "Largest standard deviation of a matched position.", unit="px", low=0.01, high=2.0)
     min_correlation: float = knob(0.75, "Smallest correlation of the matched patches.", low=0.0, high=0.999)
@@ -102,9 +103,18 @@ def patch_offsets(patch_px: int, row_step: int) -> tuple[np.ndarray, np.ndarray,
     return u.ravel(), v.ravel(), (half_w, half_h)
 
 
-def match_patches(template: SplineImage, xy: np.ndarray, searches: Sequence[SplineImage], starts: Sequence[np.ndarray],
-                  shapes: Sequence[np.ndarray], settings: MatchingSettings, *, row_step: int = 1,
-                  template_shape: np.ndarray | None = None, monitor: Monitor | None = None) -> list[Matches]:
+def match_patches(
+    template: SplineImage,
+    xy: np.ndarray,
+    searches: Sequence[SplineImage],
+    starts: Sequence[np.ndarray],
+    shapes: Sequence[np.ndarray],
+    settings: MatchingSettings,
+    *,
+    row_step: int = 1,
+    template_shape: np.ndarray | None = None,
+    monitor: Monitor | None = None,
+) -> list[Matches]:
     """Find the patches about `xy` (N, 2) of the template image in each search image.
 
     `starts` are the approximate positions (N, 2) and `shapes` the approximate affine shapes (N, 2, 2), one of each per search image.
@@ -228,8 +238,17 @@ class _Templates:
         variance = self.contrast[rows].astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / max(1, self.n_pixels - PARAMETERS)
         return np.sqrt(variance * np.maximum(self.inverse[rows, 0, 0], self.inverse[rows, 3, 3]))
 
-    def _judge(self, image: SplineImage, start: np.ndarray, start_shape: np.ndarray, c: np.ndarray, A: np.ndarray, status: np.ndarray,
-               correlation: np.ndarray, iterations: np.ndarray) -> Matches:
+    def _judge(
+        self,
+        image: SplineImage,
+        start: np.ndarray,
+        start_shape: np.ndarray,
+        c: np.ndarray,
+        A: np.ndarray,
+        status: np.ndarray,
+        correlation: np.ndarray,
+        iterations: np.ndarray,
+    ) -> Matches:
         s = self._settings
         dof = max(1, self.n_pixels - PARAMETERS)
         lost = np.clip(1 - correlation**2, 0, 1)
@@ -240,13 +259,27 @@ class _Templates:
         K_o = variance[:, None, None] * (A @ transferred @ A.transpose(0, 2, 1))
         sigma0 = 50 * np.sqrt(lost * self.n_pixels / dof)
         sigma = np.sqrt(np.maximum(K[:, [0, 1], [0, 1]], 0)).max(axis=1)
-        for bad, why in ((np.abs(c - start).max(axis=1) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
-                         (~image.inside(c, np.array(self._half) * 0.5), MatchStatus.OUT_OF_IMAGE),
-                         (np.abs(A - start_shape).max(axis=(1, 2)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
-                         (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
-                         (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE), (sigma0 > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE)):
+        for bad, why in (
+            (np.abs(c - start).max(axis=1) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
+            (~image.inside(c, np.array(self._half) * 0.5), MatchStatus.OUT_OF_IMAGE),
+            (np.abs(A - start_shape).max(axis=(1, 2)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
+            (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
+            (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE),
+            (sigma0 > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE),
+        ):
             status[(status == MatchStatus.OK) & bad] = why
-        return Matches(xy=c, shape=A, covariance=K, offset=self.offset, spread=self.spread, transfer_covariance=K_o, sigma0=sigma0, correlation=correlation, iterations=iterations, status=status)
+        return Matches(
+            xy=c,
+            shape=A,
+            covariance=K,
+            offset=self.offset,
+            spread=self.spread,
+            transfer_covariance=K_o,
+            sigma0=sigma0,
+            correlation=correlation,
+            iterations=iterations,
+            status=status,
+        )
 
 
 def _warp(c: np.ndarray, A: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -273,5 +306,15 @@ def _compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray
 
 def _empty() -> Matches:
     z = np.zeros
-    return Matches(xy=z((0, 2)), shape=z((0, 2, 2)), covariance=z((0, 2, 2)), offset=z((0, 2)), spread=z((0, 2)),
-                   transfer_covariance=z((0, 2, 2)), sigma0=z(0), correlation=z(0), iterations=z(0, np.int16), status=z(0, np.int8))
+    return Matches(
+        xy=z((0, 2)),
+        shape=z((0, 2, 2)),
+        covariance=z((0, 2, 2)),
+        offset=z((0, 2)),
+        spread=z((0, 2)),
+        transfer_covariance=z((0, 2, 2)),
+        sigma0=z(0),
+        correlation=z(0),
+        iterations=z(0, np.int16),
+        status=z(0, np.int8),
+    )

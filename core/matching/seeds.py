@@ -39,8 +39,10 @@ class Approximations:
     depth_m: np.ndarray  # (M,) in the reference camera
 
 
-def approximations_at_depth(cameras: Sequence[Camera], reference: int, rows: RowGrid, xy: np.ndarray, depth_m: np.ndarray) -> Approximations:
-    """The plane-induced starts of points `xy` (M, 2) (rows' pixels of the reference) at depth (M,), for a plane that faces the reference camera."""
+def approximations_at_depth(
+    cameras: Sequence[Camera], reference: int, rows: RowGrid, xy: np.ndarray, depth_m: np.ndarray
+) -> Approximations:
+    """The starts of points `xy` (M, 2) (rows' pixels of the reference) at depth (M,), induced by planes that face the reference camera."""
     base = cameras[reference]
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     X = base.points_at_depth(rows.to_frame(xy[:, None, :] + corners), np.asarray(depth_m)[:, None])  # (M, 3, 3)
@@ -49,8 +51,17 @@ def approximations_at_depth(cameras: Sequence[Camera], reference: int, rows: Row
     return Approximations(xy=image[:, :, 0], shape=shape, depth_m=np.asarray(depth_m, dtype=np.float64))
 
 
-def sweep_seeds(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, settings: MatchingSettings, *,
-                spacing_px: int, depth_range_m: tuple[float, float] | None, monitor: Monitor) -> Approximations:
+def sweep_seeds(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    grid: TemplateGrid,
+    settings: MatchingSettings,
+    *,
+    spacing_px: int,
+    depth_range_m: tuple[float, float] | None,
+    monitor: Monitor,
+) -> Approximations:
     """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
 
     `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig.
@@ -90,8 +101,15 @@ def _inverse_depths(cameras: Sequence[Camera], reference: int, near: float, far:
     return np.linspace(1 / far, 1 / near, count)
 
 
-def _sweep_scores(images: Sequence[SplineImage], cameras: Sequence[Camera], reference: int, rows: RowGrid, settings: MatchingSettings,
-                  xy: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def _sweep_scores(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    rows: RowGrid,
+    settings: MatchingSettings,
+    xy: np.ndarray,
+    inverse: np.ndarray,
+) -> np.ndarray:
     """Smallest correlation over the search views (m, D), −1 where a view does not see the point.  (1)"""
     m, D = len(xy), len(inverse)
     u, v, half = patch_offsets(settings.patch_px, rows.step)
@@ -113,12 +131,16 @@ def _sweep_scores(images: Sequence[SplineImage], cameras: Sequence[Camera], refe
     return np.where(seen_by_all, total / views, -1.0)
 
 
-def _correlations(image: SplineImage, c: np.ndarray, A: np.ndarray, f: np.ndarray, owner: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _correlations(
+    image: SplineImage, c: np.ndarray, A: np.ndarray, f: np.ndarray, owner: np.ndarray, u: np.ndarray, v: np.ndarray
+) -> np.ndarray:
     rho = np.empty(len(c))
     for i in range(0, len(c), 16_384):
         s = slice(i, i + 16_384)
         c32, A32 = c[s].astype(np.float32), A[s].astype(np.float32)
-        g = _normalised(image.sample(c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v))
+        g = _normalised(
+            image.sample(c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v)
+        )
         rho[s] = np.einsum("ij,ij->i", g, f[owner[s]])
     return rho
 

@@ -42,7 +42,9 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         n, k = len(self.xyz_m), self.xy_px.shape[1]
-        for name, shape in dict(xyz_m=(n, 3), covariance_m2=(n, 3, 3), normals=(n, 3), intensity=(n,), xy_px=(n, k, 2), residual_px=(n,)).items():
+        for name, shape in dict(
+            xyz_m=(n, 3), covariance_m2=(n, 3, 3), normals=(n, 3), intensity=(n,), xy_px=(n, k, 2), residual_px=(n,)
+        ).items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
 
     @property
@@ -72,8 +74,15 @@ def point_cloud(field: TripletField, grey: np.ndarray, camera: Camera, reference
         if settings.correct_curvature:
             xyz, K = _corrected(field, surface, camera, reference)
     pixel = np.rint(field.xy[:, reference]).astype(int)
-    return PointCloud(frame=frame, xyz_m=xyz, covariance_m2=K, normals=normal, intensity=grey[pixel[:, 1], pixel[:, 0]],
-                      xy_px=field.grid.rows.to_frame(field.xy).reshape(n, k, 2), residual_px=field.residual_px)
+    return PointCloud(
+        frame=frame,
+        xyz_m=xyz,
+        covariance_m2=K,
+        normals=normal,
+        intensity=grey[pixel[:, 1], pixel[:, 0]],
+        xy_px=field.grid.rows.to_frame(field.xy).reshape(n, k, 2),
+        residual_px=field.residual_px,
+    )
 
 
 def _corrected(field: TripletField, surface: LocalSurface, camera: Camera, reference: int) -> tuple[np.ndarray, np.ndarray]:

@@ -2,8 +2,8 @@
 
     D(a, b) = D0 + Da a + Db b + ½ Daa a² + Dab a b + ½ Dbb b² ,   a, b in full-frame pixels of the reference image        (1)
 
-It gives the normal, tells points that disagree with their neighbours, and the curvature that an affine patch averages away: a patch is matched at
-the mean of (1) over its texture, so a round body is measured too flat; with the variances s_a², s_b² of the texture's energy in the patch
+It gives the normal, tells points that disagree with their neighbours, and the curvature that an affine patch averages away: a patch is
+matched at the mean of (1) over its texture, so a round body is measured too flat; with the variances s_a², s_b² of the texture's energy
 
     D0 − D̄ = −½ (Daa s_a² + Dbb s_b²)                                                                                       (2)
 """
@@ -44,12 +44,19 @@ def local_surface(field: TripletField, camera: Camera, reference: int) -> LocalS
     D = np.where(valid, depth[neighbour], 0.0)
     spacing_m = field.grid.spacing_px * depth / camera.focal_px
     weight = valid & (np.abs(D - depth[:, None]) < 3.0 * spacing_m[:, None] * np.hypot(a, b) / field.grid.spacing_px + spacing_m[:, None])
-    coefficients, scatter = _robust_quadric(a, b, RADIUS_CELLS * field.grid.spacing_px, D - depth[:, None], weight.astype(np.float64), MIN_SCALE * spacing_m)
+    coefficients, scatter = _robust_quadric(
+        a, b, RADIUS_CELLS * field.grid.spacing_px, D - depth[:, None], weight.astype(np.float64), MIN_SCALE * spacing_m
+    )
     step = field.grid.rows.step
     across = field.spread * (1.0, step**2)
-    return LocalSurface(depth_m=depth, fitted_m=depth + coefficients[:, 0], scatter_m=scatter, neighbours=weight.sum(axis=1) - 1,
-                        flattening_m=-0.5 * (coefficients[:, 3] * across[:, 0] + coefficients[:, 5] * across[:, 1]),  # (2)
-                        normal=_normals(field, camera, reference, depth, coefficients))
+    return LocalSurface(
+        depth_m=depth,
+        fitted_m=depth + coefficients[:, 0],
+        scatter_m=scatter,
+        neighbours=weight.sum(axis=1) - 1,
+        flattening_m=-0.5 * (coefficients[:, 3] * across[:, 0] + coefficients[:, 5] * across[:, 1]),  # (2)
+        normal=_normals(field, camera, reference, depth, coefficients),
+    )
 
 
 def _neighbourhoods(field: TripletField) -> np.ndarray:
@@ -63,8 +70,9 @@ def _neighbourhoods(field: TripletField) -> np.ndarray:
     return row_of[j[:, None] + dj, i[:, None] + di]
 
 
-def _robust_quadric(a: np.ndarray, b: np.ndarray, unit: float, D: np.ndarray, weight: np.ndarray,
-                    min_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _robust_quadric(
+    a: np.ndarray, b: np.ndarray, unit: float, D: np.ndarray, weight: np.ndarray, min_scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (N, 6) of (1) and the scatter (N,), by iteratively reweighted least squares (Tukey)."""
     scale = np.array([1, unit, unit, unit**2, unit**2, unit**2])
     basis = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=2) / scale  # (N, m, 6)

@@ -6,7 +6,8 @@
     spatial   least squares matching of the reference view's patch in the other views of frame i + 1          (4)
     verify    |x_s − x_t| ≤ max(0.5 px, 3 √(σ_s² + σ_t²)), else once more in a box twice as large, else stop  (5)
 
-Kept: the reference view's temporal result, elsewhere the mean of temporal and spatial weighted by their covariances; their rays' meeting point.
+Kept: the reference view's temporal result, elsewhere the mean of temporal and spatial weighted by their covariances; then the point
+where the rays meet.
 """
 
 from collections.abc import Sequence
@@ -33,12 +34,20 @@ class TrackingSettings:
     """How points are followed from frame to frame, and which trajectories are kept."""
 
     spacing_px: int = knob(8, "Distance between tracked points in the reference image.", unit="px", low=1, high=64)
-    box_px: int = knob(12, "Half size of the box that is searched about the predicted position; the second try has twice as much.",
-                       unit="px", low=2, high=64)
+    box_px: int = knob(
+        12,
+        "Half size of the box that is searched about the predicted position; the second try has twice as much.",
+        unit="px",
+        low=2,
+        high=64,
+    )
     min_correlation: float = knob(0.6, "Smallest correlation in the box.", low=0.0, high=0.99)
-    max_residual_px: float = knob(0.7, "Largest distance by which rays may miss, or what the calibration of the take needs.", unit="px",
-                                  low=0.05, high=10.0)
-    regenerate_every: int = knob(2, "Every so many frames, new points start where the surface has none (0: never).", unit="frames", low=0, high=1000)
+    max_residual_px: float = knob(
+        0.7, "Largest distance by which rays may miss, or what the calibration of the take needs.", unit="px", low=0.05, high=10.0
+    )
+    regenerate_every: int = knob(
+        2, "Every so many frames, new points start where the surface has none (0: never).", unit="frames", low=0, high=1000
+    )
     max_speed: float = knob(10.0, "Trajectories faster than this are cut.", unit="m/s", low=0.1, high=100.0)
     max_acceleration: float = knob(150.0, "Trajectories that accelerate more than this are cut.", unit="m/s²", low=1.0, high=10_000.0)
     min_length: int = knob(5, "Trajectories of fewer frames are removed.", unit="frames", low=2, high=1000)
@@ -90,9 +99,17 @@ class TrackingView:
     limit_px: float  # by which rays may miss
 
 
-def track_step(view: TrackingView, before: TrackedFrame | None, current: TrackedFrame, images: Sequence[SplineImage],
-               next_images: Sequence[SplineImage], next_grey: Sequence[np.ndarray], grey: Sequence[np.ndarray], frame: int,
-               monitor: Monitor) -> TrackedFrame:
+def track_step(
+    view: TrackingView,
+    before: TrackedFrame | None,
+    current: TrackedFrame,
+    images: Sequence[SplineImage],
+    next_images: Sequence[SplineImage],
+    next_grey: Sequence[np.ndarray],
+    grey: Sequence[np.ndarray],
+    frame: int,
+    monitor: Monitor,
+) -> TrackedFrame:
     """Follow all points of `current` to `frame`, whose images are `next_images` and `next_grey` (rows, float32)."""
     n = len(current.identity)
     predicted, known = _predict(current, before)
@@ -111,8 +128,16 @@ def track_step(view: TrackingView, before: TrackedFrame | None, current: Tracked
         if not len(rest):
             break
     kept = reason == TrackStatus.MEASURED
-    return TrackedFrame(frame=frame, identity=current.identity[kept], xy=result.xy[kept], shape=result.shape[kept], xyz_m=result.xyz_m[kept],
-                        covariance_m2=result.covariance_m2[kept], ended=current.identity[~kept], reason=reason[~kept])
+    return TrackedFrame(
+        frame=frame,
+        identity=current.identity[kept],
+        xy=result.xy[kept],
+        shape=result.shape[kept],
+        xyz_m=result.xyz_m[kept],
+        covariance_m2=result.covariance_m2[kept],
+        ended=current.identity[~kept],
+        reason=reason[~kept],
+    )
 
 
 def _predict(current: TrackedFrame, before: TrackedFrame | None) -> tuple[np.ndarray, np.ndarray]:
@@ -124,8 +149,16 @@ def _predict(current: TrackedFrame, before: TrackedFrame | None) -> tuple[np.nda
     return np.where(known[:, None], 2 * current.xyz_m - before.xyz_m[at], current.xyz_m), known
 
 
-def _attempt(view: TrackingView, points: TrackedFrame, predicted: np.ndarray, box: np.ndarray, images: Sequence[SplineImage],
-             next_images: Sequence[SplineImage], next_grey: Sequence[np.ndarray], grey: Sequence[np.ndarray]) -> tuple[TrackedFrame, np.ndarray]:
+def _attempt(
+    view: TrackingView,
+    points: TrackedFrame,
+    predicted: np.ndarray,
+    box: np.ndarray,
+    images: Sequence[SplineImage],
+    next_images: Sequence[SplineImage],
+    next_grey: Sequence[np.ndarray],
+    grey: Sequence[np.ndarray],
+) -> tuple[TrackedFrame, np.ndarray]:
     n, K = len(points.identity), len(view.cameras)
     status = np.full(n, TrackStatus.MEASURED, dtype=np.int8)
     start = np.empty((n, K, 2))
@@ -137,8 +170,9 @@ def _attempt(view: TrackingView, points: TrackedFrame, predicted: np.ndarray, bo
     temporal = _temporal(view, points, start, images, next_images, status)
     xy, covariance, shape = _verify(view, points, temporal, next_images, status)
     good = status == TrackStatus.MEASURED
-    point = forward_intersection(view.cameras, np.where(good[:, None, None], view.rows.to_frame(xy), np.nan),
-                                 view.rows.covariance_to_frame(covariance))
+    point = forward_intersection(
+        view.cameras, np.where(good[:, None, None], view.rows.to_frame(xy), np.nan), view.rows.covariance_to_frame(covariance)
+    )
     with np.errstate(invalid="ignore"):
         _mark(status, ~(point.rms_residual_px <= view.limit_px), TrackStatus.RAYS_MISS)
     return _tracked(points, xy, shape, point), status
@@ -148,8 +182,9 @@ def _mark(status: np.ndarray, bad: np.ndarray, why: TrackStatus) -> None:
     status[bad & (status == TrackStatus.MEASURED)] = why
 
 
-def _search_box(grey: np.ndarray, next_grey: np.ndarray, xy: np.ndarray, centre: np.ndarray, box: np.ndarray,
-                view: TrackingView) -> tuple[np.ndarray, np.ndarray]:
+def _search_box(
+    grey: np.ndarray, next_grey: np.ndarray, xy: np.ndarray, centre: np.ndarray, box: np.ndarray, view: TrackingView
+) -> tuple[np.ndarray, np.ndarray]:
     """Start positions (n, 2) where the patch correlates best within the box, and that correlation (n,).  (2)"""
     _, _, (w, h) = patch_offsets(view.matching.patch_px, view.rows.step)
     H, W = grey.shape
@@ -170,8 +205,14 @@ def _search_box(grey: np.ndarray, next_grey: np.ndarray, xy: np.ndarray, centre:
     return start, best
 
 
-def _temporal(view: TrackingView, points: TrackedFrame, start: np.ndarray, images: Sequence[SplineImage], next_images: Sequence[SplineImage],
-              status: np.ndarray) -> list[Matches]:
+def _temporal(
+    view: TrackingView,
+    points: TrackedFrame,
+    start: np.ndarray,
+    images: Sequence[SplineImage],
+    next_images: Sequence[SplineImage],
+    status: np.ndarray,
+) -> list[Matches]:
     """The patch of frame i found in frame i + 1, per view.  (3)"""
     eye = np.tile(np.eye(2), (len(start), 1, 1))
     matches = []
@@ -183,16 +224,24 @@ def _temporal(view: TrackingView, points: TrackedFrame, start: np.ndarray, image
     return matches
 
 
-def _verify(view: TrackingView, points: TrackedFrame, temporal: list[Matches], next_images: Sequence[SplineImage],
-            status: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _verify(
+    view: TrackingView, points: TrackedFrame, temporal: list[Matches], next_images: Sequence[SplineImage], status: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, covariances and shapes of frame i + 1 in every view, where spatial and temporal matching agree.  (4), (5)"""
     ref = view.reference
     others = [k for k in range(len(view.cameras)) if k != ref]
     good = status == TrackStatus.MEASURED
     centre = temporal[ref].xy
     starts = [np.where(good[:, None], temporal[k].xy, np.nan) for k in others]
-    spatial = match_patches(next_images[ref], centre, [next_images[k] for k in others], starts, [points.shape[:, k] for k in others],
-                            view.matching, row_step=view.rows.step)
+    spatial = match_patches(
+        next_images[ref],
+        centre,
+        [next_images[k] for k in others],
+        starts,
+        [points.shape[:, k] for k in others],
+        view.matching,
+        row_step=view.rows.step,
+    )
     xy = np.stack([m.xy for m in temporal], axis=1)
     covariance = np.stack([m.covariance for m in temporal], axis=1)
     shape = points.shape.copy()
@@ -216,8 +265,16 @@ def _weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray
 
 
 def _tracked(points: TrackedFrame, xy: np.ndarray, shape: np.ndarray, point: Intersection) -> TrackedFrame:
-    return TrackedFrame(frame=points.frame, identity=points.identity, xy=xy, shape=shape, xyz_m=point.xyz_m, covariance_m2=point.covariance_m2,
-                        ended=points.ended, reason=points.reason)
+    return TrackedFrame(
+        frame=points.frame,
+        identity=points.identity,
+        xy=xy,
+        shape=shape,
+        xyz_m=point.xyz_m,
+        covariance_m2=point.covariance_m2,
+        ended=points.ended,
+        reason=points.reason,
+    )
 
 
 def _replace_rows(all_rows: TrackedFrame, rows: np.ndarray, found: TrackedFrame, good: np.ndarray) -> TrackedFrame:

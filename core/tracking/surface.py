@@ -13,8 +13,16 @@ def start_tracks(field: TripletField, frame: int, settings: TrackingSettings) ->
     """The first tracked points: the measured surface, thinned to the tracking's spacing."""
     rows = _thinned(field, settings.spacing_px)
     none = np.zeros(0, dtype=np.int64)
-    return TrackedFrame(frame=frame, identity=np.arange(len(rows)), xy=field.xy[rows], shape=field.shape[rows], xyz_m=field.xyz_m[rows],
-                        covariance_m2=field.covariance_m2[rows], ended=none, reason=none.astype(np.int8))
+    return TrackedFrame(
+        frame=frame,
+        identity=np.arange(len(rows)),
+        xy=field.xy[rows],
+        shape=field.shape[rows],
+        xyz_m=field.xyz_m[rows],
+        covariance_m2=field.covariance_m2[rows],
+        ended=none,
+        reason=none.astype(np.int8),
+    )
 
 
 def regenerate(tracked: TrackedFrame, field: TripletField, reference: int, next_identity: int, settings: TrackingSettings) -> TrackedFrame:
@@ -29,8 +37,16 @@ def regenerate(tracked: TrackedFrame, field: TripletField, reference: int, next_
     def both(name: str) -> np.ndarray:
         return np.concatenate([getattr(tracked, name), getattr(field, name)[rows]])
 
-    return TrackedFrame(frame=tracked.frame, identity=np.concatenate([tracked.identity, identity]), xy=both("xy"), shape=both("shape"),
-                        xyz_m=both("xyz_m"), covariance_m2=both("covariance_m2"), ended=tracked.ended, reason=tracked.reason)
+    return TrackedFrame(
+        frame=tracked.frame,
+        identity=np.concatenate([tracked.identity, identity]),
+        xy=both("xy"),
+        shape=both("shape"),
+        xyz_m=both("xyz_m"),
+        covariance_m2=both("covariance_m2"),
+        ended=tracked.ended,
+        reason=tracked.reason,
+    )
 
 
 def _thinned(field: TripletField, spacing_px: int) -> np.ndarray:

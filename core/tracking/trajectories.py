@@ -79,8 +79,8 @@ def _longest_run(mask: np.ndarray) -> np.ndarray:
     """Of each column of mask (T, N), only its longest run of True (the first, where several are as long)."""
     T, N = mask.shape
     length = np.zeros((T + 1, N), dtype=np.int32)
-    for t in range(T):
-        length[t + 1] = (length[t] + 1) * mask[t]
+    for step in range(T):
+        length[step + 1] = (length[step] + 1) * mask[step]
     end, longest = length.argmax(axis=0), length.max(axis=0)
     t = np.arange(1, T + 1)[:, None]
     return (t <= end) & (t > end - longest)
@@ -94,4 +94,6 @@ def _with_kinematics(frames: np.ndarray, time_s: np.ndarray, xyz: np.ndarray, si
         forward, backward = np.concatenate([step, step[:1] * np.nan]), np.concatenate([step[:1] * np.nan, step])
         velocity = np.where(np.isnan(forward), backward, np.where(np.isnan(backward), forward, 0.5 * (forward + backward)))  # (1)
         acceleration = (forward - backward) / dt
-    return Trajectories(frames=frames, time_s=time_s, xyz_m=xyz, velocity_m_s=velocity, acceleration_m_s2=acceleration, sigma_m=sigma, status=status)
+    return Trajectories(
+        frames=frames, time_s=time_s, xyz_m=xyz, velocity_m_s=velocity, acceleration_m_s2=acceleration, sigma_m=sigma, status=status
+    )

@@ -1,0 +1,277 @@
+"""The `tricap` command: what a terminal and `blender --command tricap` offer. Commands that need Blender are joined in __main__.py.
+
+Exit codes: 0 done, 2 the input needs mending (one sentence on stderr), 130 cancelled (what is done is kept), 1 our bug (with a traceback).
+"""
+
+import argparse
+import json
+import shutil
+import signal
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from . import pipeline, store
+from .errors import InputError
+from .progress import Cancelled, Monitor
+from .take import open_take, read_take
+
+Adder = Callable[[Any], None]  # adds a sub-command to the parser; the command's `run(args, monitor)` gives the lines to show
+
+
+def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
+    """Run one command of the core, or of those that `adders` join; gives the exit code."""
+    parser = build_parser(adders)
+    args = parser.parse_args(argv)
+    args.parser = parser
+    monitor = Monitor(_progress_line if sys.stderr.isatty() and not args.quiet else None if args.quiet else _plain_progress())
+    try:
+        with _interrupts(monitor):
+            lines = args.run(args, monitor)
+    except InputError as error:
+        _say(f"tricap: {error}", sys.stderr)
+        return 2
+    except Cancelled as stop:
+        _say(f"tricap: {stop}", sys.stderr)
+        return 130
+    if not args.quiet:
+        for line in lines:
+            _say(line, sys.stdout)
+    return 0
+
+
+def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
+    """The parser with all commands."""
+    parser = argparse.ArgumentParser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _new_command(commands)
+    _stage_command(commands, "seeds", "show the depth and number of the surface seeds that are found", _seeds, out=False)
+    _stage_command(commands, "measure", "the surface of each frame", _stages("measure"))
+    _stage_command(commands, "track", "trajectories of the surface's points", _stages("measure", "track"))
+    _stage_command(commands, "fit", "the body's shape and motion", _stages("measure", "track", "fit"))
+    everything = _stage_command(commands, "run", "all of it, from the images to the Blender file; a stopped run goes on", _run)
+    everything.add_argument("--restart", action="store_true", help="begin anew instead of going on")
+    demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")
+    demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
+    demo.set_defaults(run=_demo, json=False)
+    for add in adders:
+        add(commands)
+    for sub in commands.choices.values():
+        sub.add_argument("--quiet", action="store_true", help="say nothing but errors")
+    return parser
+
+
+def _new_command(commands: Any) -> None:
+    new = commands.add_parser("new", help="make a take of movies or image folders")
+    new.add_argument("take", type=Path, metavar="TAKE", help="the folder to make")
+    new.add_argument("--views", nargs="+", required=True, metavar="NAME=FILE", help="movies or image folders, in the order of the cameras")
+    new.add_argument("--interlaced", choices=("none", "odd", "even"), default="none", help="which lines to keep of interlaced video")
+    new.add_argument("--fps", type=float, default=25.0, metavar="F", help="frames per second")
+    new.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml to copy into the take")
+    new.add_argument("--model", default=None, metavar="NAME", help="body model, such as arm.R")
+    new.set_defaults(run=_new)
+
+
+def _stage_command(commands: Any, name: str, about: str, action: Callable[..., list[str]], *, out: bool = True) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=about, description=about[0].upper() + about[1:])
+    parser.add_argument("take", type=Path, metavar="TAKE", help="folder with take.toml")
+    if out:
+        parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results")
+        parser.add_argument("--json", action="store_true", help="print run.json at the end")
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
+    parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
+    parser.set_defaults(run=action)
+    return parser
+
+
+def _stages(*names: str) -> Callable[[argparse.Namespace, Monitor], list[str]]:
+    def action(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+        job = pipeline.open_run(args.take, args.out, _overrides(args.set), _frames(args.frames))
+        for name in names:
+            getattr(pipeline, name)(job, monitor)
+        return _summary(job, args.json)
+
+    return action
+
+
+def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    job = pipeline.run(args.take, args.out, _overrides(args.set), monitor, restart=args.restart, frames=_frames(args.frames))
+    scene = _build_scene(job, args.parser, monitor)
+    return _summary(job, args.json) + ([] if args.json else scene)
+
+
+def _build_scene(job: pipeline.Run, parser: argparse.ArgumentParser, monitor: Monitor) -> list[str]:
+    """body.blend, through the command `scene` of the add-on where there is a Blender."""
+    blend = job.results.path("body.blend")
+    try:
+        args = parser.parse_args(["scene", str(job.results.folder), "--blend", str(blend)])
+        return [str(line) for line in args.run(args, monitor)]
+    except InputError as error:
+        job.warn(f"No body.blend was written: {error}")
+        job.results.write_run(job.account)
+    return []
+
+
+def _summary(job: pipeline.Run, as_json: bool) -> list[str]:
+    if as_json:
+        return [json.dumps(job.results.read_run(), indent=1, ensure_ascii=False)]
+    return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in job.account["warnings"])]
+
+
+def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    from .measuring import first_seeds
+
+    footage = open_take(read_take(args.take))
+    settings = pipeline.settings_of(footage.take.settings, _overrides(args.set), str(args.take))
+    frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
+    where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor)
+    near, far = where.depth_range_m
+    return [
+        f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (from {where.method}), "
+        f"{len(footage.take.seeds.joints)} clicked joints, {len(where.planes)} planes of the room left out."
+    ]
+
+
+def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Make TAKE with take.toml; footage outside the folder is linked into it, or copied where links cannot be made."""
+    folder: Path = args.take
+    if (folder / "take.toml").exists():
+        raise InputError(f"{folder} is a take already; choose another folder.")
+    views = [tuple(v.split("=", 1)) for v in args.views]
+    if any(len(v) != 2 or not all(v) for v in views):
+        raise InputError("Write each view as NAME=FILE, such as L=left.mp4.")
+    lines = ['format = "tricap-take"', "version = 1", f"fps = {args.fps!r}", f'interlaced = "{args.interlaced}"', 'rig = "rig.toml"', ""]
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, source in views:
+        lines += ["[[views]]", f'name = "{name}"', _linked(folder, name, Path(source)), ""]
+    if args.rig:
+        store.write_bytes(folder / "rig.toml", _read(args.rig))
+    if args.model:
+        lines += ["[body]", f'model = "{args.model}"', ""]
+    text = "\n".join(lines)
+    tomllib.loads(text)
+    store.write_text(folder / "take.toml", text)
+    rig = "" if args.rig else " Copy or calibrate rig.toml into it."
+    return [f"{folder}: a take of {len(views)} views.{rig}"]
+
+
+def _linked(folder: Path, name: str, source: Path) -> str:
+    if not source.exists():
+        raise InputError(f"The footage {source} of view {name} is missing; check the path.")
+    if source.is_dir():
+        endings = sorted({p.suffix for p in source.iterdir() if p.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")})
+        if len(endings) != 1:
+            raise InputError(
+                f"The folder {source} of view {name} holds {'no images' if not endings else 'images of several kinds'}; it needs one kind."
+            )
+        _link(folder / name, source)
+        return f'images = "{name}/*{endings[0]}"'
+    _link(folder / f"{name}{source.suffix}", source)
+    return f'movie = "{name}{source.suffix}"'
+
+
+def _link(target: Path, source: Path) -> None:
+    if target.exists():
+        return
+    try:
+        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
+    except OSError:
+        (shutil.copytree if source.is_dir() else shutil.copy2)(source, target)
+
+
+def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Make the synthetic arm, run everything, and compare with the truth."""
+    from .synthetic.arm import make_arm_take
+    from .synthetic.score import score_run
+
+    take, out = args.out / "take", args.out
+    if not (take / "take.toml").exists():
+        make_arm_take(take, monitor=monitor)
+    job = pipeline.run(take, out, None, monitor)
+    lines = _build_scene(job, args.parser, monitor)
+    return [
+        str(job),
+        *lines,
+        "Measured against the truth of the recording:",
+        str(score_run(take, out, monitor)),
+        f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}   Blender file: {out / 'body.blend'}",
+    ]
+
+
+def _overrides(pairs: list[str]) -> dict[str, dict[str, Any]]:
+    """--set GROUP.NAME=VALUE as tables; values are read as TOML, plain words as text."""
+    tables: dict[str, dict[str, Any]] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        group, dot, knob = name.partition(".")
+        if not equals or not dot:
+            raise InputError(f"--set {pair} cannot be read; write GROUP.NAME=VALUE, such as matching.patch_px=17.")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        tables.setdefault(group, {})[knob] = value
+    return tables
+
+
+def _frames(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    if not colon or not first.isdigit() or not last.isdigit():
+        raise InputError(f"--frames {text} cannot be read; write the first frame and one after the last, such as 0:40.")
+    return int(first), int(last)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
+
+
+@contextmanager
+def _interrupts(monitor: Monitor) -> Iterator[None]:
+    """Ctrl-C cancels at the next step instead of breaking off anywhere."""
+    try:
+        before = signal.getsignal(signal.SIGINT)
+
+        def stop(number: int, frame: Any) -> None:
+            monitor.cancel()
+            signal.signal(signal.SIGINT, before)  # a second Ctrl-C breaks off at once
+
+        signal.signal(signal.SIGINT, stop)
+    except ValueError:  # not the main thread: somebody else owns the signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _progress_line(stage: str, done: float, total: float) -> None:
+    part = min(1.0, done / total) if total else 1.0
+    sys.stderr.write(f"\r{stage:<24} [{'#' * round(30 * part):<30}] {100 * part:3.0f} %" + ("\n" if part >= 1 else ""))
+    sys.stderr.flush()
+
+
+def _plain_progress() -> Callable[[str, float, float], None]:
+    """A line per tenth of a stage."""
+    last: dict[str, int] = {}
+
+    def report(stage: str, done: float, total: float) -> None:
+        tenth = int(10 * done / total) if total else 10
+        if last.get(stage) != tenth:
+            last[stage] = tenth
+            _say(f"{stage}: {10 * tenth} %", sys.stderr)
+
+    return report
+
+
+def _say(text: str, stream: Any) -> None:
+    stream.write(text + "\n")
+    stream.flush()

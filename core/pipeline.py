@@ -1,0 +1,320 @@
+"""The stages of a run, each a page: measure → track → fit → (scene, in Blender). What a run did stands in run.json.
+
+Every stage asks the stages before it for their results; what is checkpointed is not computed again, so a stopped run goes on where it was.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import store
+from .body.shape import write_body
+from .body.skin import SkinSettings, limb_skin
+from .errors import InputError
+from .fitting.body_motion import BodyFit
+from .fitting.sequence import fit_sequence
+from .fitting.settings import FitSettings
+from .following import track_frames
+from .matching.growing import GrowingSettings
+from .matching.least_squares import MatchingSettings
+from .measuring import MeasuredFrame, clicked_depth, measure_frames
+from .motion.ply import write_mesh
+from .motion.tables import write_joints, write_motion
+from .progress import Cancelled, Monitor
+from .report.pages import write_report
+from .results import Results
+from .settings import from_table, nearest_name, to_table
+from .surface.cloud import PointCloud, SurfaceSettings
+from .take import Footage, open_take, read_take
+from .tracking.step import TrackedFrame, TrackingSettings
+from .tracking.trajectories import Trajectories, assemble, filter_by_thresholds
+
+SETTINGS: dict[str, type] = {
+    "matching": MatchingSettings,
+    "growing": GrowingSettings,
+    "surface": SurfaceSettings,
+    "tracking": TrackingSettings,
+    "fitting": FitSettings,
+    "skin": SkinSettings,
+}
+Overrides = Mapping[str, Mapping[str, Any]]
+DOUBTFUL_RESIDUAL_PX = 1.0
+
+
+@dataclass(kw_only=True)
+class Run:
+    """A run under way: an opened take, its settings, and the folder for its results. `account` becomes run.json."""
+
+    footage: Footage
+    settings: dict[str, Any]
+    results: Results
+    account: dict[str, Any] = field(default_factory=dict)
+    measured: list[MeasuredFrame] = field(default_factory=list)
+    trajectories: Trajectories | None = None
+    body: BodyFit | None = None
+
+    @property
+    def clouds(self) -> list[PointCloud]:
+        """The clouds in the order of time."""
+        return [m.cloud for m in self.measured]
+
+    def warn(self, sentence: str) -> None:
+        """Note something that the user should know."""
+        if sentence not in self.account["warnings"]:
+            self.account["warnings"].append(sentence)
+
+    def finish_stage(self, stage: str, began: float, **figures: Any) -> None:
+        """Note what a stage took and found, and write run.json."""
+        self.account["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), **figures}
+        self.results.write_run(self.account)
+
+    def __str__(self) -> str:
+        """One line for a panel."""
+        stages = self.account["stages"]
+        parts = [f"{len(self.measured)} frames"]
+        if "measure" in stages:
+            parts.append(f"{stages['measure']['points_per_frame']:.0f} points a frame (sigma {stages['measure']['sigma_mm']:.2f} mm)")
+        if "track" in stages:
+            parts.append(f"{stages['track']['trajectories']} trajectories")
+        if "fit" in stages and "not_done" not in stages["fit"]:
+            parts.append("body fitted")
+        return ", ".join(parts)
+
+
+def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> dict[str, Any]:
+    """All settings of a run: the defaults, then take.toml's, then the command's or the panel's.
+
+    Raises:
+        InputError: an unknown table or name, or a value that cannot be.
+    """
+    groups: dict[str, dict[str, Any]] = {name: {} for name in SETTINGS}
+    for source, label in ((take_settings, where), (overrides, "the settings")):
+        for name, table in source.items():
+            if name not in SETTINGS:
+                raise InputError(f"{label} has no group of settings “{name}”.{nearest_name(name, list(SETTINGS))}")
+            groups[name].update(table)
+    return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
+
+
+def open_run(take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None) -> Run:
+    """Open a take and the folder for its results. Everything that can be checked before computing is checked here.
+
+    Raises:
+        InputError: the take, the rig, the settings or the folder need mending.
+    """
+    take = read_take(take_folder)
+    settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
+    footage = open_take(take)
+    if frames is not None:
+        if frames[0] not in footage.frames or frames[1] - 1 not in footage.frames or frames[0] >= frames[1]:
+            raise InputError(
+                f"Frames {frames[0]}:{frames[1]} are not among the take's frames {footage.frames.start}:{footage.frames.stop}; "
+                "choose others."
+            )
+        footage = Footage(take=take, rig=footage.rig, sequences=footage.sequences, frames=range(*frames))
+    for name, at in take.seeds.joints.items():
+        clicked_depth(footage, name, at)
+    results = Results(out)
+    before = results.read_run()
+    account = {
+        "take": str(take.folder),
+        "frames": [footage.frames.start, footage.frames.stop],
+        "fps": take.fps,
+        "interlaced": take.interlaced,
+        "views": [v.name for v in take.views],
+        "reference_view": take.reference_view,
+        "model": take.body_model,
+        "settings": {name: to_table(value) for name, value in settings.items()},
+        "inputs": {"take.toml": store.digest(take.folder / "take.toml"), take.rig_path.name: store.digest(take.rig_path)},
+        "rig": {k: v for k, v in footage.rig.metadata.items() if isinstance(v, (str, int, float))},
+        "stages": before.get("stages", {}),
+        "warnings": [],
+    }
+    return Run(footage=footage, settings=settings, results=results, account=account)
+
+
+def measure(run: Run, monitor: Monitor) -> None:
+    """The surface of every frame: clouds/NNNN.ply.
+
+    Raises:
+        InputError: the footage cannot be read, or nothing can be measured.
+        Cancelled: the frames measured so far are kept.
+    """
+    began, s = time.perf_counter(), run.settings
+    _forget_other_clouds(run)
+    done = []
+    try:
+        for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor):
+            run.results.write_cloud(m.cloud)
+            done.append(m)
+    except Cancelled as stop:
+        raise Cancelled(
+            f"Stopped: the surface of {len(done)} of {len(run.footage.frames)} frames is kept; the same command goes on from there."
+        ) from stop
+    run.measured = sorted(done, key=lambda m: m.frame)
+    points, residual = [len(m.cloud.xyz_m) for m in run.measured], _median([m.cloud.residual_px for m in run.measured])
+    empty = [m.frame for m in run.measured if not len(m.cloud.xyz_m)]
+    if empty:
+        run.warn(f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}.")
+    if residual > DOUBTFUL_RESIDUAL_PX:
+        run.warn(
+            f"The rays of matched points miss each other by {residual:.1f} px: "
+            "does rig.toml belong to this recording, and were the views in step?"
+        )
+    run.finish_stage(
+        "measure",
+        began,
+        frames=len(points),
+        points_per_frame=float(np.mean(points)),
+        residual_px=residual,
+        sigma_mm=1e3 * _median([m.cloud.sigma_m for m in run.measured]),
+        foreground=done[0].foreground.method,
+        background_planes=len(done[0].foreground.planes),
+    )
+
+
+def track(run: Run, monitor: Monitor) -> None:
+    """The trajectories of the surface's points: trajectories.npz. Measures first where that is needed.
+
+    Raises:
+        InputError: see `measure`.
+        Cancelled: what is done is kept.
+    """
+    if not run.measured:
+        measure(run, monitor)
+    began, s = time.perf_counter(), run.settings
+    steps: list[TrackedFrame] = []
+    try:
+        steps.extend(track_frames(run.footage, run.measured, s["matching"], s["tracking"], run.results, monitor))
+    except Cancelled as stop:
+        raise Cancelled(
+            "Stopped: the surface of all frames is kept, and the tracks as far as they are; the same command goes on from there."
+        ) from stop
+    raw = assemble(steps, run.footage.take.fps)
+    run.trajectories = filter_by_thresholds(raw, s["tracking"])
+    run.results.write_trajectories(run.trajectories, {"format": "tricap-trajectories", "version": 1, "fps": run.footage.take.fps})
+    seen = run.trajectories.seen
+    run.finish_stage(
+        "track",
+        began,
+        started=int(raw.seen.shape[1]),
+        trajectories=int(seen.shape[1]),
+        points_per_frame=float(seen.sum(axis=1).mean()),
+        mean_length_frames=float(seen.sum(axis=0).mean()) if seen.shape[1] else 0.0,
+        sigma_mm=1e3 * _median([run.trajectories.sigma_m[seen]]),
+    )
+
+
+def fit(run: Run, monitor: Monitor) -> None:
+    """The body's shape and motion: body.toml, joints.csv, motion.csv, skin/. Measures and tracks first where that is needed.
+
+    A take without a model or clicked joints has no body; run.json says so.
+
+    Raises:
+        InputError: the clicks contradict each other, or the limb has no points.
+        Cancelled: surface and tracks are kept.
+    """
+    if run.trajectories is None:
+        track(run, monitor)
+    began, take = time.perf_counter(), run.footage.take
+    run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
+    missing = "no [body] model" if take.body_model is None else "no clicked joints" if not take.seeds.joints else ""
+    if missing:
+        run.warn(f"No body was fitted: take.toml has {missing}.")
+        run.finish_stage("fit", began, not_done=missing)
+        return
+    time_s = np.array([m.frame for m in run.measured]) / take.fps
+    try:
+        body = fit_sequence(
+            run.footage.rig,
+            str(take.body_model),
+            run.clouds,
+            {name: {view: xy.tolist() for view, xy in at.items()} for name, at in take.seeds.joints.items()},
+            take.seeds.frame,
+            time_s,
+            run.trajectories,  # type: ignore[arg-type]
+            run.settings["fitting"],
+            monitor,
+        )
+        run.body = body
+        _write_body(run, body, monitor)
+    except Cancelled as stop:
+        run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
+        raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop
+    states = {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
+    if set(states) - {"fitted"}:
+        run.warn(
+            "Frames in which the body rests partly on prediction: "
+            + ", ".join(f"{n} {w}" for w, n in states.items() if w != "fitted")
+            + "."
+        )
+    run.finish_stage(
+        "fit",
+        began,
+        frames=states,
+        iterations=body.iterations,
+        converged=body.converged,
+        sigma0=_median([body.motion.sigma0]),
+        joint_sigma_mm=1e3 * _median([body.motion.joint_sigma_m.ravel()]),
+    )
+
+
+def report(run: Run, monitor: Monitor) -> None:
+    """report/report.html with its pictures."""
+    began = time.perf_counter()
+    write_report(run.results, run.footage, run.account, run.clouds, run.trajectories, run.body, monitor)
+    run.finish_stage("report", began)
+
+
+def run(
+    take_folder: Path,
+    out: Path,
+    overrides: Overrides | None = None,
+    monitor: Monitor | None = None,
+    *,
+    restart: bool = False,
+    frames: tuple[int, int] | None = None,
+) -> Run:
+    """Everything that needs no Blender, from the images to the report. A stopped run goes on where it was; `restart` begins anew.
+
+    Raises:
+        InputError: something of the input needs mending; nothing that was computed is lost.
+        Cancelled: what is done is kept.
+    """
+    monitor = monitor or Monitor()
+    job = open_run(take_folder, out, overrides, frames)
+    if restart:
+        job.results.remove("cache")
+        job.account["stages"] = {}
+    for stage in (measure, track, fit, report):
+        stage(job, monitor)
+    return job
+
+
+def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
+    skins = []
+    for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
+        monitor.step("skin", i, len(body.motion.frames))
+        skins.append((int(frame), limb_skin(body.shape, values, run.settings["skin"])))
+    for frame, skin in skins:
+        write_mesh(run.results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)
+    write_joints(run.results.path("joints.csv"), body.motion)
+    write_motion(run.results.path("motion.csv"), body.motion, body.shape.skeleton)
+    write_body(run.results.path("body.toml"), body.shape)
+
+
+def _forget_other_clouds(run: Run) -> None:
+    """Remove clouds of frames that this run does not have, and what an earlier run made of other clouds."""
+    for path in run.results.path("clouds").glob("*.ply"):
+        if not path.stem.isdigit() or int(path.stem) not in run.footage.frames:
+            path.unlink()
+
+
+def _median(parts: list[np.ndarray]) -> float:
+    values = np.concatenate([np.asarray(p, dtype=np.float64).ravel() for p in parts]) if parts else np.zeros(0)
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else 0.0

@@ -1,0 +1,59 @@
+"""Curves over the frames as SVG, with a band of one sigma."""
+
+import html
+from collections.abc import Mapping
+
+import numpy as np
+
+WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 520, 170, 56, 26, 26
+COLOURS = ("#c0392b", "#2471a3", "#1e8449")
+
+
+def curve_graph(title: str, unit: str, frames: np.ndarray, curves: Mapping[str, np.ndarray], sigma: np.ndarray | None = None) -> str:
+    """One graph; NaN interrupts a curve. `sigma` is the band of the first curve."""
+    values = np.concatenate([c for c in curves.values()])
+    first = next(iter(curves.values()))
+    if sigma is not None:
+        values = np.concatenate([values, first + sigma, first - sigma])
+    values = values[np.isfinite(values)]
+    if not len(values) or not len(frames):
+        return ""
+    low, high = float(values.min()), float(values.max())
+    pad = 0.08 * (high - low) or max(abs(high), 1.0) * 0.1
+    low, high = low - pad, high + pad
+    x = LEFT + (WIDTH - LEFT - 10) * (frames - frames[0]) / max(1, frames[-1] - frames[0])
+
+    def y(value: np.ndarray | float) -> np.ndarray:
+        return TOP + (HEIGHT - TOP - BOTTOM) * (high - np.asarray(value)) / (high - low)
+
+    parts = [
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" xmlns="http://www.w3.org/2000/svg" font-family="sans-serif" font-size="11">',
+        f'<text x="{LEFT}" y="15" font-size="13">{html.escape(title)}{f" [{html.escape(unit)}]" if unit else ""}</text>',
+    ]
+    for value in np.linspace(low + pad, high - pad, 3):
+        parts.append(
+            f'<line x1="{LEFT}" x2="{WIDTH - 10}" y1="{y(value):.1f}" y2="{y(value):.1f}" stroke="#ddd"/>'
+            f'<text x="{LEFT - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value:.4g}</text>'
+        )
+    parts += [
+        f'<text x="{LEFT}" y="{HEIGHT - 8}">frame {frames[0]}</text>',
+        f'<text x="{WIDTH - 10}" y="{HEIGHT - 8}" text-anchor="end">{frames[-1]}</text>',
+    ]
+    if sigma is not None:
+        for px, c, s in _runs(x, first, sigma):
+            band = _points(np.concatenate([px, px[::-1]]), np.concatenate([y(c + s), y(c - s)[::-1]]))
+            parts.append(f'<polygon points="{band}" fill="{COLOURS[0]}" opacity="0.18"/>')
+    for (_, curve), stroke in zip(curves.items(), COLOURS):
+        parts += [f'<polyline points="{_points(px, y(c))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>' for px, c in _runs(x, curve)]
+    return "".join(parts) + "</svg>"
+
+
+def _runs(x: np.ndarray, *curves: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+    """The stretches in which all curves are finite."""
+    finite = np.isfinite(np.stack(curves)).all(axis=0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], finite, [False]]).astype(int)))
+    return [(x[a:b], *(c[a:b] for c in curves)) for a, b in zip(edges[::2], edges[1::2])]
+
+
+def _points(x: np.ndarray, y: np.ndarray) -> str:
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y))

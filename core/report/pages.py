@@ -1,0 +1,148 @@
+"""report/report.html: one page that needs nothing beside it, and its pictures as files."""
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .. import store
+from ..body.skin import SkinSettings
+from ..fitting.body_motion import BodyFit
+from ..progress import Monitor
+from ..results import Results
+from ..surface.cloud import PointCloud
+from ..take import Footage
+from ..tracking.trajectories import Trajectories
+from . import pictures
+from .graphs import curve_graph
+
+STYLE = (
+    "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}img,svg{max-width:100%}"
+    "table{border-collapse:collapse}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #ddd}"
+    ".note{background:#fff3d0;padding:.4em .8em}pre{white-space:pre-wrap}"
+)
+LABELS = {
+    "points_per_frame": "points a frame",
+    "residual_px": "rays miss by [px], median",
+    "sigma_mm": "sigma of a position [mm], median",
+    "joint_sigma_mm": "sigma of a joint's coordinate [mm], median",
+    "mean_length_frames": "mean length [frames]",
+}
+
+
+def write_report(
+    results: Results,
+    footage: Footage,
+    account: Mapping[str, Any],
+    clouds: Sequence[PointCloud],
+    trajectories: Trajectories | None,
+    body: BodyFit | None,
+    monitor: Monitor,
+) -> None:
+    """Write the page and its pictures. Cancelling leaves the report of the run before."""
+    files = _pictures(footage, account, clouds, trajectories, body, monitor)
+    graphs = _graphs(clouds, trajectories, body)
+    page = _page(account, files, graphs)
+    results.remove("report")
+    for name, (_, data) in files.items():
+        store.write_bytes(results.path("report", name), data)
+    store.write_text(results.path("report", "report.html"), page)
+
+
+def _pictures(
+    footage: Footage,
+    account: Mapping[str, Any],
+    clouds: Sequence[PointCloud],
+    trajectories: Trajectories | None,
+    body: BodyFit | None,
+    monitor: Monitor,
+) -> dict[str, tuple[str, bytes]]:
+    """File name → (caption, PNG), for the first, a middle and the last frame."""
+    ref, found = footage.take.reference, {}
+    camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
+    chosen = sorted({0, len(clouds) // 2, len(clouds) - 1})
+    skin = SkinSettings(**account["settings"]["skin"])
+    for done, i in enumerate(chosen):
+        monitor.step("report", done, len(chosen))
+        cloud = clouds[i]
+        images = footage.read(cloud.frame)
+        sigma = 1e3 * cloud.sigma_m
+        high = float(np.percentile(sigma, 95)) if len(sigma) else 1.0
+        found[f"surface_{cloud.frame:04d}.png"] = (
+            f"Frame {cloud.frame}, view {view}: {len(sigma)} measured points, sigma from 0 (blue) to {high:.2f} mm (red)",
+            pictures.png(pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high)),
+        )
+        found[f"cloud_{cloud.frame:04d}.png"] = (
+            f"Frame {cloud.frame}: the cloud from the front and from its right side",
+            pictures.png(pictures.cloud_views(cloud, camera, account["settings"]["growing"]["spacing_px"])),
+        )
+        if trajectories is not None:
+            found[f"tracks_{cloud.frame:04d}.png"] = (
+                f"Frame {cloud.frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast",
+                pictures.png(pictures.tracks_over_footage(images[ref], camera, trajectories, i)),
+            )
+        if body is not None:
+            for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
+                found[f"body_{cloud.frame:04d}_{name}.png"] = (
+                    f"Frame {cloud.frame}, view {name}: the fitted body",
+                    pictures.png(pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin)),
+                )
+    return found
+
+
+def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None) -> list[str]:
+    frames = np.array([c.frame for c in clouds])
+    graphs = [
+        curve_graph("Measured points", "", frames, {"points": np.array([float(len(c.xyz_m)) for c in clouds])}),
+        curve_graph("Residual of the rays (median)", "px", frames, {"residual": _medians([c.residual_px for c in clouds])}),
+        curve_graph("Sigma of the points (median)", "mm", frames, {"sigma": 1e3 * _medians([c.sigma_m for c in clouds])}),
+    ]
+    if trajectories is not None:
+        graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.seen.sum(axis=1).astype(float)}))
+    if body is not None:
+        angles = [i for i, dof in enumerate(body.shape.skeleton.dofs) if i not in set(body.shape.skeleton.layout.set("base").tolist())]
+        for i in angles:
+            name = body.motion.dof_names[i]
+            graphs.append(
+                curve_graph(
+                    name, "°", body.motion.frames, {name: np.degrees(body.motion.values[:, i])}, np.degrees(body.motion.sigma[:, i])
+                )
+            )
+    return graphs
+
+
+def _page(account: Mapping[str, Any], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
+    notes = "".join(f'<p class="note">{html.escape(w)}</p>' for w in account["warnings"])
+    stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in account["stages"].items())
+    shown = "".join(
+        f'<figure><img alt="" src="data:image/png;base64,{base64.b64encode(data).decode()}"><figcaption>{html.escape(caption)}'
+        "</figcaption></figure>"
+        for caption, data in files.values()
+    )
+    settings = html.escape(
+        "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in account["settings"].items())
+    )
+    take = html.escape(account["take"].rsplit("/", 1)[-1])
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tricap: {take}</title><style>{STYLE}</style><h1>{take}</h1>'
+        f"<p>{len(account['views'])} views ({html.escape(', '.join(account['views']))}), "
+        f"frames {account['frames'][0]} to {account['frames'][1] - 1}, {account['fps']:g} frames/s, "
+        f"interlaced: {account['interlaced']}</p>{notes}<h2>Stages</h2><table>{stages}</table>"
+        f"<h2>Over time</h2>{''.join(graphs)}<h2>Pictures</h2>{shown}<h2>Settings</h2><pre>{settings}</pre></html>\n"
+    )
+
+
+def _figures(figures: Mapping[str, Any]) -> str:
+    said = []
+    for name, value in figures.items():
+        text = (
+            f"{value:.3g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:.0f}" if isinstance(value, float) else str(value)
+        )
+        said.append(f"{html.escape(LABELS.get(name, name.replace('_', ' ')))}: {html.escape(text)}")
+    return "; ".join(said)
+
+
+def _medians(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.array([float(np.median(p)) if len(p) else np.nan for p in parts])

@@ -1,0 +1,112 @@
+"""Pictures of a run: the fitted body over the footage, trajectories over the footage, the cloud from the front and from the side."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from ..body.shape import BodyShape
+from ..body.skeleton import joint_positions
+from ..body.skin import SkinSettings, limb_skin
+from ..geometry.camera import Camera
+from ..geometry.raster import shade
+from ..surface.cloud import PointCloud
+from ..tracking.trajectories import Trajectories
+
+SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
+BONE_COLOUR, JOINT_COLOUR = (60, 60, 230), (40, 220, 255)
+OPACITY = 0.55
+PANEL_PX = 480
+TAIL_FRAMES = 10
+
+
+def body_over_footage(grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> np.ndarray:
+    """The skin of one posture, shaded, with its bones, over one view (h, w, 3) uint8. `values` (D,) are the posture's DOFs."""
+    skin = limb_skin(shape, values, settings)
+    picture = colour(grey).astype(np.float32)
+    light, covered = shade(camera, skin.vertices_m, skin.triangles)
+    alpha = (OPACITY * covered)[..., None]
+    picture = (1 - alpha) * picture + alpha * light[..., None] * SKIN_COLOUR
+    return _draw_bones(picture.clip(0, 255).astype(np.uint8), camera, shape, values)
+
+
+def _draw_bones(picture: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray) -> np.ndarray:
+    joints = joint_positions(shape.skeleton, shape.lengths_m, values)
+    pixel = {name: camera.project(xyz) for name, xyz in joints.items()}
+    for bone in shape.skeleton.bones:
+        ends = np.array([pixel[bone.head_joint], pixel[bone.tail_joint]])
+        if np.isfinite(ends).all():
+            cv2.line(picture, _point(ends[0]), _point(ends[1]), BONE_COLOUR, 2, cv2.LINE_AA)
+    for xy in pixel.values():
+        if np.isfinite(xy).all():
+            cv2.circle(picture, _point(xy), 4, JOINT_COLOUR, -1, cv2.LINE_AA)
+    return picture
+
+
+def tracks_over_footage(grey: np.ndarray, camera: Camera, trajectories: Trajectories, index: int) -> np.ndarray:
+    """The points seen at one frame with the way they came, coloured by speed (blue slow, red fast), over one view."""
+    picture = colour(grey)
+    first = max(0, index - TAIL_FRAMES)
+    seen = trajectories.seen[index]
+    way = camera.project(trajectories.xyz_m[first : index + 1, seen])
+    speed = np.nan_to_num(np.linalg.norm(trajectories.velocity_m_s[index, seen], axis=1))
+    colours = _colours(speed, 0.0, max(0.2, float(np.percentile(speed, 98)) if len(speed) else 0.2))
+    for xy, c in zip(way.transpose(1, 0, 2), colours):
+        xy = xy[np.isfinite(xy).all(axis=1)]
+        cv2.polylines(picture, [np.rint(xy * 8).astype(np.int32)], False, c, 1, cv2.LINE_AA, 3)
+        cv2.circle(picture, _point(xy[-1]), 1, c, -1, cv2.LINE_AA)
+    return picture
+
+
+def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarray:
+    """The cloud as a shaded body from the front (along the reference camera) and from its right side, in one picture."""
+    p = camera.to_camera(cloud.xyz_m)
+    n = cloud.normals @ camera.R_cam_world.T
+    if not len(p):
+        return np.zeros((PANEL_PX, 2 * PANEL_PX, 3), np.uint8)
+    centre = np.median(p, axis=0)
+    extent = np.percentile(np.abs(p - centre), 99, axis=0).max()
+    scale = 0.46 * PANEL_PX / max(float(extent), 1e-3)
+    radius = max(1, round(0.75 * spacing_px * float(centre[2]) / camera.focal_px * scale))
+    front = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    side = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
+    return np.hstack([_points_picture((p - centre) @ R.T, n @ R.T, scale, radius) for R in (front, side)])
+
+
+def _points_picture(p: np.ndarray, n: np.ndarray, scale: float, radius: int) -> np.ndarray:
+    """Points as discs, far ones first, lit from the upper left."""
+    picture = np.full((PANEL_PX, PANEL_PX, 3), 28, np.uint8)
+    light = np.array([-0.45, -0.55, -0.70])
+    grey = 60 + 195 * np.clip(n @ light, 0, 1)
+    for i in np.argsort(-p[:, 2]):
+        at = (round(PANEL_PX / 2 + p[i, 0] * scale), round(PANEL_PX / 2 + p[i, 1] * scale))
+        cv2.circle(picture, at, radius, (grey[i] * 0.85, grey[i] * 0.95, float(grey[i])), -1)
+    return picture
+
+
+def points_over_footage(grey: np.ndarray, xy_px: np.ndarray, values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Matched points over one view, coloured by a value from blue (low) to red (high)."""
+    picture = colour(grey)
+    for xy, c in zip(xy_px, _colours(values, low, high)):
+        cv2.circle(picture, _point(xy), 1, c, -1, cv2.LINE_AA)
+    return picture
+
+
+def colour(grey: np.ndarray) -> np.ndarray:
+    """A grey image (h, w) as BGR uint8."""
+    return cv2.cvtColor(np.clip(grey, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+
+
+def png(picture: np.ndarray) -> bytes:
+    """A picture as PNG."""
+    return bytes(cv2.imencode(".png", picture)[1])
+
+
+def _colours(values: np.ndarray, low: float, high: float) -> Sequence[tuple[int, int, int]]:
+    index = np.clip(255 * (values - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)
+    table = cv2.applyColorMap(index.reshape(-1, 1), cv2.COLORMAP_JET).reshape(-1, 3)
+    return [(int(b), int(g), int(r)) for b, g, r in table]
+
+
+def _point(xy: np.ndarray) -> tuple[int, int]:
+    return round(float(np.clip(xy[0], -30_000, 30_000))), round(float(np.clip(xy[1], -30_000, 30_000)))
