@@ -5,15 +5,16 @@ has touched in Blender is handed on, so that the take's own [settings] and the d
 """
 
 import dataclasses
-import importlib.util
 from collections.abc import Mapping
 from typing import Any
 
 import bpy
 import numpy as np
 
+from ..core import pipeline
 from ..core import settings as knobs
 
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 GROUPS: list[type] = []  # the PropertyGroup classes, in order of registration
 
 
@@ -65,10 +66,6 @@ def overrides(scene: bpy.types.Scene) -> dict[str, dict[str, Any]]:
 
 def stages() -> Mapping[str, type]:
     """Settings class of every stage, by the name it has in take.toml."""
-    if importlib.util.find_spec("..core.pipeline", __package__) is None:
-        return {}
-    from ..core import pipeline
-
     return pipeline.SETTINGS
 
 
@@ -81,8 +78,9 @@ def register() -> None:
     """Make the classes of all stages and hang them onto the scene as `scene.tricap`."""
     groups = {name: group_class(name, settings) for name, settings in stages().items()}
     annotations: dict[str, Any] = {
-        "take": bpy.props.StringProperty(name="Take", subtype="DIR_PATH", description="Folder of the recording; it holds take.toml"),
-        "out": bpy.props.StringProperty(name="Output", subtype="DIR_PATH",
+        "take": bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,
+                                         description="Folder of the recording; it holds take.toml"),
+        "out": bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,
                                         description="Folder for the results; empty: beside the .blend, or beside the take"),
         "last": bpy.props.StringProperty(name="Result", description="What the last run found"),
     }

@@ -11,6 +11,8 @@ from ..jobs import JobOperator
 from ..scene.build import SceneReport, write_scene
 from ..scene.contents import Contents, read_contents
 
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
 
 class BuildScene(JobOperator, bpy.types.Operator):
     """Put the results of a run into this scene: cameras with footage, cloud, trajectories, armature, action and skin"""
@@ -19,9 +21,9 @@ class BuildScene(JobOperator, bpy.types.Operator):
     bl_label = "Build Scene"
     bl_options = {"UNDO"}
 
-    out: bpy.props.StringProperty(name="Contents", subtype="DIR_PATH",  # type: ignore[valid-type]
+    out: bpy.props.StringProperty(name="Contents", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                   description="Folder of a run; empty: the panel's output folder")
-    blend: bpy.props.StringProperty(name="Save As", subtype="FILE_PATH",  # type: ignore[valid-type]
+    blend: bpy.props.StringProperty(name="Save As", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                     description="Also save a copy of the file under this name; empty: do not save")
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Contents]:

@@ -6,12 +6,13 @@ from typing import Any
 
 import bpy
 
+from ...core import pipeline
 from ...core.progress import Monitor
 from .. import folders, properties
 from ..jobs import JobOperator
 from ..scene.build import write_scene
 from ..scene.contents import Contents, read_contents
-from .build_scene import tell
+from .build_scene import RELATIVE, tell
 
 
 class Run(JobOperator, bpy.types.Operator):
@@ -21,9 +22,9 @@ class Run(JobOperator, bpy.types.Operator):
     bl_label = "Run"
     bl_options = {"UNDO"}
 
-    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH",  # type: ignore[valid-type]
+    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                    description="Folder with take.toml; empty: the panel's")
-    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH",  # type: ignore[valid-type]
+    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                   description="Folder for the results; empty: the panel's")
     build: bpy.props.BoolProperty(name="Build Scene", default=True,  # type: ignore[valid-type]
                                   description="Put the results into this scene afterwards")
@@ -48,7 +49,5 @@ class Run(JobOperator, bpy.types.Operator):
 
 def measure(take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor) -> tuple[Any, Contents | None]:
     """The computation, free of bpy: the whole run, and its results read back for the scene."""
-    from ...core import pipeline
-
     report = pipeline.run(take, out, overrides, monitor)
     return report, read_contents(out, monitor) if build else None

@@ -78,6 +78,8 @@ def remove_earlier() -> None:
         used |= {background.clip for o in objects if o.type == "CAMERA" for background in o.data.background_images if background.clip}
         used |= {modifier.node_group for o in objects for modifier in o.modifiers if modifier.type == "NODES" and modifier.node_group}
         used |= {m for o in objects if hasattr(o.data, "materials") for m in o.data.materials if m}
+        if scene.active_clip in used:
+            scene.active_clip = None
         bpy.data.batch_remove(objects)
         bpy.data.collections.remove(collection)
         for _ in range(2):  # materials are free only once their meshes and node groups are gone
@@ -110,7 +112,8 @@ def save_blend(path: Path) -> None:
     except (OSError, RuntimeError) as error:
         raise InputError(f"Cannot write {path}: {str(error).strip()} Choose another folder or free some space.") from error
     finally:
-        part.unlink(missing_ok=True)
+        if part.exists():
+            part.unlink()
 
 
 def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, contents: Contents, warnings: list[str]) -> int:

@@ -15,6 +15,7 @@ from ...core import store
 from ...core.body.shape import BodyShape, read_body
 from ...core.errors import InputError
 from ...core.motion.ply import Ply, read_ply
+from ...core.motion.tables import MotionTable, read_motion
 from ...core.progress import Monitor
 from ...core.take import Footage, open_take, read_take
 
@@ -31,7 +32,7 @@ class Contents:
     clouds: Mapping[int, Ply] = field(default_factory=dict)
     trajectories: Mapping[str, np.ndarray] | None = None
     shape: BodyShape | None = None
-    motion: Any = None
+    motion: MotionTable | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -55,8 +56,6 @@ def read_contents(out: Path, monitor: Monitor) -> Contents:
         InputError: OUT is no folder of results, or a file in it is damaged.
         Cancelled: the monitor was cancelled.
     """
-    from ...core.motion import tables
-
     out = Path(out)
     if not (out / "run.json").is_file():
         raise InputError(f"{out} holds no results of Tricap (no run.json); choose the output folder of a run.")
@@ -70,7 +69,7 @@ def read_contents(out: Path, monitor: Monitor) -> Contents:
     trajectories = _optional(out / "trajectories.npz", "trajectories", _arrays, warnings)
     monitor.step("reading results", 2, 3)
     shape = _optional(out / "body.toml", "armature and metaballs", read_body, warnings)
-    motion = _optional(out / "motion.csv", "action", tables.read_motion, warnings)
+    motion = _motion(out / "motion.csv", shape, warnings)
     monitor.step("reading results", 3, 3)
     return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
                    warnings=tuple(warnings))
@@ -103,6 +102,13 @@ def _optional(path: Path, what: str, read: Callable[[Path], Any], warnings: list
         return read(path)
     warnings.append(f"No {what} in the scene: {path.name} is not in {path.parent}.")
     return None
+
+
+def _motion(path: Path, shape: BodyShape | None, warnings: list[str]) -> MotionTable | None:
+    if shape is None and path.is_file():
+        warnings.append(f"No action in the scene: {path.name} needs body.toml beside it.")
+        return None
+    return _optional(path, "action", lambda file: read_motion(file, shape.skeleton), warnings)
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:

@@ -20,7 +20,7 @@ from . import paint
 NAME = "Flesh"
 KERNELS = ((0.2389, 0.9153), (0.5289, 1.3594), (0.2276, 1.8949))  # stiffness s_j, size a_j  (1)
 STIFFNESS_MAX = 10.0  # Blender's own limit
-SIZE_MAX = 16.0  # half axis / radius; the viewport draws circles of the radius, which large factors hide inside the flesh. Blender's limit: 20
+SIZE_MAX = 16.0  # largest half axis / radius (Blender's limit: 20): the viewport draws circles of the radius, which the flesh then hides
 RESOLUTION_M, RENDER_RESOLUTION_M = 0.008, 0.005
 SKIN_COLOUR = (0.80, 0.52, 0.41)
 

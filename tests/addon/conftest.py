@@ -14,10 +14,12 @@ from tricap.core import store
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape, write_body
 from tricap.core.body.skeleton import joint_positions
+from tricap.core.fitting.body_motion import BodyMotion
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.motion.ply import write_cloud
+from tricap.core.motion.tables import write_joints, write_motion
 
 if importlib.util.find_spec("bpy"):
     import bpy  # noqa: F401  Blender's own modules, such as addon_utils, are found only after it
@@ -90,7 +92,13 @@ def small_run(tmp_path: Path) -> SmallRun:
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     store.write_json(out / "run.json", {"take": str(take)})
     write_body(out / "body.toml", shape)
-    write_motion(out, shape, motion, sigma, joints)
+    places = np.stack(list(joints.values()), axis=1)
+    fit = BodyMotion(
+        frames=np.array(FRAMES), time_s=np.array(FRAMES) / FPS, dof_names=shape.skeleton.dof_names, values=motion,
+        covariance=np.eye(motion.shape[1]) * sigma[..., None] ** 2, joint_names=tuple(joints), joints_m=places,
+        joint_sigma_m=np.full((len(FRAMES), len(joints)), 1e-3), status=("fitted",) * len(FRAMES), sigma0=np.ones(len(FRAMES)))
+    write_joints(out / "joints.csv", fit)
+    write_motion(out / "motion.csv", fit, shape.skeleton)
     random = np.random.default_rng(7)
     for i, frame in enumerate(FRAMES):
         n = 40 + i
@@ -99,9 +107,9 @@ def small_run(tmp_path: Path) -> SmallRun:
                     intensity=random.uniform(0, 255, n))
     xyz = np.stack([joints["elbow.R"], joints["wrist.R"]], axis=1)
     xyz[0, 1] = np.nan
-    np.savez(out / "trajectories.npz", frames=np.array(FRAMES), time_s=np.array(FRAMES) / FPS, xyz_m=xyz,
-             velocity_m_s=np.gradient(xyz, axis=0) * FPS, acceleration_m_s2=np.zeros_like(xyz), sigma_m=np.full(xyz.shape[:2], 1e-3),
-             status=np.zeros(xyz.shape[:2], dtype=np.int8))
+    store.save(out / "trajectories.npz", dict(
+        frames=np.array(FRAMES), time_s=np.array(FRAMES) / FPS, xyz_m=xyz, velocity_m_s=np.gradient(xyz, axis=0) * FPS,
+        acceleration_m_s2=np.zeros_like(xyz), sigma_m=np.full(xyz.shape[:2], 1e-3), status=np.zeros(xyz.shape[:2], dtype=np.int8)), {})
     return SmallRun(out=out, take=take, rig=rig, shape=shape, motion=motion, sigma=sigma, joints_m=joints)
 
 

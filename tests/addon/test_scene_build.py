@@ -1,0 +1,168 @@
+"""A run's results as a .blend: built, saved, opened again, played."""
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from tricap.core.errors import InputError
+
+from .conftest import FPS, FRAMES, SmallRun
+
+JOINT_M, ANGLE_DEG = 1e-4, 0.01
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """A table with a header, as any script would read it."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_after_saving_and_opening_the_armature_plays_the_tables(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    blend = tmp_path / "sub" / "body.blend"
+    report = build_scene(small_run.out, blend)
+    assert report.warnings == () and report.counts["frames of motion"] == len(FRAMES)
+    assert [path.name for path in blend.parent.iterdir()] == ["body.blend"]
+    empty.ops.wm.open_mainfile(filepath=str(blend))
+    assert played_joints_m(empty, small_run) < JOINT_M
+    assert played_angles_deg(empty, small_run) < ANGLE_DEG
+
+
+def played_joints_m(bpy: ModuleType, run: SmallRun) -> float:
+    """Largest distance of an armature's joint from joints.csv, all frames."""
+    worst = 0.0
+    for row in rows(run.out / "joints.csv"):
+        bpy.context.scene.frame_set(int(row["frame"]))
+        pose = bpy.data.objects["Body"].evaluated_get(bpy.context.evaluated_depsgraph_get()).pose
+        at = {bone.head_joint: pose.bones[bone.name].head for bone in run.shape.skeleton.bones}
+        at |= {bone.tail_joint: pose.bones[bone.name].tail for bone in run.shape.skeleton.bones}
+        xyz = np.array([float(row[axis]) for axis in "xyz"])
+        worst = max(worst, float(np.linalg.norm(np.array(at[row["joint"]]) - xyz)))
+    return worst
+
+
+def played_angles_deg(bpy: ModuleType, run: SmallRun) -> float:
+    """Largest difference of a pose channel from motion.csv, and of a sigma's curve from its column, all frames, in degrees (or dm)."""
+    from tricap.addon.scene.armature import channel_of
+
+    body, worst = bpy.data.objects["Body"], 0.0
+    for row in rows(run.out / "motion.csv"):
+        bpy.context.scene.frame_set(int(row["frame"]))
+        for name, (bone, channel, index) in channel_of(run.shape).items():
+            unit = np.degrees if channel == "rotation_euler" else float
+            pose_bone = body.pose.bones[bone]
+            worst = max(worst, abs(unit(getattr(pose_bone, channel)[index]) - float(row[name])))
+            worst = max(worst, abs(unit(pose_bone[f"sigma {name}"]) - float(row[f"sigma {name}"])))
+    return worst
+
+
+def test_frames_rate_and_footage_are_the_takes(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(small_run.out)
+    scene = empty.context.scene
+    assert (scene.frame_start, scene.frame_end) == (FRAMES.start, FRAMES.stop - 1)
+    assert scene.render.fps / scene.render.fps_base == pytest.approx(FPS, rel=1e-6)
+    assert scene.camera["tricap_view"] == "C" and scene.camera["tricap_interlaced"] == "odd"
+    assert sorted(clip.name for clip in empty.data.movieclips) == ["Footage C", "Footage L", "Footage R"]
+    assert scene.active_clip.name == "Footage C"
+
+
+def test_cloud_and_trails_show_the_current_frame(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(small_run.out)
+    for i, frame in enumerate(FRAMES):
+        empty.context.scene.frame_set(frame)
+        graph = empty.context.evaluated_depsgraph_get()
+        shown = empty.data.objects["Cloud"].evaluated_get(graph).evaluated_geometry()
+        points = shown.pointcloud
+        assert len(points.points) == 40 + i
+        assert {"frame", "sigma", "normal", "intensity"} <= set(points.attributes.keys())
+        assert {value.value for value in points.attributes["frame"].data} == {frame}
+        trail = empty.data.objects["Trajectories"].evaluated_get(graph).data
+        assert (len(trail.polygons) > 0) == (i > 0)
+    empty.context.scene.frame_set(FRAMES.stop + 5)
+    shown = empty.data.objects["Cloud"].evaluated_get(empty.context.evaluated_depsgraph_get()).evaluated_geometry()
+    assert len(shown.pointcloud.points) == 0
+    mesh = empty.data.objects["Trajectories"].data
+    assert (len(mesh.vertices), len(mesh.edges)) == (2 * len(FRAMES) - 1, 2 * len(FRAMES) - 3)  # the wrist was not seen in the first frame
+
+
+def test_building_again_replaces_and_nothing_piles_up(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    def census() -> dict[str, list[str]]:
+        kinds = "objects meshes armatures actions metaballs materials node_groups movieclips cameras collections".split()
+        return {kind: sorted(each.name for each in getattr(empty.data, kind)) for kind in kinds}
+
+    mine = empty.data.objects.new("my own", None)
+    empty.context.scene.collection.objects.link(mine)
+    build_scene(small_run.out)
+    first = census()
+    build_scene(small_run.out)
+    assert census() == first and "my own" in first["objects"]
+
+
+@pytest.mark.parametrize("missing, said", [
+    ("clouds", "No point cloud"), ("trajectories.npz", "No trajectories"), ("body.toml", "No armature"), ("motion.csv", "No action"),
+])
+def test_what_is_missing_is_left_out_and_said(empty: ModuleType, small_run: SmallRun, missing: str, said: str) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    path = small_run.out / missing
+    path.rename(path.with_name("elsewhere"))
+    report = build_scene(small_run.out)
+    assert [warning for warning in report.warnings if said in warning]
+    assert report.counts["cameras"] == 3
+
+
+def test_a_take_that_was_moved_costs_only_cameras_and_footage(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    small_run.take.rename(small_run.take.with_name("moved"))
+    report = build_scene(small_run.out)
+    assert report.counts["cameras"] == 0 and report.counts["bones"] == 2
+    assert "No cameras and footage" in report.warnings[0] and "take.toml" in report.warnings[0]
+
+
+@pytest.mark.parametrize("damaged", ["body.toml", "motion.csv", "trajectories.npz", "clouds/0003.ply", "run.json"])
+def test_damaged_results_leave_the_scene_alone(empty: ModuleType, small_run: SmallRun, tmp_path: Path, damaged: str) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    (small_run.out / damaged).write_bytes(b"\x00nonsense")
+    with pytest.raises(InputError, match=Path(damaged).name):
+        build_scene(small_run.out, tmp_path / "body.blend")
+    assert not (tmp_path / "body.blend").exists() and not empty.data.collections
+
+
+def test_a_place_that_cannot_be_written_is_told(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(InputError, match="Cannot write .*body.blend"):
+        build_scene(small_run.out, tmp_path / "file" / "body.blend")
+    with pytest.raises(InputError, match="let it end in .blend"):
+        build_scene(small_run.out, tmp_path / "body.obj")
+
+
+def test_the_operator_builds_saves_and_keeps_the_open_file(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    assert blender.ops.tricap.build_scene(out=str(small_run.out), blend=str(tmp_path / "copy.blend")) == {"FINISHED"}
+    assert blender.data.filepath == "" and (tmp_path / "copy.blend").is_file()
+    assert "Tricap" in blender.data.collections
+
+
+def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    line = [sys.executable, "-m", "tricap", "scene", str(small_run.out), "--blend", str(tmp_path / "c.blend")]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and (tmp_path / "c.blend").is_file(), done.stdout + done.stderr
+    assert "2 bones" in done.stdout
+    wrong = subprocess.run([*line[:4], str(tmp_path), *line[5:]], capture_output=True, text=True, timeout=120)
+    assert wrong.returncode == 2 and "Traceback" not in wrong.stderr and "no run.json" in wrong.stderr
