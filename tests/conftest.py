@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 TAKES = ROOT.parent / "shared" / "takes"
 EXTENSION = "bl_ext.user_default.tricap"
+PLATFORM = {"linux": "linux-x64", "win32": "windows-x64", "darwin": "macos-arm64"}[sys.platform]
 # Blender looks for its user's files when bpy is first imported, whichever test does that: never in a real profile.
 PROFILE = Path(tempfile.mkdtemp(prefix="tricap-profile-"))
 os.environ["BLENDER_USER_RESOURCES"] = str(PROFILE)
@@ -35,14 +37,14 @@ def dev() -> ModuleType:
 @pytest.fixture(scope="session")
 def extension_zip(dev: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The extension without its wheels: scipy and OpenCV are beside bpy already."""
-    (made,) = dev.build(["linux-x64"], str(tmp_path_factory.mktemp("zip")), with_wheels=False)
+    (made,) = dev.build([PLATFORM], str(tmp_path_factory.mktemp("zip")), with_wheels=False)
     return Path(made)
 
 
 @pytest.fixture(scope="session")
 def full_extension_zip(dev: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The extension as users get it, with its wheels (downloaded once, about 130 MB)."""
-    (made,) = dev.build(["linux-x64"], str(tmp_path_factory.mktemp("full_zip")), with_wheels=True)
+    (made,) = dev.build([PLATFORM], str(tmp_path_factory.mktemp("full_zip")), with_wheels=True)
     return Path(made)
 
 

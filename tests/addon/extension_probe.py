@@ -17,7 +17,7 @@ from pathlib import Path
 import bpy
 
 EXTENSION = "bl_ext.user_default.tricap"
-FRAMES = 4
+FRAMES = 6
 
 
 def drawn_by(cls: type) -> list[str]:

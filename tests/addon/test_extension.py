@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import sysconfig
 import tomllib
 from pathlib import Path
 from types import ModuleType
@@ -54,12 +55,18 @@ def unregister():
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is not installed for this Python")
 
 
-def probe(package: Path, folder: Path, *, run_the_path: bool = False) -> dict[str, Any]:
-    """Install `package` into Blender in a process of its own, with the empty profile folder/profile; what it found."""
+def probe(package: Path, folder: Path, *, packages: Path | None = None, run_the_path: bool = False) -> dict[str, Any]:
+    """Install `package` into Blender in a process of its own, with the empty profile folder/profile; what it found.
+
+    With `packages`, that folder takes the place of Python's own site-packages.
+    """
     (folder / "profile").mkdir()
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile"), "PYTHONDONTWRITEBYTECODE": "1"}
-    line = [sys.executable, str(PROBE), str(package), str(folder / "found.json"), *([str(folder)] if run_the_path else [])]
-    done = subprocess.run(line, env=environment, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S)
+    if packages:
+        environment["PYTHONPATH"] = str(packages)
+    python = [sys.executable, "-S"] if packages else [sys.executable]
+    arguments = [PROBE, package, folder / "found.json", *([folder] if run_the_path else [])]
+    done = subprocess.run([*python, *map(str, arguments)], env=environment, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S)
     output = done.stdout + done.stderr
     assert done.returncode == 0 and "Traceback" not in output, output
     return json.loads((folder / "found.json").read_text(encoding="utf-8"))
@@ -69,6 +76,15 @@ def probe(package: Path, folder: Path, *, run_the_path: bool = False) -> dict[st
 def found(extension_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The zip without wheels (quick)."""
     return probe(extension_zip, tmp_path_factory.mktemp("extension"))
+
+
+def blender_alone(folder: Path) -> Path:
+    """A folder of packages with bpy and what comes with Blender, without scipy and OpenCV: as in Blender itself."""
+    folder.mkdir()
+    for source in Path(sysconfig.get_path("purelib")).iterdir():
+        if not source.name.startswith(("scipy", "cv2", "opencv")) and source.suffix != ".pth":
+            (folder / source.name).symlink_to(source, target_is_directory=source.is_dir())
+    return folder
 
 
 def assert_nothing_left(found: dict[str, Any]) -> None:
@@ -120,7 +136,7 @@ def test_an_extension_that_leaves_things_behind_is_found_out(dev: ModuleType, tm
 
 @pytest.mark.slow
 def test_the_whole_path_runs_from_the_zip_with_its_own_wheels(full_extension_zip: Path, tmp_path: Path) -> None:
-    found = probe(full_extension_zip, tmp_path, run_the_path=True)
+    found = probe(full_extension_zip, tmp_path, packages=blender_alone(tmp_path / "packages"), run_the_path=True)
     own = (tmp_path / "profile" / "extensions" / ".local").as_posix()
     assert found["used"]["scipy"].startswith(own) and found["used"]["cv2"].startswith(own)
     assert not found["used"]["numpy"].startswith(own), "numpy is Blender's"
