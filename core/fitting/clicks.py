@@ -49,7 +49,7 @@ def read_clicks(rig: Rig, joint_names: Sequence[str], joints: Mapping[str, Mappi
     located = [name for name, place in zip(joint_names, places) if np.isfinite(place).all()]
     if len(located) < 2:
         raise InputError(f"The body needs at least two of the joints {', '.join(joint_names)} clicked in two views each, "
-                         f"but there {'is' if len(located) == 1 else 'are'} {', '.join(located) or 'none'}; click more under [seeds.joints].")
+                         f"but has {', '.join(located) or 'none'}; click more of them under [seeds.joints].")
     observation = ClickedJoints(cameras=tuple(cameras), joint=np.array(index), xy_px=np.array(xy), sigma_px=sigma_px)
     return Clicks(observation=observation, xyz_m=places)
 

@@ -58,7 +58,8 @@ def thinned(cloud: Cloud, voxel_m: float) -> CloudPoints:
     mean = [np.stack([np.bincount(which, column) for column in table.T], axis=1) / count[:, None]
             for table in (xyz, normals, sigma[:, None])]
     length = np.linalg.norm(mean[1], axis=1, keepdims=True)
-    return CloudPoints(frame=int(cloud.frame), xyz_m=mean[0], normals=mean[1] / np.where(length > 0.3, length, np.inf), sigma_m=mean[2][:, 0])
+    normals = mean[1] / np.where(length > 0.3, length, np.inf)
+    return CloudPoints(frame=int(cloud.frame), xyz_m=mean[0], normals=normals, sigma_m=mean[2][:, 0])
 
 
 def _sigma_along(normals: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from ..body.skeleton import Skeleton, joint_positions
 from .clicks import Clicks
 from .observations import JointLimits, MotionPrior, Observation, ShapePrior
 from .solver import Problem, Solution, solve
-from .state import BodyState, ShapeParameters
+from .state import ShapeParameters
 
 GRID_STEP = np.radians(25.0)
 FREE_SPAN = np.pi  # search range of a DOF without limits
@@ -69,7 +69,7 @@ def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarr
 
 
 def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> list[Observation]:
-    """Soft limits, and the models' beliefs about DOFs; where a model believes nothing, a sigma of 180° or 10 m keeps the equations regular."""
+    """Soft limits, and the model's beliefs about DOFs; where it has none, a sigma of 180° or 10 m keeps the equations regular."""
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
     mean, sigma = np.array([(dof.prior_mean, dof.prior_sigma) for dof in skeleton.dofs]).T
     base = skeleton.layout.set("base")
@@ -78,11 +78,6 @@ def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> l
     sigma[free] = np.pi
     mean[base], sigma[base] = about_m, 10.0
     return [JointLimits(low=low, high=high, sigma=limit_sigma), MotionPrior(mean=mean, sigma=sigma)]
-
-
-def posture(parameters: ShapeParameters, solution: Solution) -> BodyState:
-    """The body of a solution of one frame."""
-    return parameters.state(solution.motion[0], solution.vector)
 
 
 def _movers(skeleton: Skeleton, bone: int) -> np.ndarray:

@@ -39,6 +39,11 @@ class Part:
         q, terms = self._terms(state, xyz_m)
         return terms.sum(axis=1), sum(self._bone_gradients(state, q, terms)[1])  # type: ignore[return-value]
 
+    def shares(self, state: BodyState, xyz_m: np.ndarray) -> np.ndarray:
+        """Which part (N, m) of F at each point comes from which of the balls."""
+        terms = self._terms(state, xyz_m)[1]
+        return terms / np.maximum(terms.sum(axis=1, keepdims=True), 1e-300)
+
     def jacobian(self, state: BodyState, xyz_m: np.ndarray, shape: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """F (N,) and its derivative (N, D + S) to motion and shape, or (N, D) to motion."""
         q, terms = self._terms(state, xyz_m)

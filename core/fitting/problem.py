@@ -2,9 +2,9 @@
 
     Σ_t Σ_i w_i (r_i(θ_t, s) / σ0)² + Σ_t Σ_i w_i (r_i(θ_t, θ_{t+1}, s) / σ1)² + Σ_j r_j(s)² + Σ_t |θ̈_t / σ_a|²  →  min          (1)
 
-r are residuals of unit weight (D'Apuzzo et al. 1999, Eqs. 9–12). Measured points and tracked points carry robust weights w and scales σ0, σ1
-that are estimated from them. Which limb a point belongs to is decided anew at every linearisation. Holding the shape while the pose is
-solved is choosing an empty set of free shape parameters.
+r are residuals of unit weight (D'Apuzzo et al. 1999, Eqs. 9–12). Measured points and tracked points carry robust weights w and scales
+σ0, σ1 that are estimated from them. Which limb a point belongs to is decided anew at every linearisation. Holding the shape while the
+pose is solved is choosing an empty set of free shape parameters.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,9 @@
 """Which limb does a measured point belong to? (D'Apuzzo et al. 1999, §3.3: the closest limb in the posture so far.)
 
-Closest is the limb with the smallest distance from the bone's segment, minus the limb's radius there (a fat trunk must not swallow the points
-of a thin arm). A point is nobody's when it is further from that surface than a gate, when it lies along the bone where the surface is
-another part's (the shoulder belongs to the trunk, what is beyond the wrist to the hand), or when its normal points into the limb.
+Closest is the limb with the smallest distance from the bone's segment, minus the limb's radius there (a fat trunk must not swallow the
+points of a thin arm). A point is nobody's when it is further from that surface than a gate, when it lies along the bone where the surface
+is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the hand), or when its normal
+points into the limb.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """The state vector of the fit, [S_motion, S_skel] of the papers: who stands where, and the body that a vector means.
 
 One frame's motion (D,) [rad, m] is followed by the shape (S,), which all frames share: ln of the bone lengths (B,), then ln of the cross
-radii l_x and l_z of every ball (M, 2). Logarithms keep lengths positive and make their sigmas relative. A ball's centre and its radius along
-the bone scale with the bone.
+radii l_x and l_z of every ball (M, 2). Logarithms keep lengths positive and make their sigmas relative. A ball's centre and its radius
+along the bone scale with the bone.
 """
 
 from dataclasses import dataclass

@@ -12,11 +12,10 @@ from .clicked_joint import ClickedJoints
 from .equal_radii import EqualRadii
 from .gaussian_prior import MotionPrior, ShapePrior
 from .joint_limit import JointLimits
-from .joint_position import JointPositions
 from .material_step import MaterialSteps
 from .surface_point import SurfacePoints
 
-__all__ = ["ClickedJoints", "EqualRadii", "JointLimits", "JointPositions", "MaterialSteps", "MotionPrior", "Observation", "ShapePrior",
+__all__ = ["ClickedJoints", "EqualRadii", "JointLimits", "MaterialSteps", "MotionPrior", "Observation", "ShapePrior",
            "SurfacePoints"]
 
 

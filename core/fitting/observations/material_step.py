@@ -1,8 +1,9 @@
 """Tracked points stay where they are in their limb from one frame to the next: p(t+1) − p(t) = ε with p = Rᵀ(X − head) in the bone's axes.
 
-They show what a surface of revolution cannot: twist, and sliding along the bone; and, over time, where the joints are, because a joint is the
-point that moves with both its limbs. Differences of successive frames leave no nuisance unknowns and keep the normal equations in their band;
-as long as the same points are seen the errors telescope, so little is lost against places common to all frames. σ 1–10 mm (skin slides).
+They show what a surface of revolution cannot: twist, and sliding along the bone; and, over time, where the joints are, because a joint
+is the point that moves with both its limbs. Differences of successive frames leave no nuisance unknowns and keep the normal equations in
+their band; as long as the same points are seen the errors telescope, so little is lost against places common to all frames. The sigma
+is 1–10 mm (skin slides).
 """
 
 from dataclasses import dataclass

@@ -9,7 +9,6 @@ from tricap.core.fitting.observations import (
     ClickedJoints,
     EqualRadii,
     JointLimits,
-    JointPositions,
     MaterialSteps,
     MotionPrior,
     ShapePrior,
@@ -43,7 +42,6 @@ def _cases(parameters: ShapeParameters, state, rng):
     return [SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma).scaled(state),
             SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma, form="paper").scaled(state),
             ClickedJoints(cameras=(camera,) * joints, joint=np.arange(joints), xy_px=rng.normal(400, 50, (joints, 2)), sigma_px=5.0),
-            JointPositions(xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=0.01),
             JointLimits(low=np.full(dofs, -0.2), high=np.full(dofs, 0.2), sigma=0.03),
             MotionPrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
             ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)), EqualRadii(sigma=0.1)]

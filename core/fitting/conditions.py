@@ -1,0 +1,65 @@
+"""What stays the same throughout one fit: the model, the clicks, what is believed beforehand, and how points become observations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..body.model_file import BodyModel
+from .acceleration import Acceleration
+from .clicks import Clicks
+from .cloud_points import CloudPoints
+from .observations import EqualRadii, Observation, ShapePrior, SurfacePoints
+from .problem import Problem
+from .robust import robust_weights
+from .segmentation import segment
+from .settings import FitSettings
+from .state import BodyState, ShapeParameters
+
+SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
+NO_SHAPE = np.zeros(0, dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Conditions:
+    """Model, settings and clicks of one fit."""
+
+    model: BodyModel
+    parameters: ShapeParameters
+    settings: FitSettings
+    clicks: Clicks
+    click: int  # index of the click frame
+    priors: list[Observation]  # of every frame's motion
+
+    def surface(self, points: CloudPoints, state: BodyState, wide: float = 1.0) -> SurfacePoints:
+        """The points near a body's surface, as observations of it; `wide` multiplies the gate.
+
+        Points within one patch share the model's error: the weight of their common part is divided among them (`crowding`).
+        """
+        s = self.settings
+        rows, bone = segment(points, state, self.model.surface, s.gate_m * wide)
+        own, model = points.sigma_m[rows] ** 2 + 1e-12, s.model_sigma_m**2
+        share = max(1.0, (s.model_patch_m / s.voxel_m) ** 2)
+        found = SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=np.sqrt(own + model),
+                              crowding=(own + share * model) / (own + model), form=s.residual)
+        return found.scaled(state)
+
+    def of_shape(self) -> list[Observation]:
+        """What is believed about the shape."""
+        mean, s = self.parameters.vector(), self.settings
+        sigma = np.full(len(mean), s.radius_sigma)
+        sigma[self.parameters.layout.set("lengths")] = s.length_sigma
+        return [ShapePrior(mean=mean, sigma=sigma), EqualRadii(sigma=s.roundness_sigma)]
+
+    def problem(self, observe: Callable[[int, BodyState], list[Observation]], free: str | None = None,
+                smoothness: Acceleration | None = None) -> Problem:
+        """An adjustment in which the shape parameters of the set `free` may change."""
+        shape = self.parameters.layout.set(free) if free else NO_SHAPE
+        return Problem(parameters=self.parameters, observe=observe, of_shape=self.of_shape(), free_shape=shape, smoothness=smoothness,
+                       robust=self.settings.robust, robust_width=self.settings.robust_width)
+
+    def support(self, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
+        """How many points a body explains: the sum of their weights at a fixed width."""
+        state = self.parameters.state(motion, vector)
+        found = self.surface(points, state)
+        return float(robust_weights(found.residual(state) * found.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", 3.0).sum())
