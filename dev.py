@@ -163,7 +163,7 @@ def run(*command: object) -> int:
 def lint() -> int:
     """Style of everything, types of the core."""
     python = venv_program("python")
-    return run(python, "-m", "ruff", "check", ".") or run(python, "-m", "mypy")
+    return max(run(python, "-m", "ruff", "check", "."), run(python, "-m", "mypy"))
 
 
 def demo(out: str) -> int:
