@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from .errors import InputError
 
 T = TypeVar("T")
+LARGEST_NUMBER = 1e300  # beyond: infinity, or a whole number that no float can hold
 
 
 def knob(
@@ -53,8 +54,8 @@ def _checked(value: Any, field: "dataclasses.Field[Any]", where: str) -> Any:
         if not isinstance(value, str) or (meta.get("choices") and value not in meta["choices"]):
             raise InputError(f"{label} is {value!r}; choose one of: {', '.join(meta.get('choices') or ('a text',))}.")
         return value
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
-        raise InputError(f"{label} is {value!r}; a number{' in ' + meta['unit'] if meta.get('unit') else ''} is needed.")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST_NUMBER:
+        raise InputError(f"{label} is {str(value)[:40]}; a number{' in ' + meta['unit'] if meta.get('unit') else ''} is needed.")
     if isinstance(default, int) and value != int(value):
         raise InputError(f"{label} is {value!r}; a whole number is needed.")
     low, high = meta.get("low"), meta.get("high")

@@ -6,9 +6,11 @@ A file appears under its name only when it is complete: everything is written be
 import hashlib
 import io
 import json
+import math
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,17 @@ from .errors import InputError
 
 HEADER = "header_json"
 STORE_VERSION = 1
+DAMAGED = (  # what numpy, zipfile and zlib raise for a file with wrong bytes, or for another kind of file
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    MemoryError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -51,8 +64,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """`write_bytes` of readable JSON."""
-    write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    """`write_bytes` of readable JSON. JSON has no NaN and no infinity: they become null."""
+    write_text(path, json.dumps(_with_null(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def _with_null(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _with_null(v) for name, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_with_null(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_json(path: Path) -> Any:
@@ -90,7 +111,7 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         header = json.loads(str(arrays.pop(HEADER)))
     except FileNotFoundError as error:
         raise InputError(f"{path} is missing; run the stage that writes it.") from error
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         raise InputError(f"{path} is not a result of Tricap or is damaged; remove it and run again.") from error
     if not isinstance(header, dict) or header.get("store_version") != STORE_VERSION:
         raise InputError(f"{path} was written by another version of Tricap; remove it and run again.")

@@ -4,6 +4,7 @@ Joint and view names, and every key, are checked when the file is read; the imag
 """
 
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe"
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
 KEYS = ("format", "version", "fps", "interlaced", "rig", "reference_view", "frames", "views", "body", "seeds", "settings")
 
+UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 
@@ -111,11 +113,23 @@ def read_take(folder: Path) -> Take:
     folder = Path(folder)
     path = folder / "take.toml" if folder.name != "take.toml" else folder
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return take_of_text(path.read_text(encoding="utf-8"), path)
     except OSError as error:
         raise InputError(
             f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
         ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a TOML file: {error}.") from error
+
+
+def take_of_text(text: str, path: Path) -> Take:
+    """The take that a take.toml of this text at `path` describes.
+
+    Raises:
+        InputError: the text is no TOML, has an unknown key, or a value that cannot be.
+    """
+    try:
+        table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a TOML file: {error}.") from error
     return _take(table, path.parent.resolve(), str(path))
@@ -145,6 +159,8 @@ def _frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
                 f"The views of {take.folder.name} are not equally long: {said} frames. "
                 "Trim them, or set `offset_frames` or `frames` in take.toml."
             )
+        if counts[0] <= first:
+            raise InputError(f"With these `offset_frames` the views of {take.folder.name} have no frame in common; mend them in take.toml.")
         return range(first, counts[0])
     start, stop = take.frames
     if start < first or stop > min(counts):
@@ -192,6 +208,8 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
     body = _table(table, "body", where)
     _known(body, ("model",), f"[body] of {where}")
+    if not isinstance(body.get("model", ""), str):
+        raise InputError(f"`model` under [body] of {where} is {body['model']!r}; write the name of a body model, such as \"arm.R\".")
     return Take(
         folder=folder,
         fps=float(fps),
@@ -216,6 +234,8 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         offset = entry.get("offset_frames", 0)
         if not isinstance(entry.get("name"), str) or not entry["name"] or not isinstance(offset, int):
             raise InputError(f"A {label} needs a name (text); `offset_frames` is a whole number.")
+        if UNFIT_FOR_NAMES.search(entry["name"]):
+            raise InputError(f"The {label} has a character in its name that file names cannot have; choose a plain name such as \"L\".")
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         views.append(View(name=entry["name"], images=entry.get("images"), movie=entry.get("movie"), offset_frames=offset))

@@ -1,6 +1,8 @@
 """The camera rig and its file, rig.toml: the layout of Anipose, Pose2Sim and caliscope, in metres."""
 
+import json
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -49,7 +51,7 @@ def read_rig(path: Path) -> Rig:
         raise InputError(f"The rig {path} is not a TOML file: {error}.") from error
     metadata = table.get("metadata", {})
     unit = metadata.get("unit", "m") if isinstance(metadata, dict) else None
-    if unit not in UNITS_M:
+    if not isinstance(unit, str) or unit not in UNITS_M:
         raise InputError(f"The rig {path} is in an unknown unit {unit!r}; write one of {', '.join(UNITS_M)} under [metadata].")
     cameras = tuple(_camera(key, entry, path, UNITS_M[unit]) for key, entry in table.items() if key.startswith("cam"))
     if not cameras:
@@ -78,7 +80,7 @@ def write_rig(path: Path, rig: Rig) -> None:
         lines.append("")
     lines += ["[metadata]", 'unit = "m"']
     lines += [
-        f"{k} = {_text(v) if isinstance(v, str) else repr(v)}"
+        f"{k if re.fullmatch('[A-Za-z0-9_-]+', k) else _text(k)} = {_text(v) if isinstance(v, str) else _number(v)}"
         for k, v in rig.metadata.items()
         if k != "unit" and isinstance(v, (str, int, float)) and not isinstance(v, bool)
     ]
@@ -99,7 +101,8 @@ def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:
     distortions[: len(given)] = given
     if entry.get("fisheye", False):
         raise InputError(f"{label} is a fisheye camera, which is not supported; calibrate it with k1, k2, p1, p2, k3.")
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or min(size) < 8:
+    upright = matrix[1, 0] == 0 and matrix[2].tolist() == [0, 0, 1]
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not upright or min(size) < 8:
         raise InputError(f"{label} has an impossible matrix or size; calibrate it again.")
     affinity = _array(entry, "affinity", (2,), label) if "affinity" in entry else np.zeros(2)
     return Camera(
@@ -129,5 +132,11 @@ def _numbers(array: np.ndarray) -> str:
     return repr(np.asarray(array).tolist())
 
 
+def _number(value: float) -> str:
+    """A number as TOML has it; numpy's own numbers show their type in their repr."""
+    return repr(int(value)) if isinstance(value, int) else repr(float(value))
+
+
 def _text(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    """A TOML basic string; JSON's escapes are a part of TOML's."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import spline_filter1d
 
 FINENESS = 4
+LONGEST_LOOK_UP = 32_000  # OpenCV looks up at most 32,766 rows at once
 
 
 class SplineImage:
@@ -22,8 +23,11 @@ class SplineImage:
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Grey values (n, m) float32 at columns x and rows y (n, m) float32; beyond the border the image is mirrored.
 
-        n and m stay below 32,767 (a limit of the look-up).
+        m stays below 32,767, and so does four times the image's width and height (limits of the look-up).
         """
+        if len(x) > LONGEST_LOOK_UP:
+            starts = range(0, len(x), LONGEST_LOOK_UP)
+            return np.concatenate([self.sample(x[i : i + LONGEST_LOOK_UP], y[i : i + LONGEST_LOOK_UP]) for i in starts])
         return cv2.remap(
             self._fine, x * np.float32(FINENESS), y * np.float32(FINENESS), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
         )

@@ -13,7 +13,8 @@ import numpy as np
 from ..errors import InputError
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
-MAX_PIXELS = 64_000_000
+MAX_PIXELS, MAX_SIDE_PX = 64_000_000, 8191  # the side: four times as many are still looked up by OpenCV
+KINDS = ("uint8", "uint16", "float32", "float64")
 
 
 class Sequence(Protocol):
@@ -126,7 +127,10 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         if not path.is_file():
             raise InputError(f"The movie {path} of view {view} is missing; mend `movie` in take.toml.")
         return Movie(path)
-    paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS), key=_natural))
+    try:
+        paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS), key=_natural))
+    except (ValueError, IndexError, NotImplementedError):  # what pathlib raises for a pattern that is none
+        paths = ()
     if not paths:
         raise InputError(f"View {view} has no images: nothing in {folder} agrees with “{pattern}”. Mend `images` in take.toml.")
     _check_numbering(paths, view)
@@ -137,7 +141,7 @@ def read_image(path: Path) -> np.ndarray:
     """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour.
 
     Raises:
-        InputError: the file is missing, is not an image, or is larger than 64 megapixels.
+        InputError: the file is missing, is not an image, is larger than 64 megapixels or 8191 pixels a side, or of a strange kind.
     """
     try:
         data = np.fromfile(path, dtype=np.uint8)
@@ -149,13 +153,17 @@ def read_image(path: Path) -> np.ndarray:
         image = None
     if image is None:
         raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
-    if image.shape[0] * image.shape[1] > MAX_PIXELS:
+    if image.shape[0] * image.shape[1] > MAX_PIXELS or max(image.shape[:2]) > MAX_SIDE_PX:
         raise InputError(f"{path} has {image.shape[1]}×{image.shape[0]} pixels, more than can be measured; scale the footage down.")
+    if image.dtype.name not in KINDS:
+        raise InputError(f"{path} holds {image.dtype.name} pixels; save it with 8 or 16 bits a channel.")
     return grey(image)
 
 
 def grey(image: np.ndarray) -> np.ndarray:
     """Grey values (h, w) float32 0…255 of an image of 8 or 16 bits or float 0…1, grey, BGR or BGRA."""
+    if image.dtype == np.float64:
+        image = image.astype(np.float32)
     if image.ndim == 3:
         image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY) if image.shape[2] >= 3 else image[:, :, 0]
     if image.dtype == np.uint16:
@@ -166,20 +174,23 @@ def grey(image: np.ndarray) -> np.ndarray:
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
 
 
 def _check_numbering(paths: tuple[Path, ...], view: str) -> None:
-    """A gap in the numbers is a missing image, where the numbers otherwise count by one."""
-    numbers = [re.findall(r"\d+", p.stem) for p in paths]
-    if len(paths) < 3 or not all(numbers):
+    """A gap in the numbers is a missing image, where most of the numbers count by the same step."""
+    numbers = [[int(n) for n in re.findall(r"\d+", p.stem)] for p in paths]
+    if len(paths) < 3 or not numbers[0] or len({len(n) for n in numbers}) > 1:
         return
-    last = [int(n[-1]) for n in numbers]
-    steps = np.diff(last)
-    usual = int(np.median(steps))
-    gaps = np.flatnonzero(steps != usual)
-    if usual > 0 and 0 < len(gaps) <= max(1, len(paths) // 10) and steps[gaps[0]] > usual:
-        raise InputError(
-            f"View {view} lacks the image(s) between {paths[gaps[0]].name} and {paths[gaps[0] + 1].name}; "
-            "restore them, or renumber the files of all views alike."
-        )
+    table = np.array(numbers, dtype=object)
+    counting = [column for column in table.T if len(set(column)) > 1]
+    steps = [int(b - a) for a, b in zip(counting[-1], counting[-1][1:])] if counting else [0]
+    usual = min(set(steps), key=lambda step: (-steps.count(step), step))
+    if usual < 1 or 2 * steps.count(usual) < len(steps):
+        return
+    for i, step in enumerate(steps):
+        if step > usual and step % usual == 0:
+            raise InputError(
+                f"View {view} lacks the image(s) between {paths[i].name} and {paths[i + 1].name}; "
+                "restore them, or renumber the files of all views alike."
+            )
