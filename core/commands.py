@@ -4,7 +4,9 @@ Exit codes: 0 done, 2 the input needs mending (one sentence on stderr), 130 canc
 """
 
 import argparse
+import glob
 import json
+import os
 import shutil
 import signal
 import sys
@@ -14,10 +16,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from . import pipeline, store
 from .errors import InputError
+from .geometry.rig import read_rig
 from .progress import Cancelled, Monitor
-from .take import open_take, read_take
+from .take import open_take, read_take, take_of_text
 
 Adder = Callable[[Any], None]  # adds a sub-command to the parser; the command's `run(args, monitor)` gives the lines to show
 
@@ -27,6 +32,7 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     parser = build_parser(adders)
     args = parser.parse_args(argv)
     args.parser = parser
+    _quiet_decoders()
     monitor = Monitor(_progress_line if sys.stderr.isatty() and not args.quiet else None if args.quiet else _plain_progress())
     try:
         with _interrupts(monitor):
@@ -37,7 +43,7 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     except Cancelled as stop:
         _say(f"tricap: {stop}", sys.stderr)
         return 130
-    if not args.quiet:
+    if not args.quiet or getattr(args, "json", False):
         for line in lines:
             _say(line, sys.stdout)
     return 0
@@ -80,8 +86,8 @@ def _stage_command(commands: Any, name: str, about: str, action: Callable[..., l
     parser.add_argument("take", type=Path, metavar="TAKE", help="folder with take.toml")
     if out:
         parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results")
-        parser.add_argument("--json", action="store_true", help="print run.json at the end")
-    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
+        parser.add_argument("--json", action="store_true", help="print run.json at the end, and nothing else on standard output")
+        parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
     parser.set_defaults(run=action)
     return parser
@@ -106,6 +112,8 @@ def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 def _build_scene(job: pipeline.Run, parser: argparse.ArgumentParser, monitor: Monitor) -> list[str]:
     """body.blend, through the command `scene` of the add-on where there is a Blender."""
     blend = job.results.path("body.blend")
+    if "scene" not in _names_of(parser):
+        return []
     try:
         args = parser.parse_args(["scene", str(job.results.folder), "--blend", str(blend)])
         return [str(line) for line in args.run(args, monitor)]
@@ -136,7 +144,10 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Make TAKE with take.toml; footage outside the folder is linked into it, or copied where links cannot be made."""
+    """Make TAKE with take.toml; footage outside the folder is linked into it, or copied where links cannot be made.
+
+    Everything is checked before the first file is made.
+    """
     folder: Path = args.take
     if (folder / "take.toml").exists():
         raise InputError(f"{folder} is a take already; choose another folder.")
@@ -144,21 +155,26 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if any(len(v) != 2 or not all(v) for v in views):
         raise InputError("Write each view as NAME=FILE, such as L=left.mp4.")
     lines = ['format = "tricap-take"', "version = 1", f"fps = {args.fps!r}", f'interlaced = "{args.interlaced}"', 'rig = "rig.toml"', ""]
-    folder.mkdir(parents=True, exist_ok=True)
+    links: list[tuple[Path, Path]] = []
     for name, source in views:
-        lines += ["[[views]]", f'name = "{name}"', _linked(folder, name, Path(source)), ""]
-    if args.rig:
-        store.write_bytes(folder / "rig.toml", _read(args.rig))
+        line, link = _footage(folder, name, Path(source))
+        lines += ["[[views]]", f"name = {json.dumps(name)}", line, ""]
+        links.append(link)
     if args.model:
-        lines += ["[body]", f'model = "{args.model}"', ""]
+        lines += ["[body]", f"model = {json.dumps(args.model)}", ""]
     text = "\n".join(lines)
-    tomllib.loads(text)
-    store.write_text(folder / "take.toml", text)
-    rig = "" if args.rig else " Copy or calibrate rig.toml into it."
-    return [f"{folder}: a take of {len(views)} views.{rig}"]
+    take = take_of_text(text, folder / "take.toml")
+    if args.rig:
+        rig = read_rig(args.rig)
+        for view in take.views:
+            rig[view.name]
+    _make_take(folder, text, links, args.rig)
+    note = "" if args.rig else " Copy or calibrate rig.toml into it."
+    return [f"{folder}: a take of {len(views)} views.{note}"]
 
 
-def _linked(folder: Path, name: str, source: Path) -> str:
+def _footage(folder: Path, name: str, source: Path) -> tuple[str, tuple[Path, Path]]:
+    """What take.toml says of a view's footage, and the link that it needs: (where, to what)."""
     if not source.exists():
         raise InputError(f"The footage {source} of view {name} is missing; check the path.")
     if source.is_dir():
@@ -167,15 +183,38 @@ def _linked(folder: Path, name: str, source: Path) -> str:
             raise InputError(
                 f"The folder {source} of view {name} holds {'no images' if not endings else 'images of several kinds'}; it needs one kind."
             )
-        _link(folder / name, source)
-        return f'images = "{name}/*{endings[0]}"'
-    _link(folder / f"{name}{source.suffix}", source)
-    return f'movie = "{name}{source.suffix}"'
+        said, target = f"images = {json.dumps(f'{glob.escape(name)}/*{endings[0]}')}", folder / name
+    else:
+        said, target = f"movie = {json.dumps(name + source.suffix)}", folder / f"{name}{source.suffix}"
+    if target.exists() and not target.samefile(source):
+        raise InputError(f"{target} is there already and is not the footage {source}; choose another folder or another name for the view.")
+    return said, (target, source)
+
+
+def _make_take(folder: Path, text: str, links: list[tuple[Path, Path]], rig: Path | None) -> None:
+    """Write the folder; what was linked or copied goes again if something fails."""
+    made: list[Path] = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for target, source in links:
+            if not target.exists():
+                made.append(target)
+                _link(target, source)
+        if rig:
+            store.write_bytes(folder / "rig.toml", rig.read_bytes())
+        store.write_text(folder / "take.toml", text)
+    except (OSError, InputError) as error:
+        for target in made:
+            if target.is_dir() and not target.is_symlink():
+                shutil.rmtree(target, ignore_errors=True)
+            else:
+                target.unlink(missing_ok=True)
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"Cannot make the take {folder}: {error.strerror or error}. Choose another folder.") from error
 
 
 def _link(target: Path, source: Path) -> None:
-    if target.exists():
-        return
     try:
         target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
     except OSError:
@@ -221,16 +260,9 @@ def _frames(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     first, colon, last = text.partition(":")
-    if not colon or not first.isdigit() or not last.isdigit():
+    if not colon or not first.isdecimal() or not last.isdecimal():
         raise InputError(f"--frames {text} cannot be read; write the first frame and one after the last, such as 0:40.")
     return int(first), int(last)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
 
 
 @contextmanager
@@ -238,19 +270,32 @@ def _interrupts(monitor: Monitor) -> Iterator[None]:
     """Ctrl-C cancels at the next step instead of breaking off anywhere."""
     try:
         before = signal.getsignal(signal.SIGINT)
+        if before is None:  # set outside Python, as Blender does: it could not be put back
+            raise ValueError
 
         def stop(number: int, frame: Any) -> None:
             monitor.cancel()
             signal.signal(signal.SIGINT, before)  # a second Ctrl-C breaks off at once
 
         signal.signal(signal.SIGINT, stop)
-    except ValueError:  # not the main thread: somebody else owns the signals
+    except ValueError:  # also when not in the main thread: somebody else owns the signals
         yield
         return
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _quiet_decoders() -> None:
+    """The decoders' own messages stay away from the terminal: what is wrong with a file is said in our one sentence."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    getattr(cv2.utils, "logging", cv2).setLogLevel(0)  # OpenCV 5, OpenCV 4
+
+
+def _names_of(parser: argparse.ArgumentParser) -> list[str]:
+    """The names of the sub-commands."""
+    return [name for action in parser._actions if isinstance(action.choices, dict) for name in action.choices]
 
 
 def _progress_line(stage: str, done: float, total: float) -> None:
