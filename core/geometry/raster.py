@@ -24,20 +24,48 @@ SLIVER = 1e-9  # twice the area [samples²] below which a triangle has no slope 
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Pieces:
+    """Triangles in the image, and where each comes from: the near plane cuts a triangle of the mesh into up to two."""
+
+    xy_px: np.ndarray  # (M, 3, 2)
+    inverse_z: np.ndarray  # (M, 3)
+    source: np.ndarray  # (M,) index of the mesh's triangle
+    cut: np.ndarray  # (M,) whether it is a part of its source
+    corner_weights: np.ndarray  # (M, 3, 3) the corners as weights of the source's corners
+
+    def __post_init__(self) -> None:
+        m = len(self.source)
+        for name, shape, kind in (("xy_px", (m, 3, 2), np.float64), ("inverse_z", (m, 3), np.float64), ("source", (m,), np.int64),
+                                  ("cut", (m,), np.bool_), ("corner_weights", (m, 3, 3), np.float64)):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, kind, name))
+
+    def weights(self, piece: np.ndarray, xy_px: np.ndarray) -> np.ndarray:
+        """Weights (N, 3) of the corners of the mesh's triangle at pixels (N, 2) in or near pieces (N,).  (2)"""
+        dx, dy = (self.xy_px[piece, :, axis] - xy_px[:, axis, None] for axis in (0, 1))
+        b = np.stack([dx[:, i] * dy[:, j] - dx[:, j] * dy[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
+        b[np.abs(b[:, 0] + b[:, 1] + b[:, 2]) <= SLIVER] = 1.0
+        b *= self.inverse_z[piece]
+        b /= (b[:, 0] + b[:, 1] + b[:, 2])[:, None]
+        cut = np.flatnonzero(self.cut[piece])
+        b[cut] = np.einsum("nk,nkc->nc", b[cut], self.corner_weights[piece[cut]])
+        return b
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Raster:
-    """The samples of a grid that meet a mesh, in scan order; N of them."""
+    """The samples of a grid that meet a mesh, in scan order; N of them. Weights are worked out when they are asked for."""
 
     x_px: np.ndarray  # (W,) full-frame x of the grid's columns
     y_px: np.ndarray  # (H,) full-frame y of the grid's rows
     sample: np.ndarray  # (N,) flat index row · W + column, increasing
-    triangle: np.ndarray  # (N,) index of the nearest triangle
-    barycentric: np.ndarray  # (N, 3) perspective-correct weights of its corners  (2)
+    piece: np.ndarray  # (N,) index of the nearest piece
     depth_m: np.ndarray  # (N,) z in the camera's frame
+    pieces: Pieces
 
     def __post_init__(self) -> None:
         n = len(self.sample)
         for name, shape, kind in (("x_px", (None,), np.float64), ("y_px", (None,), np.float64), ("sample", (n,), np.int64),
-                                  ("triangle", (n,), np.int64), ("barycentric", (n, 3), np.float64), ("depth_m", (n,), np.float64)):
+                                  ("piece", (n,), np.int64), ("depth_m", (n,), np.float64)):
             object.__setattr__(self, name, frozen(getattr(self, name), shape, kind, name))
 
     @property
@@ -45,11 +73,26 @@ class Raster:
         """(rows, columns) of the grid."""
         return len(self.y_px), len(self.x_px)
 
+    @property
+    def triangle(self) -> np.ndarray:
+        """Index of the mesh's triangle at each sample (N,)."""
+        return self.pieces.source[self.piece]
+
+    @property
+    def xy_px(self) -> np.ndarray:
+        """Full-frame pixels of the samples (N, 2)."""
+        return np.stack([self.x_px[self.sample % len(self.x_px)], self.y_px[self.sample // len(self.x_px)]], axis=1)
+
     def interpolate(self, values: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """Values at the vertices (V, …) carried to the samples (N, …) of the mesh's `triangles` (F, 3)."""
-        corners = np.asarray(values)[np.asarray(triangles)[self.triangle]]
-        carried: np.ndarray = np.einsum("nk,nk...->n...", self.barycentric, corners)
-        return carried
+        """Values at the vertices (V, …) of the mesh with `triangles` (F, 3), carried to the samples (N, …)."""
+        return self.interpolate_at(np.arange(len(self.sample)), self.xy_px, values, triangles)
+
+    def interpolate_at(self, which: np.ndarray, xy_px: np.ndarray, values: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """Values of the triangles seen by the samples `which` (K,), at pixels (K, 2) beside those samples: (K, …)."""
+        piece, values = self.piece[which], np.asarray(values)
+        corners, weights = np.asarray(triangles)[self.pieces.source[piece]], self.pieces.weights(piece, xy_px)
+        across = (slice(None), *[None] * (values.ndim - 1))
+        return sum(weights[:, i][across] * values[corners[:, i]] for i in range(3))  # type: ignore[return-value]
 
     def image(self, values: np.ndarray, background: float = np.nan) -> np.ndarray:
         """Values at the samples (N,) as a picture (H, W)."""
@@ -58,23 +101,12 @@ class Raster:
         return picture
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Corners:
-    """Triangles in the image: positions, inverse depths, and where each comes from (a cut triangle gives up to two)."""
-
-    xy_px: np.ndarray  # (M, 3, 2)
-    inverse_z: np.ndarray  # (M, 3)
-    source: np.ndarray  # (M,) index of the mesh's triangle
-    cut: np.ndarray  # (M,) whether it is a part of its source
-    weights: np.ndarray  # (M, 3, 3) the corners as weights of the source's corners
-
-
 def rasterize(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, *, rows: np.ndarray | None = None, factor: int = 1,
               back_faces: bool = False) -> Raster:
     """Find the triangle that each sample of the picture shows.
 
     `vertices_m` (V, 3) world, `triangles` (F, 3) counter-clockwise seen from outside. `rows`: increasing full-frame rows to
-    fill (one field of an interlaced frame), default all. `factor`²  samples are spread evenly over each pixel.
+    fill (one field of an interlaced frame), default all. `factor`² samples are spread evenly over each pixel.
     `back_faces`: whether triangles seen from behind are drawn. What reaches out of the picture, behind the camera or nearer than
     1 cm is cut off. About 0.1 s for 10,000 triangles that fill 768 × 576 samples.
     """
@@ -83,15 +115,14 @@ def rasterize(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, *, 
     kept = np.arange(height, dtype=np.float64) if rows is None else np.asarray(rows, dtype=np.float64)
     x_px = (np.arange(width)[:, None] + offsets).reshape(-1)
     y_px = (kept[:, None] + offsets).reshape(-1)
-    corners = _corners(camera, np.asarray(vertices_m, dtype=np.float64), np.asarray(triangles), back_faces)
-    column = (corners.xy_px[..., 0] - x_px[0]) * factor
-    line, part, start, stop = _spans(column, corners.xy_px[..., 1], y_px, len(x_px))
-    sample, owner, depth = _nearest(column, corners, line, part, start, stop, y_px, len(x_px))
-    weights = _weights(column, corners, owner, sample % len(x_px), y_px[sample // len(x_px)])
-    return Raster(x_px=x_px, y_px=y_px, sample=sample, triangle=corners.source[owner], barycentric=weights, depth_m=depth)
+    pieces = _pieces(camera, np.asarray(vertices_m, dtype=np.float64), np.asarray(triangles), back_faces)
+    column = (pieces.xy_px[..., 0] - x_px[0]) * factor
+    line, part, start, stop = _spans(column, pieces.xy_px[..., 1], y_px, len(x_px))
+    sample, owner, depth = _nearest(column, pieces, line, part, start, stop, y_px, len(x_px))
+    return Raster(x_px=x_px, y_px=y_px, sample=sample, piece=owner, depth_m=depth, pieces=pieces)
 
 
-def _corners(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, back_faces: bool) -> _Corners:
+def _pieces(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, back_faces: bool) -> Pieces:
     inside = camera.to_camera(vertices_m)
     ahead = (inside[:, 2] >= NEAR_M)[triangles].sum(axis=1)
     whole = np.flatnonzero(ahead == 3)
@@ -105,7 +136,7 @@ def _corners(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, back
         xy, z = np.concatenate([xy, _image(camera, points)]), np.concatenate([z, points[..., 2]])
         whole, weights = np.concatenate([whole, source]), np.concatenate([weights, cut_weights])
     keep = np.isfinite(xy).all(axis=(1, 2)) & (back_faces | (_doubled_area(xy) < 0))  # y points down: outside is negative
-    return _Corners(xy_px=xy[keep], inverse_z=1 / z[keep], source=whole[keep], cut=ahead[whole[keep]] < 3, weights=weights[keep])
+    return Pieces(xy_px=xy[keep], inverse_z=1 / z[keep], source=whole[keep], cut=ahead[whole[keep]] < 3, corner_weights=weights[keep])
 
 
 def _cut(points: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -173,12 +204,12 @@ def _expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return run, np.arange(len(run)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
-def _nearest(column: np.ndarray, corners: _Corners, line: np.ndarray, part: np.ndarray, start: np.ndarray, stop: np.ndarray,
+def _nearest(column: np.ndarray, pieces: Pieces, line: np.ndarray, part: np.ndarray, start: np.ndarray, stop: np.ndarray,
              y_px: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The z-buffer: flat sample indices (N,), increasing, with their triangle and depth."""
-    along_x, along_y = _depth_slopes(column, corners)
-    at_start = (corners.inverse_z[part, 0] + (start - column[part, 0]) * along_x[part]
-                + (y_px[line] - corners.xy_px[part, 0, 1]) * along_y[part])
+    along_x, along_y = _depth_slopes(column, pieces)
+    at_start = (pieces.inverse_z[part, 0] + (start - column[part, 0]) * along_x[part]
+                + (y_px[line] - pieces.xy_px[part, 0, 1]) * along_y[part])
     span, at = _expand(start, stop - start)
     sample = line[span] * width + at
     inverse_z = at_start[span] + (at - start[span]) * along_x[part[span]]
@@ -191,26 +222,14 @@ def _nearest(column: np.ndarray, corners: _Corners, line: np.ndarray, part: np.n
     return hit, owner[hit], 1 / buffer[hit]
 
 
-def _depth_slopes(column: np.ndarray, corners: _Corners) -> tuple[np.ndarray, np.ndarray]:
+def _depth_slopes(column: np.ndarray, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
     """Change of inverse depth per column and per pixel of y, for each triangle."""
-    a = np.stack([column[:, 1] - column[:, 0], corners.xy_px[:, 1, 1] - corners.xy_px[:, 0, 1]], axis=1)
-    b = np.stack([column[:, 2] - column[:, 0], corners.xy_px[:, 2, 1] - corners.xy_px[:, 0, 1]], axis=1)
+    a = np.stack([column[:, 1] - column[:, 0], pieces.xy_px[:, 1, 1] - pieces.xy_px[:, 0, 1]], axis=1)
+    b = np.stack([column[:, 2] - column[:, 0], pieces.xy_px[:, 2, 1] - pieces.xy_px[:, 0, 1]], axis=1)
     area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     inverse_area = np.where(np.abs(area) > SLIVER, 1 / np.where(area == 0, 1.0, area), 0.0)
-    da, db = (corners.inverse_z[:, i] - corners.inverse_z[:, 0] for i in (1, 2))
+    da, db = (pieces.inverse_z[:, i] - pieces.inverse_z[:, 0] for i in (1, 2))
     return (da * b[:, 1] - db * a[:, 1]) * inverse_area, (db * a[:, 0] - da * b[:, 0]) * inverse_area
-
-
-def _weights(column: np.ndarray, corners: _Corners, owner: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Perspective-correct weights (N, 3) of the corners of the mesh's triangle at samples in columns x and rows y.  (2)"""
-    dx, dy = column[owner] - x[:, None], corners.xy_px[owner, :, 1] - y[:, None]
-    b = np.stack([dx[:, (i + 1) % 3] * dy[:, (i + 2) % 3] - dx[:, (i + 2) % 3] * dy[:, (i + 1) % 3] for i in range(3)], axis=1)
-    total = b.sum(axis=1, keepdims=True)
-    b = np.clip(np.where(np.abs(total) > SLIVER, b / np.where(total == 0, 1.0, total), 1 / 3), 0.0, 1.0) * corners.inverse_z[owner]
-    b /= b.sum(axis=1, keepdims=True)
-    cut = np.flatnonzero(corners.cut[owner])
-    b[cut] = np.einsum("nk,nkc->nc", b[cut], corners.weights[owner[cut]])
-    return b
 
 
 def vertex_normals(vertices_m: np.ndarray, triangles: np.ndarray) -> np.ndarray:

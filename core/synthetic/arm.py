@@ -24,13 +24,12 @@ from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
 from ..errors import InputError
 from ..geometry.camera import Camera
-from ..geometry.raster import vertex_normals
 from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
 from ..images.fields import row_grid
 from ..progress import Monitor
 from ..settings import knob
-from .figure import Part, joined, moving_parts, standing_parts, wall
+from .figure import Part, arm_parts, joined, torso_parts, wall
 from .film import Layer, Sensor, digitize, expose, paint, seen_vertices
 from .texture import SolidNoise, solid_noise
 from .truth import motion_capture_name
@@ -61,8 +60,25 @@ class ArmTakeSettings:
     seed: int = knob(1, "Another seed: other textures, noise and clicks.", low=0, high=2**31 - 1)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Studio:
+    """What does not change during the recording."""
+
+    settings: ArmTakeSettings
+    rig: Rig
+    shape: BodyShape
+    at_rest: tuple[Part, ...]
+    noise: SolidNoise
+    backdrops: tuple[Layer, ...]  # the wall, as each camera sees it
+
+    def body(self, time_s: float) -> tuple[Part, ...]:
+        """The person at one moment."""
+        motion = arm_motion(time_s)
+        return (*arm_parts(self.shape, motion, self.at_rest), *torso_parts(motion[:3]))
+
+
 def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor: Monitor | None = None) -> None:
-    """Make the recording in `folder`: a take and truth.npz. The same settings give the same pictures and truth. About 12 s for
+    """Make the recording in `folder`: a take and truth.npz. The same settings give the same pictures and truth. About 15 s for
     16 frames.
 
     take.toml is written last: as long as it is missing, the recording is not complete.
@@ -73,17 +89,21 @@ def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor
     """
     settings, monitor, folder = settings or ArmTakeSettings(), monitor or Monitor(), Path(folder)
     _clear(folder)
-    rig, shape, noise = arm_rig(settings.width_px), arm_shape(), solid_noise(settings.seed)
-    still = (*standing_parts(SHOULDER_M), wall(WALL_Y_M))
-    layers = [paint(camera, still, noise) for camera in rig.cameras]
-    write_rig(folder / "rig.toml", rig)
+    studio = _studio(settings)
+    write_rig(folder / "rig.toml", studio.rig)
     visible = []
     for frame in range(settings.frames):
         monitor.step(STAGE, frame, settings.frames)
-        visible.append(_film_frame(folder, settings, frame, rig, shape, noise, layers))
-    store.write_bytes(folder / "truth.npz", _truth(settings, shape, np.array(visible)))
-    store.write_text(folder / "take.toml", _take_toml(settings, rig, shape))
+        visible.append(_film_frame(folder, studio, frame))
+    store.write_bytes(folder / "truth.npz", _truth(studio, np.array(visible)))
+    store.write_text(folder / "take.toml", _take_toml(studio))
     monitor.step(STAGE, settings.frames, settings.frames)
+
+
+def _studio(settings: ArmTakeSettings) -> _Studio:
+    rig, shape, noise = arm_rig(settings.width_px), arm_shape(), solid_noise(settings.seed)
+    return _Studio(settings=settings, rig=rig, shape=shape, noise=noise, at_rest=arm_parts(shape, np.zeros(len(shape.skeleton.dof_names))),
+                   backdrops=tuple(paint(camera, [wall(WALL_Y_M)], noise) for camera in rig.cameras))
 
 
 def arm_shape() -> BodyShape:
@@ -142,21 +162,17 @@ def _clear(folder: Path) -> None:
         raise InputError(f"Cannot make room for a recording in {folder}: {error.strerror or error}; choose another folder.") from error
 
 
-def _film_frame(folder: Path, settings: ArmTakeSettings, frame: int, rig: Rig, shape: BodyShape, noise: SolidNoise,
-                still: list[Layer]) -> np.ndarray:
+def _film_frame(folder: Path, studio: _Studio, frame: int) -> np.ndarray:
     """Write one frame of all views; return which vertices (V,) all of them see in the rows that are kept."""
-    kept = row_grid(settings.interlaced)
-    rest = moving_parts(shape, np.zeros(len(shape.skeleton.dof_names)))
+    settings, kept = studio.settings, row_grid(studio.settings.interlaced)
     instants = [frame / settings.fps] + ([(frame + 0.5) / settings.fps] if kept.step == 2 else [])
-    fields = [moving_parts(shape, arm_motion(time), rest) for time in instants]
-    body = (*fields[0], *standing_parts(SHOULDER_M))
-    vertices = joined(body)[0]
-    normals = np.concatenate([vertex_normals(p.vertices_m, p.triangles) for p in body])
-    seen = np.ones(len(vertices), dtype=bool)
-    for i, camera in enumerate(rig.cameras):
+    bodies = [studio.body(time) for time in instants]
+    scene = joined(bodies[0])
+    seen = np.ones(len(scene.vertices_m), dtype=bool)
+    for i, camera in enumerate(studio.rig.cameras):
         sensor = SENSORS[camera.name]
-        layers = [paint(camera, parts, noise, still[i]) for parts in fields]
-        seen &= seen_vertices(camera, vertices, normals, layers[0])
+        layers = [paint(camera, parts, studio.noise, studio.backdrops[i]) for parts in bodies]
+        seen &= seen_vertices(camera, scene.vertices_m, scene.normals, layers[0])
         picture = expose(layers[0], sensor)
         if kept.step == 2:
             picture[1 - kept.offset::2] = expose(layers[1], sensor)[1 - kept.offset::2]
@@ -169,14 +185,14 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
     store.write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
-def _truth(settings: ArmTakeSettings, shape: BodyShape, visible: np.ndarray) -> bytes:
-    time = np.arange(settings.frames) / settings.fps
-    motion = arm_motion(time)
-    bodies: list[tuple[Part, ...]] = [(*moving_parts(shape, values), *standing_parts(SHOULDER_M)) for values in motion]
+def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
+    shape, time = studio.shape, np.arange(studio.settings.frames) / studio.settings.fps
+    motion, bodies = arm_motion(time), [studio.body(moment) for moment in time]
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     textured = np.concatenate([np.full(len(p.vertices_m), p.material.textured) for p in bodies[0]])
     arrays = dict(
-        vertices_m=np.array([joined(body)[0] for body in bodies], dtype=np.float32), triangles=joined(bodies[0])[1].astype(np.int32),
+        vertices_m=np.array([np.concatenate([p.vertices_m for p in body]) for body in bodies], dtype=np.float32),
+        triangles=joined(bodies[0]).triangles.astype(np.int32),
         textured=textured, visible=np.packbits(visible, axis=1), joints_m=np.stack([joints[name] for name in JOINTS], axis=1),
         joint_names=np.array([motion_capture_name(name) for name in JOINTS]), time_s=time, motion_values=motion,
         dof_names=np.array(shape.skeleton.dof_names),
@@ -187,7 +203,8 @@ def _truth(settings: ArmTakeSettings, shape: BodyShape, visible: np.ndarray) -> 
     return buffer.getvalue()
 
 
-def _take_toml(settings: ArmTakeSettings, rig: Rig, shape: BodyShape) -> str:
+def _take_toml(studio: _Studio) -> str:
+    settings, rig, shape = studio.settings, studio.rig, studio.shape
     rng = np.random.default_rng([settings.seed, 77])
     joints = joint_positions(shape.skeleton, shape.lengths_m, arm_motion(0.0))
     lines = ['format = "tricap-take"', "version = 1", f"fps = {settings.fps!r}", f'interlaced = "{settings.interlaced}"',

@@ -11,6 +11,7 @@ import numpy as np
 from ..body.shape import BodyShape
 from ..body.skeleton import bone_frames
 from ..body.skin import SkinSettings, limb_skin
+from ..geometry.raster import vertex_normals
 from ..values import frozen
 
 SKIN = SkinSettings(contours=48, rays=64, cap_contours=10)
@@ -50,7 +51,7 @@ class Part:
         object.__setattr__(self, "rest_m", frozen(self.rest_m, (v, 3), name="rest_m"))
 
 
-def moving_parts(shape: BodyShape, motion: np.ndarray, rest: Sequence["Part"] | None = None) -> tuple[Part, ...]:
+def arm_parts(shape: BodyShape, motion: np.ndarray, rest: Sequence["Part"] | None = None) -> tuple[Part, ...]:
     """The sleeve and the hand in one posture (D,). `rest`: the same parts in the rest pose, as made without it."""
     skin = limb_skin(shape, motion, SKIN)
     centre = np.array([0.0, shape.lengths_m[-1] + HAND_CENTRE_M, 0.0])  # in the forearm's axes
@@ -62,14 +63,14 @@ def moving_parts(shape: BodyShape, motion: np.ndarray, rest: Sequence["Part"] | 
             Part(vertices_m=hand, triangles=hand_triangles, rest_m=rest_m[1], material=BARE_SKIN))
 
 
-def standing_parts(shoulder_m: np.ndarray) -> tuple[Part, ...]:
-    """Torso, neck and head of a person whose right shoulder is at `shoulder_m` (3,); they keep still."""
+def torso_parts(shoulder_m: np.ndarray) -> tuple[Part, ...]:
+    """Torso, neck and head of a person whose right shoulder is at `shoulder_m` (3,); they sway with it."""
     parts = []
     for centre, semi_axes, power, n, material in (
-            ((0.150, 0.01, -0.26), (0.225, 0.115, 0.335), 3.0, 96, CLOTH), ((0.150, 0.0, 0.10), (0.058, 0.062, 0.11), 2.0, 32, BARE_SKIN),
+            ((0.150, 0.01, -0.26), (0.225, 0.125, 0.335), 2.5, 96, CLOTH), ((0.150, 0.0, 0.10), (0.058, 0.062, 0.11), 2.0, 32, BARE_SKIN),
             ((0.150, -0.015, 0.26), (0.075, 0.095, 0.120), 2.0, 40, BARE_SKIN)):
         vertices, triangles = superellipsoid(shoulder_m + np.array(centre), np.array(semi_axes), power, n, n)
-        parts.append(Part(vertices_m=vertices, triangles=triangles, rest_m=vertices, material=material))
+        parts.append(Part(vertices_m=vertices, triangles=triangles, rest_m=vertices - shoulder_m, material=material))
     return tuple(parts)
 
 
@@ -98,8 +99,23 @@ def superellipsoid(centre_m: np.ndarray, semi_axes_m: np.ndarray, power: float, 
     return centre_m + sphere * radius * semi_axes_m, np.concatenate([top, sides, bottom])
 
 
-def joined(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All parts as one mesh: vertices (V, 3), triangles (F, 3), and the part of each triangle (F,)."""
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Scene:
+    """Several parts as one mesh."""
+
+    vertices_m: np.ndarray  # (V, 3)
+    triangles: np.ndarray  # (F, 3)
+    normals: np.ndarray  # (V, 3)
+    rest_m: np.ndarray  # (V, 3)
+    owner: np.ndarray  # (F,) the part of each triangle
+    materials: tuple[Material, ...]  # of the parts
+
+
+def joined(parts: Sequence[Part]) -> Scene:
+    """All parts as one mesh, each with normals of its own."""
     start = np.cumsum([0, *(len(p.vertices_m) for p in parts)])
-    triangles = np.concatenate([p.triangles + first for p, first in zip(parts, start)])
-    return np.concatenate([p.vertices_m for p in parts]), triangles, np.repeat(np.arange(len(parts)), [len(p.triangles) for p in parts])
+    return Scene(vertices_m=np.concatenate([p.vertices_m for p in parts]),
+                 triangles=np.concatenate([p.triangles + first for p, first in zip(parts, start)]),
+                 normals=np.concatenate([vertex_normals(p.vertices_m, p.triangles) for p in parts]),
+                 rest_m=np.concatenate([p.rest_m for p in parts]), materials=tuple(p.material for p in parts),
+                 owner=np.repeat(np.arange(len(parts)), [len(p.triangles) for p in parts]))

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.raster import rasterize, vertex_normals
+from ..geometry.raster import Raster, rasterize
 from ..values import frozen
-from .figure import Part, joined
+from .figure import Part, Scene, joined
 from .texture import SolidNoise
 
 SAMPLES = 2  # per pixel and direction
+OUTLINE_STEP_M = 0.006  # samples of one pixel that lie farther apart in depth are on an outline
 AMBIENT = 0.45
 LIGHT = np.array([-0.40, -0.75, 0.53])  # towards the light: from the left, the front and above
 
@@ -35,7 +36,8 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Layer:
-    """What a camera sees of some parts, `SAMPLES`² samples a pixel: light (H, W) float32 and depth z_cam [m] float32, inf: nothing."""
+    """What a camera sees of some parts: light (H, W) float32 of each pixel, and depth z_cam [m] of `SAMPLES`² samples a pixel
+    (H · SAMPLES, W · SAMPLES) float32, inf where there is nothing."""
 
     light: np.ndarray
     depth_m: np.ndarray
@@ -46,35 +48,63 @@ class Layer:
 
 
 def paint(camera: Camera, parts: Sequence[Part], noise: SolidNoise, behind: Layer | None = None) -> Layer:
-    """The parts before what lies behind them.  (1)"""
-    vertices, triangles, owner = joined(parts)
-    raster = rasterize(camera, vertices, triangles, factor=SAMPLES)
-    nearer = np.ones(len(raster.sample), dtype=bool) if behind is None else raster.depth_m < behind.depth_m.ravel()[raster.sample]
-    normals = np.concatenate([vertex_normals(p.vertices_m, p.triangles) for p in parts])
-    rest = np.concatenate([p.rest_m for p in parts])
-    light = np.zeros(raster.shape, np.float32) if behind is None else behind.light.copy()
+    """The parts before what lies behind them.
+
+    Pixels inside a part are shaded at their centres, which is enough for textures that are smooth over a pixel; pixels on an outline are
+    the mean of their samples.
+    """
+    scene = joined(parts)
+    raster = rasterize(camera, scene.vertices_m, scene.triangles, factor=SAMPLES)
+    light = np.zeros(camera.size_px[::-1], np.float32) if behind is None else behind.light.copy()
     depth = np.full(raster.shape, np.inf, np.float32) if behind is None else behind.depth_m.copy()
+    nearer = np.flatnonzero(raster.depth_m < depth.ravel()[raster.sample])
     depth.reshape(-1)[raster.sample[nearer]] = raster.depth_m[nearer]
-    for i, part in enumerate(parts):
-        shown = np.flatnonzero(nearer & (owner[raster.triangle] == i))
-        weights, corners = raster.barycentric[shown], triangles[raster.triangle[shown]]
-        at, normal = (np.einsum("nk,nkc->nc", weights, values[corners]) for values in (rest, normals))
-        light.reshape(-1)[raster.sample[shown]] = _reflected(part, at, normal, noise)
+    hit = np.full(raster.shape, -1)
+    hit.reshape(-1)[raster.sample[nearer]] = nearer
+    pixel, outline = _inner_and_outline(hit, depth, scene.owner[raster.triangle])
+    centre = np.stack([pixel % light.shape[1], pixel // light.shape[1]], axis=1)
+    light.reshape(-1)[pixel] = _reflected(scene, raster, hit[::SAMPLES, ::SAMPLES].ravel()[pixel], centre, noise)
+    here = np.stack([plane.ravel()[outline] for plane in _planes(hit)], axis=1)
+    samples = np.repeat(light.reshape(-1, 1)[outline], SAMPLES**2, axis=1)
+    samples[here >= 0] = _reflected(scene, raster, here[here >= 0], raster.xy_px[here[here >= 0]], noise)
+    light.reshape(-1)[outline] = samples.mean(axis=1)
     return Layer(light=light, depth_m=depth)
 
 
-def _reflected(part: Part, rest_m: np.ndarray, normal: np.ndarray, noise: SolidNoise) -> np.ndarray:
-    m = part.material
-    texture = m.mean + m.contrast * noise(rest_m / m.stretch + m.offset_m)
-    lambert = np.clip(normal @ LIGHT / np.maximum(np.linalg.norm(normal, axis=1) * np.linalg.norm(LIGHT), 1e-12), 0, None)
-    return texture * (AMBIENT + (1 - AMBIENT) * lambert)
+def _planes(samples: np.ndarray) -> list[np.ndarray]:
+    """Samples (H · SAMPLES, W · SAMPLES) as SAMPLES² pictures (H, W), one for each place within a pixel."""
+    return [samples[i::SAMPLES, j::SAMPLES] for i in range(SAMPLES) for j in range(SAMPLES)]
+
+
+def _inner_and_outline(hit: np.ndarray, depth: np.ndarray, part_of_hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (flat) whose samples all show one smooth stretch of one part, and the other pixels that show something."""
+    part = np.append(part_of_hit, -1).astype(np.int8)[hit]  # −1: what lies behind
+    touched, alike = np.zeros(_planes(part)[0].shape, dtype=bool), np.ones(_planes(part)[0].shape, dtype=bool)
+    first, near, far = _planes(part)[0], _planes(depth)[0], _planes(depth)[0]
+    for p, d in zip(_planes(part), _planes(depth)):
+        touched |= p >= 0
+        alike &= p == first
+        near, far = np.minimum(near, d), np.maximum(far, d)
+    inner = touched & alike & (near > far - OUTLINE_STEP_M)
+    return np.flatnonzero(inner), np.flatnonzero(touched & ~inner)
+
+
+def _reflected(scene: Scene, raster: Raster, which: np.ndarray, xy_px: np.ndarray, noise: SolidNoise) -> np.ndarray:
+    """Light (K,) of the surfaces behind the raster's samples `which`, at pixels (K, 2).  (1)"""
+    at = raster.interpolate_at(which, xy_px, np.concatenate([scene.rest_m, scene.normals], axis=1), scene.triangles)
+    rest, normal = at[:, :3], at[:, 3:]
+    length = np.sqrt(np.einsum("ni,ni->n", normal, normal) * (LIGHT @ LIGHT))
+    lambert = np.clip(normal @ LIGHT / np.maximum(length, 1e-12), 0, None)
+    owner, texture = scene.owner[raster.triangle[which]], np.zeros(len(which), np.float32)
+    for i, m in enumerate(scene.materials):
+        here = np.flatnonzero(owner == i)
+        texture[here] = m.mean + m.contrast * noise(rest[here] / m.stretch + m.offset_m)
+    return texture * (AMBIENT + (1 - AMBIENT) * lambert).astype(np.float32)
 
 
 def expose(layer: Layer, sensor: Sensor) -> np.ndarray:
     """The expected grey values (H, W) of a picture without noise.  (2)"""
-    h, w = layer.light.shape
-    pixels = cv2.resize(layer.light, (w // SAMPLES, h // SAMPLES), interpolation=cv2.INTER_AREA)
-    return sensor.offset + sensor.gain * cv2.GaussianBlur(pixels, (0, 0), sensor.blur_px, borderType=cv2.BORDER_REPLICATE)
+    return sensor.offset + sensor.gain * cv2.GaussianBlur(layer.light, (0, 0), sensor.blur_px, borderType=cv2.BORDER_REPLICATE)
 
 
 def digitize(expected: np.ndarray, sensor: Sensor, noise_level: float, rng: np.random.Generator) -> np.ndarray:

@@ -43,11 +43,11 @@ def test_tilted_plane_depth_is_that_of_the_ray() -> None:
     cam = camera(R_cam_world=rotation_from_vector(np.array([0.1, -0.2, 0.05])), t_cam_world_m=[0.1, 0.2, 0.3])
     vertices, triangles = grid(1, 0.5, 0.4, lambda x, y: 2 + 0.3 * x - 0.2 * y)
     raster = rasterize(cam, vertices, triangles)
-    xy = np.stack([raster.x_px[raster.sample % 160], raster.y_px[raster.sample // 160]], axis=1)
+    xy = raster.xy_px
     assert len(xy) > 3000
     on_ray = cam.points_at_depth(xy, raster.depth_m)
     assert np.abs(on_ray[:, 2] - (2 + 0.3 * on_ray[:, 0] - 0.2 * on_ray[:, 1])).max() < 1e-9
-    assert np.abs(raster.interpolate(vertices, triangles) - on_ray).max() < 1e-9  # weights are perspective-correct
+    assert np.abs(raster.interpolate(vertices, triangles) - on_ray).max() < 1e-9  # the weights are perspective-correct
 
 
 def test_sphere_depth_through_a_distorting_camera() -> None:
@@ -55,7 +55,7 @@ def test_sphere_depth_through_a_distorting_camera() -> None:
     centre, radius = (0.12, -0.08, 1.0), 0.2
     vertices, triangles = sphere(centre, radius, 120)
     raster = rasterize(cam, vertices, triangles)
-    xy = np.stack([raster.x_px[raster.sample % 160], raster.y_px[raster.sample // 160]], axis=1)
+    xy = raster.xy_px
     off = np.linalg.norm(cam.points_at_depth(xy, raster.depth_m) - centre, axis=1) - radius
     # a chord over 2π/240 lies R (1 - cos) ≈ 0.034 mm inside, twice that over a diagonal; grazing rays magnify it along the ray,
     # so the distance from the surface is the measure. Straight edges between distorted corners add < 0.01 mm here.

@@ -5,8 +5,8 @@ import pytest
 
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import vertex_normals
-from tricap.core.synthetic.figure import BARE_SKIN, CLOTH, Part, superellipsoid, wall
-from tricap.core.synthetic.film import Sensor, digitize, expose, paint, seen_vertices
+from tricap.core.synthetic.figure import BARE_SKIN, CLOTH, Material, Part, superellipsoid, wall
+from tricap.core.synthetic.film import AMBIENT, LIGHT, Sensor, digitize, expose, paint, seen_vertices
 from tricap.core.synthetic.texture import solid_noise
 
 CAMERA = Camera(name="C", size_px=(160, 120), matrix=np.array([[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]]),
@@ -32,9 +32,23 @@ def test_a_layer_covers_what_lies_behind_and_keeps_what_lies_before() -> None:
     behind = paint(CAMERA, [wall(2.0, 20, 1.5, (0.0, 0.0)), ball(1.0, 0.1)], NOISE)
     assert np.isfinite(behind.depth_m).all() and abs(behind.depth_m[120, 160] - 0.9) < 1e-3
     both = paint(CAMERA, [ball(1.5, 0.3, BARE_SKIN)], NOISE, behind)
-    assert abs(both.depth_m[120, 160] - 0.9) < 1e-3 and both.light[120, 160] == behind.light[120, 160]
-    assert abs(both.depth_m[120, 240] - 1.2504) < 5e-3 and both.light[120, 240] != behind.light[120, 240]
+    assert abs(both.depth_m[120, 160] - 0.9) < 1e-3 and both.light[60, 80] == behind.light[60, 80]
+    assert abs(both.depth_m[120, 240] - 1.2504) < 5e-3 and both.light[60, 120] != behind.light[60, 120]
     assert both.light[5, 5] == behind.light[5, 5]
+
+
+def test_outlines_are_covered_in_part_and_inner_pixels_are_shaded_at_their_centres() -> None:
+    bright = ball(1.0, 0.1, Material(mean=100.0, contrast=0.0))
+    light = paint(CAMERA, [bright], NOISE).light
+    hit = paint(CAMERA, [bright], NOISE).depth_m < np.inf
+    share = hit.reshape(120, 2, 160, 2).mean(axis=(1, 3))
+    assert set(np.unique(share)) == {0.0, 0.25, 0.5, 0.75, 1.0}
+    assert (light[share == 0] == 0).all() and (light[share > 0] > 0).all() and (light <= 100.001 * share).all()
+    x, y = 88, 52  # the normal of the ball there, from the ray through the pixel's centre
+    ray = CAMERA.rays(np.array([x, y])) / np.linalg.norm(CAMERA.rays(np.array([x, y])))
+    depth = ray[1] - np.sqrt(ray[1] ** 2 - 1 + 0.01)
+    normal = (ray * depth - [0, 1, 0]) / 0.1
+    assert light[y, x] == pytest.approx(100 * (AMBIENT + (1 - AMBIENT) * normal @ LIGHT / np.linalg.norm(LIGHT)), rel=2e-3)
 
 
 def test_exposure_is_blurred_and_has_the_camera_s_gain() -> None:

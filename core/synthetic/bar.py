@@ -1,0 +1,137 @@
+"""A waved reference bar before synthetic cameras: its image points with noise, gaps and blunders, for tests and benchmarks.
+
+The wave is a Lissajous figure through the volume with the bar turning through all directions; cameras are those of CALIBRATION's
+benchmark (a row of three) or drawn at random: in a row, exactly in a row, parallel, in a triangle, wide apart.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..geometry.camera_derivatives import camera_of
+from ..values import frozen
+
+RIG_KINDS = ("row", "exact row", "parallel", "triangle", "wide")
+SIZE_PX = (768, 576)
+VOLUME_CENTRE_M, VOLUME_SIZE_M = np.array([0.0, 0.0, 2.5]), np.array([1.0, 1.5, 1.0])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BarNoise:
+    """What is wrong with the image points."""
+
+    sigma_px: float = 0.05
+    missing: float = 0.10  # fraction of the image points
+    gross: float = 0.02  # fraction displaced by 5 … 200 px
+    unlabelled: bool = False  # ends in random order in each camera
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class WavedBar:
+    """The truth and what the cameras saw."""
+
+    cameras: tuple[Camera, ...]
+    length_m: float
+    ends_m: np.ndarray  # (N, 2, 3)
+    xy_px: np.ndarray  # (N, C, 2, 2), NaN: missing
+    wrong: np.ndarray  # (N, C, 2) displaced
+    swapped: np.ndarray  # (N, C) ends in the other order
+
+    def __post_init__(self) -> None:
+        N, C = len(self.ends_m), len(self.cameras)
+        for name, shape, dtype in (
+            ("ends_m", (N, 2, 3), np.float64),
+            ("xy_px", (N, C, 2, 2), np.float64),
+            ("wrong", (N, C, 2), bool),
+            ("swapped", (N, C), bool),
+        ):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, dtype, name))
+
+
+def benchmark_cameras(simple_lens: bool = False) -> tuple[Camera, ...]:
+    """Three cameras of 768×576 in a row of 1.5 m; with `simple_lens` only f and k1 differ from a pinhole in the image's middle."""
+    rng = np.random.default_rng(42)
+    f, k1 = (760.0, 775.0, 752.0), (-0.15, -0.16, -0.145)
+    pp = ((7.3, -4.2), (-5.1, 6.0), (3.4, 2.5))
+    rest = (
+        (0.05, -0.008, 5e-4, -3e-4, 3e-4, 1e-4),
+        (0.06, -0.008, -4e-4, 6e-4, -2e-4, 2e-4),
+        (0.045, -0.008, 3e-4, 8e-4, 4e-4, -1e-4),
+    )
+    cameras = []
+    for i, x in enumerate((-0.75, 0.0, 0.75)):
+        k2, k3, p1, p2, b1, b2 = (0.0,) * 6 if simple_lens else rest[i]
+        cx, cy = (0.0, 0.0) if simple_lens else pp[i]
+        interior = np.array([f[i], (SIZE_PX[0] - 1) / 2 + cx, (SIZE_PX[1] - 1) / 2 + cy, k1[i], k2, k3, p1, p2, b1, b2])
+        centre = np.array([x, 0.0, 0.0]) + rng.uniform(-0.03, 0.03, 3)
+        R = _looking_at(centre, VOLUME_CENTRE_M + rng.uniform(-0.04, 0.04, 3), np.radians(rng.uniform(-1, 1)))
+        cameras.append(camera_of("LCR"[i], SIZE_PX, interior, R, -R @ centre))
+    return tuple(cameras)
+
+
+def random_cameras(rng: np.random.Generator, kind: str) -> tuple[Camera, ...]:
+    """Three cameras about the same volume, focal lengths 500–1500 px that differ by up to ±25 %, a lens with all distortions."""
+    places = {
+        "row": [[-0.75, 0, 0], [0, 0, 0], [0.75, 0, 0]],
+        "exact row": [[-0.75, 0, 0], [0, 0, 0], [0.75, 0, 0]],
+        "parallel": [[-0.3, 0, 0], [0, 0, 0], [0.3, 0, 0]],
+        "triangle": [[-0.6, 0, 0], [0.6, 0, 0], [0, -0.6, 0]],
+        "wide": [[-2.0, 0, 1.0], [0, -0.3, 0], [2.0, 0, 1.0]],
+    }[kind]
+    f0 = rng.uniform(500, 1500)
+    cameras = []
+    for name, place in zip("LCR", np.array(places, dtype=np.float64)):
+        f = f0 * rng.uniform(0.75, 1.25)
+        rho = 480.0 / f  # half the diagonal in units of f
+        k1, k2, k3 = rng.uniform(-0.10, 0.03) / rho**2, rng.uniform(-0.02, 0.02) / rho**4, rng.uniform(-0.004, 0.004) / rho**6
+        small = rng.uniform(-6e-4, 6e-4, 2), rng.uniform(-4e-4, 4e-4, 2)
+        interior = np.array([f, 383.5, 287.5, k1, k2, k3, *small[0], *small[1]]) + np.r_[0, rng.uniform(-8, 8, 2), np.zeros(7)]
+        exact = kind == "exact row"
+        distance = 2.5 * max(f, 600.0) / 760.0  # longer lenses stand further back
+        centre = place * distance / 2.5 + [0, 0, 2.5 - distance] + (0 if exact else rng.uniform(-0.03, 0.03, 3))
+        aim = VOLUME_CENTRE_M + (0 if exact else rng.uniform(-0.05, 0.05, 3))
+        if kind == "parallel":
+            aim = centre + [0, 0, 1]
+        R = _looking_at(centre, aim, 0.0 if exact else np.radians(rng.uniform(-3, 3)))
+        cameras.append(camera_of(name, SIZE_PX, interior, R, -R @ centre))
+    return tuple(cameras)
+
+
+def waved_bar(cameras: Sequence[Camera], positions: int, rng: np.random.Generator, noise: BarNoise, length_m: float = 0.5) -> WavedBar:
+    """Wave a bar through the volume and take its image points."""
+    ends = bar_ends(positions, rng, length_m)
+    xy = np.stack([c.project(ends) for c in cameras], axis=1)
+    inside = np.stack([c.sees(xy[:, i]) for i, c in enumerate(cameras)], axis=1)
+    wrong = rng.random(inside.shape) < noise.gross
+    angle, far = rng.uniform(0, 2 * np.pi, inside.shape), rng.uniform(5, 200, inside.shape)
+    xy = xy + rng.normal(0, noise.sigma_px, xy.shape)
+    xy += wrong[..., None] * far[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    xy[~inside | (rng.random(inside.shape) < noise.missing)] = np.nan
+    swapped = (rng.random(inside.shape[:2]) < 0.5) & noise.unlabelled
+    xy = np.where(swapped[..., None, None], xy[:, :, ::-1], xy)
+    return WavedBar(cameras=tuple(cameras), length_m=length_m, ends_m=ends, xy_px=xy, wrong=wrong, swapped=swapped)
+
+
+def bar_ends(positions: int, rng: np.random.Generator, length_m: float) -> np.ndarray:
+    """Ends (N, 2, 3) of a bar on a Lissajous wave that fills the volume, turning through all directions."""
+    time = np.arange(positions)
+    rates = np.array([0.0731, 0.1127, 0.0519]) * rng.uniform(0.85, 1.15, 3)
+    reach = (VOLUME_SIZE_M / 2) * 0.98 - length_m / 4
+    centre = VOLUME_CENTRE_M + reach * np.sin(rates * time[:, None] + rng.uniform(0, 2 * np.pi, 3))
+    azimuth = 0.091 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi)
+    height = np.sin(0.0673 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi))
+    across = np.sqrt(1 - height**2)
+    direction = np.stack([across * np.cos(azimuth), height, across * np.sin(azimuth)], axis=-1)
+    return np.stack([centre + direction * length_m / 2, centre - direction * length_m / 2], axis=1)
+
+
+def _looking_at(centre: np.ndarray, aim: np.ndarray, roll: float) -> np.ndarray:
+    """R_cam_world of a camera at `centre` that looks at `aim`; y of the world is down."""
+    z = (aim - centre) / np.linalg.norm(aim - centre)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    c, s = np.cos(roll), np.sin(roll)
+    return np.stack([c * x + s * y, c * y - s * x, z])
