@@ -25,6 +25,7 @@ from .seeds import Approximations
 NEIGHBOURS = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
 TEMPLATE_SIGMA_PX = 0.02  # of the template point itself, so that it may move along with the adjustment
 NOISE_SIGMAS = 4.0
+EQUAL_SIGMA_PX = 1.0  # far above matching's own: all rays weigh alike
 PATCH_STEP_PX = 4
 SEED_MEDIANS, MAX_LIMIT_PX = 3.0, 2.5
 
@@ -105,7 +106,8 @@ def grow(
     state = _State(n_cells, len(cameras))
     camera = cameras[reference]
     cells, start, shape, parent_depth = _seed_front(grid, seeds, reference)
-    limit_px = _residual_limit(_measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching)[1], growing)
+    matched, point, _ = _measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching, EQUAL_SIGMA_PX)
+    limit_px, rig_sigma_px = _rig_quality(matched, point, growing)
     for enlarged in range(growing.bigger_patches + 1):
         settings = replace(matching, patch_px=matching.patch_px + PATCH_STEP_PX * enlarged)
         if enlarged:
@@ -115,18 +117,27 @@ def grow(
             monitor.step("surface", int(state.accepted.sum()), n_cells)
             state.attempts[cells] += 1
             xy = grid.xy(cells)
-            matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings)
+            matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px)
             good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, foreground)
             _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], reference)
             cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
     return _field(state, grid, limit_px)
 
 
-def _residual_limit(seeds: Intersection, growing: GrowingSettings) -> float:
-    """What the calibration allows: a rig whose rays miss each other by 0.6 px everywhere must not lose its points for that."""
-    residual = seeds.rms_residual_px[np.isfinite(seeds.rms_residual_px)]
-    typical = float(np.median(residual)) if len(residual) else 0.0
-    return max(growing.max_residual_px, min(SEED_MEDIANS * typical, MAX_LIMIT_PX))
+def _rig_quality(matched: Sequence[Matches], seeds: Intersection, growing: GrowingSettings) -> tuple[float, float]:
+    """The residual to allow, and the sigma of an image point that the rig and the affine patch add to matching, both from the seeds.
+
+    A rig whose rays miss each other by 0.6 px everywhere must not lose its points for that, and its sigmas must say so: with K equally
+    weighted rays the mean square residual is σ² (2 K − 3) / K, of which matching explains its own part.
+    """
+    known = np.isfinite(seeds.rms_residual_px)
+    if not known.any():
+        return growing.max_residual_px, 0.0
+    typical = float(np.median(seeds.rms_residual_px[known]))
+    rays = len(matched) + 1
+    explained = float(np.median([np.trace(m.transfer_covariance[known], axis1=1, axis2=2) / 2 for m in matched]))
+    unexplained = typical**2 * rays / (2 * rays - 3) - explained
+    return max(growing.max_residual_px, min(SEED_MEDIANS * typical, MAX_LIMIT_PX)), float(np.sqrt(max(0.0, unexplained)))
 
 
 def _front_from(
@@ -157,7 +168,9 @@ def _measure(
     start: np.ndarray,
     shape: np.ndarray,
     matching: MatchingSettings,
+    rig_sigma_px: float,
 ) -> tuple[list[Matches], Intersection, np.ndarray]:
+    """Match points in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
     views = [k for k in range(len(cameras)) if k != reference]
     matched = match_patches(
         images[reference],
@@ -169,12 +182,13 @@ def _measure(
         row_step=grid.rows.step,
     )
     image_xy = np.full((len(xy), len(cameras), 2), np.nan)
-    K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2, (len(xy), len(cameras), 1, 1))
+    rig = np.diag([1.0, 1 / grid.rows.step**2]) * rig_sigma_px**2
+    K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(cameras), 1, 1))
     image_xy[:, reference] = xy + matched[0].offset
     every = np.all([m.ok for m in matched], axis=0)
     for k, m in zip(views, matched):
         image_xy[every, k] = m.transfer_xy[every]
-        K[every, k] = m.transfer_covariance[every]
+        K[every, k] = m.transfer_covariance[every] + rig
     image_xy[~every] = np.nan
     point = forward_intersection(cameras, grid.rows.to_frame(image_xy), grid.rows.covariance_to_frame(K))
     return matched, point, cameras[reference].to_camera(point.xyz_m)[:, 2]
