@@ -9,6 +9,10 @@ import pytest
 import tricap
 from tricap.__main__ import main
 
+PATIENCE_S = 900
+PROMISED = ("run.json", "clouds/0000.ply", "trajectories.npz", "joints.csv", "motion.csv", "body.toml", "skin/0000.ply",
+            "report/report.html", "body.blend")
+
 
 def test_the_parser_joins_the_commands_of_core_and_addon(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -29,6 +33,18 @@ def test_it_runs_as_a_module_and_faults_of_the_input_end_with_2(tmp_path: Path) 
                           capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2 and done.stderr.startswith("tricap: ") and done.stderr.count("\n") == 1, done.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_demo_ends_and_leaves_every_promised_file(tmp_path: Path) -> None:
+    pytest.importorskip("bpy")
+    out = tmp_path / "demo"
+    done = subprocess.run([sys.executable, "-m", "tricap", "demo", "--out", str(out)],
+                          capture_output=True, text=True, cwd=tmp_path, timeout=PATIENCE_S)
+    assert done.returncode == 0, done.stderr
+    assert "truth" in done.stdout and "body.blend" in done.stdout
+    missing = [name for name in PROMISED if not (out / name).is_file()]
+    assert not missing, done.stdout + done.stderr
 
 
 def test_a_wrong_command_ends_with_2(tmp_path: Path) -> None:
