@@ -117,11 +117,11 @@ def waved_bar(cameras: Sequence[Camera], positions: int, rng: np.random.Generato
 def bar_ends(positions: int, rng: np.random.Generator, length_m: float) -> np.ndarray:
     """Ends (N, 2, 3) of a bar on a Lissajous wave that fills the volume, turning through all directions."""
     time = np.arange(positions)
-    rates = np.array([0.0731, 0.1127, 0.0519]) * rng.uniform(0.85, 1.15, 3)
+    rates = np.array([0.1831, 0.2827, 0.1319]) * rng.uniform(0.85, 1.15, 3)
     reach = (VOLUME_SIZE_M / 2) * 0.98 - length_m / 4
     centre = VOLUME_CENTRE_M + reach * np.sin(rates * time[:, None] + rng.uniform(0, 2 * np.pi, 3))
-    azimuth = 0.091 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi)
-    height = np.sin(0.0673 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi))
+    azimuth = 0.231 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi)
+    height = np.sin(0.1673 * rng.uniform(0.85, 1.15) * time + rng.uniform(0, 2 * np.pi))
     across = np.sqrt(1 - height**2)
     direction = np.stack([across * np.cos(azimuth), height, across * np.sin(azimuth)], axis=-1)
     return np.stack([centre + direction * length_m / 2, centre - direction * length_m / 2], axis=1)

@@ -1,0 +1,1 @@
+"""Calibration: from the images of a waved reference bar to cameras with known quality."""

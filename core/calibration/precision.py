@@ -1,0 +1,87 @@
+"""What the adjustment says about space: covariance of the cameras in the free network, and the error it makes at points of a volume.
+
+    Q_c = (S + μ G Gᵀ)⁻¹ − G (Gᵀ G)⁻¹ μ⁻¹ … Gᵀ = S⁺                              (1)   minimum trace, cameras
+    X(c): ∂X/∂c = −(Σ G_cᵀ G_c)⁻¹ G_cᵀ J_c                                      (2)   a point intersected by the cameras that see it
+    ΔX_i − (τ + θ × X_i) → min over τ, θ                                         (3)   what no rigid motion of the whole explains
+
+Mapping through (3) is an S-transformation to the datum of the points themselves (Baarda 1973), so the figures do not depend on the datum.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..geometry.camera_derivatives import exterior_derivatives, image_with_derivatives, interior_of
+from ..geometry.rotation import cross_matrix
+from .bundle import Network, Normals, Unknowns, free_network, reduce_to_cameras
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PredictedError:
+    """Errors at points of space that come from the calibration alone (not from measuring the points), as standard deviations [m]."""
+
+    xyz_m: np.ndarray  # (M, 3)
+    sigma_m: np.ndarray  # (M,) root of the variance summed over x, y, z
+    rms_m: float
+    length_rms_m: float  # of pairs (point 2 i, point 2 i + 1)
+
+
+def camera_covariance(network: Network, normals: Normals, unknowns: Unknowns) -> np.ndarray:
+    """Cofactors (C p, C p) of the camera unknowns in the free network, for sigma0 = 1 px.  (1)"""
+    S = reduce_to_cameras(normals)[0]
+    scale = 1 / np.sqrt(np.maximum(np.diag(normals.V), 1e-12))
+    G = np.linalg.qr(free_network(network, unknowns) / scale[:, None])[0]
+    scaled = (S * scale * scale[:, None] + (S * scale * scale[:, None]).T) / 2
+    values, vectors = np.linalg.eigh(scaled + G @ G.T)
+    Q = (vectors / np.maximum(values, 1e-15)) @ vectors.T - G @ G.T
+    return Q * scale * scale[:, None]
+
+
+def point_derivatives(cameras: Sequence[Camera], unknowns: Unknowns, xyz_m: np.ndarray) -> np.ndarray:
+    """Derivatives (M, 3, C p) of intersected points (M, 3) to the camera unknowns; NaN where fewer than two cameras see a point.  (2)"""
+    M, p = len(xyz_m), len(unknowns.columns)
+    A, N, rays = np.zeros((M, 3, len(cameras) * p)), np.zeros((M, 3, 3)), np.zeros(M)
+    for c, camera in enumerate(cameras):
+        q = camera.to_camera(xyz_m)
+        seen = (q[:, 2] > 1e-3) & camera.sees(camera.project(xyz_m))
+        q = np.where(seen[:, None], q, [0.0, 0.0, 1.0])
+        _, J_interior, G = image_with_derivatives(interior_of(camera), q)
+        J = np.concatenate([J_interior, exterior_derivatives(G, q)], axis=-1)[..., unknowns.columns]
+        GR = (G @ camera.R_cam_world) * seen[:, None, None]
+        N += GR.transpose(0, 2, 1) @ GR
+        A[:, :, c * p : (c + 1) * p] = GR.transpose(0, 2, 1) @ J
+        rays += seen
+    D = np.full_like(A, np.nan)
+    good = rays >= 2
+    D[good] = -np.linalg.solve(N[good], A[good])
+    return D
+
+
+def without_rigid_motion(D: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
+    """Derivatives (M, 3, q) less the rigid motion of the whole that fits them best.  (3)"""
+    M = len(xyz_m)
+    T = np.concatenate([np.broadcast_to(np.eye(3), (M, 3, 3)), -cross_matrix(xyz_m - xyz_m.mean(axis=0))], axis=-1).reshape(3 * M, 6)
+    flat = D.reshape(3 * M, -1)
+    return (flat - T @ np.linalg.lstsq(T, flat, rcond=None)[0]).reshape(D.shape)
+
+
+def predicted_error(cameras: Sequence[Camera], unknowns: Unknowns, covariance: np.ndarray, pairs_m: np.ndarray) -> PredictedError:
+    """The error at the ends of test bars (K, 2, 3) from the cameras' covariance (C p, C p); points that two cameras do not see are left out."""
+    points = pairs_m.reshape(-1, 3)
+    D = point_derivatives(cameras, unknowns, points)
+    both = np.isfinite(D).all(axis=(1, 2)).reshape(-1, 2).all(axis=1)
+    keep = np.repeat(both, 2)
+    D, points = without_rigid_motion(D[keep], points[keep]), points[keep]
+    variance = np.einsum("mij,jk,mik->m", D, covariance, D, optimize=True)
+    d = points[0::2] - points[1::2]
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    along = np.einsum("mi,mij->mj", d, D[0::2] - D[1::2])
+    length = np.einsum("mj,jk,mk->m", along, covariance, along, optimize=True)
+    return PredictedError(
+        xyz_m=points,
+        sigma_m=np.sqrt(np.maximum(variance, 0)),
+        rms_m=float(np.sqrt(max(variance.mean(), 0.0))) if len(points) else np.inf,
+        length_rms_m=float(np.sqrt(max(length.mean(), 0.0))) if len(points) else np.inf,
+    )
