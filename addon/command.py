@@ -5,6 +5,10 @@ Importing this module does not need bpy; running the command does.
 
 import argparse
 import importlib.util
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +36,29 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """
     if importlib.util.find_spec("bpy") is None:
         raise InputError("`tricap scene` needs Blender: install bpy in this Python, or use `blender --command tricap scene …`.")
-    import bpy
+    with _standard_output_kept_clean():
+        import bpy
 
-    from .scene.build import build_scene
-    from .scene.cameras import look_through
+        from .scene.build import build_scene
+        from .scene.cameras import look_through
 
-    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    look_through()
-    report = build_scene(args.out, args.blend, monitor)
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+        look_through()
+        report = build_scene(args.out, args.blend, monitor)
     return [*report.warnings, f"{args.blend}: {report}"]
+
+
+@contextmanager
+def _standard_output_kept_clean() -> Iterator[None]:
+    """Blender itself, below Python, writes notes to standard output; they go to standard error, so that ours can be read by machines."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def register() -> None:

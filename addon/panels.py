@@ -41,8 +41,9 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
             build.operator("tricap.build_scene", icon="ARMATURE_DATA")
         if not props.take and not props.out:
             layout.label(text="Choose the folder of a recording.", icon="INFO")
-        for line in props.last.splitlines():
-            layout.label(text=line)
+        found = layout.column(align=True)
+        for part in props.last.split(", ") if props.last else ():
+            found.label(text=part)
 
 
 class TRICAP_PT_advanced(TricapPanel, bpy.types.Panel):

@@ -163,6 +163,6 @@ def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> 
     line = [sys.executable, "-m", "tricap", "scene", str(small_run.out), "--blend", str(tmp_path / "c.blend")]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0 and (tmp_path / "c.blend").is_file(), done.stdout + done.stderr
-    assert "2 bones" in done.stdout
+    assert done.stdout.splitlines() == [done.stdout.strip()] and "2 bones" in done.stdout  # nothing of Blender's own
     wrong = subprocess.run([*line[:4], str(tmp_path), *line[5:]], capture_output=True, text=True, timeout=120)
     assert wrong.returncode == 2 and "Traceback" not in wrong.stderr and "no run.json" in wrong.stderr

@@ -1,0 +1,58 @@
+"""The operator that runs a take: the same numbers as the command line's, with the panel's settings, and a scene at the end."""
+
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tricap.core import pipeline
+from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
+
+NUMBERS = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply", "clouds/0003.ply", "skin/0003.ply")
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small sample recording."""
+    folder = tmp_path_factory.mktemp("recordings") / "sample"
+    make_arm_take(folder, ArmTakeSettings(frames=6, width_px=512))
+    return folder
+
+
+def test_the_operator_gives_the_commands_numbers_and_a_scene(blender: ModuleType, take: Path, tmp_path: Path) -> None:
+    overrides = {"growing": {"spacing_px": 6}}
+    pipeline.run(take, tmp_path / "command", overrides)
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene = blender.context.scene
+    scene.tricap.take, scene.tricap.out = str(take), str(tmp_path / "operator")
+    scene.tricap.growing.spacing_px = 6
+    assert blender.ops.tricap.run() == {"FINISHED"}
+    for name in NUMBERS:
+        assert (tmp_path / "operator" / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
+    assert "body fitted" in scene.tricap.last
+    assert blender.data.objects["Body"].animation_data.action is not None
+
+
+def test_the_output_folder_is_chosen_beside_the_file_or_the_take(blender: ModuleType, take: Path, tmp_path: Path) -> None:
+    from bl_ext.user_default.tricap.addon import folders
+
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene = blender.context.scene
+    scene.tricap.take = str(take)
+    assert folders.output_folder("", scene) == take.parent / "sample_tricap"
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert folders.output_folder("", scene) == tmp_path / "sample_tricap"
+    assert folders.output_folder("//results", scene) == tmp_path / "results"
+    assert folders.output_folder("", scene, str(take.parent)) == tmp_path / f"{take.parent.name}_tricap"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(folders.InputError, match="choose another output folder"):
+        folders.check_writable(tmp_path / "file" / "out")
+
+
+def test_a_take_that_needs_mending_leaves_no_result(blender: ModuleType, take: Path, tmp_path: Path) -> None:
+    (tmp_path / "bad").mkdir()
+    text = (take / "take.toml").read_text(encoding="utf-8") + "\n[sedes]\nframe = 0\n"
+    (tmp_path / "bad" / "take.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(RuntimeError, match="sedes"):
+        blender.ops.tricap.run(take=str(tmp_path / "bad"), out=str(tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
