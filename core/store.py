@@ -92,7 +92,7 @@ def read_json(path: Path) -> Any:
 
 def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, compress: bool = True) -> None:
     """Arrays and a JSON header into one .npz (no pickle). Checkpoints are not compressed: that takes longer than computing some."""
-    text = json.dumps({"store_version": STORE_VERSION, **header}, sort_keys=True, allow_nan=False)
+    text = json.dumps({"store_version": STORE_VERSION, "arrays": sorted(arrays), **header}, sort_keys=True, allow_nan=False)
     buffer = io.BytesIO()
     write = np.savez_compressed if compress else np.savez
     write(buffer, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
@@ -115,6 +115,8 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise InputError(f"{path} is not a result of Tricap or is damaged; remove it and run again.") from error
     if not isinstance(header, dict) or header.get("store_version") != STORE_VERSION:
         raise InputError(f"{path} was written by another version of Tricap; remove it and run again.")
+    if header.pop("arrays", sorted(arrays)) != sorted(arrays):
+        raise InputError(f"{path} is damaged: it lacks a part; remove it and run again.")
     return arrays, header
 
 
