@@ -1,6 +1,6 @@
 """Frame after frame, forwards and backwards from the click frame, with the shape held (D'Apuzzo et al. 1999, §3.3).
 
-Each frame starts from the prediction 2θ_i − θ_{i−1}, which is also a weak observation. A frame that explains far fewer points than its
+Each frame starts from the prediction 2θ_i − θ_{i−1}, which is also a weak observation; tracked points tie it to its neighbour. A frame that explains far fewer points than its
 neighbour is tried again from the neighbour's posture; one without points keeps the prediction, and the next is tried from both.
 """
 
@@ -9,7 +9,8 @@ import numpy as np
 from ..progress import Monitor
 from .cloud_points import CloudPoints
 from .conditions import Conditions
-from .observations import MotionPrior, Observation
+from .material_tracks import MaterialTracks
+from .observations import MotionPrior, Observation, StepsFromFixed
 from .segmentation import crop
 from .solver import Solution, solve
 from .state import BodyState
@@ -19,7 +20,7 @@ COASTING = 5  # after so many frames without points the prediction stands still
 REACH_M = 0.20  # of the points looked at in one frame; half of it is kept for the adjustment of the sequence
 
 
-def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first: Solution,
+def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first: Solution, tracks: MaterialTracks | None,
            monitor: Monitor) -> tuple[np.ndarray, list[CloudPoints]]:
     """Motion (T, D) of all frames, and the points near the body in each."""
     T, done = len(points), 1
@@ -29,8 +30,10 @@ def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first
         support, seen = None, [fit.click]
         for t in range(fit.click + direction, T if direction > 0 else -1, direction):
             monitor.step("fit frame after frame", done, T)
-            near = crop(points[t], fit.parameters.state(motion[t - direction], first.vector), REACH_M)
-            motion[t], found = _next_posture(fit, near, _predictions(motion, time_s, seen, t), first, support)
+            before = fit.parameters.state(motion[t - direction], first.vector)
+            moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else None
+            near = crop(points[t], before, REACH_M)
+            motion[t], found = _next_posture(fit, near, moved, _predictions(motion, time_s, seen, t), first, support)
             if found is not None:
                 support = found
                 seen.append(t)
@@ -46,7 +49,15 @@ def _predictions(motion: np.ndarray, time_s: np.ndarray, seen: list[int], t: int
     return [last + rate * (time_s[t] - time_s[seen[-1]]), last]
 
 
-def _next_posture(fit: Conditions, points: CloudPoints, predictions: list[np.ndarray], first: Solution,
+def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, direction: int) -> StepsFromFixed | None:
+    """What tracked points say about frame t, when the neighbour's body is held."""
+    if tracks is None:
+        return None
+    steps = tracks.steps(t - 1, before, None) if direction > 0 else tracks.steps(t, None, before)
+    return None if steps is None else StepsFromFixed(steps=steps, other=before, backwards=direction < 0)
+
+
+def _next_posture(fit: Conditions, points: CloudPoints, moved: StepsFromFixed | None, predictions: list[np.ndarray], first: Solution,
                   last_support: float | None) -> tuple[np.ndarray, float | None]:
     """The posture (D,) and its support; None if the frame has too few points, and the posture is the prediction."""
     s, skeleton = fit.settings, fit.model.skeleton
@@ -57,7 +68,7 @@ def _next_posture(fit: Conditions, points: CloudPoints, predictions: list[np.nda
         prior = MotionPrior(mean=start, sigma=sigma)
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior) -> list[Observation]:
-            return [fit.surface(points, state), prior, *fit.priors]
+            return [fit.surface(points, state), *([moved] if moved is not None else []), prior, *fit.priors]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
         support = fit.support(points, solution.motion[0], first.vector)

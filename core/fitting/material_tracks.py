@@ -41,21 +41,25 @@ class MaterialTracks:
         self._surface, self._settings = surface, settings
         self._pairs = [self._pair(t) for t in range(len(frames) - 1)]
 
-    def steps(self, t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
-        """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`)."""
+    def steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
+        """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`); None stands for a body not yet known."""
         rows, sigma = self._pairs[t]
-        start, end = (CloudPoints(frame=t, xyz_m=self._xyz[i][rows], normals=np.zeros((len(rows), 3)), sigma_m=sigma) for i in (t, t + 1))
-        (at_a, bone_a), (at_b, bone_b) = (segment(p, s, self._surface, self._settings.gate_m) for p, s in ((start, a), (end, b)))
-        _, ia, ib = np.intersect1d(at_a, at_b, assume_unique=True, return_indices=True)
-        same = bone_a[ia] == bone_b[ib]
-        keep = at_a[ia][same]
+        found = [self._limbs(i, rows, sigma, state) for i, state in ((t, a), (t + 1, b)) if state is not None]
+        keep = np.flatnonzero((found[0] >= 0) & (found[0] == found[-1]))
         if not len(keep):
             return None
-        skin = self._settings.track_sigma_m
+        own, skin = sigma[keep] ** 2 + 1e-12, self._settings.track_sigma_m**2
         share = max(1.0, (self._settings.model_patch_m / SPACING_M) ** 2)
-        crowding = (sigma[keep] ** 2 + share * skin**2) / (sigma[keep] ** 2 + skin**2 + 1e-12)
-        return MaterialSteps(from_m=start.xyz_m[keep], to_m=end.xyz_m[keep], bone=bone_a[ia][same],
-                             sigma_m=np.sqrt(sigma[keep] ** 2 + skin**2 + 1e-12), crowding=np.repeat(crowding, 3))
+        return MaterialSteps(from_m=self._xyz[t][rows[keep]], to_m=self._xyz[t + 1][rows[keep]], bone=found[0][keep],
+                             sigma_m=np.sqrt(own + skin), crowding=np.repeat((own + share * skin) / (own + skin), 3))
+
+    def _limbs(self, t: int, rows: np.ndarray, sigma: np.ndarray, state: BodyState) -> np.ndarray:
+        """The bone of each point in one frame, −1 for nobody's."""
+        points = CloudPoints(frame=t, xyz_m=self._xyz[t][rows], normals=np.zeros((len(rows), 3)), sigma_m=sigma)
+        mine, bone = segment(points, state, self._surface, self._settings.gate_m)
+        limbs = np.full(len(rows), -1)
+        limbs[mine] = bone
+        return limbs
 
     def _pair(self, t: int) -> tuple[np.ndarray, np.ndarray]:
         """Points seen in frames t and t + 1, the first in each cell, and the sigma of their steps."""

@@ -60,8 +60,11 @@ def fit_sequence(rig: Rig, model_name: str, clouds: Sequence[Cloud], joints: Map
         monitor.step("thin the clouds", i, len(clouds))
         points.append(thinned(cloud, settings.voxel_m))
     first = fit_click_frame(fit, points[fit.click], monitor)
-    motion, points = follow(fit, points, time_s, first, monitor)
-    problem = _whole_sequence(fit, points, time_s, trajectories)
+    tracks = None
+    if trajectories is not None and settings.use_trajectories:
+        tracks = MaterialTracks(trajectories, [p.frame for p in points], fit.model.surface, settings)
+    motion, points = follow(fit, points, time_s, first, tracks, monitor)
+    problem = _whole_sequence(fit, points, time_s, tracks)
     solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
     return _result(fit, points, time_s, solution, problem)
 
@@ -84,7 +87,7 @@ def _conditions(rig: Rig, model_name: str, frames: list[int], joints: Mapping[st
                       click=frames.index(click_frame), priors=priors)
 
 
-def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, trajectories: Trajectories | None) -> Problem:
+def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, tracks: MaterialTracks | None) -> Problem:
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
     sigma[skeleton.layout.set("base")] = s.acceleration_m_s2
@@ -94,9 +97,6 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [fit.surface(points[t], state), *([clicked] if t == fit.click else []), *fit.priors]
 
-    tracks = None
-    if trajectories is not None and s.use_trajectories:
-        tracks = MaterialTracks(trajectories, [p.frame for p in points], fit.model.surface, s)
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
     return replace(problem, of_shape_weight=weight, observe_step=None if tracks is None else tracks.steps)
 

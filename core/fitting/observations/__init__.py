@@ -12,11 +12,11 @@ from .clicked_joint import ClickedJoints
 from .equal_radii import EqualRadii
 from .gaussian_prior import MotionPrior, ShapePrior
 from .joint_limit import JointLimits
-from .material_step import MaterialSteps
+from .material_step import MaterialSteps, StepsFromFixed
 from .surface_point import SurfacePoints
 
 __all__ = ["ClickedJoints", "EqualRadii", "JointLimits", "MaterialSteps", "MotionPrior", "Observation", "ShapePrior",
-           "SurfacePoints"]
+           "StepsFromFixed", "SurfacePoints"]
 
 
 class Observation(Protocol):

@@ -36,6 +36,32 @@ class MaterialSteps:
         return (J / self.sigma_m[:, None, None]).reshape(3 * len(self.bone), -1)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepsFromFixed:
+    """The same observations for one body `b`, while the other frame's body is held."""
+
+    steps: MaterialSteps
+    other: BodyState
+    backwards: bool = False  # the held body is frame b, the observed one frame a
+    robust: bool = True
+
+    @property
+    def crowding(self) -> np.ndarray | float:
+        """As in the steps."""
+        return self.steps.crowding
+
+    def residual(self, state: BodyState) -> np.ndarray:
+        """(3N,)"""
+        return self.steps.residual(state, self.other) if self.backwards else self.steps.residual(self.other, state)
+
+    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
+        """(3N, D); with shape (3N, D + S), where both bodies have it."""
+        a, b = (state, self.other) if self.backwards else (self.other, state)
+        D, J = state.n_motion, self.steps.jacobian(a, b)
+        motion = J[:, :D] if self.backwards else J[:, D : 2 * D]
+        return np.concatenate([motion, J[:, 2 * D :]], axis=1) if shape else motion
+
+
 def _local(state: BodyState, bone: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
     return np.einsum("nij,ni->nj", state.R[bone], xyz_m - state.head_m[bone])
 
