@@ -34,6 +34,18 @@ def test_after_saving_and_opening_the_armature_plays_the_tables(empty: ModuleTyp
     assert played_angles_deg(empty, small_run) < ANGLE_DEG
 
 
+def test_appended_to_another_file_it_plays_the_same(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(small_run.out, tmp_path / "body.blend")
+    empty.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with empty.data.libraries.load(str(tmp_path / "body.blend")) as (source, target):
+        target.collections = [name for name in source.collections if name == "Tricap"]
+    empty.context.scene.collection.children.link(target.collections[0])
+    assert played_joints_m(empty, small_run) < JOINT_M
+    assert played_angles_deg(empty, small_run) < ANGLE_DEG
+
+
 def played_joints_m(bpy: ModuleType, run: SmallRun) -> float:
     """Largest distance of an armature's joint from joints.csv, all frames."""
     worst = 0.0
@@ -72,6 +84,16 @@ def test_frames_rate_and_footage_are_the_takes(empty: ModuleType, small_run: Sma
     assert scene.camera["tricap_view"] == "C" and scene.camera["tricap_interlaced"] == "odd"
     assert sorted(clip.name for clip in empty.data.movieclips) == ["Footage C", "Footage L", "Footage R"]
     assert scene.active_clip.name == "Footage C"
+
+
+def test_footage_that_starts_later_is_shifted(empty: ModuleType, small_run: SmallRun) -> None:
+    """Image 0 of view L belongs to take frame 1: its number is the frame's − 1."""
+    from tricap.addon.scene.build import build_scene
+
+    path = small_run.take / "take.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace('"L/*.png"', '"L/*.png", offset_frames = -1'), encoding="utf-8")
+    assert build_scene(small_run.out).warnings == ()
+    assert {clip.name: clip.frame_start for clip in empty.data.movieclips} == {"Footage L": 1, "Footage C": 0, "Footage R": 0}
 
 
 def test_cloud_and_trails_show_the_current_frame(empty: ModuleType, small_run: SmallRun) -> None:
