@@ -24,8 +24,9 @@ def knob(
 
 def nearest_name(name: str, known: "list[str] | tuple[str, ...]") -> str:
     """A hint " (did you mean “x”?)" for a misspelt name, or the list of what is known."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f" Did you mean “{close[0]}”?" if close else f" Known are: {', '.join(known)}."
+    lower = {k.lower(): k for k in known}
+    close = difflib.get_close_matches(name.lower(), list(lower), n=1, cutoff=0.5)
+    return f" Did you mean “{lower[close[0]]}”?" if close else f" Known are: {', '.join(known)}."
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:

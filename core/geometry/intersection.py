@@ -18,7 +18,7 @@ CONVERGED_M = 1e-7
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Intersection:
-    """N points in space. A point that fewer than two rays meet is NaN."""
+    """N points in space. A point that fewer than two rays meet is NaN in every array."""
 
     xyz_m: np.ndarray  # (N, 3) world
     covariance_m2: np.ndarray  # (N, 3, 3) from the a priori covariances of the image points
@@ -62,7 +62,7 @@ def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covarianc
         xyz_m=X,
         covariance_m2=K,
         residual_px=np.where(usable[:, None, None], v, np.nan),
-        sigma0=np.sqrt(vPv / np.maximum(2 * rays - 3, 1)),
+        sigma0=np.where(usable, np.sqrt(vPv / np.maximum(2 * rays - 3, 1)), np.nan),
         rays=rays,
     )
 

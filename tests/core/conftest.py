@@ -59,8 +59,10 @@ class Body:
         return Body(**values | dict(R=rotation @ self.R, t=self.t + np.asarray(shift_m)))
 
 
-def three_cameras(*, width: int = WIDTH, height: int = HEIGHT, focal: float = FOCAL_PX, base_m: float = 0.35, distorted: bool = True) -> Rig:
-    """L, C and R in a row before the origin of the world, looking along +z at the point (0, 0, DEPTH_M)."""
+def three_cameras(
+    *, width: int = WIDTH, height: int = HEIGHT, focal: float = FOCAL_PX, base_m: float = 0.35, distorted: bool = True
+) -> Rig:
+    """L, C and R in a row about the origin of the world, looking along +z at the point (0, 0, DEPTH_M)."""
     cameras = []
     for name, x in (("L", -base_m), ("C", 0.0), ("R", base_m)):
         ahead = np.array([-x, 0.0, DEPTH_M]) / np.hypot(x, DEPTH_M)
