@@ -1,0 +1,140 @@
+"""Where the bar was, as seen by cameras that are known roughly: intersection that survives wrong rays, and which end is which.
+
+    Σ (I − d dᵀ)(X − C) = 0                                                    (1)   where the rays of an end pass each other closest
+    end in two cameras, the same or the other: Sampson's distance, and | |A − B| / L − 1 |   (2)   truncated, summed over pairs of cameras
+"""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from .bundle import Network
+from .epipolar import sampson
+from .observations import BarObservations
+
+DOUBTFUL_PX = 4.0
+LENGTH_TOLERANCE = 0.05
+MAX_FLIPPED_CAMERAS = 9  # beyond this many cameras orders are compared with the first camera's only
+
+
+def with_bars(network: Network, observations: BarObservations, doubtful_px: float = DOUBTFUL_PX) -> tuple[Network, np.ndarray]:
+    """The cameras of `network` with the bar positions of `observations`, and which image points (N, C, 2) can take part.
+
+    An end that fewer than two cameras see takes no part. Ends that the cameras disagree on are intersected from the pair of cameras that
+    most of the others agree with.
+    """
+    cameras = network.cameras(observations.names, observations.size_px)
+    seen = observations.seen
+    used = seen & (seen.sum(axis=1, keepdims=True) >= 2)
+    N = len(seen)
+    rays = [_rays(camera, observations.xy_px[:, c].reshape(-1, 2)) for c, camera in enumerate(cameras)]
+    centres = np.stack([c.centre_m for c in cameras])
+    flat = np.moveaxis(used, 1, 2).reshape(2 * N, -1)  # (2 N, C)
+    X = _meeting_points(centres, rays, flat)
+    cost = _cost(cameras, observations, X, flat, doubtful_px)
+    doubtful = np.flatnonzero((cost > 1.0) & (flat.sum(axis=1) >= 3))
+    for pair in combinations(range(len(cameras)), 2) if len(doubtful) else ():
+        only = np.zeros_like(flat[doubtful])
+        only[:, pair] = flat[doubtful][:, pair]
+        only[only.sum(axis=1) < 2] = False
+        trial = _meeting_points(centres, [r[doubtful] for r in rays], only)
+        trial_cost = np.where(only.any(axis=1), _cost(cameras, observations, trial, flat, doubtful_px, doubtful), np.inf)
+        better = trial_cost < cost[doubtful]
+        X[doubtful[better]], cost[doubtful[better]] = trial[better], trial_cost[better]
+    return _bars(network, X.reshape(N, 2, 3), used)
+
+
+def _rays(camera: Camera, xy: np.ndarray) -> np.ndarray:
+    d = camera.rays(np.where(np.isfinite(xy), xy, np.asarray(camera.size_px) / 2))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def _meeting_points(centres: np.ndarray, rays: list[np.ndarray], used: np.ndarray) -> np.ndarray:
+    """(M, 3); far away where fewer than two rays are used.  (1)"""
+    A, b = np.tile(np.eye(3) * 1e-9, (len(used), 1, 1)), np.zeros((len(used), 3))
+    for c, d in enumerate(rays):
+        across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * used[:, c, None, None]
+        A += across
+        b += across @ centres[c]
+    return np.linalg.solve(A, b[..., None])[..., 0]
+
+
+def _cost(
+    cameras: tuple[Camera, ...],
+    observations: BarObservations,
+    X: np.ndarray,
+    used: np.ndarray,
+    width_px: float,
+    rows: np.ndarray | None = None,
+) -> np.ndarray:
+    """Σ min(1, r² / width²) over the cameras (M,), for the ends `rows`."""
+    total = np.zeros(len(X))
+    for c, camera in enumerate(cameras):
+        xy = observations.xy_px[:, c].reshape(-1, 2)
+        xy, seen = (xy, used[:, c]) if rows is None else (xy[rows], used[rows, c])
+        square = np.sum((xy - camera.project(X)) ** 2, axis=1) / width_px**2
+        total += np.where(seen, np.where(np.isfinite(square), np.minimum(square, 1.0), 1.0), 0.0)
+    return total
+
+
+def _bars(network: Network, ends: np.ndarray, used: np.ndarray) -> tuple[Network, np.ndarray]:
+    """Middles and directions of ends (N, 2, 3); of a bar with one end known the other is put anywhere."""
+    known = used.any(axis=1)  # (N, 2)
+    difference = ends[:, 0] - ends[:, 1]
+    difference[~known.all(axis=1)] = [1.0, 0.0, 0.0]
+    norm = np.linalg.norm(difference, axis=1, keepdims=True)
+    direction = np.where(norm > 1e-9, difference / np.maximum(norm, 1e-9), [1.0, 0.0, 0.0])
+    half = direction * network.length_m / 2
+    middle = np.where(known.all(axis=1)[:, None], ends.mean(axis=1), np.where(known[:, :1], ends[:, 0] - half, ends[:, 1] + half))
+    middle[~known.any(axis=1)] = 0.0
+    return replace(network, middle=middle, direction=direction), used
+
+
+def labelled_ends(network: Network, observations: BarObservations, tolerance_px: float) -> BarObservations:
+    """The observations with the ends in the same order in all cameras, by the order (2) that fits the cameras best at each position."""
+    cameras = network.cameras(observations.names, observations.size_px)
+    C, N = len(cameras), len(observations.xy_px)
+    pairs = {(i, j): _pair_cost(cameras, observations, i, j, tolerance_px) for i, j in combinations(range(C), 2)}
+    if C > MAX_FLIPPED_CAMERAS:
+        flips = np.stack([np.zeros(N, dtype=bool), *(pairs[0, j][:, 1] < pairs[0, j][:, 0] for j in range(1, C))], axis=1)
+    else:
+        orders = (np.arange(2 ** (C - 1))[:, None] >> np.arange(C - 1)) & 1
+        orders = np.concatenate([np.zeros((len(orders), 1), dtype=int), orders], axis=1)
+        total = np.stack([sum((pairs[i, j][:, o[i] ^ o[j]] for i, j in pairs), np.zeros(N)) for o in orders])
+        flips = orders[np.argmin(total, axis=0)].astype(bool)
+    xy = np.where(flips[..., None, None], observations.xy_px[:, :, ::-1], observations.xy_px)
+    return observations.changed(xy)
+
+
+def _pair_cost(cameras: tuple[Camera, ...], observations: BarObservations, i: int, j: int, tolerance_px: float) -> np.ndarray:
+    """Cost (N, 2) of the same and the other order of the ends in camera j.  (2)"""
+    a, b = cameras[i], cameras[j]
+    seen = observations.seen
+    R = b.R_cam_world @ a.R_cam_world.T
+    t = b.t_cam_world_m - R @ a.t_cam_world_m
+    E = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ R
+    xi, xj = (np.where(seen[:, c, :, None], observations.xy_px[:, c], np.asarray(cameras[c].size_px) / 2) for c in (i, j))
+    ni, nj = a.directions(xi), b.directions(xj)
+    focal = np.sqrt(a.focal_px * b.focal_px)
+    cost = np.zeros((len(xi), 2))
+    for other in (0, 1):
+        mj, seen_j = (nj[:, ::-1], seen[:, j, ::-1]) if other else (nj, seen[:, j])
+        both = seen[:, i] & seen_j
+        distance = np.minimum(sampson(E, ni[..., :2], mj[..., :2]) * focal / tolerance_px, 1.0) ** 2
+        cost[:, other] = np.sum(np.where(both, distance, 0.0), axis=1)
+        off = np.abs(_lengths(ni @ R.T, mj, t) / observations.length_m - 1) / LENGTH_TOLERANCE
+        cost[:, other] += np.where(both.all(axis=1), np.minimum(off, 1.0) ** 2, 0.0)
+    return cost
+
+
+def _lengths(hi: np.ndarray, hj: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Lengths (N,) of bars whose ends lie on rays (N, 2, 3) of two cameras; huge if a ray would have to run backwards."""
+    aa, bb, ab = np.sum(hi * hi, -1), np.sum(hj * hj, -1), np.sum(hi * hj, -1)
+    determinant = np.maximum(aa * bb - ab * ab, 1e-15)
+    depth_i = (ab * (hj @ t) - bb * (hi @ t)) / determinant
+    depth_j = (aa * (hj @ t) - ab * (hi @ t)) / determinant
+    points = (hi * depth_i[..., None] + t + hj * depth_j[..., None]) / 2
+    behind = ((depth_i <= 0) | (depth_j <= 0)).any(axis=1)
+    return np.where(behind, 1e9, np.linalg.norm(points[:, 0] - points[:, 1], axis=1))

@@ -1,0 +1,228 @@
+"""Initial values from nothing but the image points and the bar's length: focal lengths, distortion, poses, scale, bar positions.
+
+Pairs of cameras that share most complete bars form a tree. For every pair all guesses of the focal lengths (f_i on a geometric grid, f_j up to
+two steps away) and of a common distortion κ are evaluated (`epipolar`); the best sum over the tree is found by dynamic programming, the
+best few are adjusted shortly with f, k1 and the poses free, and the one with the smallest robust sum of squares wins.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.camera_derivatives import INTERIOR
+from .bars import with_bars
+from .bundle import Adjusted, Network, adjust
+from .epipolar import PAIR_TOLERANCE, PairGuesses, agreeing, sampson, try_guesses, undistorted
+from .observations import BarObservations
+from .pseudo import lens_knowledge
+
+FOCAL_GRID = np.geomspace(0.45, 3.2, 12)  # of the image width
+STEPS = (-2, -1, 0, 1, 2)  # f_j of a pair on the grid, from f_i
+KAPPAS = (-0.12, -0.06, 0.0, 0.04)
+BARS_PER_PAIR, BARS_PER_TRIAL = 60, 120
+CANDIDATES = 4
+MIN_BARS_PER_PAIR = 8
+COARSE_CAUCHY_PX = 3.0
+TILT = np.tan(np.radians(25))
+
+Guesses = dict[tuple[int, int, int], tuple[float, np.ndarray, np.ndarray]]  # (κ, f_i, f_j) by index: score, R, t
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Pair:
+    """Two cameras and the complete bars on which both agree: positions (m,) and whether camera j has the ends in the other order."""
+
+    i: int
+    j: int
+    positions: np.ndarray
+    swapped: np.ndarray
+
+    def points(self, observations: BarObservations, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Image points (m, 2, 2) of both cameras, of at most `most` positions."""
+        some = np.unique(np.linspace(0, len(self.positions) - 1, most).astype(int))
+        at, swapped = self.positions[some], self.swapped[some]
+        xj = observations.xy_px[at, self.j]
+        return observations.xy_px[at, self.i], np.where(swapped[:, None, None], xj[:, ::-1], xj)
+
+
+def initial_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted:
+    """The best start, adjusted on a part of the positions: its cameras hold for all of them.
+
+    Raises:
+        InputError: the cameras share too few bars.
+    """
+    tree = spanning_tree(observations)
+    guesses = {(p.i, p.j): _pair_guesses(observations, p, focal_px) for p in tree}
+    best: Adjusted | None = None
+    trials = [_trial(observations, tree, network) for network in _starts(observations, tree, guesses, focal_px)]
+    for trial in trials:
+        if best is None or trial.cost < best.cost:
+            best = trial
+    assert best is not None
+    return best
+
+
+def spanning_tree(observations: BarObservations) -> list[Pair]:
+    """The pairs that join all cameras and share most bars (Prim's algorithm).
+
+    Raises:
+        InputError: a camera shares too few bars with the others.
+    """
+    C = len(observations.names)
+    pairs = {(i, j): shared_bars(observations, i, j) for i in range(C) for j in range(i + 1, C)}
+    joined = [int(np.argmax([sum(len(p.positions) for k, p in pairs.items() if c in k) for c in range(C)]))]
+    tree: list[Pair] = []
+    while len(joined) < C:
+        edges = [(len(p.positions), k) for k, p in pairs.items() if (k[0] in joined) != (k[1] in joined)]
+        count, (i, j) = max(edges)
+        if count < MIN_BARS_PER_PAIR:
+            alone = [observations.names[c] for c in range(C) if c not in joined]
+            raise InputError(
+                f"Camera {', '.join(alone)} and the other cameras see too few of the same bar positions ({count} that agree, "
+                f"at least {MIN_BARS_PER_PAIR} are needed); wave the bar where several cameras see both of its ends, and check that "
+                "the sequences start at the same instant."
+            )
+        pair = pairs[i, j]
+        if j in joined:
+            pair = Pair(i=j, j=i, positions=pair.positions, swapped=pair.swapped)
+        tree.append(pair)
+        joined.append(pair.j)
+    return tree
+
+
+def shared_bars(observations: BarObservations, i: int, j: int) -> Pair:
+    """The positions whose two ends agree with one epipolar geometry of cameras i and j, with the order of the ends resolved."""
+    both = np.flatnonzero(observations.complete[:, i] & observations.complete[:, j])
+    xi, xj = observations.xy_px[both, i], observations.xy_px[both, j]
+    width = float(observations.size_px[[i, j], 0].max())
+    if observations.labelled:
+        ok, _ = agreeing(xi.reshape(-1, 2), xj.reshape(-1, 2), width)
+        good = ok.reshape(-1, 2).all(axis=1)
+        return Pair(i=i, j=j, positions=both[good], swapped=np.zeros(good.sum(), dtype=bool))
+    best = np.zeros(0, dtype=int), np.zeros(0, dtype=bool)
+    for subset, swapped in _orders(xi, xj):
+        found = _ordered(xi, xj, subset, swapped, width)
+        if len(found[0]) > len(best[0]):
+            best = found
+        if len(best[0]) > 0.6 * len(both):
+            break
+    return Pair(i=i, j=j, positions=both[best[0]], swapped=best[1])
+
+
+def _orders(xi: np.ndarray, xj: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Guesses which end in camera j is which in camera i: as they come; upper with upper; and for cameras on their side."""
+    di, dj = xi[:, 0] - xi[:, 1], xj[:, 0] - xj[:, 1]
+    orders = [(np.ones(len(di), dtype=bool), np.zeros(len(di), dtype=bool))]
+    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
+    for turned in (dj, dj @ quarter, -dj @ quarter, -dj):
+        upright = (np.abs(di[:, 1]) > TILT * np.abs(di[:, 0])) & (np.abs(turned[:, 1]) > TILT * np.abs(turned[:, 0]))
+        orders.append((upright, np.sign(di[:, 1]) != np.sign(turned[:, 1])))
+    return [orders[1], orders[0], *orders[2:]]
+
+
+def _ordered(xi: np.ndarray, xj: np.ndarray, subset: np.ndarray, swapped: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the bars that agree when `subset` is ordered by `swapped`, and the order of each, all bars tried both ways at the end."""
+    ordered = np.where(swapped[:, None, None], xj[:, ::-1], xj)
+    ok, F = agreeing(xi[subset].reshape(-1, 2), ordered[subset].reshape(-1, 2), width)
+    if not ok.any():
+        return np.zeros(0, dtype=int), np.zeros(0, dtype=bool)
+    straight = sampson(F, xi, xj).max(axis=1)
+    crossed = sampson(F, xi, xj[:, ::-1]).max(axis=1)
+    good = (np.minimum(straight, crossed) < 0.5 * PAIR_TOLERANCE * width) & (np.maximum(straight, crossed) > 2 * PAIR_TOLERANCE * width)
+    return np.flatnonzero(good), (crossed < straight)[good]
+
+
+def _pair_guesses(observations: BarObservations, pair: Pair, focal_px: float | None) -> Guesses:
+    """Score, R and t of every guess (κ, f_i, f_j by their indices)."""
+    grid = _grid(observations, focal_px)
+    index = [(a, a + s) for a in range(len(grid)) for s in STEPS if 0 <= a + s < len(grid)]
+    fi, fj = grid[[a for a, _ in index]], grid[[b for _, b in index]]
+    xi, xj = pair.points(observations, BARS_PER_PAIR)
+    table = {}
+    for k, kappa in enumerate(KAPPAS):
+        ui, uj = undistorted(xi, observations.size_px[pair.i], kappa), undistorted(xj, observations.size_px[pair.j], kappa)
+        tried: PairGuesses = try_guesses(ui, uj, fi, fj, observations.length_m)
+        for n, (a, b) in enumerate(index):
+            table[k, a, b] = (float(tried.score[n]), tried.R[n], tried.t_m[n])
+    return table
+
+
+def _grid(observations: BarObservations, focal_px: float | None) -> np.ndarray:
+    if focal_px is not None:
+        return focal_px * np.array([0.75, 0.87, 1.0, 1.15, 1.33])
+    return FOCAL_GRID * float(np.median(observations.size_px[:, 0]))
+
+
+def _starts(observations: BarObservations, tree: list[Pair], guesses: dict[tuple[int, int], Guesses], focal_px: float | None) -> list[Network]:
+    """Networks without bars of the best guesses, one per focal length of the first camera and κ."""
+    grid = _grid(observations, focal_px)
+    root = tree[0].i
+    ranked = []
+    for k in range(len(KAPPAS)):
+        for a in range(len(grid)):
+            chosen: dict[int, int] = {root: a}
+            ranked.append((_best_below(tree, guesses, root, k, a, len(grid), chosen), k, a, chosen))
+    ranked.sort(key=lambda entry: entry[0])
+    return [_chained(observations, tree, guesses, k, chosen, grid) for _, k, _, chosen in ranked[:CANDIDATES]]
+
+
+def _best_below(tree: list[Pair], guesses: dict[tuple[int, int], Guesses], camera: int, k: int, a: int, grid: int, chosen: dict[int, int]) -> float:
+    """Smallest sum of scores of the pairs below a camera whose focal length is a; what was chosen is noted."""
+    total = 0.0
+    for pair in (p for p in tree if p.i == camera):
+        best, below = np.inf, {}
+        for b in (a + s for s in STEPS if 0 <= a + s < grid):
+            deeper: dict[int, int] = {pair.j: b}
+            score = guesses[pair.i, pair.j][k, a, b][0] + _best_below(tree, guesses, pair.j, k, b, grid, deeper)
+            if score < best:
+                best, below = score, deeper
+        chosen.update(below)
+        total += best
+    return total
+
+
+def _chained(observations: BarObservations, tree: list[Pair], guesses: dict[tuple[int, int], Guesses], k: int, chosen: dict[int, int], grid: np.ndarray) -> Network:
+    C = len(observations.names)
+    interior = np.zeros((C, len(INTERIOR)))
+    R, t = np.tile(np.eye(3), (C, 1, 1)), np.zeros((C, 3))
+    for c in range(C):
+        size = observations.size_px[c]
+        f = grid[chosen[c]]
+        interior[c, :3] = f, (size[0] - 1) / 2, (size[1] - 1) / 2
+        interior[c, 3] = KAPPAS[k] / (float(size @ size) / 4 / f**2)
+    for pair in tree:  # parents come before their children
+        _, R_ij, t_ij = guesses[pair.i, pair.j][k, chosen[pair.i], chosen[pair.j]]
+        R[pair.j], t[pair.j] = R_ij @ R[pair.i], R_ij @ t[pair.i] + t_ij
+    empty = np.zeros((0, 3))
+    return Network(interior=interior, R=R, t=t, middle=empty, direction=empty, length_m=observations.length_m)
+
+
+def _trial(observations: BarObservations, tree: list[Pair], network: Network) -> Adjusted:
+    """A short robust adjustment of f, k1 and the poses on bars that the pairs of the tree agree on."""
+    part = trial_part(observations, tree)
+    network, used = with_bars(network, part)
+    knowledge = lens_knowledge(part.size_px, network.interior[:, 0]).only("f", "k1")
+    return adjust(network, part.xy_px, used, knowledge, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3, max_iterations=12, tolerance=1e-2)
+
+
+def trial_part(observations: BarObservations, tree: list[Pair]) -> BarObservations:
+    """Labelled positions on which all pairs of the tree agree as far as they see them, at most `BARS_PER_TRIAL`."""
+    C = len(observations.names)
+    known = np.zeros((len(observations.xy_px), C), dtype=bool)
+    flipped = np.zeros_like(known)
+    root = tree[0].i
+    for pair in tree:
+        if pair.i == root:
+            known[pair.positions, root] = True
+        follows = known[pair.positions, pair.i]
+        at = pair.positions[follows]
+        known[at, pair.j] = True
+        flipped[at, pair.j] = flipped[at, pair.i] ^ pair.swapped[follows]
+    xy = np.where(flipped[..., None, None], observations.xy_px[:, :, ::-1], observations.xy_px)
+    xy = np.where(known[..., None, None], xy, np.nan)
+    order = np.argsort(-known.sum(axis=1), kind="stable")
+    enough = order[: max(BARS_PER_TRIAL, int((known.sum(axis=1) == C).sum()))]
+    some = np.sort(enough[np.unique(np.linspace(0, len(enough) - 1, BARS_PER_TRIAL).astype(int))])
+    some = some[known[some].sum(axis=1) >= 2]
+    return observations.changed(xy[some], observations.frames[some])

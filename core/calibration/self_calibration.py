@@ -1,0 +1,177 @@
+"""Self-calibration from image points of a waved bar: start, robust adjustment, blunders, selection of the lens's unknowns, precision.
+
+1  initial values from nothing (`reference_bar`), on a part of the positions;
+2  f, k1 → + principal point, k2, p1, p2 → all unknowns, robustly, on that part;
+3  all positions: order of the ends, intersection, robust adjustment;
+4  least squares; Baarda's test w = v / (σ0 √q_vv) per image point, the worst of each bar is taken out, until nothing is        (1)
+5  unknowns of the lens that are not significant are left out, one group at a time (Wald's test of the group):
+   F = xᵀ Q_xx⁻¹ x / (m σ0²) < F_{1−α}(m, r)                                                                                  (2)
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from ..geometry.camera_derivatives import INTERIOR
+from ..progress import Monitor
+from .bars import labelled_ends, with_bars
+from .blunders import redundant_parts
+from .bundle import Adjusted, Network, Unknowns, adjust, normal_equations, residuals
+from .observations import BarObservations
+from .precision import camera_covariance
+from .pseudo import lens_knowledge
+from .reference_bar import initial_network
+
+GROUPS = (("k3",), ("b1", "b2"), ("p1", "p2"), ("k2",), ("cx", "cy"), ("k1",))  # in the order in which they are doubted
+SIGNIFICANCE = 0.02  # α of (2)
+CRITICAL_W = 4.1  # |w| beyond it: 1 good point in 5000 (two coordinates)
+PART = 400
+ROUNDS = 6
+MIN_SIGMA_PX = 0.004
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Calibration:
+    """An adjusted network and all that is needed to judge it."""
+
+    observations: BarObservations  # with the ends in order
+    network: Network
+    used: np.ndarray  # (N, C, 2) image points that take part
+    residual_px: np.ndarray  # (N, C, 2, 2)
+    unknowns: Unknowns
+    sigma0_px: float
+    redundancy: float
+    covariance: np.ndarray  # (C p, C p) of the camera unknowns, times sigma0², free network
+    decisions: tuple[str, ...]  # why unknowns were left out
+    converged: bool
+
+
+def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float | None = None) -> Calibration:
+    """Calibrate the cameras from image points and the bar's length alone.
+
+    Raises:
+        InputError: the cameras share too few bars.
+    """
+    monitor.step("calibration", 0, 5)
+    start = initial_network(observations, focal_px)
+    monitor.step("calibration", 1, 5)
+    network, labelled = refined_start(start.network, observations)
+    monitor.step("calibration", 2, 5)
+    knowledge = lens_knowledge(observations.size_px, network.interior[:, 0])
+    network, used = with_bars(network, labelled)
+    sigma = robust_sigma(residuals(network, labelled.xy_px), used)
+    first = adjust(network, labelled.xy_px, used, knowledge, cauchy_px=3 * sigma, unit_px=sigma, max_iterations=8, tolerance=0.05)
+    monitor.step("calibration", 3, 5)
+    return without_insignificant(*without_blunders(first, labelled, used, knowledge), labelled, monitor)
+
+
+def refined_start(network: Network, observations: BarObservations) -> tuple[Network, BarObservations]:
+    """The cameras with all unknowns adjusted on a part of the positions, and all observations with their ends in order."""
+    knowledge = lens_knowledge(observations.size_px, network.interior[:, 0])
+    some = np.unique(np.linspace(0, len(observations.xy_px) - 1, PART).astype(int))
+    cauchy = 2.0
+    for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR, INTERIOR):
+        part = _ordered(network, observations.part(some), max(2.0, 3 * cauchy))
+        network, used = with_bars(network, part)
+        sigma = robust_sigma(residuals(network, part.xy_px), used)
+        cauchy = 1.5 * sigma
+        done = adjust(network, part.xy_px, used, knowledge.only(*names), cauchy_px=cauchy, unit_px=sigma, max_iterations=8, tolerance=0.1)
+        network = done.network
+    return network, _ordered(network, observations, max(2.0, 6 * sigma))
+
+
+def _ordered(network: Network, observations: BarObservations, tolerance_px: float) -> BarObservations:
+    return observations if observations.labelled else labelled_ends(network, observations, tolerance_px)
+
+
+def robust_sigma(residual_px: np.ndarray, used: np.ndarray) -> float:
+    """Sigma of an image coordinate from the median of the residuals [px], untouched by a third of blunders."""
+    values = np.abs(residual_px[used])
+    return max(MIN_SIGMA_PX, float(1.4826 * np.median(values))) if values.size else 1.0
+
+
+def without_blunders(
+    first: Adjusted, observations: BarObservations, used: np.ndarray, unknowns: Unknowns
+) -> tuple[Adjusted, np.ndarray, float, float]:
+    """Least squares with blunders tested out: the adjustment, what is used, sigma0 and the redundancy.  (1)"""
+    state = first
+    sigma = robust_sigma(first.residual_px, used)
+    keep = enough_rays(used & (np.linalg.norm(np.nan_to_num(first.residual_px), axis=-1) < 6.5 * sigma))
+    for _ in range(ROUNDS):
+        state = adjust(state.network, observations.xy_px, keep, unknowns, unit_px=sigma, max_iterations=10, tolerance=1e-2)
+        parts = redundant_parts(state.network, keep, unknowns, sigma)
+        square = np.sum(np.where(keep[..., None], state.residual_px, 0.0) ** 2)
+        redundancy = max(1.0, float(parts[keep].sum()))
+        sigma = max(float(np.sqrt(square / redundancy)), 1e-6)
+        w = _tested(state.residual_px, parts, sigma)
+        worst = (w > CRITICAL_W) & keep & (w >= np.where(keep, w, 0.0).max(axis=(1, 2), keepdims=True))
+        if not worst.any():
+            break
+        keep = enough_rays(keep & ~worst)
+    return state, keep, sigma, redundancy
+
+
+def _tested(residual_px: np.ndarray, parts: np.ndarray, sigma: float) -> np.ndarray:
+    """w (N, C, 2) of the image points, the larger of both coordinates."""
+    w = np.abs(residual_px) / (sigma * np.sqrt(np.maximum(parts, 0.02)))
+    return np.nan_to_num(w.max(axis=-1))
+
+
+def enough_rays(used: np.ndarray) -> np.ndarray:
+    """Without the ends that fewer than two cameras see."""
+    return used & (used.sum(axis=1, keepdims=True) >= 2)
+
+
+def without_insignificant(
+    state: Adjusted, keep: np.ndarray, sigma: float, redundancy: float, observations: BarObservations, monitor: Monitor
+) -> Calibration:
+    """Leave out the groups of interior unknowns that are not significant, adjusting anew after each.  (2)"""
+    unknowns = lens_knowledge(observations.size_px, state.network.interior[:, 0])
+    decisions: list[str] = []
+    covariance = _covariance(state, keep, unknowns, sigma)
+    doubted = list(GROUPS)
+    while doubted:
+        tests = [(wald(state.network, unknowns, covariance, group, redundancy), group) for group in doubted]
+        probability, group = max(tests, key=lambda entry: entry[0])
+        if probability <= SIGNIFICANCE:
+            break
+        doubted.remove(group)
+        decisions.append(f"{', '.join(group)} left out: not significant (p = {probability:.2g})")
+        unknowns = replace(unknowns, free=unknowns.free & ~np.isin(INTERIOR, group))
+        interior = np.where(unknowns.free, state.network.interior, unknowns.expected)
+        fixed = replace(state.network, interior=interior)
+        state = adjust(fixed, observations.xy_px, keep, unknowns, unit_px=sigma, max_iterations=10, tolerance=1e-2)
+        covariance = _covariance(state, keep, unknowns, sigma)
+    monitor.step("calibration", 5, 5)
+    square = float(np.sum(state.residual_px[keep] ** 2))
+    sigma = float(np.sqrt(square / redundancy))
+    return Calibration(
+        observations=observations,
+        network=state.network,
+        used=keep,
+        residual_px=state.residual_px,
+        unknowns=unknowns,
+        sigma0_px=sigma,
+        redundancy=redundancy,
+        covariance=_covariance(state, keep, unknowns, sigma),
+        decisions=tuple(decisions),
+        converged=state.converged,
+    )
+
+
+def _covariance(state: Adjusted, keep: np.ndarray, unknowns: Unknowns, sigma: float) -> np.ndarray:
+    normals = normal_equations(state.network, state.residual_px, keep.astype(np.float64), unknowns, sigma)
+    return camera_covariance(state.network, normals, unknowns) * sigma**2
+
+
+def wald(network: Network, unknowns: Unknowns, covariance: np.ndarray, group: tuple[str, ...], redundancy: float) -> float:
+    """Probability of values as large as those of a group in all cameras if they were as expected.  (2)"""
+    columns = list(unknowns.columns)
+    C, p = len(network.R), len(columns)
+    at = [columns.index(INTERIOR.index(name)) for name in group]
+    index = np.array([c * p + a for c in range(C) for a in at])
+    names = [INTERIOR.index(name) for name in group]
+    x = (network.interior - unknowns.expected)[:, names].ravel()
+    F = x @ np.linalg.solve(covariance[np.ix_(index, index)], x) / len(x)
+    return float(f_distribution.sf(F, len(x), redundancy))
