@@ -18,6 +18,7 @@ from .surface.cloud import PointCloud
 from .tracking.trajectories import Trajectories
 
 FORMAT, VERSION = "tricap-run", 1
+OURS = ("clouds", "trajectories.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend")  # what a run replaces
 
 
 class Results:
@@ -27,9 +28,11 @@ class Results:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
-        foreign = self.folder.is_dir() and any(self.folder.iterdir()) and not (self.folder / "run.json").exists()
-        if foreign and not (self.folder / "cache").is_dir():
-            raise InputError(f"{folder} holds other files and no run of Tricap; choose an empty or a new folder for the results.")
+        theirs = [n for n in OURS if (self.folder / n).exists()] if not (self.folder / "run.json").exists() else []
+        if theirs and not (self.folder / "cache").is_dir():
+            raise InputError(
+                f"{folder} holds “{theirs[0]}”, which no run of Tricap wrote; choose an empty or a new folder for the results."
+            )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

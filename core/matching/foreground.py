@@ -17,6 +17,7 @@ CLUSTER_WIDTH, CLUSTER_SHARE = 0.12, 0.3  # of log depth; of the seeds in the ri
 PLANE_TOLERANCE_M, PLANE_SHARE, PLANE_MIN, BEHIND_SHARE = 0.015, 0.3, 25, 0.03
 PLANE_TRIALS, MAX_PLANES = 400, 3
 STATIC_NOISE = 2.0
+PLANE_EXTENT_M = 1.2  # longer than the flat front of a person who stands still
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -64,7 +65,8 @@ def after(cloud_depth_m: np.ndarray, before: Foreground) -> Foreground:
 def background_planes(static_xyz_m: np.ndarray, all_xyz_m: np.ndarray, cameras_m: Sequence[np.ndarray]) -> np.ndarray:
     """Planes (P, 4) of floor and walls among seeds (N, 3) that do not change over time.
 
-    A plane must hold PLANE_SHARE of the static seeds that are left and have almost none of all seeds behind it. The trials are seeded.
+    A plane must hold PLANE_SHARE of the static seeds that are left, be longer than a body's flat parts, and have almost none of all seeds
+    behind it. The trials are seeded.
     """
     planes: list[np.ndarray] = []
     rest = static_xyz_m
@@ -75,12 +77,18 @@ def background_planes(static_xyz_m: np.ndarray, all_xyz_m: np.ndarray, cameras_m
         distance = rest @ plane[:3] - plane[3]
         inlier = np.abs(distance) < PLANE_TOLERANCE_M
         behind = float(np.mean(all_xyz_m @ plane[:3] - plane[3] < -4 * PLANE_TOLERANCE_M))
-        if inlier.sum() < max(PLANE_MIN, PLANE_SHARE * len(rest)) or behind > BEHIND_SHARE:
+        if inlier.sum() < max(PLANE_MIN, PLANE_SHARE * len(rest)) or behind > BEHIND_SHARE or _extent(rest[inlier]) < PLANE_EXTENT_M:
             break
         planes.append(plane)
         all_xyz_m = all_xyz_m[all_xyz_m @ plane[:3] - plane[3] > -4 * PLANE_TOLERANCE_M]
         rest = rest[distance > 2 * PLANE_TOLERANCE_M]
     return np.array(planes).reshape(-1, 4)
+
+
+def _extent(points: np.ndarray) -> float:
+    """Length of a group of points along its longest axis, without its outermost twentieths."""
+    along = (points - points.mean(axis=0)) @ np.linalg.svd(points - points.mean(axis=0))[2][0]
+    return float(np.diff(np.percentile(along, [5, 95]))[0])
 
 
 def _best_plane(points: np.ndarray, eye: np.ndarray, random: np.random.Generator) -> np.ndarray:

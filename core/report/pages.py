@@ -46,8 +46,8 @@ def write_report(
     graphs = _graphs(clouds, trajectories, body)
     page = _page(account, files, graphs)
     results.remove("report")
-    for name, (_, data) in files.items():
-        store.write_bytes(results.path("report", name), data)
+    for name, (_, picture) in files.items():
+        store.write_bytes(results.path("report", name), pictures.png(picture))
     store.write_text(results.path("report", "report.html"), page)
 
 
@@ -58,8 +58,8 @@ def _pictures(
     trajectories: Trajectories | None,
     body: BodyFit | None,
     monitor: Monitor,
-) -> dict[str, tuple[str, bytes]]:
-    """File name → (caption, PNG), for the first, a middle and the last frame."""
+) -> dict[str, tuple[str, np.ndarray]]:
+    """File name → (caption, picture), for the first, a middle and the last frame."""
     ref, found = footage.take.reference, {}
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
     chosen = sorted({0, len(clouds) // 2, len(clouds) - 1})
@@ -72,22 +72,22 @@ def _pictures(
         high = float(np.percentile(sigma, 95)) if len(sigma) else 1.0
         found[f"surface_{cloud.frame:04d}.png"] = (
             f"Frame {cloud.frame}, view {view}: {len(sigma)} measured points, sigma from 0 (blue) to {high:.2f} mm (red)",
-            pictures.png(pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high)),
+            pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high),
         )
         found[f"cloud_{cloud.frame:04d}.png"] = (
             f"Frame {cloud.frame}: the cloud from the front and from its right side",
-            pictures.png(pictures.cloud_views(cloud, camera, account["settings"]["growing"]["spacing_px"])),
+            pictures.cloud_views(cloud, camera, account["settings"]["growing"]["spacing_px"]),
         )
         if trajectories is not None:
             found[f"tracks_{cloud.frame:04d}.png"] = (
                 f"Frame {cloud.frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast",
-                pictures.png(pictures.tracks_over_footage(images[ref], camera, trajectories, i)),
+                pictures.tracks_over_footage(images[ref], camera, trajectories, i),
             )
         if body is not None:
             for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
                 found[f"body_{cloud.frame:04d}_{name}.png"] = (
                     f"Frame {cloud.frame}, view {name}: the fitted body",
-                    pictures.png(pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin)),
+                    pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin),
                 )
     return found
 
@@ -113,13 +113,13 @@ def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, bod
     return graphs
 
 
-def _page(account: Mapping[str, Any], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
+def _page(account: Mapping[str, Any], files: Mapping[str, tuple[str, np.ndarray]], graphs: Sequence[str]) -> str:
     notes = "".join(f'<p class="note">{html.escape(w)}</p>' for w in account["warnings"])
     stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in account["stages"].items())
     shown = "".join(
-        f'<figure><img alt="" src="data:image/png;base64,{base64.b64encode(data).decode()}"><figcaption>{html.escape(caption)}'
-        "</figcaption></figure>"
-        for caption, data in files.values()
+        f'<figure><img alt="" src="data:image/jpeg;base64,{base64.b64encode(pictures.jpeg(picture)).decode()}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        for caption, picture in files.values()
     )
     settings = html.escape(
         "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in account["settings"].items())

@@ -67,7 +67,7 @@ def cloud_views(cloud: PointCloud, camera: Camera, spacing_px: int) -> np.ndarra
     centre = np.median(p, axis=0)
     extent = np.percentile(np.abs(p - centre), 99, axis=0).max()
     scale = 0.46 * PANEL_PX / max(float(extent), 1e-3)
-    radius = max(1, round(0.75 * spacing_px * float(centre[2]) / camera.focal_px * scale))
+    radius = max(1, round(0.9 * spacing_px * float(centre[2]) / camera.focal_px * scale))
     front = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
     side = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
     return np.hstack([_points_picture((p - centre) @ R.T, n @ R.T, scale, radius) for R in (front, side)])
@@ -102,7 +102,14 @@ def png(picture: np.ndarray) -> bytes:
     return bytes(cv2.imencode(".png", picture)[1])
 
 
+def jpeg(picture: np.ndarray) -> bytes:
+    """A picture as JPEG, for pages that carry many."""
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+
+
 def _colours(values: np.ndarray, low: float, high: float) -> Sequence[tuple[int, int, int]]:
+    if not len(values):
+        return []
     index = np.clip(255 * (values - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)
     table = cv2.applyColorMap(index.reshape(-1, 1), cv2.COLORMAP_JET).reshape(-1, 3)
     return [(int(b), int(g), int(r)) for b, g, r in table]
