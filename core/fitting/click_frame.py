@@ -10,6 +10,7 @@ from .cloud_points import CloudPoints
 from .conditions import Conditions
 from .inverse_kinematics import inverse_kinematics, other_postures
 from .observations import Observation
+from .problem import linearise
 from .segmentation import crop
 from .solver import Solution, solve
 from .state import BodyState
@@ -56,6 +57,15 @@ def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarr
             problem = fit.problem(_observe(fit, near, 1.0), free)
             solution = solve(problem, solution.motion, solution.vector, steps=ALTERNATION_STEPS, scales=solution.scales)
     return solution
+
+
+def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """ln of the bone lengths (B,) and their sigmas, as the click frame knows them."""
+    near = crop(points, fit.parameters.state(solution.motion[0], solution.vector), REACH_M)
+    problem = fit.problem(_observe(fit, near, 1.0), "shape")
+    covariance = linearise(problem, solution.motion, solution.vector, solution.scales).equations.covariance()[2]
+    lengths = fit.parameters.layout.set("lengths")
+    return solution.vector[lengths], np.sqrt(np.diag(covariance)[lengths])
 
 
 def _starts(fit: Conditions, motion: np.ndarray) -> list[np.ndarray]:

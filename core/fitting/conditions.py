@@ -44,11 +44,12 @@ class Conditions:
                               crowding=(own + share * model) / (own + model), form=s.residual)
         return found.scaled(state)
 
-    def of_shape(self) -> list[Observation]:
-        """What is believed about the shape."""
+    def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
+        """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the model is known."""
         mean, s = self.parameters.vector(), self.settings
         sigma = np.full(len(mean), s.radius_sigma)
-        sigma[self.parameters.layout.set("lengths")] = s.length_sigma
+        of_lengths = self.parameters.layout.set("lengths")
+        mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], s.length_sigma)
         return [ShapePrior(mean=mean, sigma=sigma), EqualRadii(sigma=s.roundness_sigma)]
 
     def problem(self, observe: Callable[[int, BodyState], list[Observation]], free: str | None = None,

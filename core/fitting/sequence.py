@@ -6,7 +6,8 @@
 4. One adjustment over the whole sequence: the shape once, a posture per frame, tied over time by tracked points and weak accelerations.
 
 A body is not made of metaballs. What it differs, it differs in every frame, so forty frames tell no more of the shape than one does: in
-step 4 clicks and beliefs about the shape weigh as much against the points as they would in a single frame (`shared_frames`).
+step 4 what is known of the shape beforehand (radii from the model, bone lengths from the click frame) weighs as much against the points
+as it would in a single frame (`shared_frames`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from ..geometry.rig import Rig
 from ..progress import Monitor
 from .acceleration import Acceleration
 from .body_motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
-from .click_frame import fit_click_frame
+from .click_frame import clicked_lengths, fit_click_frame
 from .clicks import read_clicks
 from .cloud_points import Cloud, CloudPoints, thinned
 from .conditions import Conditions
@@ -64,7 +65,7 @@ def fit_sequence(rig: Rig, model_name: str, clouds: Sequence[Cloud], joints: Map
     if trajectories is not None and settings.use_trajectories:
         tracks = MaterialTracks(trajectories, [p.frame for p in points], fit.model.surface, settings)
     motion, points = follow(fit, points, time_s, first, tracks, monitor)
-    problem = _whole_sequence(fit, points, time_s, tracks)
+    problem = _whole_sequence(fit, points, time_s, tracks, clicked_lengths(fit, points[fit.click], first))
     solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
     return _result(fit, points, time_s, solution, problem)
 
@@ -87,18 +88,18 @@ def _conditions(rig: Rig, model_name: str, frames: list[int], joints: Mapping[st
                       click=frames.index(click_frame), priors=priors)
 
 
-def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, tracks: MaterialTracks | None) -> Problem:
+def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, tracks: MaterialTracks | None,
+                    lengths: tuple[np.ndarray, np.ndarray]) -> Problem:
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
     sigma[skeleton.layout.set("base")] = s.acceleration_m_s2
-    weight = _shared_weight(points, s)
-    clicked = replace(fit.clicks.observation, sigma_px=s.click_sigma_px / weight**0.5)
 
     def observe(t: int, state: BodyState) -> list[Observation]:
-        return [fit.surface(points[t], state), *([clicked] if t == fit.click else []), *fit.priors]
+        return [fit.surface(points[t], state), *([fit.clicks.observation] if t == fit.click else []), *fit.priors]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
-    return replace(problem, of_shape_weight=weight, observe_step=None if tracks is None else tracks.steps)
+    return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),
+                   observe_step=None if tracks is None else tracks.steps)
 
 
 def _shared_weight(points: list[CloudPoints], settings: FitSettings) -> float:
