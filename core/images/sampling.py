@@ -1,7 +1,8 @@
 """Sub-pixel sampling: the cubic B-spline through the grey values (Unser 1999, doi:10.1109/79.799930).
 
 Prepared once per image: the exact spline on a grid four times as fine. A sample is a bilinear look-up in that grid, whose peak
-interpolation bias is 0.0009 px; bilinear sampling of the image itself would have 0.012 px.
+interpolation bias is 0.0009 px (texture of 1 px blur); bilinear sampling of the image itself would have 0.012 px. OpenCV 4 rounds the place of
+a look-up to 1/32 of the fine grid, at most 0.0039 px; a patch of many samples at unlike places averages that away, OpenCV 5 does not round.
 """
 
 import cv2
@@ -25,6 +26,8 @@ class SplineImage:
 
         m stays below 32,767, and so does four times the image's width and height (limits of the look-up).
         """
+        if not x.size:
+            return np.zeros(x.shape, np.float32)
         if len(x) > LONGEST_LOOK_UP:
             starts = range(0, len(x), LONGEST_LOOK_UP)
             return np.concatenate([self.sample(x[i : i + LONGEST_LOOK_UP], y[i : i + LONGEST_LOOK_UP]) for i in starts])

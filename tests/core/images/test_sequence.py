@@ -1,0 +1,191 @@
+"""Reading footage: every kind of image, movies, natural order, gaps, and files that are not what they say."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.errors import InputError
+from tricap.core.images import sequence
+from tricap.core.images.sequence import ImageFiles, Movie, grey, open_sequence, read_image
+
+RAMP = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) * 21
+
+
+def write(path: Path, image: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(path.suffix, image)[1].tobytes())
+    return path
+
+
+def numbered(folder: Path, *numbers: object, pattern: str = "{}.png") -> Path:
+    for i, n in enumerate(numbers):
+        write(folder / pattern.format(n), np.full((8, 8), i, np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("ending", [".png", ".tif", ".bmp", ".pgm"])
+def test_8_bits(tmp_path: Path, ending: str) -> None:
+    image = (RAMP // 257).astype(np.uint8)
+    got = read_image(write(tmp_path / f"a{ending}", image))
+    assert got.dtype == np.float32 and np.array_equal(got, image)
+
+
+@pytest.mark.parametrize("ending", [".png", ".tif", ".pgm"])
+def test_16_bits_span_the_same_range(tmp_path: Path, ending: str) -> None:
+    got = read_image(write(tmp_path / f"a{ending}", RAMP))
+    assert got.dtype == np.float32 and np.abs(got - RAMP / 257).max() < 1e-4
+    assert read_image(write(tmp_path / "white.png", np.full((8, 8), 65535, np.uint16))).max() == 255
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_colour_becomes_luma(tmp_path: Path, dtype: type, channels: int) -> None:
+    top = np.iinfo(dtype).max
+    image = np.zeros((8, 9, channels), dtype)
+    image[:, :3, 0], image[:, 3:6, 1], image[:, 6:, 2] = top, top, top  # blue, green, red
+    got = read_image(write(tmp_path / "a.png", image))
+    assert got.shape == (8, 9)
+    assert np.allclose(got[0, [0, 3, 6]], [0.114 * 255, 0.587 * 255, 0.299 * 255], atol=0.6)  # Rec. 601; 8 bits are rounded
+
+
+def test_floats_of_one_are_white() -> None:
+    for dtype in (np.float32, np.float64):
+        for shape in ((4, 5), (4, 5, 3)):
+            assert np.allclose(grey(np.full(shape, 0.5, dtype)), 127.5, atol=0.01)
+    assert grey(np.full((4, 5), np.nan, np.float32)).max() == 0
+
+
+def test_paths_with_spaces_and_accents(tmp_path: Path) -> None:
+    folder = numbered(tmp_path / "Prise numéro 1 äöß 日本" / "vue gauche", *range(3))
+    footage = open_sequence(folder.parent, images="vue gauche/*.png", movie=None, view="L")
+    assert footage.count == 3 and [int(footage.read(i)[0, 0]) for i in range(3)] == [0, 1, 2]
+    movie = write_movie(folder.parent / "vue é.avi", 3)
+    assert open_sequence(folder.parent, images=None, movie=movie.name, view="L").count == 3
+
+
+def test_natural_order(tmp_path: Path) -> None:
+    numbered(tmp_path / "L", 8, 9, 10, 11, pattern="take2_{}_c.png")
+    (tmp_path / "L" / "notes.txt").write_text("")
+    footage = open_sequence(tmp_path, images="L/*", movie=None, view="L")
+    assert [p.name for p in footage.files()] == [f"take2_{n}_c.png" for n in (8, 9, 10, 11)]
+    names = ["a²1.png", "1²2.png", "B2.png", "b10.png"]
+    for name in names:
+        write(tmp_path / "odd" / name, np.zeros((8, 8), np.uint8))
+    assert [p.name for p in open_sequence(tmp_path, images="odd/*", movie=None, view="L").files()][-2:] == ["B2.png", "b10.png"]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "between"),
+    [
+        ((0, 1, 3), "1.png and 3.png"),
+        ((0, 2, 3), "0.png and 2.png"),
+        ((0, 1, 2, 3, 4, 7, 8), "4.png and 7.png"),
+        ((0, 1, 3, 4, 6, 7), "1.png and 3.png"),  # two gaps in a short sequence
+        ((10, 20, 40, 50), "20.png and 40.png"),
+        (tuple(n for n in range(60) if n not in (7, 8, 20, 33, 50)), "6.png and 9.png"),
+    ],
+)
+def test_a_missing_image_in_a_numbered_sequence(tmp_path: Path, numbers: tuple[int, ...], between: str) -> None:
+    for pattern in ("{}.png", "frame_{}_cam2.png"):
+        folder = numbered(tmp_path / pattern[:5], *numbers, pattern=pattern)
+        with pytest.raises(InputError, match="View L lacks the image") as error:
+            open_sequence(tmp_path, images=f"{folder.name}/*.png", movie=None, view="L")
+        first, last = between.split(" and ")
+        assert pattern.format(first[:-4]) in str(error.value) and pattern.format(last[:-4]) in str(error.value)
+
+
+@pytest.mark.parametrize("numbers", [(5,), (3, 9), (1000, 1040, 1079, 1121, 1160), ("a", "b", "c", "d"), (2, 4, 6, 8), ("a1", "b1", "c1")])
+def test_sequences_without_a_gap(tmp_path: Path, numbers: tuple[object, ...]) -> None:
+    numbered(tmp_path / "L", *numbers)
+    assert open_sequence(tmp_path, images="L/*.png", movie=None, view="L").count == len(numbers)
+
+
+@pytest.mark.parametrize("pattern", ["", ".", "***", "a**/x.png", "L/*.jpg", "L/[.png", "\0", "~/*.png", "R/*.png", "*/"])
+def test_patterns_that_find_nothing(tmp_path: Path, pattern: str) -> None:
+    numbered(tmp_path / "L", 0, 1)
+    try:
+        found = open_sequence(tmp_path, images=pattern, movie=None, view="L")
+    except InputError as error:
+        assert "View L has no images" in str(error)
+    else:
+        assert pattern in ("***", "a**/x.png") and found.count  # patterns of newer Pythons
+
+
+@pytest.mark.parametrize("path", ["../L/*.png", "/etc/*.png", "L/../../x.png"])
+def test_paths_outside_the_take(tmp_path: Path, path: str) -> None:
+    for how in (dict(images=path, movie=None), dict(images=None, movie=path)):
+        with pytest.raises(InputError, match="lies outside the take"):
+            open_sequence(tmp_path, view="L", **how)  # type: ignore[arg-type]
+
+
+def test_files_that_are_no_images(tmp_path: Path) -> None:
+    whole = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8))[1].tobytes()
+    jpeg = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8))[1].tobytes()
+    contents = dict(text=b"not an image\n", empty=b"", cut=whole[: len(whole) // 2], zeros=b"\0" * 1000, cut_jpeg=jpeg[: len(jpeg) // 2])
+    for name, content in contents.items():
+        path = tmp_path / f"{name}.png"
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=f"{name}.png is not an image that can be read; replace it"):
+            read_image(path)
+    with pytest.raises(InputError, match="Cannot read the image .*gone.png"):
+        ImageFiles((tmp_path / "gone.png",), "*.png").read(0)
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(InputError, match="Cannot read the image"):
+        read_image(tmp_path / "folder.png")
+
+
+def test_images_of_a_kind_or_size_that_cannot_be_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="holds int32 pixels"):
+        read_image(write(tmp_path / "a.tif", np.zeros((8, 8), np.int32)))
+    with pytest.raises(InputError, match="has 8192×8 pixels, more than can be measured"):
+        read_image(write(tmp_path / "wide.png", np.zeros((8, 8192), np.uint8)))
+    monkeypatch.setattr(sequence, "MAX_PIXELS", 63)
+    with pytest.raises(InputError, match="has 8×8 pixels"):
+        read_image(write(tmp_path / "b.png", np.zeros((8, 8), np.uint8)))
+
+
+def write_movie(path: Path, frames: int) -> Path:
+    """Frames of the grey values 20, 40, …, with one bright square that wanders; JPEG-compressed."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25, (64, 48))
+    assert writer.isOpened()
+    for picture in movie_pictures(frames):
+        writer.write(np.repeat(picture[:, :, None], 3, axis=2))
+    writer.release()
+    return path
+
+
+def movie_pictures(frames: int) -> list[np.ndarray]:
+    pictures = []
+    for i in range(frames):
+        picture = np.full((48, 64), 20 + 20 * i, np.uint8)
+        picture[8:16, 8 * (i % 8) : 8 * (i % 8) + 8] = 240
+        pictures.append(picture)
+    return pictures
+
+
+def test_a_movie_gives_the_frames_that_were_written_in_any_order(tmp_path: Path) -> None:
+    path, pictures = write_movie(tmp_path / "m.avi", 7), movie_pictures(7)
+    movie = open_sequence(tmp_path, images=None, movie="m.avi", view="L")
+    assert movie.count == 7 and movie.files() == (path,)
+    for i in (0, 1, 2, 6, 3, 3, 0, 5):
+        assert np.abs(movie.read(i) - pictures[i]).mean() < 2.0, i  # neighbours differ by 20
+    files = ImageFiles(tuple(write(tmp_path / f"{i}.png", p) for i, p in enumerate(pictures)), "*.png")
+    assert max(float(np.abs(movie.read(i) - files.read(i)).mean()) for i in range(7)) < 2.0
+
+
+def test_a_movie_that_ends_early(tmp_path: Path) -> None:
+    movie = Movie(write_movie(tmp_path / "m.avi", 4))
+    with pytest.raises(InputError, match="Frame 4 of .*m.avi cannot be decoded; it promises 4 frames"):
+        movie.read(4)
+    assert movie.read(1)[0, 0] == pytest.approx(40, abs=2)
+
+
+def test_movies_that_are_none(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("no movie")
+    with pytest.raises(InputError, match="text.mp4 is not a movie that can be decoded"):
+        open_sequence(tmp_path, images=None, movie="text.mp4", view="L")
+    for name in ("missing.mp4", "", "\0"):
+        with pytest.raises(InputError, match="of view L is missing"):
+            open_sequence(tmp_path, images=None, movie=name, view="L")
