@@ -1,0 +1,177 @@
+"""Armatures and their actions as plain values, in the world. Main thread only.
+
+Frames are read by playing the scene once (constraints, drivers and layers included); all the rest is done on arrays.
+"""
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+
+from ...core.errors import InputError
+from ...core.motion.retarget.mapping import RigMap
+from ...core.motion.retarget.rig import Motion, Rig
+from ...core.motion.retarget.turns import matrix_from_euler
+from ...core.progress import Monitor
+
+UNIFORM = 1e-3  # scales along the axes may differ by this part
+FEW_BONES = 3
+
+
+def read_rig(armature_object: bpy.types.Object) -> Rig:
+    """The rest pose of an armature object in the world, parents first.
+
+    Raises:
+        InputError: it is no armature, has no bones, or is scaled unevenly.
+    """
+    if armature_object is None or armature_object.type != "ARMATURE":
+        raise InputError(f"{getattr(armature_object, 'name', 'Nothing')} is no armature; choose an armature.")
+    bones = in_order(armature_object)
+    if not bones:
+        raise InputError(f"The armature “{armature_object.name}” has no bones; choose another.")
+    world = world_matrix(armature_object)
+    scale_of(armature_object)
+    rest = np.array([bone.matrix_local for bone in bones])
+    index = {bone.name: i for i, bone in enumerate(bones)}
+    return Rig(names=tuple(index), parents=np.array([index[b.parent.name] if b.parent else -1 for b in bones]),
+               R_rest=orthonormal(world[:3, :3] @ rest[:, :3, :3]), head_m=_moved(world, [b.head_local for b in bones]),
+               tail_m=_moved(world, [b.tail_local for b in bones]), connected=np.array([b.use_connect for b in bones]),
+               inherits_rotation=np.array([b.use_inherit_rotation for b in bones]), roles=humanoid_roles(armature_object),
+               sole_m={})
+
+
+def in_order(armature_object: bpy.types.Object) -> list[bpy.types.Bone]:
+    """All bones, parents before children."""
+    ordered: list[bpy.types.Bone] = []
+    front = [bone for bone in armature_object.data.bones if bone.parent is None]
+    while front:
+        bone = front.pop(0)
+        ordered.append(bone)
+        front = [*bone.children, *front]
+    return ordered
+
+
+def world_matrix(armature_object: bpy.types.Object) -> np.ndarray:
+    """Object to world (4, 4)."""
+    return np.array(armature_object.matrix_world)
+
+
+def scale_of(armature_object: bpy.types.Object) -> float:
+    """The object's scale.
+
+    Raises:
+        InputError: it differs along the axes, is none, or mirrors.
+    """
+    M = world_matrix(armature_object)[:3, :3]
+    lengths = np.linalg.norm(M, axis=0)
+    if not np.isfinite(M).all() or lengths.min() < 1e-9:
+        raise InputError(f"The armature “{armature_object.name}” is scaled to nothing; give it a size.")
+    sheared = np.abs(M.T @ M / lengths.mean() ** 2 - np.eye(3)).max() > 2 * UNIFORM
+    if sheared or np.linalg.det(M) < 0:
+        raise InputError(f"The armature “{armature_object.name}” is scaled unevenly or mirrored; apply its scale (Ctrl A).")
+    return float(lengths.mean())
+
+
+def _moved(world: np.ndarray, points: Sequence[object]) -> np.ndarray:
+    return np.array(points, dtype=float).reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
+
+
+def orthonormal(M: np.ndarray) -> np.ndarray:
+    """The rotations (…, 3, 3) nearest to matrices without shear: their columns' directions."""
+    U, _, V = np.linalg.svd(M)
+    return U @ V
+
+
+def humanoid_roles(armature_object: bpy.types.Object) -> dict[str, str]:
+    """What a VRM file says its bones are, if the importer of VRM files kept it."""
+    extension = getattr(armature_object.data, "vrm_addon_extension", None)
+    bones = getattr(getattr(getattr(extension, "vrm1", None), "humanoid", None), "human_bones", None)
+    found = {}
+    for role, attribute in VRM.items():
+        bone = getattr(bones, attribute, None)
+        name = getattr(getattr(bone, "node", None), "bone_name", "")
+        if name in armature_object.data.bones:
+            found[role] = name
+    return found
+
+
+VRM = {"hips": "hips", "head": "head"} | {
+    f"{role}.{side}": f"{word}_{part}" for side, word in (("L", "left"), ("R", "right")) for role, part in (
+        ("clavicle", "shoulder"), ("upper_arm", "upper_arm"), ("forearm", "lower_arm"), ("hand", "hand"), ("thigh", "upper_leg"),
+        ("shin", "lower_leg"), ("foot", "foot"), ("toe", "toes"))}
+
+
+def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> Rig:
+    """The rig with the points under its feet, from the skins that it moves: where they would touch a floor tilted this way and that."""
+    wanted = [name for side in "LR" for part in ("foot", "toe") for name in rig_map.bones.get(f"{part}.{side}", ())]
+    points: dict[str, list[np.ndarray]] = {}
+    for skin in [o for o in bpy.data.objects if o.type == "MESH" and armature_object in (m.object for m in o.modifiers if m.type == "ARMATURE")]:
+        groups = {group.index: group.name for group in skin.vertex_groups if group.name in wanted}
+        if not groups:
+            continue
+        place = np.empty(3 * len(skin.data.vertices))
+        skin.data.vertices.foreach_get("co", place)
+        place = _moved(world_matrix(skin), place.reshape(-1, 3))
+        for name, vertices in _mostly(skin, groups).items():
+            points.setdefault(name, []).append(place[vertices])
+    soles = {name: undermost(np.concatenate(parts)) for name, parts in points.items()}
+    return Rig(**{f: getattr(rig, f) for f in rig.__dataclass_fields__ if f != "sole_m"}, sole_m=soles)
+
+
+def _mostly(skin: bpy.types.Object, groups: dict[int, str]) -> dict[str, list[int]]:
+    """Vertices by the group that holds more than half of their weight."""
+    found: dict[str, list[int]] = {}
+    for vertex in skin.data.vertices:
+        weights = {g.group: g.weight for g in vertex.groups}
+        strongest = max(weights, key=lambda group: weights[group], default=-1)
+        if strongest in groups and weights[strongest] > 0.5 * sum(weights.values()):
+            found.setdefault(groups[strongest], []).append(vertex.index)
+    return found
+
+
+def undermost(points: np.ndarray) -> np.ndarray:
+    """The points (K, 3) of a cloud that a plane touches from below, at tilts of up to 75° in all directions."""
+    tilt, heading = np.meshgrid(np.radians([0, 15, 30, 45, 60, 75]), np.radians(np.arange(0, 360, 30)))
+    down = -np.stack([np.sin(tilt) * np.cos(heading), np.sin(tilt) * np.sin(heading), np.cos(tilt)], axis=-1).reshape(-1, 3)
+    return points[np.unique(np.argmax(down @ points.T, axis=1))]
+
+
+def read_motion(armature_object: bpy.types.Object, rig: Rig, frames: Sequence[int], monitor: Monitor | None = None) -> Motion:
+    """The motion of an armature as it plays in its scene, constraints and all. The scene's frame is put back."""
+    scene = bpy.context.scene
+    now, names, monitor = scene.frame_current, rig.names, monitor or Monitor()
+    pose = np.empty((len(frames), len(names), 4, 4))
+    world = np.empty((len(frames), 4, 4))
+    try:
+        for i, frame in enumerate(frames):
+            monitor.step("reading the motion", i, len(frames))
+            scene.frame_set(int(frame))
+            bones = armature_object.pose.bones
+            pose[i] = [bones[name].matrix for name in names]
+            world[i] = armature_object.matrix_world
+    finally:
+        scene.frame_set(now)
+    placed = world[:, None] @ pose
+    return Motion(rig=rig, fps=scene.render.fps / scene.render.fps_base, frames=np.asarray(frames, dtype=float),
+                  R=orthonormal(placed[..., :3, :3]), head_m=placed[..., :3, 3])
+
+
+def action_frames(armature_object: bpy.types.Object) -> range:
+    """The whole frames of an armature's action.
+
+    Raises:
+        InputError: it has none.
+    """
+    data = armature_object.animation_data
+    if data is None or (data.action is None and not data.nla_tracks):
+        raise InputError(f"The armature “{armature_object.name}” has no action; choose one that moves.")
+    if data.action is None:
+        scene = bpy.context.scene
+        return range(scene.frame_start, scene.frame_end + 1)
+    first, last = data.action.frame_range
+    return range(int(np.ceil(first - 1e-4)), int(np.floor(last + 1e-4)) + 1)
+
+
+def euler_rest(pose_bone: bpy.types.PoseBone) -> np.ndarray:
+    """The rotation (3, 3) of a pose bone's Euler channels, for those who need it without the depsgraph."""
+    return matrix_from_euler(np.array(pose_bone.rotation_euler), pose_bone.rotation_mode)

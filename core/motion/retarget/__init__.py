@@ -1,0 +1,1 @@
+"""Retargeting: the motion of one skeleton onto another, whatever their rest poses, bone rolls, names and proportions."""

@@ -1,0 +1,123 @@
+"""When a foot stands: from the motion itself, with hysteresis, separately for heel (the ankle) and ball (the toe's joint).
+
+A joint comes to stand when it is both slow and low, and stands until it is clearly faster or higher: two thresholds, so that noise
+does not make it flicker. Speeds and heights are those of a person with legs of 0.9 m; other sizes are scaled.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from ...settings import knob
+from .mapping import RigMap
+from .rig import Motion
+from .roles import SIDES, sided
+from .turns import unit
+
+LEG_M = 0.9
+LOW_PERCENTILE = 3.0
+SMOOTH_S = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeetSettings:
+    """How feet are kept on the floor."""
+
+    mode: str = knob("auto", "when feet stand: never, by the motion, or whenever they are low", choices=("off", "auto", "always"))
+    land_speed_m_s: float = knob(0.25, "a foot slower than this comes to stand", unit="m/s", low=0.01, high=5.0)
+    leave_speed_m_s: float = knob(0.45, "a standing foot faster than this leaves", unit="m/s", low=0.01, high=5.0)
+    land_height_m: float = knob(0.05, "a joint of the foot lower than this above its lowest level may stand", unit="m", low=0.0, high=1.0)
+    leave_height_m: float = knob(0.08, "a standing joint higher than this leaves", unit="m", low=0.0, high=1.0)
+    shortest_s: float = knob(0.06, "shorter contacts and shorter gaps are overlooked", unit="s", low=0.0, high=1.0)
+    blend_s: float = knob(0.15, "a foot is let go over this time", unit="s", low=0.0, high=2.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Contacts:
+    """By side: frames (T,) in which the ankle (heel) and the toe's joint (ball) stand; and the ankles' level on the floor [m]."""
+
+    ankle: Mapping[str, np.ndarray]
+    toe: Mapping[str, np.ndarray]
+    ankle_level_m: float
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """The sides that have a foot."""
+        return tuple(self.ankle)
+
+
+def leg_length(rig_joints: Mapping[str, np.ndarray]) -> float:
+    """Thigh and shin together, from places of "thigh", "shin" and "foot"."""
+    return float(np.linalg.norm(rig_joints["shin"] - rig_joints["thigh"]) + np.linalg.norm(rig_joints["foot"] - rig_joints["shin"]))
+
+
+def find_contacts(motion: Motion, rig_map: RigMap, settings: FeetSettings, leg_m: float) -> Contacts | None:
+    """The contacts of both feet; None if the motion has no legs."""
+    ankle, toe, levels = {}, {}, []
+    for side in SIDES:
+        name = rig_map.first(sided("foot", side))
+        if name is None or sided("shin", side) not in rig_map.bones:
+            continue
+        places = motion.head_m[:, motion.rig.index[name]]
+        ankle[side] = stands(places, motion.fps, settings, leg_m / LEG_M)
+        levels.append(np.percentile(places[ankle[side], 2] if ankle[side].any() else places[:, 2], LOW_PERCENTILE * 5))
+        ball = ball_places(motion, rig_map, side)
+        toe[side] = ankle[side] & False if ball is None else stands(ball, motion.fps, settings, leg_m / LEG_M)
+    return Contacts(ankle=ankle, toe=toe, ankle_level_m=float(np.mean(levels))) if ankle else None
+
+
+def ball_places(motion: Motion, rig_map: RigMap, side: str) -> np.ndarray | None:
+    """Where the ball of the foot is (T, 3): the toe's joint, or the end of a foot without toes."""
+    toe, foot = rig_map.first(sided("toe", side)), rig_map.bones[sided("foot", side)][-1]
+    if toe is not None:
+        return motion.head_m[:, motion.rig.index[toe]]
+    b = motion.rig.index[foot]
+    along = motion.rig.tail_m[b] - motion.rig.head_m[b]
+    if abs(unit(along)[2]) > 0.95:  # upright: no foot's length, but an importer's guess
+        return None
+    return motion.head_m[:, b] + motion.R[:, b] @ (motion.rig.R_rest[b].T @ along)
+
+
+def stands(places: np.ndarray, fps: float, settings: FeetSettings, scale: float) -> np.ndarray:
+    """Frames (T,) in which a joint at `places` (T, 3) stands."""
+    if settings.mode == "off":
+        return np.zeros(len(places), dtype=bool)
+    window = max(1, 2 * round(SMOOTH_S * fps / 2) + 1)
+    smooth = uniform_filter1d(places, window, axis=0, mode="nearest")
+    speed = np.linalg.norm(np.gradient(smooth, axis=0), axis=1) * fps if len(places) > 1 else np.zeros(1)
+    height = places[:, 2] - np.percentile(places[:, 2], LOW_PERCENTILE)
+    slow, fast = settings.land_speed_m_s * scale, max(settings.leave_speed_m_s, settings.land_speed_m_s) * scale
+    if settings.mode == "always":
+        slow = fast = np.inf
+    low, high = settings.land_height_m * scale, max(settings.leave_height_m, settings.land_height_m) * scale
+    on = hysteresis((speed < slow) & (height < low), (speed > fast) | (height > high))
+    shortest = settings.shortest_s * fps
+    return without_short(without_short(on, False, shortest), True, shortest)
+
+
+def hysteresis(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """True from a frame where `begin` holds until one where `end` does; also back in time from `begin` as long as `end` does not hold."""
+    on = begin & ~end
+    for step in (1, -1):
+        state, order = False, range(len(begin))[::step]
+        for t in order:
+            state = not end[t] and (state or bool(begin[t]))
+            on[t] |= state
+    return on
+
+
+def runs(on: np.ndarray) -> list[tuple[int, int]]:
+    """Stretches [first, last + 1) in which `on` (T,) holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
+
+
+def without_short(on: np.ndarray, value: bool, shortest: float) -> np.ndarray:
+    """With stretches of `value` that are shorter than `shortest` frames turned over, but not those at the ends."""
+    result = on.copy()
+    for a, b in runs(on == value):
+        if b - a < shortest and a > 0 and b < len(on):
+            result[a:b] = not value
+    return result

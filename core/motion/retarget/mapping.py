@@ -1,0 +1,287 @@
+"""Which bones of a rig are which parts of a body: found by names, completed by the way the bones hang together, or read from a file.
+
+The spine and the neck need no names: they are what lies between hips, arms and head. What could not be mapped is listed in `missing`
+with the reason, never guessed silently; `notes` say what was found by shape alone.
+"""
+
+from collections.abc import Mapping as Map
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ... import store
+from ...errors import InputError
+from ...settings import nearest_name
+from .names import Reading, read_name
+from .rig import Rig
+from .roles import ARM, FINGERS, LEG, ROLES, SIDES, sided
+
+NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm", "forearm", "thigh", "shin")))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RigMap:
+    """`bones`: by role, a chain of bone names from the body outwards. `twist`: by role, bones that share its twist."""
+
+    bones: Map[str, tuple[str, ...]]
+    twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    origin: str = "names"
+
+    def first(self, role: str) -> str | None:
+        """The bone at whose head the part begins."""
+        return self.bones[role][0] if role in self.bones else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """A family of rigs: the bones' names by role. `prefixes` may stand before every name."""
+
+    name: str
+    bones: Map[str, tuple[str, ...]]
+    twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
+    prefixes: tuple[str, ...] = ("",)
+
+
+def read_preset(path: Path) -> Preset:
+    """A preset from a JSON file; "{s}" in a role or name stands for both sides, written as `sides` says.
+
+    Raises:
+        InputError: the file cannot be read, or is no mapping.
+    """
+    table = store.read_json(path)
+    if not isinstance(table, dict) or not isinstance(table.get("bones"), dict):
+        raise InputError(f"{path} is no mapping of bones; it needs a table “bones” with a name or list of names by role.")
+    sides = table.get("sides", {"L": "L", "R": "R"})
+    prefixes = table.get("prefixes", [""])
+    if not isinstance(sides, dict) or set(sides) != {"L", "R"} or not all(isinstance(x, str) for x in [*sides.values(), *prefixes]):
+        raise InputError(f"{path} has odd “sides” or “prefixes”; write {{\"L\": \"Left\", \"R\": \"Right\"}} and a list of texts.")
+    parts = {key: _by_role(table.get(key, {}), sides, key, path) for key in ("bones", "twist")}
+    return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), **parts)
+
+
+def _by_role(table: Any, sides: Map[str, str], key: str, path: Path) -> dict[str, tuple[str, ...]]:
+    rows: dict[str, tuple[str, ...]] = {}
+    for role, names in table.items() if isinstance(table, dict) else ():
+        chain = [names] if isinstance(names, str) else names
+        if not isinstance(chain, list) or not chain or not all(isinstance(name, str) for name in chain):
+            raise InputError(f"{path} names no bones for “{role}” in “{key}”; write a name or a list of names.")
+        for side, written in sides.items() if role.endswith("{s}") else (("", ""),):
+            rows[role.replace("{s}", side)] = tuple(name.replace("{s}", written) for name in chain)
+    for role in rows:
+        if role not in ROLES:
+            raise InputError(f"{path} maps “{role}”, which is no part of the body.{nearest_name(role, list(ROLES))}")
+    return rows
+
+
+def write_map(path: Path, rig_map: RigMap, name: str) -> None:
+    """The mapping as a preset file that `read_preset` reads and people edit.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    store.write_json(path, {"name": name, "bones": {r: list(c) for r, c in rig_map.bones.items()},
+                            "twist": {r: list(c) for r, c in rig_map.twist.items()}})
+
+
+def apply_preset(rig: Rig, preset: Preset) -> RigMap:
+    """The mapping that a preset gives on this rig; bones that the rig lacks are missing.
+
+    Raises:
+        InputError: none of its bones are in the rig.
+    """
+    best = max(preset.prefixes, key=lambda prefix: sum(prefix + name in rig.index for chain in preset.bones.values() for name in chain))
+    found = {role: tuple(best + name for name in chain if best + name in rig.index) for role, chain in preset.bones.items()}
+    twist = {role: tuple(best + name for name in chain if best + name in rig.index) for role, chain in preset.twist.items()}
+    bones = {role: chain for role, chain in found.items() if chain}
+    if not bones:
+        raise InputError(f"None of the bones of the mapping “{preset.name}” are in this rig; choose another or let it be found.")
+    missing = tuple(f"{role}: no bone “{preset.bones[role][0]}”" for role in preset.bones if role not in bones)
+    return RigMap(bones=bones, twist={role: chain for role, chain in twist.items() if chain and role in bones}, missing=missing,
+                  origin=f"mapping “{preset.name}”")
+
+
+def fit_of(rig: Rig, preset: Preset) -> float:
+    """How much of a preset (0…1) a rig has under exactly these names."""
+    names = [name for chain in preset.bones.values() for name in chain]
+    return max(sum(prefix + name in rig.index for name in names) for prefix in preset.prefixes) / max(len(names), 1)
+
+
+def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
+    """Recognise a rig: by what its file says, by a family's names, by single names, and by its shape, in that order of trust.
+
+    Raises:
+        InputError: nothing of a body could be recognised.
+    """
+    from .shape import by_shape
+
+    best = max(presets, key=lambda preset: fit_of(rig, preset), default=None)
+    if best is not None and fit_of(rig, best) > 0.9:
+        return _completed(rig, apply_preset(rig, best))
+    named = by_names(rig)
+    if all(role in named.bones for role in NEEDED) or _is_limb(named):
+        return named
+    shaped = by_shape(rig)
+    if shaped is not None and len(shaped.bones) > len(named.bones):
+        return shaped
+    if named.bones:
+        return named
+    raise InputError("No part of a body could be recognised in this rig, neither by its bones' names nor by its shape;"
+                     " write a mapping (see docs/retargeting.md).")
+
+
+def _is_limb(named: RigMap) -> bool:
+    """A measured limb, or half a body: whole limbs, but not all of them."""
+    whole = [all(sided(part, side) in named.bones for part in parts) for side in SIDES for parts in (ARM[1:3], LEG[:2])]
+    return any(whole) and len(named.bones) <= 8
+
+
+def by_names(rig: Rig) -> RigMap:
+    """What the names say, with the spine and neck from what lies between."""
+    readings = {name: read_name(name) for name in rig.names}
+    bones: dict[str, tuple[str, ...]] = {role: (bone,) for role, bone in rig.roles.items() if role in ROLES and bone in rig.index}
+    for side in SIDES:
+        for parts in (ARM, LEG):
+            _limb(rig, readings, side, parts, bones)
+        _fingers(rig, readings, side, bones)
+    _torso(rig, readings, bones)
+    return _completed(rig, RigMap(bones=bones))
+
+
+def _limb(rig: Rig, readings: Map[str, Reading], side: str, parts: Sequence[str], bones: dict[str, tuple[str, ...]]) -> None:
+    """Fill in one limb from the body outwards: each part's bones must hang on those of the part before."""
+    sure = {part: [n for n, r in readings.items() if r.side == side and r.part == part and not r.twist] for part in parts}
+    _guess(rig, readings, side, parts, sure)
+    above: str | None = None
+    for part in parts:
+        role = sided(part, side)
+        if role not in bones:
+            chain = _chain(rig, [n for n in sure[part] if above is None or _hangs_on(rig, n, above)])
+            if chain:
+                bones[role] = chain
+        above = bones[role][-1] if role in bones else above
+
+
+def _guess(rig: Rig, readings: Map[str, Reading], side: str, parts: Sequence[str], sure: dict[str, list[str]]) -> None:
+    """Fill parts that nothing is surely called, from names with several meanings: the deepest bone for the outermost part that can be
+    one, but a thigh and an upper arm come first if there is not enough for both."""
+    taken = {n for names in sure.values() for n in names}
+    free = [n for n, r in readings.items() if r.side == side and r.perhaps and not r.twist and n not in taken]
+    order = [part for part in ("upper_arm", "clavicle", "shin", "thigh") if part in parts and not sure[part]]
+    if "shin" in order and "thigh" in order and len(free) < 2:
+        order.remove("shin")
+    for part in order:
+        guesses = [n for n in free if part in readings[n].perhaps]
+        if guesses:
+            deepest = max(guesses, key=lambda n: len(rig.ancestors(rig.index[n])))
+            sure[part] = [deepest]
+            free.remove(deepest)
+
+
+def _hangs_on(rig: Rig, name: str, above: str) -> bool:
+    return rig.index[above] in rig.ancestors(rig.index[name])[1:]
+
+
+def _chain(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
+    """Of bones with the same meaning, those on one line from the body outwards, the longest such line."""
+    lines = []
+    for bottom in names:
+        line = [rig.names[b] for b in reversed(rig.ancestors(rig.index[bottom])) if rig.names[b] in names]
+        lines.append(tuple(line))
+    return max(lines, key=len, default=())
+
+
+def _fingers(rig: Rig, readings: Map[str, Reading], side: str, bones: dict[str, tuple[str, ...]]) -> None:
+    hand = bones.get(sided("hand", side))
+    for finger in FINGERS if hand else ():
+        found = sorted((int(r.finger.split(".")[1]), n) for n, r in readings.items()
+                       if r.side == side and r.finger.startswith(finger) and hand and _hangs_on(rig, n, hand[-1]))
+        numbers = [n for k, n in found if k > 0]
+        if len({k for k, _ in found if k > 0}) == len(numbers):
+            for k, name in enumerate(numbers[:3], 1):
+                bones.setdefault(f"{finger}.{k}.{side}", (name,))
+
+
+def _torso(rig: Rig, readings: Map[str, Reading], bones: dict[str, tuple[str, ...]]) -> None:
+    """Hips, spine, neck and head: between the limbs, named or not."""
+    thighs = [rig.index[bones[r][0]] for r in ("thigh.L", "thigh.R") if r in bones]
+    arms = [rig.index[bones[r][0]] for side in SIDES for r in (sided("clavicle", side), sided("upper_arm", side)) if r in bones]
+    central = [(r.part, rig.index[n]) for n, r in readings.items() if not r.side]
+    named = {part: [b for p, b in central if p == part] for part in ("hips", "head", "neck", "spine")}
+    hips = rig.index[bones["hips"][0]] if "hips" in bones else None
+    if hips is None and len(thighs) == 2:
+        fork = rig.common(*thighs)
+        hips = next((b for b in rig.ancestors(fork) if b in named["hips"]), fork) if fork is not None else None
+    if hips is None and named["hips"]:
+        hips = min(named["hips"])
+    if hips is not None:
+        bones.setdefault("hips", (rig.names[hips],))
+    head = rig.index[bones["head"][0]] if "head" in bones else min(named["head"], default=None)
+    chest = _fork(rig, arms, head, hips, named["spine"])
+    if chest is not None and hips is not None:
+        fork = rig.common(hips, chest)
+        line = rig.path(hips, chest)[1:] or (rig.path(fork, chest)[1:] if fork is not None and chest != hips else [])
+        if line:
+            bones["spine"] = tuple(rig.names[b] for b in line)
+    top = chest if chest is not None else hips
+    if head is None and top is not None:
+        head = _central_end(rig, top, arms, named["neck"])
+    if head is not None:
+        bones.setdefault("head", (rig.names[head],))
+        line = rig.path(top, head)[1:-1] if top is not None else [b for b in rig.ancestors(head)[:0:-1] if b in named["neck"]]
+        if line:
+            bones["neck"] = tuple(rig.names[b] for b in line)
+
+
+def _fork(rig: Rig, arms: Sequence[int], head: int | None, hips: int | None, spine: Sequence[int]) -> int | None:
+    """The chest: where the arms (and the head) part."""
+    ends = [rig.ancestors(b)[1] for b in arms if len(rig.ancestors(b)) > 1]
+    chest: int | None = ends[0] if ends else None
+    for end in ends[1:]:
+        chest = rig.common(chest, end) if chest is not None else None
+    if chest is not None and head is not None:
+        chest = rig.common(chest, head)
+    if chest is None or chest == hips:
+        below = [b for b in spine if hips is None or hips in rig.ancestors(b)]
+        chest = max(below, key=lambda b: len(rig.ancestors(b)), default=None)
+    return chest
+
+
+def _central_end(rig: Rig, top: int, arms: Sequence[int], necks: Sequence[int]) -> int | None:
+    """A head that is not called so: the last bone of the line that goes on upwards from the chest, between the arms."""
+    on_arms = {b for arm in arms for b in rig.ancestors(arm)}
+    bone, found = top, None
+    while True:
+        width = rig.height_m * 0.02
+        ahead = [c for c in rig.children[bone] if c not in on_arms and abs(rig.head_m[c][0] - rig.head_m[top][0]) < width
+                 and rig.head_m[c][2] > rig.head_m[bone][2] - width and rig.tail_m[c][2] > rig.head_m[c][2]]
+        if not ahead or len(rig.children[bone]) > 3 and bone != top:
+            return found
+        bone = found = max(ahead, key=lambda c: rig.tail_m[c][2])
+
+
+def _completed(rig: Rig, found: RigMap) -> RigMap:
+    """Add limbs' in-between bones and twist bones, and list what is missing."""
+    bones, twist = dict(found.bones), dict(found.twist)
+    used = {name for chain in bones.values() for name in chain} | {name for names in twist.values() for name in names}
+    for side in SIDES:
+        for part, after in (("upper_arm", "forearm"), ("forearm", "hand"), ("thigh", "shin"), ("shin", "foot")):
+            role, following = sided(part, side), bones.get(sided(after, side))
+            if role not in bones:
+                continue
+            first = rig.index[bones[role][0]]
+            if following:
+                line = [rig.names[b] for b in rig.path(first, rig.index[following[0]])[:-1]]
+                bones[role] = tuple(n for n in line if n in bones[role] or n not in used) or bones[role]
+            line_bones = {rig.index[n] for n in bones[role]}
+            beside = [n for b, n in enumerate(rig.names) if n not in used and n not in bones[role] and rig.parents[b] in line_bones
+                      and read_name(n).twist and not rig.children[b]]
+            if beside:
+                twist.setdefault(role, tuple(beside))
+    known = {name for chain in bones.values() for name in chain}
+    missing = found.missing + tuple(f"{role}: no bone was recognised" for role in NEEDED if role not in bones and not any(
+        text.startswith(role) for text in found.missing))
+    return RigMap(bones={role: bones[role] for role in ROLES if role in bones}, twist=twist, missing=missing, notes=found.notes + (
+        (f"{len(rig.names) - len(known)} other bones follow their parents",) if len(rig.names) > len(known) else ()), origin=found.origin)

@@ -1,0 +1,201 @@
+"""Retargeting as a whole: the motion of a source onto a target rig.
+
+    mapping (both) → contacts (source) → rotations (transfer) → root, scaled by the legs → feet → pose channels
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...errors import InputError
+from ...progress import Monitor
+from ...settings import knob
+from . import feet
+from .contacts import Contacts, FeetSettings, find_contacts
+from .mapping import RigMap
+from .rig import Motion, Rig, channels, head_of
+from .roles import SIDES, sided
+from .transfer import alignments, body_axes, follow, share_twist, turn
+
+SHORTEST_LIMB_M = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetargetSettings:
+    """What of the motion is taken over."""
+
+    root: str = knob("travel", "how the body moves through the room: as the source, on the spot, or not at all",
+                     choices=("travel", "in place", "still"))
+    scale: float = knob(0.0, "size of the target's steps against the source's; 0: by the length of the legs", low=0.0, high=1000.0)
+    twist: bool = knob(True, "spread the twist of the limbs over twist bones and forearms")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Retargeted:
+    """The target's motion, its pose channels, and how it came about."""
+
+    motion: Motion
+    basis: np.ndarray  # (T, B, 3, 3) pose channels
+    shift_m: np.ndarray  # (T, 3) of the carrier's head against where its parent leaves it, in the world
+    carrier: int  # the bone whose location channels carry the body; −1 for none
+    driven: np.ndarray  # (B,) bones that get keys
+    scale: float
+    roles: tuple[str, ...]
+    contacts: Contacts | None
+    notes: tuple[str, ...]
+
+
+def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, settings: RetargetSettings | None = None,
+             feet_settings: FeetSettings | None = None, monitor: Monitor | None = None, floor_m: float = 0.0) -> Retargeted:
+    """The motion of `source` on the rig `target`; `floor_m` is the floor's height under the target.
+
+    Raises:
+        InputError: nothing is common to both, or limbs have no length.
+        Cancelled: the monitor was cancelled.
+    """
+    settings, feet_settings, monitor = settings or RetargetSettings(), feet_settings or FeetSettings(), monitor or Monitor()
+    monitor.step("retargeting", 0, 4)
+    aligned = alignments(source.rig, source_map, target, target_map)
+    if not aligned:
+        raise InputError("Source and target have no part of the body in common; check the two mappings.")
+    scale = settings.scale or _scale(source.rig, source_map, target, target_map)
+    contacts = find_contacts(source, source_map, feet_settings, _leg_m(source.rig, source_map) or source.rig.height_m / 2)
+    legs = feet.find_legs(target, target_map, floor_m) if "hips" in aligned else {}
+    if contacts is not None:
+        aligned = aligned | _level(source, source_map, aligned, contacts)
+    turned = turn(source, source_map, target, target_map, aligned)
+    monitor.step("retargeting", 1, 4)
+    if settings.twist:
+        turned = share_twist(target, target_map, turned)
+    R, driven = turned.R, turned.driven
+    carrier = _carrier(target, target_map) if "hips" in aligned and settings.root != "still" else -1
+    monitor.step("retargeting", 2, 4)
+    R, shift = _grounded(source, source_map, target, target_map, R, driven, carrier, scale, legs, contacts, feet_settings, floor_m)
+    monitor.step("retargeting", 3, 4)
+    if settings.root == "in place" and carrier >= 0:
+        shift = shift - (shift - shift[0]) * (1.0, 1.0, 0.0)
+    head = _heads(target, R, carrier, shift)
+    moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
+    monitor.step("retargeting", 4, 4)
+    return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, driven=driven, scale=scale,
+                      roles=tuple(aligned), contacts=contacts, notes=_notes(source_map, target_map, carrier))
+
+
+def _notes(source_map: RigMap, target_map: RigMap, carrier: int) -> tuple[str, ...]:
+    lost = [role for role in source_map.bones if role not in target_map.bones and "." not in role[:-2]]
+    notes = [f"the target has no {', '.join(lost)}: their parents take it up"] if lost else []
+    return (*notes, *([] if carrier >= 0 else ["the body does not travel: no hips in common"]))
+
+
+def _place(rig: Rig, rig_map: RigMap, part: str, side: str) -> np.ndarray | None:
+    name = rig_map.first(sided(part, side))
+    return rig.head_m[rig.index[name]] if name else None
+
+
+def _leg_m(rig: Rig, rig_map: RigMap) -> float:
+    """Mean length of thigh and shin; 0 without legs."""
+    lengths = []
+    for side in SIDES:
+        a, b, c = (_place(rig, rig_map, part, side) for part in ("thigh", "shin", "foot"))
+        if a is not None and b is not None and c is not None:
+            lengths.append(np.linalg.norm(b - a) + np.linalg.norm(c - b))
+    return float(np.mean(lengths)) if lengths else 0.0
+
+
+def _scale(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap) -> float:
+    own, other = _leg_m(source, source_map), _leg_m(target, target_map)
+    if own > SHORTEST_LIMB_M and other > SHORTEST_LIMB_M:
+        return other / own
+    if {"thigh.L", "thigh.R"} & set(source_map.bones) & set(target_map.bones) and min(own, other) <= SHORTEST_LIMB_M:
+        raise InputError("The legs of the source or the target have no length; mend the rig's rest pose, or set the scale.")
+    return target.height_m / source.height_m if min(source.height_m, target.height_m) > SHORTEST_LIMB_M else 1.0
+
+
+def _level(source: Motion, source_map: RigMap, aligned: Mapping[str, np.ndarray], contacts: Contacts) -> dict[str, np.ndarray]:
+    """Alignments of the feet and toes that stand level when the source's do."""
+    level = {}
+    for side in contacts.sides:
+        both = contacts.ankle[side] & contacts.toe[side]
+        flat = both if both.any() else contacts.ankle[side]
+        for part in ("foot", "toe"):
+            role = sided(part, side)
+            if role in aligned:
+                b = source.rig.index[source_map.bones[role][-1]]
+                level[role] = feet.level_feet(source.R[:, b] @ source.rig.R_rest[b].T, flat, aligned[role])
+    return level
+
+
+def _carrier(target: Rig, target_map: RigMap) -> int:
+    """The bone that can carry the body: the hips, or what they hang on if they are connected to it."""
+    bone = target.index[target_map.bones["hips"][0]]
+    while target.connected[bone] and target.parents[bone] >= 0:
+        bone = int(target.parents[bone])
+    return bone
+
+
+def _heads(target: Rig, R: np.ndarray, carrier: int, shift: np.ndarray) -> np.ndarray:
+    head = np.empty(R.shape[:3])
+    for b in range(len(target.names)):
+        head[:, b] = head_of(target, R, head, b) + (shift if b == carrier else 0.0)
+    return head
+
+
+def hip_centre(motion: Motion, rig_map: RigMap) -> np.ndarray:
+    """Between the heads of the thighs (T, 3), or the head of the hips."""
+    names = [rig_map.first(sided("thigh", side)) for side in SIDES]
+    known = [motion.head_m[:, motion.rig.index[name]] for name in names if name]
+    return np.mean(known, axis=0) if len(known) == 2 else motion.head_m[:, motion.rig.index[rig_map.bones["hips"][0]]]
+
+
+def _grounded(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, carrier: int,
+              scale: float, legs: Mapping[str, feet.Leg], contacts: Contacts | None, settings: FeetSettings, floor_m: float
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """R with feet on the floor and the carrier's shift (T, 3)."""
+    shift = np.zeros((len(R), 3))
+    if carrier < 0:
+        return R, shift
+    pinning = contacts is not None and settings.mode != "off" and bool(legs)
+    if pinning and contacts is not None:
+        R = follow(target, feet.lock_flat(R, legs, contacts, target, settings, source.fps), driven)
+    still = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=_heads(target, R, carrier, shift))
+    shift = _travel(source, source_map, target, target_map, contacts, scale, legs, floor_m) - hip_centre(still, target_map)
+    if not pinning or contacts is None:
+        return R, shift
+    heads = still.head_m + shift[:, None]
+    ankles = {side: heads[:, leg.foot[0]] for side, leg in legs.items()}
+    stands = feet.find_stands(legs, contacts, target, R, floor_m)
+    correction, places = feet.carry_root(stands, ankles, source.fps)
+    return _pinned(target, target_map, R, driven, heads + correction[:, None], legs, stands, places,
+                   floor_m, settings.blend_s * source.fps), shift + correction
+
+
+def _travel(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, contacts: Contacts | None, scale: float,
+            legs: Mapping[str, feet.Leg], floor_m: float) -> np.ndarray:
+    """Where the middle of the hips goes (T, 3): as the source's, scaled, with the ankles' levels on the floor as the origin of height."""
+    path = hip_centre(source, source_map)
+    if contacts is None or not legs:
+        rest_s = source.rig.head_m[source.rig.index[source_map.bones["hips"][0]]]
+        rest_t = target.head_m[target.index[target_map.bones["hips"][0]]]
+        return rest_t + scale * (path - rest_s)
+    level = np.mean([target.head_m[leg.foot[0], 2] - leg.sole_m[:, 2].min() for leg in legs.values()])
+    return scale * (path - (0.0, 0.0, contacts.ankle_level_m)) + (0.0, 0.0, floor_m + level)
+
+
+def _pinned(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, heads: np.ndarray, legs: Mapping[str, feet.Leg],
+            stands: list[feet.Stand], places: np.ndarray, floor_m: float, blend: float) -> np.ndarray:
+    """R with the legs bent so that standing feet stand."""
+    ankles = {side: heads[:, leg.foot[0]] for side, leg in legs.items()}
+    low = {side: feet.lowest(leg, target, R) for side, leg in legs.items()}
+    goals = feet.ankle_goals(stands, places, ankles, low, floor_m, blend)
+    front = -body_axes(target, target_map)[:, 1]
+    for side, leg in legs.items():
+        thigh = leg.thigh[0]
+        forward = R[:, thigh] @ (target.R_rest[thigh].T @ front)
+        R = feet.bend_leg(leg, target, R, heads[:, thigh], goals[side], forward)
+    return follow(target, R, driven)
+
+
+def restarted(motion: Motion, first_frame: float) -> Motion:
+    """The same motion, beginning at another frame."""
+    return replace(motion, frames=motion.frames - motion.frames[0] + first_frame)

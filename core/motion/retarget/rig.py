@@ -1,0 +1,152 @@
+"""A rig and a motion as plain values, wherever they came from: an armature, a BVH file, a measured body.
+
+Everything is in the world (metres, Z up) with the rest pose given as frames and places:
+
+    R_b = R_parent · R_rest,parentᵀ · R_rest,b · B_b                the pose of a bone; B_b is its pose channel          (1)
+    head_b = head_parent + R_parent · R_rest,parentᵀ · (head_rest,b − head_rest,parent) + shift                         (2)
+
+A bone that does not inherit rotation has R_b = R_rest,b · B_b.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from ...errors import InputError
+from ...values import frozen
+from .turns import transposed
+
+SHORTEST_BONE_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rig:
+    """Bones, parents first, in their rest pose in the world.
+
+    `roles`: what the file itself says its bones are (VRM's humanoid). `sole_m`: by bone, points (K, 3) under the foot in the rest
+    pose, where the skin touches the floor.
+    """
+
+    names: tuple[str, ...]
+    parents: np.ndarray  # (B,) index, −1 for none
+    R_rest: np.ndarray  # (B, 3, 3) columns are the bone's axes in the world
+    head_m: np.ndarray  # (B, 3)
+    tail_m: np.ndarray  # (B, 3)
+    connected: np.ndarray  # (B,) the head cannot leave the parent's tail
+    inherits_rotation: np.ndarray  # (B,)
+    roles: Mapping[str, str] = field(default_factory=dict)
+    sole_m: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        for name, shape, dtype in (("parents", (n,), np.intp), ("R_rest", (n, 3, 3), float), ("head_m", (n, 3), float),
+                                   ("tail_m", (n, 3), float), ("connected", (n,), bool), ("inherits_rotation", (n,), bool)):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, dtype, name))
+        if n == 0:
+            raise InputError("The rig has no bones; choose an armature with bones.")
+        if len(set(self.names)) < n:
+            raise InputError("Two bones of the rig have the same name; give each a name of its own.")
+        if not (self.parents < np.arange(n)).all():
+            raise InputError("The rig's bones are not in order, or go round in a circle; a parent must come before its children.")
+        if not all(np.isfinite(a).all() for a in (self.R_rest, self.head_m, self.tail_m)):
+            raise InputError("The rig has bones at places that are no numbers; mend its rest pose.")
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Where a bone stands, by its name."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    @cached_property
+    def children(self) -> tuple[tuple[int, ...], ...]:
+        """The children of each bone."""
+        lists: list[list[int]] = [[] for _ in self.names]
+        for child, parent in enumerate(self.parents):
+            if parent >= 0:
+                lists[parent].append(child)
+        return tuple(map(tuple, lists))
+
+    @cached_property
+    def height_m(self) -> float:
+        """Height of the rest pose from its lowest to its highest joint."""
+        ends = np.concatenate([self.head_m, self.tail_m])
+        return float(np.ptp(ends[:, 2]))
+
+    def ancestors(self, bone: int) -> list[int]:
+        """The bone itself and what it hangs on, upwards."""
+        line = [bone]
+        while self.parents[line[-1]] >= 0:
+            line.append(int(self.parents[line[-1]]))
+        return line
+
+    def path(self, top: int, bottom: int) -> list[int]:
+        """The bones from `top` down to `bottom`, both included; empty if bottom does not hang on top."""
+        line = self.ancestors(bottom)
+        return line[: line.index(top) + 1][::-1] if top in line else []
+
+    def common(self, a: int, b: int) -> int | None:
+        """The lowest bone on which both hang (or that is one of them)."""
+        line = set(self.ancestors(b))
+        return next((bone for bone in self.ancestors(a) if bone in line), None)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Motion:
+    """A rig that moves: R (T, B, 3, 3) and heads (T, B, 3) [m] in the world, at frames (T,) of `fps` frames per second."""
+
+    rig: Rig
+    fps: float
+    frames: np.ndarray  # (T,) frame numbers of the scene
+    R: np.ndarray  # (T, B, 3, 3)
+    head_m: np.ndarray  # (T, B, 3)
+
+    def __post_init__(self) -> None:
+        t, n = len(self.frames), len(self.rig.names)
+        object.__setattr__(self, "frames", frozen(self.frames, (t,), float, "frames"))
+        object.__setattr__(self, "R", frozen(self.R, (t, n, 3, 3), float, "R"))
+        object.__setattr__(self, "head_m", frozen(self.head_m, (t, n, 3), float, "head_m"))
+        if t == 0:
+            raise InputError("The motion has no frames; choose one with frames.")
+        if not (np.isfinite(self.R).all() and np.isfinite(self.head_m).all()):
+            raise InputError("The motion holds places or rotations that are no numbers; fill its gaps first.")
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise InputError(f"The motion has {self.fps} frames per second; that must be a positive number.")
+
+
+def posed(rig: Rig, basis: np.ndarray, shift_m: Mapping[int, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Forward kinematics: R (T, B, 3, 3) and heads (T, B, 3) of pose channels `basis` (T, B, 3, 3).  (1), (2)
+
+    `shift_m`: by bone, an offset (T, 3) of its head in the world.
+    """
+    R, head = np.empty_like(basis), np.empty((*basis.shape[:2], 3))
+    for b in range(len(rig.names)):
+        R[:, b] = _carried(rig, R, b) @ basis[:, b]
+        head[:, b] = head_of(rig, R, head, b)
+        if shift_m and b in shift_m:
+            head[:, b] += shift_m[b]
+    return R, head
+
+
+def head_of(rig: Rig, R: np.ndarray, head: np.ndarray, b: int) -> np.ndarray:
+    """Where the head (T, 3) of bone b is when its parent stands as in R (T, B, 3, 3), head (T, B, 3).  (2)"""
+    p = rig.parents[b]
+    if p < 0:
+        return np.broadcast_to(rig.head_m[b], (len(R), 3))
+    return head[:, p] + R[:, p] @ (rig.R_rest[p].T @ (rig.head_m[b] - rig.head_m[p]))
+
+
+def channels(rig: Rig, R: np.ndarray) -> np.ndarray:
+    """The pose channels (T, B, 3, 3) that give R (T, B, 3, 3).  (1) solved for B"""
+    basis = np.empty_like(R)
+    for b in range(len(rig.names)):
+        basis[:, b] = transposed(_carried(rig, R, b)) @ R[:, b]
+    return basis
+
+
+def _carried(rig: Rig, R: np.ndarray, b: int) -> np.ndarray:
+    """The frame (T, 3, 3) of bone b when its own channel is at rest."""
+    p = rig.parents[b]
+    if p < 0 or not rig.inherits_rotation[b]:
+        return np.broadcast_to(rig.R_rest[b], (len(R), 3, 3))
+    return R[:, p] @ (rig.R_rest[p].T @ rig.R_rest[b])
