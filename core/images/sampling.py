@@ -35,6 +35,14 @@ class SplineImage:
             self._fine, x * np.float32(FINENESS), y * np.float32(FINENESS), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
         )
 
+    def sample_patches(self, centre: np.ndarray, shape: np.ndarray, basis: np.ndarray) -> np.ndarray:
+        """Grey values (N, n) float32 of patches: the points centre + shape · (u, v), `basis` (3, n) float32 holding rows 1, u, v.
+
+        `centre` (N, 2) and `shape` (N, 2, 2) in pixels; N and n stay below 32,767.
+        """
+        warp = (FINENESS * np.concatenate([centre[:, :, None], shape], axis=2)).astype(np.float32)
+        return cv2.remap(self._fine, warp[:, 0] @ basis, warp[:, 1] @ basis, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+
     def inside(self, xy: np.ndarray, margin: np.ndarray | float) -> np.ndarray:
         """Whether points (…, 2) lie inside the image by at least `margin` pixels; NaN does not."""
         h, w = self.shape

@@ -26,6 +26,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from ..geometry.small_matrices import invert_spd
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from ..settings import knob
@@ -151,7 +152,8 @@ class _Templates:
         self._settings = settings
         self._u, self._v, self._half = patch_offsets(settings.patch_px, row_step)
         self.n_pixels = len(self._u)
-        self._monomials = np.stack([np.ones_like(self._u), self._u, self._v], axis=1)  # (n, 3)
+        self._pixels = _basis(*self._half)  # (3, n)
+        self._monomials = np.ascontiguousarray(self._pixels.T)  # (n, 3)
         self.inside = image.inside(xy, np.array(self._half) + 1.0)
         f, fx, fy = self._sample(image, np.where(self.inside[:, None], xy, 0.0), shape)
         f = f - f.mean(axis=1, keepdims=True)
@@ -159,22 +161,21 @@ class _Templates:
         self.f = f / np.maximum(self.contrast, 1e-6)[:, None]
         self.fx, self.fy = fx, fy
         self.q = self._project(self.f)  # Jᵀ f̂
+        self.ones = np.concatenate([fx @ self._monomials, fy @ self._monomials], axis=1)  # Jᵀ 1
         H = self._normal_matrix()
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
         eye = np.eye(6) * MIN_CONDITION
-        self.inverse = np.linalg.inv(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
+        self.inverse = invert_spd(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
         self.offset, self.spread = self._centre_of_gravity()
         self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
 
     def _sample(self, image: SplineImage, xy: np.ndarray, shape: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Patch and its gradients by fourth-order central differences, all in one look-up with a border of two."""
         w, h = self._half
-        v, u = np.mgrid[-h - 2 : h + 3, -w - 2 : w + 3].astype(np.float32)
         A = np.broadcast_to(np.eye(2), (len(xy), 2, 2)) if shape is None else shape
-        x, y = _warp(xy, A, u.ravel(), v.ravel())
-        P = image.sample(x, y).reshape(len(xy), 2 * h + 5, 2 * w + 5)
-        fx = (8 * (P[:, 2:-2, 3:-1] - P[:, 2:-2, 1:-3]) - (P[:, 2:-2, 4:] - P[:, 2:-2, :-4])) / 12
-        fy = (8 * (P[:, 3:-1, 2:-2] - P[:, 1:-3, 2:-2]) - (P[:, 4:, 2:-2] - P[:, :-4, 2:-2])) / 12
+        P = image.sample_patches(xy, A, _basis(w + 2, h + 2)).reshape(len(xy), 2 * h + 5, 2 * w + 5)
+        fx = _difference(P[:, 2:-2, 3:-1], P[:, 2:-2, 1:-3], P[:, 2:-2, 4:], P[:, 2:-2, :-4])
+        fy = _difference(P[:, 3:-1, 2:-2], P[:, 1:-3, 2:-2], P[:, 4:, 2:-2], P[:, :-4, 2:-2])
         flat = (len(xy), self.n_pixels)
         return P[:, 2:-2, 2:-2].reshape(flat), fx.reshape(flat), fy.reshape(flat)
 
@@ -197,9 +198,8 @@ class _Templates:
         second = (m[:, :, None] * m[:, None, :]).reshape(self.n_pixels, 9)
         xx, xy, yy = ((a * b @ second).reshape(-1, 3, 3) for a, b in ((self.fx, self.fx), (self.fx, self.fy), (self.fy, self.fy)))
         H = np.concatenate([np.concatenate([xx, xy], 2), np.concatenate([xy, yy], 2)], 1).astype(np.float64)
-        mean = np.concatenate([self.fx @ m, self.fy @ m], axis=1).astype(np.float64)
-        q = self.q.astype(np.float64)
-        return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
+        ones, q = self.ones.astype(np.float64), self.q.astype(np.float64)
+        return H - ones[:, :, None] * ones[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
     def find(self, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
         """Iterate (2) and (3) for all patches, then judge them."""
@@ -213,7 +213,7 @@ class _Templates:
         for iteration in range(1, s.max_iterations + 1):
             if not len(active):
                 break
-            step, rho = self._step(image, c[active], A[active], active)
+            step, rho = self._step(image, c[active], A[active], slice(None) if len(active) == n else active)  # all: no copies
             correlation[active], iterations[active] = rho, iteration
             c[active], A[active], moved = _compose(c[active], A[active], step)
             gone = (np.abs(c[active] - start[active]).max(axis=1) > 2 * s.max_shift_px) | ~np.isfinite(moved)
@@ -223,14 +223,13 @@ class _Templates:
             active = active[~(done | gone)]
         return self._judge(image, start, shape, c, A, status, correlation, iterations)
 
-    def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, y = _warp(c, A, self._u, self._v)
-        g = image.sample(x, y)
-        g -= g.mean(axis=1, keepdims=True)
-        power = np.maximum(np.einsum("ij,ij->i", g, g), 1e-6)
-        along = np.einsum("ij,ij->i", g, self.f[rows])
+    def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+        g = image.sample_patches(c, A, self._pixels)
+        mean = g.mean(axis=1)
+        power = np.maximum(np.einsum("ij,ij->i", g, g) - self.n_pixels * mean**2, 1e-6)  # |g̃|²
+        along = np.einsum("ij,ij->i", g, self.f[rows])  # f̂ is free of its mean, so g need not be
         gain = self.contrast[rows] * along / power  # r1
-        rhs = (self._project(g, rows) - self.q[rows] * along[:, None]) * gain[:, None]
+        rhs = (self._project(g, rows) - self.ones[rows] * mean[:, None] - self.q[rows] * along[:, None]) * gain[:, None]
         return np.einsum("nij,nj->ni", self.inverse[rows], rhs.astype(np.float64)), along / np.sqrt(power)  # (2)
 
     def _sigma(self, rho: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -282,10 +281,19 @@ class _Templates:
         )
 
 
-def _warp(c: np.ndarray, A: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows (m, n) float32 of c + A u."""
-    c32, A32 = c.astype(np.float32), A.astype(np.float32)
-    return (c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v)
+def _basis(half_w: int, half_h: int) -> np.ndarray:
+    """Rows 1, u, v (3, n) float32 of a patch's pixels."""
+    v, u = np.mgrid[-half_h : half_h + 1, -half_w : half_w + 1].astype(np.float32)
+    return np.stack([np.ones(u.size, np.float32), u.ravel(), v.ravel()])
+
+
+def _difference(after: np.ndarray, before: np.ndarray, after2: np.ndarray, before2: np.ndarray) -> np.ndarray:
+    """Central difference of fourth order from the values one and two pixels away."""
+    near, far = after - before, after2 - before2
+    near *= np.float32(2 / 3)
+    far *= np.float32(1 / 12)
+    near -= far
+    return near
 
 
 def _compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
