@@ -24,7 +24,7 @@ OTHER_SIDE = {".R": ".L", ".L": ".R"}
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BodyModel:
-    """A kind of body before any measurement: skeleton with nominal lengths, default radii, and which part of a bone shows its own surface."""
+    """A kind of body before any measurement: skeleton with nominal lengths, default radii, which part of a bone shows its own surface."""
 
     name: str
     skeleton: Skeleton
@@ -80,7 +80,8 @@ def _mirrored_bone(bone: Bone) -> Bone:
     for d in bone.dofs:
         sign = 1.0 if d.axis == "x" else -1.0
         low, high = sorted((sign * d.limits[0], sign * d.limits[1]))
-        dofs.append(Dof(name=other_side(d.name), axis=d.axis, limits=(low, high), prior_mean=sign * d.prior_mean, prior_sigma=d.prior_sigma))
+        dofs.append(Dof(name=other_side(d.name), axis=d.axis, limits=(low, high),
+                        prior_mean=sign * d.prior_mean, prior_sigma=d.prior_sigma))
     R = MIRROR[:, None] * bone.R_rest * MIRROR  # x changes sign twice: the frame stays right-handed
     return Bone(name=other_side(bone.name), parent=None if bone.parent is None else other_side(bone.parent),
                 head_joint=other_side(bone.head_joint), tail_joint=other_side(bone.tail_joint),

@@ -100,7 +100,8 @@ def _shape(table: dict[str, Any]) -> BodyShape:
 
 
 def _dof(dof: Any) -> str:
-    parts = [f"name = {_text(dof.name)}", f"axis = {_text(dof.axis)}", f"limits_deg = [{degrees(dof.limits[0])!r}, {degrees(dof.limits[1])!r}]"]
+    low, high = map(degrees, dof.limits)
+    parts = [f"name = {_text(dof.name)}", f"axis = {_text(dof.axis)}", f"limits_deg = [{low!r}, {high!r}]"]
     if isfinite(dof.prior_sigma):
         parts += [f"prior_deg = {degrees(dof.prior_mean)!r}", f"prior_sigma_deg = {degrees(dof.prior_sigma)!r}"]
     return "{ " + ", ".join(parts) + " }"

@@ -4,11 +4,11 @@
     Euler_b = R_i(θ_i) · R_j(θ_j) · R_k(θ_k)             axes read from the END of the rotation mode: Blender's Euler   (2)
     head_b = head or tail of the parent bone,  tail_b = head_b + L_b · (second column of M_b)              (3)
 
-The papers write world → local, X_j = D_n … D_2 D_1 X_w with D_k = Rot_z(θ_k) · D_ini,k (Eqs. 2, 3): every DOF turns about its own local
-z and a fixed permutation of the axes, with the bone's offset s·T in the first DOF of a joint, stands in D_ini,k. Both forms are the same
-motion: D_n … D_1 is the inverse of (1) up to the last permutation, with angles of opposite sign (a test proves it). Here the angles are those
-of Blender's pose channels, in a bone frame whose y runs from head to tail. Angles are 0 in the rest pose, NOT in the anatomical one. Mirrored
-limbs (.L, .R) have equal angles about x and opposite angles about y and z, as in Blender.
+The papers write world → local, X_j = D_n … D_2 D_1 X_w with D_k = Rot_z(θ_k) · D_ini,k (Eqs. 2, 3): every DOF turns about its own
+local z; a fixed permutation of the axes, with the bone's offset s·T in the first DOF of a joint, stands in D_ini,k. Both forms are the
+same motion: D_n … D_1 is the inverse of (1) up to the last permutation, with angles of opposite sign (a test proves it). Here the angles
+are those of Blender's pose channels, in a bone frame whose y runs from head to tail. Angles are 0 in the rest pose, NOT in the anatomical
+one. Mirrored limbs (.L, .R) have equal angles about x and opposite angles about y and z, as in Blender.
 """
 
 from collections.abc import Mapping, Sequence
@@ -64,7 +64,7 @@ class Bone:
 
 
 class Layout:
-    """Where each parameter stands in a vector: `layout["elbow.R flexion"]` is its index, `layout.set("base")` the indices of a named set."""
+    """Where each parameter stands in a vector: `layout["elbow.R flexion"]` is its index, `layout.set("base")` a set's indices."""
 
     def __init__(self, names: Sequence[str], sets: Mapping[str, Sequence[int]]) -> None:
         self.names = tuple(names)
@@ -102,7 +102,7 @@ class Skeleton:
             raise InputError(f"Skeleton “{self.name}” needs the three base DOFs x, y, z.")
         for i, bone in enumerate(self.bones):
             if (bone.parent is None) != (i == 0) or (i and bone.parent not in names[:i]):
-                raise InputError(f"Bone “{bone.name}” of “{self.name}” must come after its parent “{bone.parent}”; only the first has none.")
+                raise InputError(f"Bone “{bone.name}” of “{self.name}” must come after its parent; only the first bone has none.")
             if i and bone.head_joint not in (self._bone(bone.parent).head_joint, self._bone(bone.parent).tail_joint):
                 raise InputError(f"Bone “{bone.name}” of “{self.name}” must begin at a joint of its parent “{bone.parent}”.")
 

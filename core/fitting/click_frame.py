@@ -18,6 +18,7 @@ from .state import BodyState
 REACH_M = 0.20  # points further than this from the clicked limb's surface are not looked at
 WIDE = 1.5  # the gate, as long as the radii are the model's
 POSE_STEPS, STEPS = 15, 25
+SUSPICIOUS = 3.0  # sigma0 of a posture behind the limb or beside it
 ALTERNATIONS, ALTERNATION_STEPS = 6, 5
 DEPTH_SHIFT_M = 0.04  # clicks from a short base are least certain along the view
 
@@ -44,7 +45,18 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
 
 
 def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
-    """From a motion (D,) and shape (S,) to the points: first the posture, then both, together or in turns as published."""
+    """From a motion (D,) and shape (S,) to the points; when the residuals stay suspiciously large, again by way of the clicks alone."""
+    solution = _to_points(fit, points, motion, vector)
+    if solution.scales.points < SUSPICIOUS:
+        return solution
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.settings.length_sigma)
+    again = _to_points(fit, points, clicked.motion[0], clicked.vector)
+    better = fit.support(points, again.motion[0], again.vector) > fit.support(points, solution.motion[0], solution.vector)
+    return again if better else solution
+
+
+def _to_points(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
+    """First the posture, then posture and shape, together or in turns as published."""
     near = crop(points, fit.parameters.state(motion, vector), REACH_M)
     solution = solve(fit.problem(_observe(fit, near, WIDE)), motion[None], vector, steps=POSE_STEPS)
     if fit.settings.method == "joint":

@@ -1,7 +1,8 @@
 """Frame after frame, forwards and backwards from the click frame, with the shape held (D'Apuzzo et al. 1999, §3.3).
 
-Each frame starts from the prediction 2θ_i − θ_{i−1}, which is also a weak observation; tracked points tie it to its neighbour. A frame that explains far fewer points than its
-neighbour is tried again from the neighbour's posture; one without points keeps the prediction, and the next is tried from both.
+Each frame starts from the prediction 2θ_i − θ_{i−1}, which is also a weak observation; tracked points tie it to its neighbour. A frame
+that explains far fewer points than its neighbour is tried again from the neighbour's posture; one without points keeps the prediction, and
+the next is tried from both.
 """
 
 import numpy as np

@@ -42,7 +42,7 @@ class MaterialTracks:
         self._pairs = [self._pair(t) for t in range(len(frames) - 1)]
 
     def steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
-        """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`); None stands for a body not yet known."""
+        """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`; None: not yet known)."""
         rows, sigma = self._pairs[t]
         found = [self._limbs(i, rows, sigma, state) for i, state in ((t, a), (t + 1, b)) if state is not None]
         keep = np.flatnonzero((found[0] >= 0) & (found[0] == found[-1]))

@@ -103,7 +103,7 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
 
 
 def _shared_weight(points: list[CloudPoints], settings: FitSettings) -> float:
-    """By how much T frames tell less of the shape than T times one frame: 1 for points of their own noise alone, T for the model's error."""
+    """By how much T frames tell less of the shape than T times one frame: 1 for noise of the points alone, T for the model's error."""
     own = float(np.median(np.concatenate([p.sigma_m for p in points]))) ** 2 + 1e-12
     model, frames = settings.model_sigma_m**2, min(float(len(points)), settings.shared_frames)
     return (own + frames * model) / (own + model)

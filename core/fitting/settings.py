@@ -19,7 +19,7 @@ class FitSettings:
     model_patch_m: float = knob(0.06, "Points within a patch of this size share the model's error.", unit="m", low=0.0, high=0.5)
     use_trajectories: bool = knob(True, "Let tracked points hold their places in the limbs: twist, sliding, centres of the joints.")
     track_sigma_m: float = knob(0.001, "How far a tracked point moves on its limb from frame to frame.", unit="m", low=0.0, high=0.05)
-    shared_frames: float = knob(40.0, "Over how many frames the model's error stays the same; what is believed of the shape weighs as much more.",
+    shared_frames: float = knob(40.0, "Over how many frames the model's error stays the same; beliefs of the shape weigh as much more.",
                                 low=1.0, high=1e5)
     gate_m: float = knob(0.035, "A point further than this from a limb's surface is not the limb's.", unit="m", low=0.005, high=0.3)
     click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)

@@ -9,7 +9,7 @@ from .problem import Linearised, Problem, Scales, cost, first_scales, linearise
 
 START_DAMPING, LARGEST_DAMPING = 1e-3, 1e8
 STEP_DONE = 2e-5  # rad, m, relative
-COST_DONE = 1e-6
+COST_DONE = 1e-5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,10 +4,10 @@
     metric: (√(−½ ln F) − √(½ ln 2)) · l/l₀ = ε ,       σ_D = |∇D| σ_n                              (1)
 
 F is the sum over the balls of the point's part and of the parts that it meets. (1) grows linearly with the distance, near and far, where
-(15) saturates. |∇D| is taken at the state at which the points were `scaled` and then held: it is a weight (Eq. 12). But F and D are relative
-to the radii: a point that is 1 mm off shows less of it on a thicker limb, so a limb could explain its points' noise by growing. The mean
-radius l of the balls at the point, over its value l₀ at the held state, gives both the unit of a length (a held weight alone makes radii
-run away). Inside, where −½ ln F falls below `LINEAR`, the root is continued by its tangent.
+(15) saturates. |∇D| is taken at the state at which the points were `scaled` and then held: it is a weight (Eq. 12). But F and D are
+relative to the radii: a point that is 1 mm off shows less of it on a thicker limb, so a limb could explain its points' noise by growing.
+The mean radius l of the balls at the point, over its value l₀ at the held state, gives both the unit of a length (with a held weight alone
+radii run away). Inside, where −½ ln F falls below `LINEAR`, the root is continued by its tangent.
 """
 
 from dataclasses import dataclass, replace

@@ -94,7 +94,7 @@ def tracked(shape, motion, rng, noise):
 
 @pytest.fixture
 def make_scene():
-    """A function that makes a scene: model, frames, seed, points per frame, noise [m], gross share, click error [px], shape, click frame."""
+    """A function that makes a scene: model, frames, seed, points a frame, noise [m], gross share, click error [px], shape, click frame."""
 
     def make(model="arm.R", frames=1, seed=0, points=260, noise=0.003, gross=0.0, click_px=3.0, shape=None, click=0):
         rng = np.random.default_rng(seed)

@@ -1,0 +1,46 @@
+"""body.toml and model files: round trips, and what they refuse."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import model_names, read_model
+from tricap.core.body.shape import default_shape, read_body, write_body
+from tricap.core.errors import InputError
+
+
+@pytest.mark.parametrize("model", model_names())
+def test_body_comes_back_to_the_last_bit(model: str, tmp_path: Path) -> None:
+    shape = default_shape(read_model(model))
+    write_body(tmp_path / "body.toml", shape)
+    again = read_body(tmp_path / "body.toml")
+    assert again.skeleton.dof_names == shape.skeleton.dof_names and again.skeleton.joint_names == shape.skeleton.joint_names
+    assert np.array_equal(again.lengths_m, shape.lengths_m)
+    for name in ("bone_index", "centre", "radii_m", "weight"):
+        assert np.array_equal(getattr(again.metaballs, name), getattr(shape.metaballs, name))
+    for a, b in zip(again.skeleton.bones, shape.skeleton.bones):
+        assert np.array_equal(a.R_rest, b.R_rest) and (a.parent, a.rotation_mode) == (b.parent, b.rotation_mode)
+        assert np.allclose([d.limits for d in a.dofs], [d.limits for d in b.dofs])
+    assert np.isnan(again.length_sigma_m).all()
+
+
+@pytest.mark.parametrize(("old", "new"), [("tricap-body", "other"), ("version = 1", "version = 9"), ("head =", "heed ="),
+                                          ("[[bones]]", "[[bonse]]"), ('bone = "forearm.R"', 'bone = "nose"'), ("weight = 1.0", 'weight = "much"'), ("= [", "= [[")])
+def test_faulty_bodies_are_refused(old: str, new: str, tmp_path: Path) -> None:
+    path = tmp_path / "body.toml"
+    write_body(path, default_shape(read_model("arm.R")))
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match="run the fit again"):
+        read_body(path)
+
+
+def test_a_missing_body_or_model_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="body.toml"):
+        read_body(tmp_path / "body.toml")
+    with pytest.raises(InputError, match="arm.R"):
+        read_model("arm.X")
+    text = 'format = "tricap-model"\nversion = 1\nname = "mine"\nstature_m = 1.7\nbase = "a"\nbones = [{ name = "b" }]\n'
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(InputError, match="mine.toml"):
+        read_model(tmp_path / "mine.toml")

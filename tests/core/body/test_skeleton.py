@@ -1,0 +1,126 @@
+"""The skeleton: conventions, derivatives, mirror images, and the papers' form of the same motion."""
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import mirrored, model_names, read_model
+from tricap.core.body.skeleton import Bone, Dof, Skeleton, bone_frames, frames_and_axes, joint_positions
+from tricap.core.errors import InputError
+from tricap.core.geometry.rotation import axis_rotation
+
+RNG = np.random.default_rng(0)
+
+
+def _lengths(skeleton: Skeleton) -> np.ndarray:
+    return np.array([bone.nominal_length_m for bone in skeleton.bones])
+
+
+def test_rest_pose_is_the_rest_frames() -> None:
+    skeleton = read_model("arm.R").skeleton
+    R, head = bone_frames(skeleton, _lengths(skeleton), np.zeros(8))
+    assert np.allclose(R, [bone.R_rest for bone in skeleton.bones])
+    assert np.allclose(head[0], 0)
+    assert np.allclose(head[1], _lengths(skeleton)[0] * skeleton.bones[0].R_rest[:, 1])
+
+
+def test_positive_flexion_is_the_natural_one() -> None:
+    for model, joint, forward in (("arm.R", "wrist.R", -1), ("arm.L", "wrist.L", -1), ("leg.R", "ankle.R", 1), ("leg.L", "ankle.L", 1)):
+        skeleton = read_model(model).skeleton
+        motion = np.zeros(8)
+        name = next(n for n in skeleton.dof_names if n.startswith(("elbow", "knee")) and n.endswith("flexion"))
+        motion[skeleton.layout[name]] = 0.5
+        moved = joint_positions(skeleton, _lengths(skeleton), motion)[joint][1]
+        assert np.sign(moved) == forward, "the person faces -Y: forearms bend to the front, shins to the back"
+
+
+def test_bone_rotation_is_blenders_euler_matrix() -> None:
+    skeleton = read_model("arm.R").skeleton
+    motion = RNG.normal(0, 0.5, 8)
+    flexion, abduction, twist = motion[3:6]
+    R, _ = bone_frames(skeleton, _lengths(skeleton), motion)
+    euler = axis_rotation("x", flexion) @ axis_rotation("z", abduction) @ axis_rotation("y", twist)  # Blender's mode YZX
+    assert np.allclose(R[0], skeleton.bones[0].R_rest @ euler)
+
+
+def test_the_papers_chain_is_the_same_motion() -> None:
+    """X_j = D_n … D_1 X_w with D_k = Rot_z(θ_k) · D_ini,k (Eqs. 2, 3): each D_ini,k turns the DOF's axis into z, world to local."""
+    skeleton, lengths = read_model("arm.R").skeleton, _lengths(read_model("arm.R").skeleton)
+    motion = RNG.normal(0, 0.5, 8)
+    R, head = bone_frames(skeleton, lengths, motion)
+    X = RNG.normal(0, 1, 3)
+    into_z = {"x": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]]), "y": np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0.0]]), "z": np.eye(3)}
+    point, k = X - motion[:3], 3  # s·T of the first joint is the base
+    axes_before = np.eye(3)  # how the frame so far is permuted from the bone's own axes
+    for bone, R_rel in zip(skeleton.bones, (skeleton.bones[0].R_rest, skeleton.bones[0].R_rest.T @ skeleton.bones[1].R_rest)):
+        if bone.parent:
+            point = axes_before.T @ point - np.array([0, lengths[0], 0])  # the elbow's offset along the upper arm
+            axes_before = np.eye(3)
+        static = R_rel.T
+        for axis in bone.rotation_mode.lower()[::-1]:
+            index = [i for i, dof in enumerate(bone.dofs) if dof.axis == axis]
+            if not index:
+                continue
+            D_ini = into_z[axis] @ axes_before.T @ static
+            point = axis_rotation("z", -motion[k + index[0]]) @ (D_ini @ point)
+            axes_before, static = into_z[axis], np.eye(3)
+        k += len(bone.dofs)
+    assert np.allclose(axes_before.T @ point, R[1].T @ (X - head[1]))
+
+
+@pytest.mark.parametrize("model", model_names())
+def test_axes_are_the_derivatives_of_joints(model: str) -> None:
+    skeleton = read_model(model).skeleton
+    lengths, motion, h = _lengths(skeleton), RNG.normal(0, 0.4, 8), 1e-6
+    _, head, axes = frames_and_axes(skeleton, lengths, motion)
+    tip = skeleton.bones[-1].tail_joint
+    X = joint_positions(skeleton, lengths, motion)[tip]
+    for k, name in enumerate(skeleton.dof_names):
+        step = np.eye(8)[k] * h
+        there, back = (joint_positions(skeleton, lengths, motion + s)[tip] for s in (step, -step))
+        difference = (there - back) / (2 * h)
+        wanted = axes[k] if k < 3 else np.cross(axes[k], X - head[skeleton.dof_bone[k]])
+        assert np.allclose(difference, wanted, atol=1e-8), name
+
+
+def test_many_postures_at_once_are_the_postures_one_by_one() -> None:
+    skeleton = read_model("leg.R").skeleton
+    motions = RNG.normal(0, 0.4, (2, 3, 8))
+    R, head = bone_frames(skeleton, _lengths(skeleton), motions)
+    one = bone_frames(skeleton, _lengths(skeleton), motions[1, 2])
+    assert np.allclose(R[1, 2], one[0]) and np.allclose(head[1, 2], one[1])
+
+
+@pytest.mark.parametrize("side", ["arm", "leg"])
+def test_left_is_the_mirror_image_of_right(side: str) -> None:
+    right, left = read_model(f"{side}.R"), read_model(f"{side}.L")
+    motion = RNG.normal(0, 0.4, 8)
+    signs = np.array([-1 if dof.axis == "x" else 1 for dof in right.skeleton.base_dofs]
+                     + [1 if dof.axis == "x" else -1 for dof in right.skeleton.dofs[3:]])
+    a = joint_positions(right.skeleton, _lengths(right.skeleton), motion)
+    b = joint_positions(left.skeleton, _lengths(left.skeleton), motion * signs)
+    for name, X in a.items():
+        assert np.allclose(b[name.replace(".R", ".L")], X * [-1, 1, 1]), name
+    again = mirrored(left, right.name)
+    assert [d.limits for d in again.skeleton.dofs] == [d.limits for d in right.skeleton.dofs]
+
+
+def test_layout_answers_by_name_and_names_the_nearest() -> None:
+    skeleton = read_model("arm.R").skeleton
+    assert skeleton.layout["elbow.R flexion"] == 6
+    assert skeleton.layout.set("twist").tolist() == [5, 7]
+    with pytest.raises(InputError, match="elbow.R flexion"):
+        skeleton.layout["elbow.R flexon"]
+
+
+def test_faulty_skeletons_are_refused() -> None:
+    base = tuple(Dof(name=f"a {x}", axis=x) for x in "xyz")
+    bone = Bone(name="one", parent=None, head_joint="a", tail_joint="b", nominal_length_m=1.0, R_rest=np.eye(3))
+    loose = Bone(name="two", parent="one", head_joint="c", tail_joint="d", nominal_length_m=1.0, R_rest=np.eye(3))
+    with pytest.raises(InputError, match="begin at a joint"):
+        Skeleton(name="s", bones=(bone, loose), base_dofs=base)
+    with pytest.raises(InputError, match="three base DOFs"):
+        Skeleton(name="s", bones=(bone,), base_dofs=base[:2])
+    with pytest.raises(InputError, match="no rotation"):
+        Bone(name="bad", parent=None, head_joint="a", tail_joint="b", nominal_length_m=1.0, R_rest=2 * np.eye(3))
+    with pytest.raises(InputError, match="rotation mode"):
+        Bone(name="bad", parent=None, head_joint="a", tail_joint="b", nominal_length_m=1.0, R_rest=np.eye(3), rotation_mode="XXY")
