@@ -19,11 +19,11 @@ LENGTH_TOLERANCE = 0.05
 MAX_FLIPPED_CAMERAS = 9  # beyond this many cameras orders are compared with the first camera's only
 
 
-def with_bars(network: Network, observations: BarObservations, doubtful_px: float = DOUBTFUL_PX) -> tuple[Network, np.ndarray]:
-    """The cameras of `network` with the bar positions of `observations`, and which image points (N, C, 2) can take part.
+def with_bars(network: Network, observations: BarObservations, tolerance_px: float = DOUBTFUL_PX) -> tuple[Network, np.ndarray]:
+    """The cameras of `network` with the bar positions of `observations`, and which image points (N, C, 2) fit them.
 
     An end that fewer than two cameras see takes no part. Ends that the cameras disagree on are intersected from the pair of cameras that
-    most of the others agree with.
+    most of the others agree with. A bar of a wrong length loses the end that fewer rays agree on, or both.
     """
     cameras = network.cameras(observations.names, observations.size_px)
     seen = observations.seen
@@ -33,17 +33,19 @@ def with_bars(network: Network, observations: BarObservations, doubtful_px: floa
     centres = np.stack([c.centre_m for c in cameras])
     flat = np.moveaxis(used, 1, 2).reshape(2 * N, -1)  # (2 N, C)
     X = _meeting_points(centres, rays, flat)
-    cost = _cost(cameras, observations, X, flat, doubtful_px)
+    cost = _cost(cameras, observations, X, flat, tolerance_px)
     doubtful = np.flatnonzero((cost > 1.0) & (flat.sum(axis=1) >= 3))
     for pair in combinations(range(len(cameras)), 2) if len(doubtful) else ():
         only = np.zeros_like(flat[doubtful])
         only[:, pair] = flat[doubtful][:, pair]
         only[only.sum(axis=1) < 2] = False
         trial = _meeting_points(centres, [r[doubtful] for r in rays], only)
-        trial_cost = np.where(only.any(axis=1), _cost(cameras, observations, trial, flat, doubtful_px, doubtful), np.inf)
+        trial_cost = np.where(only.any(axis=1), _cost(cameras, observations, trial, flat, tolerance_px, doubtful), np.inf)
         better = trial_cost < cost[doubtful]
         X[doubtful[better]], cost[doubtful[better]] = trial[better], trial_cost[better]
-    return _bars(network, X.reshape(N, 2, 3), used)
+    ends = X.reshape(N, 2, 3)
+    used = _fitting(cameras, observations, ends, used, tolerance_px)
+    return _bars(network, ends, _of_right_length(ends, used, network.length_m))
 
 
 def _rays(camera: Camera, xy: np.ndarray) -> np.ndarray:
@@ -77,6 +79,29 @@ def _cost(
         square = np.sum((xy - camera.project(X)) ** 2, axis=1) / width_px**2
         total += np.where(seen, np.where(np.isfinite(square), np.minimum(square, 1.0), 1.0), 0.0)
     return total
+
+
+def _fitting(
+    cameras: tuple[Camera, ...], observations: BarObservations, ends: np.ndarray, used: np.ndarray, tolerance_px: float
+) -> np.ndarray:
+    """The image points (N, C, 2) that lie within the tolerance of the ends' images, where at least two do."""
+    near = np.stack([np.linalg.norm(observations.xy_px[:, c] - camera.project(ends), axis=-1) for c, camera in enumerate(cameras)], axis=1)
+    with np.errstate(invalid="ignore"):
+        return enough_rays(used & (near < tolerance_px))
+
+
+def _of_right_length(ends: np.ndarray, used: np.ndarray, length_m: float) -> np.ndarray:
+    off = np.abs(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / length_m - 1)
+    rays = used.sum(axis=1)  # (N, 2)
+    wrong = (off > LENGTH_TOLERANCE) & (rays > 0).all(axis=1)
+    keep = np.ones_like(rays, dtype=bool)
+    keep[wrong] = rays[wrong] > rays[wrong][:, ::-1]
+    return used & keep[:, None, :]
+
+
+def enough_rays(used: np.ndarray) -> np.ndarray:
+    """Without the ends that fewer than two cameras see."""
+    return used & (used.sum(axis=1, keepdims=True) >= 2)
 
 
 def _bars(network: Network, ends: np.ndarray, used: np.ndarray) -> tuple[Network, np.ndarray]:

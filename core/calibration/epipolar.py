@@ -66,16 +66,18 @@ def undistorted(xy_px: np.ndarray, size_px: np.ndarray, kappa: float) -> np.ndar
     return u
 
 
-def try_guesses(ui: np.ndarray, uj: np.ndarray, fi: np.ndarray, fj: np.ndarray, length_m: float) -> PairGuesses:
-    """Evaluate H guesses fi, fj (H,) of the focal lengths; `ui`, `uj` (m, 2 ends, 2) are centred, undistorted points of complete bars."""
-    ni = (ui.reshape(1, -1, 2) / fi[:, None, None]).astype(np.float64)
-    nj = (uj.reshape(1, -1, 2) / fj[:, None, None]).astype(np.float64)
+def try_guesses(ui: np.ndarray, uj: np.ndarray, bars: int, fi: np.ndarray, fj: np.ndarray, length_m: float) -> PairGuesses:
+    """Evaluate H guesses fi, fj (H,) of the focal lengths; `ui`, `uj` (m, 2) are centred, undistorted points.
+
+    The first 2 `bars` of them are the ends of complete bars, one after the other; the rest are single ends.
+    """
+    ni, nj = ui / fi[:, None, None], uj / fj[:, None, None]
     focal = np.sqrt(fi * fj)
     E, distance = _essential(ni, nj, focal)
     R, t, depth_i, depth_j, before = _decomposed(E, ni, nj)
     hi, hj = _homogeneous(ni), _homogeneous(nj)
     points = ((hi * depth_i[..., None]) @ R.transpose(0, 2, 1) + t[:, None] + hj * depth_j[..., None]) / 2
-    lengths = np.linalg.norm(points[:, 0::2] - points[:, 1::2], axis=-1)
+    lengths = np.linalg.norm(points[:, 0 : 2 * bars : 2] - points[:, 1 : 2 * bars : 2], axis=-1)
     median = np.maximum(np.median(lengths, axis=1), 1e-12)
     variation = 1.4826 * np.median(np.abs(lengths - median[:, None]), axis=1) / median
     score = np.log(np.maximum(variation, 1e-5)) + 0.5 * np.log(np.maximum(distance, 0.02)) - 4 * np.log(np.maximum(before, 1e-3))
@@ -91,7 +93,6 @@ def _essential(ni: np.ndarray, nj: np.ndarray, focal: np.ndarray) -> tuple[np.nd
     hi, hj = _homogeneous(ni), _homogeneous(nj)
     A = (hj[..., :, None] * hi[..., None, :]).reshape(*hi.shape[:2], 9)
     weight = np.ones(hi.shape[:2])
-    scale = np.array([1, 1, 1.0])
     E = np.zeros((len(hi), 3, 3))
     distance = weight
     for _ in range(REWEIGHTINGS):
@@ -99,8 +100,8 @@ def _essential(ni: np.ndarray, nj: np.ndarray, focal: np.ndarray) -> tuple[np.nd
         diagonal = 1 / np.sqrt(np.maximum(np.einsum("hii->hi", N), 1e-30))
         _, vectors = np.linalg.eigh(N * diagonal[:, :, None] * diagonal[:, None, :])
         E = (vectors[:, :, 0] * diagonal).reshape(-1, 3, 3)
-        U, s, Vt = np.linalg.svd(E)
-        E = (U * np.array([1.0, 1.0, 0.0])) @ Vt * scale
+        U, _, Vt = np.linalg.svd(E)
+        E = (U * np.array([1.0, 1.0, 0.0])) @ Vt
         distance = sampson(E, ni, nj) * focal[:, None]
         width = np.maximum(2 * np.median(distance, axis=1, keepdims=True), 0.05)
         weight = 1 / (1 + (distance / width) ** 2)

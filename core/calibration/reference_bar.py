@@ -31,19 +31,27 @@ Guesses = dict[tuple[int, int, int], tuple[float, np.ndarray, np.ndarray]]  # (Î
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Pair:
-    """Two cameras and the complete bars on which both agree: positions (m,) and whether camera j has the ends in the other order."""
+    """Two cameras and the complete bars on which both agree: positions (m,) and whether camera j has the ends in the other order.
+
+    `singles` (q, 2) are position and end of ends that both see where the other end is missing or wrong.
+    """
 
     i: int
     j: int
     positions: np.ndarray
     swapped: np.ndarray
+    singles: np.ndarray
 
-    def points(self, observations: BarObservations, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """Image points (m, 2, 2) of both cameras, of at most `most` positions."""
-        some = np.unique(np.linspace(0, len(self.positions) - 1, most).astype(int))
+    def points(self, observations: BarObservations) -> tuple[np.ndarray, np.ndarray, int]:
+        """Image points (n, 2) of both cameras, those of complete bars first, and the number of these bars."""
+        some = np.unique(np.linspace(0, len(self.positions) - 1, BARS_PER_PAIR).astype(int))
         at, swapped = self.positions[some], self.swapped[some]
-        xj = observations.xy_px[at, self.j]
-        return observations.xy_px[at, self.i], np.where(swapped[:, None, None], xj[:, ::-1], xj)
+        xi, xj = observations.xy_px[at, self.i], observations.xy_px[at, self.j]
+        xj = np.where(swapped[:, None, None], xj[:, ::-1], xj)
+        n, e = self.singles[: max(0, 2 * (BARS_PER_PAIR - len(at)))].T
+        xi = np.concatenate([xi.reshape(-1, 2), observations.xy_px[n, self.i, e]])
+        xj = np.concatenate([xj.reshape(-1, 2), observations.xy_px[n, self.j, e]])
+        return xi, xj, len(at)
 
 
 def initial_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted:
@@ -85,7 +93,7 @@ def spanning_tree(observations: BarObservations) -> list[Pair]:
             )
         pair = pairs[i, j]
         if j in joined:
-            pair = Pair(i=j, j=i, positions=pair.positions, swapped=pair.swapped)
+            pair = Pair(i=j, j=i, positions=pair.positions, swapped=pair.swapped, singles=pair.singles)
         tree.append(pair)
         joined.append(pair.j)
     return tree
@@ -93,13 +101,15 @@ def spanning_tree(observations: BarObservations) -> list[Pair]:
 
 def shared_bars(observations: BarObservations, i: int, j: int) -> Pair:
     """The positions whose two ends agree with one epipolar geometry of cameras i and j, with the order of the ends resolved."""
-    both = np.flatnonzero(observations.complete[:, i] & observations.complete[:, j])
-    xi, xj = observations.xy_px[both, i], observations.xy_px[both, j]
     width = float(observations.size_px[[i, j], 0].max())
     if observations.labelled:
-        ok, _ = agreeing(xi.reshape(-1, 2), xj.reshape(-1, 2), width)
-        good = ok.reshape(-1, 2).all(axis=1)
-        return Pair(i=i, j=j, positions=both[good], swapped=np.zeros(good.sum(), dtype=bool))
+        ok = observations.seen[:, i] & observations.seen[:, j]
+        ok[ok] = agreeing(observations.xy_px[:, i][ok], observations.xy_px[:, j][ok], width)[0]
+        good = ok.all(axis=1)
+        singles = np.argwhere(ok & ~good[:, None])
+        return Pair(i=i, j=j, positions=np.flatnonzero(good), swapped=np.zeros(good.sum(), dtype=bool), singles=singles)
+    both = np.flatnonzero(observations.complete[:, i] & observations.complete[:, j])
+    xi, xj = observations.xy_px[both, i], observations.xy_px[both, j]
     best = np.zeros(0, dtype=int), np.zeros(0, dtype=bool)
     for subset, swapped in _orders(xi, xj):
         found = _ordered(xi, xj, subset, swapped, width)
@@ -107,7 +117,7 @@ def shared_bars(observations: BarObservations, i: int, j: int) -> Pair:
             best = found
         if len(best[0]) > 0.6 * len(both):
             break
-    return Pair(i=i, j=j, positions=both[best[0]], swapped=best[1])
+    return Pair(i=i, j=j, positions=both[best[0]], swapped=best[1], singles=np.zeros((0, 2), dtype=int))
 
 
 def _orders(xi: np.ndarray, xj: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -138,11 +148,11 @@ def _pair_guesses(observations: BarObservations, pair: Pair, focal_px: float | N
     grid = _grid(observations, focal_px)
     index = [(a, a + s) for a in range(len(grid)) for s in STEPS if 0 <= a + s < len(grid)]
     fi, fj = grid[[a for a, _ in index]], grid[[b for _, b in index]]
-    xi, xj = pair.points(observations, BARS_PER_PAIR)
+    xi, xj, bars = pair.points(observations)
     table = {}
     for k, kappa in enumerate(KAPPAS):
         ui, uj = undistorted(xi, observations.size_px[pair.i], kappa), undistorted(xj, observations.size_px[pair.j], kappa)
-        tried: PairGuesses = try_guesses(ui, uj, fi, fj, observations.length_m)
+        tried: PairGuesses = try_guesses(ui, uj, bars, fi, fj, observations.length_m)
         for n, (a, b) in enumerate(index):
             table[k, a, b] = (float(tried.score[n]), tried.R[n], tried.t_m[n])
     return table
@@ -201,7 +211,7 @@ def _chained(observations: BarObservations, tree: list[Pair], guesses: dict[tupl
 def _trial(observations: BarObservations, tree: list[Pair], network: Network) -> Adjusted:
     """A short robust adjustment of f, k1 and the poses on bars that the pairs of the tree agree on."""
     part = trial_part(observations, tree)
-    network, used = with_bars(network, part)
+    network, used = with_bars(network, part, 4 * COARSE_CAUCHY_PX)
     knowledge = lens_knowledge(part.size_px, network.interior[:, 0]).only("f", "k1")
     return adjust(network, part.xy_px, used, knowledge, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3, max_iterations=12, tolerance=1e-2)
 

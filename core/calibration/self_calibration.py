@@ -15,19 +15,20 @@ from scipy.stats import f as f_distribution
 
 from ..geometry.camera_derivatives import INTERIOR
 from ..progress import Monitor
-from .bars import labelled_ends, with_bars
+from .bars import enough_rays, labelled_ends, with_bars
 from .blunders import redundant_parts
-from .bundle import Adjusted, Network, Unknowns, adjust, normal_equations, residuals
+from .bundle import Adjusted, Network, Unknowns, adjust, normal_equations
 from .observations import BarObservations
 from .precision import camera_covariance
 from .pseudo import lens_knowledge
-from .reference_bar import initial_network
+from .reference_bar import COARSE_CAUCHY_PX, initial_network
 
 GROUPS = (("k3",), ("b1", "b2"), ("p1", "p2"), ("k2",), ("cx", "cy"), ("k1",))  # in the order in which they are doubted
 SIGNIFICANCE = 0.02  # α of (2)
 CRITICAL_W = 4.1  # |w| beyond it: 1 good point in 5000 (two coordinates)
 PART = 400
-ROUNDS = 6
+GROSS = 6.5  # sigmas
+ROUNDS = 15
 MIN_SIGMA_PX = 0.004
 
 
@@ -56,29 +57,27 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     monitor.step("calibration", 0, 5)
     start = initial_network(observations, focal_px)
     monitor.step("calibration", 1, 5)
-    network, labelled = refined_start(start.network, observations)
+    network, labelled, sigma = refined_start(start.network, observations)
     monitor.step("calibration", 2, 5)
     knowledge = lens_knowledge(observations.size_px, network.interior[:, 0])
-    network, used = with_bars(network, labelled)
-    sigma = robust_sigma(residuals(network, labelled.xy_px), used)
+    network, used = with_bars(network, labelled, max(10 * sigma, 1.0))
     first = adjust(network, labelled.xy_px, used, knowledge, cauchy_px=3 * sigma, unit_px=sigma, max_iterations=8, tolerance=0.05)
     monitor.step("calibration", 3, 5)
     return without_insignificant(*without_blunders(first, labelled, used, knowledge), labelled, monitor)
 
 
-def refined_start(network: Network, observations: BarObservations) -> tuple[Network, BarObservations]:
-    """The cameras with all unknowns adjusted on a part of the positions, and all observations with their ends in order."""
+def refined_start(network: Network, observations: BarObservations) -> tuple[Network, BarObservations, float]:
+    """The cameras with all unknowns adjusted on a part of the positions, all observations with their ends in order, and sigma [px]."""
     knowledge = lens_knowledge(observations.size_px, network.interior[:, 0])
     some = np.unique(np.linspace(0, len(observations.xy_px) - 1, PART).astype(int))
-    cauchy = 2.0
+    cauchy = COARSE_CAUCHY_PX
     for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR, INTERIOR):
-        part = _ordered(network, observations.part(some), max(2.0, 3 * cauchy))
-        network, used = with_bars(network, part)
-        sigma = robust_sigma(residuals(network, part.xy_px), used)
-        cauchy = 1.5 * sigma
-        done = adjust(network, part.xy_px, used, knowledge.only(*names), cauchy_px=cauchy, unit_px=sigma, max_iterations=8, tolerance=0.1)
-        network = done.network
-    return network, _ordered(network, observations, max(2.0, 6 * sigma))
+        part = _ordered(network, observations.part(some), 2 * cauchy)
+        network, used = with_bars(network, part, 3 * cauchy)
+        done = adjust(network, part.xy_px, used, knowledge.only(*names), cauchy_px=cauchy, unit_px=0.3 * cauchy, max_iterations=8, tolerance=0.1)
+        network, sigma = done.network, robust_sigma(done.residual_px, used)
+        cauchy = float(np.clip(3 * sigma, 0.3, cauchy))
+    return network, _ordered(network, observations, 2 * cauchy), sigma
 
 
 def _ordered(network: Network, observations: BarObservations, tolerance_px: float) -> BarObservations:
@@ -95,18 +94,20 @@ def without_blunders(
     first: Adjusted, observations: BarObservations, used: np.ndarray, unknowns: Unknowns
 ) -> tuple[Adjusted, np.ndarray, float, float]:
     """Least squares with blunders tested out: the adjustment, what is used, sigma0 and the redundancy.  (1)"""
-    state = first
+    state, keep = first, used
     sigma = robust_sigma(first.residual_px, used)
-    keep = enough_rays(used & (np.linalg.norm(np.nan_to_num(first.residual_px), axis=-1) < 6.5 * sigma))
-    for _ in range(ROUNDS):
-        state = adjust(state.network, observations.xy_px, keep, unknowns, unit_px=sigma, max_iterations=10, tolerance=1e-2)
+    for number in range(ROUNDS):
+        network = state.network
+        if number < 2:  # anew, so that what did not fit before the cameras were good comes back
+            network, keep = with_bars(network, observations, GROSS * sigma)
+        state = adjust(network, observations.xy_px, keep, unknowns, unit_px=sigma, max_iterations=10, tolerance=1e-2)
         parts = redundant_parts(state.network, keep, unknowns, sigma)
         square = np.sum(np.where(keep[..., None], state.residual_px, 0.0) ** 2)
         redundancy = max(1.0, float(parts[keep].sum()))
         sigma = max(float(np.sqrt(square / redundancy)), 1e-6)
         w = _tested(state.residual_px, parts, sigma)
         worst = (w > CRITICAL_W) & keep & (w >= np.where(keep, w, 0.0).max(axis=(1, 2), keepdims=True))
-        if not worst.any():
+        if number and not worst.any():
             break
         keep = enough_rays(keep & ~worst)
     return state, keep, sigma, redundancy
@@ -116,11 +117,6 @@ def _tested(residual_px: np.ndarray, parts: np.ndarray, sigma: float) -> np.ndar
     """w (N, C, 2) of the image points, the larger of both coordinates."""
     w = np.abs(residual_px) / (sigma * np.sqrt(np.maximum(parts, 0.02)))
     return np.nan_to_num(w.max(axis=-1))
-
-
-def enough_rays(used: np.ndarray) -> np.ndarray:
-    """Without the ends that fewer than two cameras see."""
-    return used & (used.sum(axis=1, keepdims=True) >= 2)
 
 
 def without_insignificant(
