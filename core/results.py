@@ -28,8 +28,8 @@ class Results:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
-        theirs = [n for n in OURS if (self.folder / n).exists()] if not (self.folder / "run.json").exists() else []
-        if theirs and not (self.folder / "cache").is_dir():
+        theirs = _not_ours(self.folder)
+        if theirs:
             raise InputError(
                 f"{folder} holds “{theirs[0]}”, which no run of Tricap wrote; choose an empty or a new folder for the results."
             )
@@ -106,3 +106,13 @@ class Results:
     def write_run(self, run: Mapping[str, Any]) -> None:
         """run.json"""
         store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})
+
+
+def _not_ours(folder: Path) -> list[str]:
+    """What lies in a folder under the name of a result or as `cache` though no run wrote there. A run stopped early leaves a cache."""
+    cache = folder / "cache"
+    if (folder / "run.json").exists():
+        return []
+    if cache.is_dir() and all(p.is_dir() and all(f.suffix in (".npz", ".part") for f in p.iterdir()) for p in cache.iterdir()):
+        return []
+    return [name for name in ("cache", *OURS) if (folder / name).exists()]
