@@ -26,7 +26,8 @@ def test_body_comes_back_to_the_last_bit(model: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("old", "new"), [("tricap-body", "other"), ("version = 1", "version = 9"), ("head =", "heed ="),
-                                          ("[[bones]]", "[[bonse]]"), ('bone = "forearm.R"', 'bone = "nose"'), ("weight = 1.0", 'weight = "much"'), ("= [", "= [[")])
+                                          ("[[bones]]", "[[bonse]]"), ("= [", "= [["),
+                                          ('bone = "forearm.R"', 'bone = "nose"'), ("weight = 1.0", 'weight = "much"')])
 def test_faulty_bodies_are_refused(old: str, new: str, tmp_path: Path) -> None:
     path = tmp_path / "body.toml"
     write_body(path, default_shape(read_model("arm.R")))
