@@ -22,7 +22,7 @@ STEPS = (-2, -1, 0, 1, 2)  # f_j of a pair on the grid, from f_i
 KAPPAS = (-0.12, -0.06, 0.0, 0.04)
 BARS_PER_PAIR, BARS_PER_TRIAL = 60, 120
 CANDIDATES = 4
-MIN_BARS_PER_PAIR = 8
+MIN_BARS_PER_PAIR = 6
 COARSE_CAUCHY_PX = 3.0
 TILT = np.tan(np.radians(25))
 

@@ -1,0 +1,152 @@
+"""The stage that calibrates: from a folder with the images of a waved reference bar to a rig with its report.
+
+BARDIR holds a folder of images or a movie per camera; their names are the cameras' names. Nothing else is required but the bar's length.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .calibration.observations import BarObservations
+from .calibration.target_tracks import BarTrack, track_bar
+from .calibration.targets import Targets, find_targets
+from .errors import InputError
+from .images.fields import row_grid
+from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence
+from .progress import Monitor
+
+MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
+MIN_POSITIONS = 12
+MIN_WAY = 0.02  # of the image width: a bar that moves less stands still
+LONGEST_BAR_M = 20.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BarFootage:
+    """The opened sequences of a waved bar, one per camera."""
+
+    folder: Path
+    names: tuple[str, ...]
+    sequences: tuple[Sequence, ...]
+    interlaced: str = "none"
+    mask: np.ndarray | None = None  # (h, w) False where no target can be
+
+    @property
+    def count(self) -> int:
+        """Number of frames that all views have."""
+        return min(s.count for s in self.sequences)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MeasuredBar:
+    """What was found in the images: per view the track of the two targets, and the observations made of them."""
+
+    tracks: tuple[BarTrack, ...]
+    observations: BarObservations
+
+
+def open_bar(folder: Path, interlaced: str = "none") -> BarFootage:
+    """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
+
+    Raises:
+        InputError: the folder is missing, holds fewer than two views, or views of different length.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; give the folder that holds one folder of images or one movie of the bar per camera.")
+    names, sequences = [], []
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            endings = {p.suffix for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS}
+            if endings:
+                ending = max(sorted(endings), key=lambda e: sum(1 for _ in path.glob(f"*{e}")))
+                names.append(path.name)
+                sequences.append(open_sequence(folder, images=f"{path.name}/*{ending}", movie=None, view=path.name))
+        elif path.suffix.lower() in MOVIE_ENDINGS:
+            names.append(path.stem)
+            sequences.append(open_sequence(folder, images=None, movie=path.name, view=path.stem))
+    if len(names) < 2:
+        raise InputError(
+            f"{folder} holds {'no views' if not names else 'only the view ' + names[0]}; "
+            "it needs a folder of images, or a movie, for each of at least two cameras."
+        )
+    counts = {name: s.count for name, s in zip(names, sequences)}
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise InputError(f"The views in {folder} have different numbers of frames ({said}); trim them to the same instants.")
+    return BarFootage(folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced)
+
+
+def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor) -> MeasuredBar:
+    """Find, measure and follow the bar's targets in all images.
+
+    Raises:
+        InputError: the length cannot be, images cannot be read, or the bar is not seen well enough to calibrate with.
+    """
+    if not (math.isfinite(length_m) and 0 < length_m < LONGEST_BAR_M):
+        raise InputError(
+            f"The bar's length is given as {length_m:g} m; give the distance between the middles of its two targets in metres, such as 0.6."
+        )
+    rows = row_grid(footage.interlaced)
+    tracks, sizes = [], []
+    for view, (name, sequence) in enumerate(zip(footage.names, footage.sequences)):
+        found: list[Targets] = []
+        size = (0, 0)
+        for n in range(footage.count):
+            monitor.step(f"targets {name}", n, footage.count)
+            image = sequence.read(n)
+            if n and image.shape[::-1] != size:
+                raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
+            size = (image.shape[1], image.shape[0])
+            targets = find_targets(rows.rows(image), None if footage.mask is None else rows.rows(footage.mask))
+            found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
+        monitor.step(f"targets {name}", footage.count, footage.count)
+        tracks.append(track_bar(found, float(size[0])))
+        sizes.append(size)
+        _check_view(footage, view, tracks[-1], size[0])
+    observations = BarObservations(
+        names=footage.names,
+        size_px=np.array(sizes, dtype=np.float64),
+        xy_px=np.stack([t.xy_px for t in tracks], axis=1),
+        length_m=length_m,
+        frames=np.arange(footage.count),
+        labelled=False,
+    )
+    _check_positions(footage, observations)
+    return MeasuredBar(tracks=tuple(tracks), observations=observations)
+
+
+def _in_frame(targets: Targets, xy_px: np.ndarray) -> Targets:
+    return Targets(xy_px=xy_px, sigma_px=targets.sigma_px, area_px=targets.area_px, contrast=targets.contrast, status=targets.status)
+
+
+def _check_view(footage: BarFootage, view: int, track: BarTrack, width_px: int) -> None:
+    """Raise InputError if a view does not show a bar that is waved."""
+    name = footage.names[view]
+    complete = np.isfinite(track.xy_px).all(axis=(1, 2))
+    if not track.spots.any():
+        raise InputError(f"No bright target is seen in any image of view {name} in {footage.folder}; light the bar from beside the camera.")
+    if complete.sum() < 2:
+        raise InputError(
+            f"View {name} in {footage.folder} never shows both targets of the bar; wave it where this camera sees both, "
+            "or leave the camera out."
+        )
+    way = np.ptp(track.xy_px[complete], axis=0).max()
+    if complete.sum() > 3 and (track.still or way < MIN_WAY * width_px):
+        raise InputError(
+            f"The bar stands still in view {name} in {footage.folder} (it moves {way:.1f} px); "
+            "wave it through the whole volume, in all directions."
+        )
+
+
+def _check_positions(footage: BarFootage, observations: BarObservations) -> None:
+    shared = int((observations.complete.sum(axis=1) >= 2).sum())
+    if shared < MIN_POSITIONS:
+        raise InputError(
+            f"Only {shared} bar positions in {footage.folder} are seen whole by two cameras; at least {MIN_POSITIONS} are needed "
+            "and 100 or more are good: wave the bar longer, through the whole volume."
+        )

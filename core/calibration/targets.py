@@ -1,0 +1,190 @@
+"""Bright targets in an image: found as blobs, measured by their grey values' centre of gravity, then by least squares matching.
+
+    x̄ = Σ (g − T) x / Σ (g − T)                                                (1)   over the blob (D'Apuzzo et al. 2000, §2.2)
+    q = | B (x − c) | ,   g(x) + e = g0 + g1 Φ(ρ (1 − q))                       (2)   an ellipse with a soft edge, Φ: the normal distribution
+
+(2) is matched by Gauss–Newton with an analytic Jacobian for many targets at once; unknowns c (2), B (3, symmetric), ρ, g0, g1. A saturated
+target only has a flat top, which (2) has as well. The sigma of c comes from the adjustment.
+
+Images are those of `images.sequence`: grey values 0…255. Coordinates are pixels of the image given.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from scipy.special import ndtr
+
+from ..values import frozen
+
+MIN_CONTRAST = 30.0  # grey values between a target's peak and the background
+RELATIVE_THRESHOLD = 0.5  # of a blob's own contrast, where its outline is
+BRIGHTNESS = 0.35  # a target has at least this part of the contrast of the brightest blob
+MIN_AREA, MAX_AREA_PART = 4, 0.02  # pixels; part of the image
+MIN_FILL, MAX_ELONGATION = 0.72, 3.5
+MOST_BLOBS = 40
+WINDOW_SIDES = (9, 13, 19, 27, 39, 57, 83, 121)
+ITERATIONS, CONVERGED_PX = 12, 1e-3
+ROBUST = 3.0  # sigmas of the grey values
+MAX_MISFIT = 0.08  # sigma0 of the match as a part of g1
+
+
+class TargetStatus(IntEnum):
+    """Why a target's position can be used or not."""
+
+    OK = 0
+    CROPPED = 1  # its window leaves the image
+    NOT_CONVERGED = 2
+    NO_DISC = 3  # it does not look like one: merged with another, hidden in part
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Targets:
+    """M blobs of one image. Pixels of that image."""
+
+    xy_px: np.ndarray  # (M, 2)
+    sigma_px: np.ndarray  # (M,) of a coordinate, from the match
+    area_px: np.ndarray  # (M,)
+    contrast: np.ndarray  # (M,) grey values
+    status: np.ndarray  # (M,) TargetStatus
+
+    def __post_init__(self) -> None:
+        M = len(self.xy_px)
+        object.__setattr__(self, "xy_px", frozen(self.xy_px, (M, 2), name="xy_px"))
+        for name, dtype in (("sigma_px", np.float64), ("area_px", np.float64), ("contrast", np.float64), ("status", np.int8)):
+            object.__setattr__(self, name, frozen(getattr(self, name), (M,), dtype, name))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Blobs:
+    """Outlines at half contrast: centroid (M, 2) of (1), widths along x and y (M, 2), area and contrast (M,), background grey value."""
+
+    xy_px: np.ndarray
+    width_px: np.ndarray
+    area_px: np.ndarray
+    contrast: np.ndarray
+    background: float
+
+
+def find_targets(image: np.ndarray, mask: np.ndarray | None = None) -> Targets:
+    """Find and measure the bright round targets of an image (h, w) float32 0…255; `mask` (h, w) is False where none can be."""
+    background = background_of(image)
+    return match_discs(image, find_blobs(image if mask is None else np.where(mask, image, np.float32(background))))
+
+
+def background_of(image: np.ndarray) -> float:
+    """The grey value of most of the image."""
+    return float(np.median(image[:: max(1, image.shape[0] // 200), :: max(1, image.shape[1] // 200)]))
+
+
+def find_blobs(image: np.ndarray) -> Blobs:
+    """Compact bright blobs, the largest and brightest first, at most `MOST_BLOBS`."""
+    background = background_of(image)
+    smooth = cv2.GaussianBlur(image, (0, 0), 0.8)
+    highest = float(smooth.max()) - background
+    rows = []
+    if highest >= MIN_CONTRAST:
+        threshold = background + max(0.7 * MIN_CONTRAST, RELATIVE_THRESHOLD * BRIGHTNESS * highest)
+        count, labels, statistics, _ = cv2.connectedComponentsWithStats((smooth > threshold).astype(np.uint8), connectivity=8)
+        by_area = 1 + np.argsort(-statistics[1:count, cv2.CC_STAT_AREA])[: 4 * MOST_BLOBS]
+        for n in by_area[statistics[by_area, cv2.CC_STAT_AREA] <= MAX_AREA_PART * image.size]:
+            x, y, w, h, _ = statistics[n]
+            row = _outlined(image[y : y + h, x : x + w], labels[y : y + h, x : x + w] == n, background)
+            if row is not None and row[4] >= BRIGHTNESS * highest:
+                rows.append((row[0] + x, row[1] + y, *row[2:]))
+    table = np.array(sorted(rows, key=lambda r: -r[4] * r[5])[:MOST_BLOBS], dtype=np.float64).reshape(-1, 6)
+    return Blobs(xy_px=table[:, :2], width_px=table[:, 2:4], area_px=table[:, 5], contrast=table[:, 4], background=background)
+
+
+def _outlined(grey: np.ndarray, inside: np.ndarray, background: float) -> tuple[float, ...] | None:
+    """Centroid x y, widths along x and y, contrast and area within the half-contrast outline; None if it is not compact.  (1)"""
+    peak = np.sort(grey[inside])[-min(5, int(inside.sum())) :].mean()
+    contrast = float(peak) - background
+    core = inside & (grey > background + RELATIVE_THRESHOLD * contrast)
+    area = int(core.sum())
+    if area < MIN_AREA:
+        return None
+    y, x = np.nonzero(core)
+    weight = grey[core].astype(np.float64) - background - RELATIVE_THRESHOLD * contrast
+    spread = np.cov(np.stack([x, y]).astype(np.float64), ddof=0) + np.eye(2) / 12
+    small, large = np.sqrt(np.linalg.eigvalsh(spread))
+    if large > MAX_ELONGATION * small or area < MIN_FILL * 4 * np.pi * small * large:
+        return None
+    width = 4 * np.sqrt(np.diag(spread))
+    return float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), float(width[0]), float(width[1]), contrast, area
+
+
+def match_discs(image: np.ndarray, blobs: Blobs) -> Targets:
+    """Least squares matching (2) of all blobs in their windows."""
+    M = len(blobs.xy_px)
+    xy, sigma, status = blobs.xy_px.copy(), np.full(M, np.nan), np.full(M, TargetStatus.CROPPED, dtype=np.int8)
+    need = 1.35 * blobs.width_px.max(axis=1, initial=0) + 6
+    side = np.array(WINDOW_SIDES)[np.minimum(np.searchsorted(WINDOW_SIDES, need), len(WINDOW_SIDES) - 1)]
+    h, w = image.shape
+    corner = np.round(xy).astype(int) - side[:, None] // 2
+    inside = (corner >= 0).all(axis=1) & (corner + side[:, None] <= [w, h]).all(axis=1) & (need <= WINDOW_SIDES[-1])
+    for size in np.unique(side[inside]):
+        rows = np.flatnonzero(inside & (side == size))
+        windows = np.stack([image[y : y + size, x : x + size] for x, y in corner[rows]]).astype(np.float64)
+        start = np.concatenate([xy[rows] - corner[rows], blobs.width_px[rows], blobs.contrast[rows, None]], axis=1)
+        at, sigma[rows], status[rows] = _matched(windows, start, blobs.background)
+        xy[rows] = at + corner[rows]
+    return Targets(xy_px=xy, sigma_px=sigma, area_px=blobs.area_px, contrast=blobs.contrast, status=status)
+
+
+def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions (m, 2) in windows (m, n, n), their sigmas and status; `start` holds x, y, widths and contrast (m, 5).  (2)"""
+    m, n, _ = windows.shape
+    grid = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2).astype(np.float64)
+    grey = windows.reshape(m, -1)
+    B = 2 / np.maximum(start[:, 2:4], 1.0)
+    p = np.stack([start[:, 0], start[:, 1], B[:, 0], B[:, 0] * 0, B[:, 1], 1.4 / B.mean(axis=1), np.full(m, background), start[:, 4]], axis=1)
+    reach = np.hypot((grid[:, 0] - p[:, 0, None]) * p[:, 2, None], (grid[:, 1] - p[:, 1, None]) * p[:, 4, None])
+    near = reach < 1.12 + 1.5 / np.sqrt(p[:, 5, None])  # what lies further out, such as the other target, takes no part
+    active, converged = np.arange(m), np.zeros(m, dtype=bool)
+    covariance, sigma0 = np.full((m, 2), np.inf), np.full(m, np.inf)
+    for _ in range(ITERATIONS):
+        v, J = _disc(p[active], grid, grey[active])
+        weight = near[active] / (1 + (v / (ROBUST * 1.4826 * _median_of_near(np.abs(v), near[active]))) ** 2)  # the bar takes no part
+        J *= weight[:, :, None] ** 0.5
+        v *= weight**0.5
+        N = J.transpose(0, 2, 1) @ J
+        N = N + np.eye(8) * (1e-4 * np.einsum("mii->mi", N)[:, :, None] + 1e-9)
+        step = np.linalg.solve(N, np.einsum("mki,mk->mi", J, v)[..., None])[..., 0]
+        step[:, :2] = np.clip(step[:, :2], -1.5, 1.5)
+        p[active] += step
+        p[active, 5] = np.maximum(p[active, 5], 0.3)
+        freedom = np.maximum(near[active].sum(axis=1) - 8, 1)
+        sigma0[active] = np.sqrt(np.sum(v * v, axis=1) / freedom)
+        covariance[active] = np.einsum("mii->mi", np.linalg.inv(N))[:, :2]
+        still = np.abs(step[:, :2]).max(axis=1) >= CONVERGED_PX
+        converged[active[~still]] = True
+        active = active[still & np.isfinite(p[active]).all(axis=1)]
+        if not len(active):
+            break
+    bad = ~converged | (np.abs(p[:, :2] - start[:, :2]) > 0.25 * start[:, 2:4] + 1.0).any(axis=1)
+    status = np.where(bad, TargetStatus.NOT_CONVERGED, np.where(sigma0 > MAX_MISFIT * p[:, 7], TargetStatus.NO_DISC, TargetStatus.OK))
+    return np.where(bad[:, None], start[:, :2], p[:, :2]), sigma0 * np.sqrt(covariance.mean(axis=1)), status.astype(np.int8)
+
+
+def _median_of_near(values: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Median (m, 1) of the values (m, k) that are near, not below a fraction of a grey value."""
+    return np.maximum(np.nanmedian(np.where(near, values, np.nan), axis=1), 0.3)[:, None]
+
+
+def _disc(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Observed − computed (m, k) of (2) and its Jacobian (m, k, 8) at parameters (m, 8)."""
+    cx, cy, b11, b12, b22, rho, g0, g1 = p.T[:, :, None]
+    ux, uy = grid[:, 0] - cx, grid[:, 1] - cy
+    wx, wy = b11 * ux + b12 * uy, b12 * ux + b22 * uy
+    q = np.sqrt(wx * wx + wy * wy + 1e-12)
+    z = rho * (1 - q)
+    inside = ndtr(z)
+    density = g1 * np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+    by_q = -density * rho / q
+    J = np.empty((*q.shape, 8))
+    J[..., 0], J[..., 1] = -by_q * (b11 * wx + b12 * wy), -by_q * (b12 * wx + b22 * wy)
+    J[..., 2], J[..., 3], J[..., 4] = by_q * wx * ux, by_q * (wx * uy + wy * ux), by_q * wy * uy
+    J[..., 5], J[..., 6], J[..., 7] = density * (1 - q), 1.0, inside
+    return grey - (g0 + g1 * inside), J
