@@ -1,6 +1,6 @@
 """Sub-pixel sampling: the cubic B-spline through the grey values (Unser 1999, doi:10.1109/79.799930).
 
-Prepared once per image: the exact spline on a grid four times as fine. A sample is a bilinear look-up in that grid, whose peak
+Prepared once per image (`noise` is the standard deviation of its grey values' noise): the exact spline on a grid four times as fine. A sample is a bilinear look-up in that grid, whose peak
 interpolation bias is 0.0009 px (texture of 1 px blur); bilinear sampling of the image itself would have 0.012 px. OpenCV 4 rounds the
 place of a look-up to 1/32 of the fine grid, at most 0.0039 px; a patch of samples at unlike places averages that away. OpenCV 5 is exact.
 """
@@ -19,6 +19,7 @@ class SplineImage:
     def __init__(self, image: np.ndarray) -> None:
         grey = np.ascontiguousarray(image, dtype=np.float32)
         self.shape: tuple[int, int] = (grey.shape[0], grey.shape[1])
+        self.noise = noise_sigma(grey)
         self._fine = _refine(_refine(grey, axis=1), axis=0)
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -49,6 +50,15 @@ class SplineImage:
         m = np.broadcast_to(np.asarray(margin, dtype=np.float64), (2,))
         with np.errstate(invalid="ignore"):
             return (xy[..., 0] >= m[0]) & (xy[..., 1] >= m[1]) & (xy[..., 0] <= w - 1 - m[0]) & (xy[..., 1] <= h - 1 - m[1])
+
+
+def noise_sigma(grey: np.ndarray) -> float:
+    """Standard deviation of the noise of an image, from its second differences (Immerkær 1996, doi:10.1006/cviu.1996.0060), robust."""
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    if min(grey.shape) < 3:
+        return 0.0
+    response = np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)[1:-1, 1:-1])
+    return float(np.median(response)) / (0.6745 * 6.0)
 
 
 def _refine(image: np.ndarray, axis: int) -> np.ndarray:

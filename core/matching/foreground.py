@@ -14,9 +14,10 @@ import numpy as np
 REACH_M = 0.55  # a body's extent in depth beyond clicked joints
 MARGIN_M = 0.30  # what a person may move in depth between frames, and a limb beyond the cloud of the frame before
 CLUSTER_WIDTH, CLUSTER_SHARE = 0.12, 0.3  # of log depth; of the seeds in the richest cluster
-PLANE_TOLERANCE_M, PLANE_SHARE, PLANE_MIN, BEHIND_SHARE = 0.015, 0.3, 25, 0.03
+PLANE_TOLERANCE_M, PLANE_SHARE, PLANE_MIN, BEHIND_SHARE = 0.015, 0.3, 20, 0.03
 PLANE_TRIALS, MAX_PLANES = 400, 3
 STATIC_NOISE = 2.0
+PLANE_SIGMAS = 3.0
 PLANE_EXTENT_M = 1.2  # longer than the flat front of a person who stands still
 
 
@@ -28,12 +29,15 @@ class Foreground:
     method: str
     planes: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))  # (P, 4) nx ny nz d
 
-    def excludes(self, xyz_m: np.ndarray) -> np.ndarray:
-        """(N,) points that lie on one of the planes, or behind it."""
+    def excludes(self, xyz_m: np.ndarray, covariance_m2: np.ndarray) -> np.ndarray:
+        """(N,) points (N, 3) that lie on one of the planes as far as their covariances (N, 3, 3) can tell, or behind it."""
         if not len(self.planes):
             return np.zeros(len(xyz_m), dtype=bool)
+        n = self.planes[:, :3]
         with np.errstate(invalid="ignore"):
-            return (xyz_m @ self.planes[:, :3].T - self.planes[:, 3] < PLANE_TOLERANCE_M).any(axis=1)
+            sigma = np.sqrt(np.einsum("pi,nij,pj->np", n, covariance_m2, n))
+            tolerance = PLANE_TOLERANCE_M + np.minimum(PLANE_SIGMAS * sigma, PLANE_TOLERANCE_M)
+            return (xyz_m @ n.T - self.planes[:, 3] < tolerance).any(axis=1)
 
 
 def around_clicks(depth_m: np.ndarray) -> Foreground:

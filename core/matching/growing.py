@@ -45,6 +45,7 @@ class GrowingSettings:
         low=0.05,
         high=10.0,
     )
+    max_ray_sigma0: float = knob(3.0, "Largest distance by which rays may miss, in units of its own sigma.", low=1.0, high=100.0)
     max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across.", low=0.5, high=20.0)
 
 
@@ -213,10 +214,11 @@ def _acceptable(
         return (
             np.all([m.ok for m in matched], axis=0)
             & (point.rms_residual_px <= limit_px)
+            & (point.sigma0 <= growing.max_ray_sigma0)
             & (depth >= near)
             & (depth <= far)
             & continues
-            & ~foreground.excludes(point.xyz_m)
+            & ~foreground.excludes(point.xyz_m, point.covariance_m2)
         )
 
 

@@ -24,7 +24,7 @@ from .least_squares import MatchingSettings, patch_offsets
 NEAREST_BASES, FARTHEST_BASES = 0.8, 40.0  # depth range to look in, in lengths of the longest base, when nothing else is known
 SWEEP_STEP_PX = 1.0
 MIN_SCORE, MIN_LEAD = 0.80, 0.04
-MIN_CONTRAST = 2.0
+MIN_CONTRAST, CONTRAST_OVER_NOISE = 0.5, 1.4
 PATCH_STRIDE = 2
 MAX_SAMPLES = 1200
 LOOK_UP = 30_000_000
@@ -84,7 +84,7 @@ def _textured(image: SplineImage, settings: MatchingSettings, rows: RowGrid, xy:
     u, v, half = patch_offsets(settings.patch_px, rows.step)
     xy = xy[image.inside(xy, np.array(half) + 3.0)]
     patch = image.sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32))
-    return xy[patch.std(axis=1) > MIN_CONTRAST]
+    return xy[patch.std(axis=1) > max(MIN_CONTRAST, CONTRAST_OVER_NOISE * image.noise)]
 
 
 def _default_range(cameras: Sequence[Camera]) -> tuple[float, float]:

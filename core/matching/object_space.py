@@ -1,0 +1,348 @@
+"""Least squares matching in object space: one piece of surface, seen by all search images at once (SCIENCE §5; Krupnik & Schenk 1997).
+
+The unknowns are not those of patches in images but of the surface on the reference view's rays q(u, v): its inverse depth, with slopes and
+curvatures, so that every search image k sees the same piece through its own camera,
+
+    w(u, v) = θ · m(u, v) ,   m = 1, u, v [, ½ u², u v, ½ v²]                                            (1)
+    h_k = M_k q + w t_k ,   M_k = R_k R_0ᵀ ,   t_k = R_k C_0 + t_k ,   x_k(u, v) = π_k(h_k) + δ_k n_k      (2)
+    f(u, v) + e = r0_k + r1_k g_k(x_k(u, v))                                                              (3)
+
+Planes are linear in inverse depth, so 1, u, v are an exact plane and move the search patches by its homography. δ_k shifts a patch
+across its epipolar line (n_k ⟂ ∂x_k/∂w) under the pseudo-observation δ_k = 0 ± σ_c: what the rig does not know. r0, r1 are eliminated.
+With the direction s_k = A_k⁻¹ ∂x_k/∂w in the template (A_k = ∂x_k/∂(u, v)) and n'_k = A_k⁻¹ n_k the design matrix is that of the template
+(see `template_patches`), with P_k = 1/σ_k² from the residuals of each image:
+
+    N = Σ_k P_k J_kᵀ M J_k + P_prior ,   N dθ = Σ_k P_k J_kᵀ M (f − r0 − r1 g_k) + P_prior (θ_prior − θ)    (4)
+
+Covariance: the template's noise is common to all search images (σ_f² = σ²/2), and the noise of the gradients makes N too large
+(SCIENCE §4), so with N' free of the gradients' noise
+
+    K = N'⁻¹ [ Σ_k ½ P_k J_kᵀ J_k + σ_f² (Σ_k P_k J_k)ᵀ (Σ_k P_k J_k) + P_prior ] N'⁻¹                       (5)
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..images.fields import RowGrid
+from ..images.sampling import SplineImage
+from ..progress import Monitor
+from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
+from .template_patches import GRADIENT_NOISE, TemplatePatches
+
+MIN_NOISE = 1.0  # grey values: no image is better than its quantisation and interpolation
+CONVERGED_SIGMAS = 0.05
+MAX_STEP_PX = 1.5
+MIN_REMAINING = 0.1  # of the gradients' energy is always texture
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SurfacePrior:
+    """Pseudo-observations θ = value ± sigma of N points, in the unknowns of (1); an infinite sigma says nothing."""
+
+    value: np.ndarray  # (N, P)
+    sigma: np.ndarray  # (N, P)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SurfacePatch:
+    """N pieces of surface: θ of (1) about the patch's middle, in units of 1/m and rows' pixels, and how well they are seen."""
+
+    theta: np.ndarray  # (N, P)
+    covariance: np.ndarray  # (N, P, P)
+    across_px: np.ndarray  # (N, S) δ of the S search views, rows' pixels
+    across_sigma_px: np.ndarray  # (N, S)
+    correlation: np.ndarray  # (N, S)
+    sigma_px: np.ndarray  # (N,) of the inverse depth at the texture's centre, as the largest shift in a search view
+    offset: np.ndarray  # (N, 2) the texture's centre of gravity, from the patch's middle
+    spread: np.ndarray  # (N, 2) variance of the texture's energy about it
+    iterations: np.ndarray  # (N,)
+    status: np.ndarray  # (N,) MatchStatus
+
+    @property
+    def ok(self) -> np.ndarray:
+        """(N,) which points passed all limits."""
+        return self.status == MatchStatus.OK
+
+
+class Epipolar:
+    """N rays of the reference view and their images in one search view: (2), with lens distortion linear over a patch."""
+
+    def __init__(self, base: Camera, camera: Camera, rows: RowGrid, xy: np.ndarray) -> None:
+        self._camera, self._rows = camera, rows
+        frame = rows.to_frame(xy)
+        q = base.directions(frame)
+        tip = base.directions(frame[:, None] + [[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+        Q = np.stack([tip[:, 0] - tip[:, 1], (tip[:, 2] - tip[:, 3]) * rows.step], axis=2)  # ∂q/∂(u, v) (N, 3, 2)
+        rotation = camera.R_cam_world @ base.R_cam_world.T
+        self._h0, self._H = q @ rotation.T, rotation @ Q
+        self.shift = camera.R_cam_world @ base.centre_m + camera.t_cam_world_m  # t_k (3,)
+
+    def centre(self, theta: np.ndarray, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Image (m, 2) of the patch's middle, ∂x/∂w (m, 2), A (m, 2, 2) and the distortion's slope L (m, 2, 2). Rows' pixels."""
+        h = self._h0[rows] + theta[:, :1] * self.shift
+        X = (h - self._camera.t_cam_world_m) @ self._camera.R_cam_world
+        frame, J = self._camera.project_with_jacobian(X)
+        J = (J @ self._camera.R_cam_world.T) / np.array([1.0, self._rows.step])[:, None]  # ∂x/∂h
+        A = J @ (self._H[rows] + self.shift[:, None] * theta[:, None, 1:3])
+        return self._rows.from_frame(frame), J @ self.shift, A, J[:, :, :2] * h[:, 2, None, None]
+
+    def warp(
+        self, theta: np.ndarray, monomials: np.ndarray, rows: np.ndarray, at: np.ndarray, slope: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and rows (m, n) float32 of x(u, v), with middle `at` (m, 2) and distortion's slope `slope` (m, 2, 2).  (2)"""
+        u, v = monomials[:, 1], monomials[:, 2]
+        w = theta.astype(np.float32) @ monomials.T
+        h0, H, t = self._h0[rows].astype(np.float32), self._H[rows].astype(np.float32), self.shift.astype(np.float32)
+        x, y, z = (h0[:, i, None] + H[:, i, :1] * u + H[:, i, 1:] * v + w * t[i] for i in range(3))
+        middle = self._h0[rows] + theta[:, :1] * self.shift
+        ab0 = (middle[:, :2] / middle[:, 2:]).astype(np.float32)
+        a, b = x / z - ab0[:, :1], y / z - ab0[:, 1:]
+        L, c = slope.astype(np.float32), at.astype(np.float32)
+        return c[:, :1] + L[:, 0, :1] * a + L[:, 0, 1:] * b, c[:, 1:] + L[:, 1, :1] * a + L[:, 1, 1:] * b
+
+
+def match_surface(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    rows: RowGrid,
+    xy: np.ndarray,
+    start: np.ndarray,
+    settings: MatchingSettings,
+    *,
+    sigma_across_px: float,
+    prior: SurfacePrior | None = None,
+    weight: np.ndarray | None = None,
+    monitor: Monitor | None = None,
+) -> SurfacePatch:
+    """Fit the surface (1) at the reference view's points `xy` (N, 2) (rows' pixels) to all images at once.
+
+    `start` (N, 3) or (N, 6) holds approximate θ; its width chooses planes or quadrics. `sigma_across_px` is σ_c, in full-frame pixels: 0.001 holds the patches on their
+    epipolar lines. `weight` (N, n) of the patch's pixels. A search image that does not hold a point makes it OUT_OF_IMAGE.
+    Cost: about 12 µs per point of 13×13 and search image.
+    """
+    n = len(xy)
+
+    def work(span: slice) -> SurfacePatch:
+        if monitor is not None and monitor.cancelled:
+            monitor.step("surface", span.start, n)
+        part = None if prior is None else SurfacePrior(value=prior.value[span], sigma=prior.sigma[span])
+        patches = TemplatePatches(
+            images[reference],
+            xy[span],
+            settings.patch_px,
+            rows.step,
+            degree=1 if start.shape[1] == 3 else 2,
+            weight=None if weight is None else weight[span],
+        )
+        lines = [Epipolar(cameras[reference], c, rows, xy[span]) for k, c in enumerate(cameras) if k != reference]
+        views = [image for k, image in enumerate(images) if k != reference]
+        return _Adjustment(patches, views, lines, part, settings, sigma_across_px).solve(start[span])
+
+    spans = [slice(i, min(i + CHUNK, n)) for i in range(0, max(n, 1), CHUNK)]
+    if len(spans) == 1:
+        return work(spans[0])
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = list(pool.map(work, spans))
+    return SurfacePatch(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in SurfacePatch.__dataclass_fields__})
+
+
+class _Adjustment:
+    """The adjustment (4) of a chunk of points."""
+
+    def __init__(
+        self,
+        patches: TemplatePatches,
+        images: Sequence[SplineImage],
+        lines: Sequence[Epipolar],
+        prior: SurfacePrior | None,
+        settings: MatchingSettings,
+        sigma_across_px: float,
+    ) -> None:
+        self._patches, self._images, self._lines, self._prior = patches, images, lines, prior
+        self._settings, self._across_weight = settings, 1 / sigma_across_px**2
+        self._S, self._P = len(images), patches.monomials.shape[1]
+
+    def solve(self, start: np.ndarray) -> SurfacePatch:
+        s, n, P, S = self._settings, len(start), self._P, self._S
+        theta, across = np.array(start, dtype=np.float64), np.zeros((n, S))
+        status = np.full(n, MatchStatus.NOT_CONVERGED, dtype=np.int8)
+        status[~self._patches.textured] = MatchStatus.NO_TEXTURE
+        status[~(self._patches.inside & np.isfinite(theta).all(axis=1))] = MatchStatus.OUT_OF_IMAGE
+        correlation, K = np.zeros((n, S)), np.zeros((n, P + S, P + S))
+        iterations, pixels_per_w = np.zeros(n, dtype=np.int16), np.ones(n)
+        active = np.flatnonzero(status == MatchStatus.NOT_CONVERGED)
+        for iteration in range(1, s.max_iterations + 1):
+            if not len(active):
+                break
+            N, rhs, K[active], correlation[active], speed, seen = self._equations(theta[active], across[active], active)
+            step = _solve(N, rhs)
+            length = np.abs(step[:, 0]) * speed
+            shrink = np.minimum(1.0, MAX_STEP_PX / np.maximum(length, 1e-12))[:, None]
+            theta[active] += step[:, :P] * shrink
+            across[active] += step[:, P:] * shrink
+            iterations[active], pixels_per_w[active] = iteration, speed
+            away = np.abs(theta[active, 0] - start[active, 0]) * speed > 2 * s.max_shift_px
+            sigma = speed * np.sqrt(np.maximum(K[active, 0, 0], 0.0))
+            done = length < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * sigma)
+            status[active[done]] = MatchStatus.OK
+            status[active[away | ~np.isfinite(length)]] = MatchStatus.SHIFT_TOO_LARGE
+            status[active[~seen]] = MatchStatus.OUT_OF_IMAGE
+            active = active[~(done | away | ~seen | ~np.isfinite(length))]
+        return self._judge(start, theta, across, K, correlation, iterations, pixels_per_w, status)
+
+    def _equations(
+        self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """N, right side, covariance (5), correlations (m, S), px per w (m,) and whether all views see the points."""
+        m, P, S, patches = len(rows), self._P, self._S, self._patches
+        N, rhs, noise = np.zeros((m, P + S, P + S)), np.zeros((m, P + S)), np.zeros((m, P + S, P + S))
+        rho, seen, speed = np.zeros((m, S)), np.ones(m, dtype=bool), np.zeros(m)
+        weights, along, side = np.zeros((m, S)), np.zeros((m, S, 2)), np.zeros((m, S, 2))
+        variance = np.full(m, np.inf)
+        for k, (image, line) in enumerate(zip(self._images, self._lines)):
+            c, e, A, L = line.centre(theta, rows)
+            length = np.linalg.norm(e, axis=1)
+            normal = np.stack([-e[:, 1], e[:, 0]], axis=1) / np.maximum(length, 1e-12)[:, None]
+            c = c + across[:, k, None] * normal
+            visible = image.inside(c, np.array(patches.half) * 0.5)
+            seen &= visible
+            x, y = line.warp(theta, patches.monomials, rows, np.where(visible[:, None], c, 0.0), L)
+            rho[:, k], _, (gx, gy) = patches.compare(image.sample(x, y), rows)
+            s, t = _apply_inverse(A, e), _apply_inverse(A, normal)
+            sigma2 = np.maximum(patches.residual_variance(rho[:, k], P + 2, rows), MIN_NOISE**2)
+            weights[:, k], along[:, k], side[:, k] = 1 / sigma2, s, t
+            variance, speed = np.minimum(variance, sigma2), np.maximum(speed, length)
+            J = _blocks(patches, rows, s, t, k, P, S)
+            N += J * weights[:, k, None, None]
+            noise += _noise_blocks(patches, rows, s, t, k, P, S) * weights[:, k, None, None] * sigma2[:, None, None]
+            rhs[:, :P] -= weights[:, k, None] * (s[:, :1] * gx + s[:, 1:] * gy)
+            rhs[:, P + k] -= weights[:, k] * (t[:, 0] * gx[:, 0] + t[:, 1] * gy[:, 0])
+        spread = 0.5 * N + 0.5 * variance[:, None, None] * _sum_blocks(patches, rows, weights, along, side, P)
+        texture = _without_noise(N, 0.5 * GRADIENT_NOISE * noise)
+        pseudo, wish = self._pseudo(theta, across, rows)
+        diagonal = np.arange(P + S)
+        for M in (N, spread, texture):
+            M[:, diagonal, diagonal] += pseudo
+        half = _inverse(texture)
+        return N, rhs + pseudo * wish, half @ spread @ half, rho, speed, seen
+
+    def _pseudo(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (m, P + S) of the pseudo-observations and what they wish to be added."""
+        weight, wish = np.zeros((len(rows), self._P + self._S)), np.zeros((len(rows), self._P + self._S))
+        weight[:, self._P :], wish[:, self._P :] = self._across_weight, -across
+        if self._prior is not None:
+            weight[:, : self._P] = 1 / self._prior.sigma[rows] ** 2
+            wish[:, : self._P] = np.where(weight[:, : self._P] > 0, self._prior.value[rows] - theta, 0.0)
+        return weight, wish
+
+    def _judge(
+        self,
+        start: np.ndarray,
+        theta: np.ndarray,
+        across: np.ndarray,
+        K: np.ndarray,
+        correlation: np.ndarray,
+        iterations: np.ndarray,
+        speed: np.ndarray,
+        status: np.ndarray,
+    ) -> SurfacePatch:
+        s, P, patches = self._settings, self._P, self._patches
+        at = np.zeros((len(theta), P))
+        at[:, 0], at[:, 1:3] = 1.0, patches.offset
+        if P == 6:
+            o = patches.offset
+            at[:, 3:] = np.stack([0.5 * o[:, 0] ** 2, o[:, 0] * o[:, 1], 0.5 * o[:, 1] ** 2], axis=1)
+        sigma = speed * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", at, K[:, :P, :P], at), 0.0))
+        lost = np.clip(1 - correlation.min(axis=1) ** 2, 0, 1)
+        pixels = np.maximum(patches.pixels, P + 3.0)
+        for bad, why in (
+            (theta[:, 0] <= 0, MatchStatus.SHIFT_TOO_LARGE),
+            (np.abs(theta[:, 0] - start[:, 0]) * speed > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
+            (np.abs(theta[:, 1:3] - start[:, 1:3]).max(axis=1) * speed > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
+            (correlation.min(axis=1) < s.min_correlation, MatchStatus.LOW_CORRELATION),
+            (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE),
+            (50 * np.sqrt(lost * pixels / (pixels - P - 2)) > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE),
+        ):
+            status[(status == MatchStatus.OK) & bad] = why
+        side = np.sqrt(np.maximum(K[:, range(P, P + self._S), range(P, P + self._S)], 0.0))
+        return SurfacePatch(
+            theta=theta,
+            covariance=K[:, :P, :P],
+            across_px=across,
+            across_sigma_px=side,
+            correlation=correlation,
+            sigma_px=sigma,
+            offset=patches.offset,
+            spread=patches.spread,
+            iterations=iterations,
+            status=status,
+        )
+
+
+def _blocks(patches: TemplatePatches, rows: np.ndarray, s: np.ndarray, t: np.ndarray, k: int, P: int, S: int) -> np.ndarray:
+    """JᵀMJ (m, P + S, P + S) of search image k: the surface's unknowns along s, its own shift across along t."""
+    J = np.zeros((len(rows), P + S, P + S))
+    J[:, :P, :P] = patches.normal(s, s, rows)
+    J[:, :P, P + k] = J[:, P + k, :P] = patches.normal(s, t, rows)[:, :, 0]
+    J[:, P + k, P + k] = patches.normal(t, t, rows)[:, 0, 0]
+    return J
+
+
+def _noise_blocks(patches: TemplatePatches, rows: np.ndarray, s: np.ndarray, t: np.ndarray, k: int, P: int, S: int) -> np.ndarray:
+    """What gradients that are noise of variance 1 add to `_blocks`, in expectation."""
+    J, M = np.zeros((len(rows), P + S, P + S)), patches.noise_moment[rows]
+    st = np.einsum("ni,ni->n", s, t)
+    J[:, :P, :P] = np.einsum("ni,ni->n", s, s)[:, None, None] * M
+    J[:, :P, P + k] = J[:, P + k, :P] = st[:, None] * M[:, 0]
+    J[:, P + k, P + k] = np.einsum("ni,ni->n", t, t) * M[:, 0, 0]
+    return J
+
+
+def _sum_blocks(patches: TemplatePatches, rows: np.ndarray, weights: np.ndarray, along: np.ndarray, side: np.ndarray, P: int) -> np.ndarray:
+    """(Σ P_k J_k)ᵀ (Σ P_k J_k): how the template's noise, common to all search images, acts."""
+    m, S = weights.shape
+    total = np.einsum("nk,nki->ni", weights, along)
+    J = np.zeros((m, P + S, P + S))
+    J[:, :P, :P] = patches.normal(total, total, rows)
+    for k in range(S):
+        t = weights[:, k, None] * side[:, k]
+        J[:, :P, P + k] = J[:, P + k, :P] = patches.normal(total, t, rows)[:, :, 0]
+        for j in range(S):
+            J[:, P + k, P + j] = patches.normal(t, weights[:, j, None] * side[:, j], rows)[:, 0, 0]
+    return J
+
+
+def _without_noise(N: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """N without the gradients' noise, of which each unknown keeps at least MIN_REMAINING of its own."""
+    d = np.einsum("nii->ni", N)
+    share = np.einsum("nii->ni", noise) / np.maximum(d, 1e-300)
+    scale = np.minimum(1.0, (1 - MIN_REMAINING) / np.maximum(share.max(axis=1), 1e-12))
+    return N - noise * scale[:, None, None]
+
+
+def _apply_inverse(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """A⁻¹ b of 2×2 matrices (m, 2, 2); zero where A is singular."""
+    det = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
+    x = np.stack([A[:, 1, 1] * b[:, 0] - A[:, 0, 1] * b[:, 1], A[:, 0, 0] * b[:, 1] - A[:, 1, 0] * b[:, 0]], axis=1)
+    return np.where((np.abs(det) > 1e-3)[:, None], x / np.where(np.abs(det) > 1e-3, det, 1.0)[:, None], 0.0)
+
+
+def _scaled(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """N with a diagonal of ones (and a trace of damping), and the scale (m, P)."""
+    scale = 1 / np.sqrt(np.maximum(np.nan_to_num(np.einsum("nii->ni", N)), 1e-30))
+    return np.nan_to_num(N * scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(N.shape[1]), scale
+
+
+def _solve(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+    M, scale = _scaled(N)
+    return scale * np.linalg.solve(M, (scale * rhs)[..., None])[..., 0]
+
+
+def _inverse(N: np.ndarray) -> np.ndarray:
+    M, scale = _scaled(N)
+    return np.linalg.inv(M) * scale[:, :, None] * scale[:, None, :]

@@ -1,0 +1,120 @@
+"""The template's side of constrained matching: patches, gradients, and their products with the monomials of the patch coordinates.
+
+In all constrained forms a parameter θ_i with the monomial m_i(u, v) moves a patch in a search image along a direction, which is the
+direction s in the template. The design matrix is then made of the template's gradients alone (the inverse-compositional idea of Baker &
+Matthews 2004):
+
+    J[:, i] = (fx s_x + fy s_y) m_i ,   m = 1, u, v, ½ u², u v, ½ v²                                            (1)
+    Jᵀ W M J = s_x² Mxx + s_x s_y (Mxy + Mxyᵀ) + s_y² Myy ,   M = I − 1 1ᵀ W / ΣW − f̂ f̂ᵀ W                      (2)
+
+with W the pixels' weights, f̂ the patch free of its mean and of unit length, and M the elimination of offset and gain. Mxx, Mxy and Myy
+belong to the template, so that normal matrices of any number of search images, in any iteration, cost a few small products.
+"""
+
+import numpy as np
+
+from ..images.sampling import SplineImage
+from .least_squares import patch_offsets
+
+GRADIENT_NOISE = 130 / 144  # variance of the fourth-order central difference, for noise of variance 1
+MIN_CONTRAST = 0.5  # grey values
+
+
+class TemplatePatches:
+    """N patches of one image about `xy` (N, 2); `weight` (N, n) of their pixels, or None for equal weights."""
+
+    def __init__(
+        self, image: SplineImage, xy: np.ndarray, patch_px: int, row_step: int, *, degree: int = 1, weight: np.ndarray | None = None
+    ) -> None:
+        self.u, self.v, self.half = patch_offsets(patch_px, row_step)
+        self.monomials = monomials(self.u, self.v, degree)  # (n, P)
+        self.inside = image.inside(xy, np.array(self.half) + 1.0)
+        f, fx, fy = _sample(image, np.where(self.inside[:, None], xy, self.half + np.array(3.0)), self.half)
+        self._weight = np.ones_like(f) if weight is None else weight.astype(np.float32)
+        self.pixels = self._weight.sum(axis=1).astype(np.float64)  # (N,)
+        self.mean_weight = self._weight / np.maximum(self.pixels, 1e-6)[:, None].astype(np.float32)
+        f = f - np.einsum("ij,ij->i", f, self.mean_weight)[:, None]
+        self.contrast = np.sqrt(np.einsum("ij,ij,ij->i", f, f, self._weight)).astype(np.float64)  # |f̃|
+        self.f = f / np.maximum(self.contrast, 1e-6)[:, None].astype(np.float32)
+        self.textured = self.inside & (self.contrast > MIN_CONTRAST * np.sqrt(np.maximum(self.pixels, 1.0)))
+        self.weighted_f = self.f * self._weight
+        self._wfx, self._wfy = fx * self._weight, fy * self._weight
+        self._centre(fx, fy)
+        self._moments(fx, fy)
+
+    def _centre(self, fx: np.ndarray, fy: np.ndarray) -> None:
+        energy = self._wfx * fx + self._wfy * fy + 1e-3 * self._weight
+        total = np.maximum(energy.sum(axis=1, keepdims=True), 1e-9)
+        moment = (energy @ np.stack([self.u, self.v, self.u**2, self.v**2], axis=1) / total).astype(np.float64)
+        self.offset = moment[:, :2]  # (N, 2) centre of gravity of the gradients' energy
+        self.spread = np.maximum(moment[:, 2:] - moment[:, :2] ** 2, 0.0)  # (N, 2)
+
+    def _moments(self, fx: np.ndarray, fy: np.ndarray) -> None:
+        m = self.monomials
+        P = m.shape[1]
+        second = (m[:, :, None] * m[:, None, :]).reshape(len(m), P * P)
+        xx, xy, yy = ((a @ second).reshape(-1, P, P).astype(np.float64) for a in (self._wfx * fx, self._wfx * fy, self._wfy * fy))
+        mean = [(w @ m).astype(np.float64) for w in (self._wfx, self._wfy)]
+        self.q = np.stack(self.project(self.f), axis=1)  # (N, 2, P)  Jᵀ W f̂ for s = (1, 0) and (0, 1)
+        n = np.maximum(self.pixels, 1e-6)[:, None, None]
+
+        def reduced(M: np.ndarray, i: int, j: int) -> np.ndarray:
+            outer = mean[i][:, :, None] * mean[j][:, None, :] / n + self.q[:, i, :, None] * self.q[:, j, None, :]
+            return M - outer
+
+        self._moment = np.stack([reduced(xx, 0, 0), reduced(xy, 0, 1), reduced(yy, 1, 1)], axis=1)  # (N, 3, P, P)
+        self.noise_moment = (self._weight @ second).reshape(-1, P, P).astype(np.float64)  # of gradients that are noise of variance 1
+
+    def project(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Products (m, P) of g (m, n) with the design matrix (1) for s = (1, 0) and s = (0, 1)."""
+        m = self.monomials
+        return (self._wfx[rows] * g @ m).astype(np.float64), (self._wfy[rows] * g @ m).astype(np.float64)
+
+    def normal(self, s: np.ndarray, t: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Jᵀ W M J' (m, P, P) of (2) between the directions s and t (m, 2)."""
+        M = self._moment[rows]
+        cross = M[:, 1]
+        return (
+            (s[:, 0] * t[:, 0])[:, None, None] * M[:, 0]
+            + (s[:, 0] * t[:, 1])[:, None, None] * cross
+            + (s[:, 1] * t[:, 0])[:, None, None] * cross.transpose(0, 2, 1)
+            + (s[:, 1] * t[:, 1])[:, None, None] * M[:, 2]
+        )
+
+    def compare(
+        self, g: np.ndarray, rows: np.ndarray | slice = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Correlation (m,), gain r1 (m,) and the products of M r1 g (m, P), for both directions, of search patches g (m, n)."""
+        g = g - np.einsum("ij,ij->i", g, self.mean_weight[rows])[:, None]
+        power = np.maximum(np.einsum("ij,ij,ij->i", g, g, self._weight[rows]), 1e-6).astype(np.float64)
+        along = np.einsum("ij,ij->i", g, self.weighted_f[rows]).astype(np.float64)
+        gain = self.contrast[rows] * along / power
+        px, py = self.project(g, rows)
+        q = self.q[rows]
+        return (
+            along / np.sqrt(power),
+            gain,
+            (gain[:, None] * (px - q[:, 0] * along[:, None]), gain[:, None] * (py - q[:, 1] * along[:, None])),
+        )
+
+    def residual_variance(self, rho: np.ndarray, parameters: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Variance [grey values²] of a pixel after the adjustment, at correlation rho (m,)."""
+        return self.contrast[rows] ** 2 * np.clip(1 - rho**2, 0, 1) / np.maximum(self.pixels[rows] - parameters, 1.0)
+
+
+def monomials(u: np.ndarray, v: np.ndarray, degree: int) -> np.ndarray:
+    """1, u, v (degree 1) and ½ u², u v, ½ v² (degree 2) as columns (n, 3 or 6) float32."""
+    columns = [np.ones_like(u), u, v] + ([0.5 * u * u, u * v, 0.5 * v * v] if degree == 2 else [])
+    return np.stack(columns, axis=-1).astype(np.float32)
+
+
+def _sample(image: SplineImage, xy: np.ndarray, half: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Patches (N, n) and their gradients by fourth-order central differences, all in one look-up with a border of two."""
+    w, h = half
+    v, u = np.mgrid[-h - 2 : h + 3, -w - 2 : w + 3].astype(np.float32)
+    x32 = xy.astype(np.float32)
+    P = image.sample(x32[:, :1] + u.ravel(), x32[:, 1:] + v.ravel()).reshape(len(xy), 2 * h + 5, 2 * w + 5)
+    fx = (8 * (P[:, 2:-2, 3:-1] - P[:, 2:-2, 1:-3]) - (P[:, 2:-2, 4:] - P[:, 2:-2, :-4])) / 12
+    fy = (8 * (P[:, 3:-1, 2:-2] - P[:, 1:-3, 2:-2]) - (P[:, 4:, 2:-2] - P[:, :-4, 2:-2])) / 12
+    flat = (len(xy), (2 * h + 1) * (2 * w + 1))
+    return P[:, 2:-2, 2:-2].reshape(flat), fx.reshape(flat), fy.reshape(flat)
