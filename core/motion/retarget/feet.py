@@ -3,11 +3,18 @@
 A walk on legs of other proportions keeps its directions only if the body's path changes. So first the path is solved for: a correction
 c(t) of the root and a place X_k for every contact k, from
 
-    Σ |r(t) + c(t) + o_f(t) − X_k − s_f(t)|²  +  τ⁴ Σ |c̈(t)|²  +  μ Σ |c(t)|²   →  min                      (1)
+    Σ |r(t) + c(t) + ω(t) × h_f(t) + o_f(t) − X_k − s_f(t)|²  +  τ⁴ Σ |c̈(t)|²  +  μ Σ |c(t)|²  +  the like of ω   →  min      (1)
 
-with r the root, o_f the ankle seen from it, and s_f how the ankle moves about the standing ball of the foot while the heel lifts. Heights
-are given: the lowest point of the sole is on the floor. Then the ankle is brought to its place by two bones of known length   (2), with
-the knee in its plane, and let go over a while so that nothing pops. Toes bend where they would go through the floor.
+with r the root, ω a small turn of the hips, h_f a hip joint, o_f the ankle seen from the root, and s_f how the ankle moves about the standing ball of the foot while the heel lifts. Heights
+are given: the lowest point of the sole is on the floor. The norm counts angles: a displacement e of the ankle turns a leg of length d by
+e/d across it, but along it, with the knee bent by φ, each of its two bones by e·d/(2 l₁ l₂ sin φ)                (4). Of a foot whose heel
+is lifted only the distance from the ball counts, since it can turn: its ankle goes to the point next to where the leg has it on the
+sphere about the standing ball,
+
+    a' = B + |a − B|_rest · unit(a − B)                                                                          (2)
+
+and the foot turns with it. What is left is taken up by two bones of known length (3), with the knee in its plane, and let go over a
+while so that nothing pops.
 """
 
 from collections.abc import Mapping
@@ -17,14 +24,19 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from ...geometry.rotation import cross_matrix
 from .contacts import Contacts, FeetSettings, runs
 from .mapping import RigMap
 from .rig import Rig
 from .roles import sided
-from .turns import between, rotate, shortest, unit
+from .turns import about, between, matrix_from_vector, rotate, shortest, unit, vector_from_matrix
 
 SMOOTH_S = 0.05  # τ: the body's path does not follow the feet's noise
 HOLD = 1e-5  # μ: where nothing stands the path stays as it was
+GIVE = 0.4  # how much counts what a lifted foot can yield to by turning
+TILT = 0.2  # a turn of the hips counts as much less than one of a leg
+BENT = np.radians(8.0)  # a knee is taken to be bent at least as much in (4)
+ROLL_M = 0.004  # the ball of a foot that rolls over its toes goes forward by at most this
 REACH = 0.9995  # a leg is not stretched beyond this part of its length
 STRAIGHT = 0.005  # a knee that is out of the line by less of the thigh's length bends forwards
 
@@ -41,6 +53,7 @@ class Leg:
     ball_m: np.ndarray  # (3,) the toe's joint in the rest pose
     sole_m: np.ndarray  # (K, 3) points under the foot, rest pose
     tip_m: np.ndarray  # (J, 3) points under the toes, rest pose
+    end_m: np.ndarray  # (3,) the foremost of them
 
 
 def find_legs(rig: Rig, rig_map: RigMap, floor_m: float) -> dict[str, Leg]:
@@ -68,7 +81,8 @@ def _leg(rig: Rig, side: str, bones: Mapping[str, tuple[int, ...]], floor_m: flo
     under = np.array([1.0, 1.0, 0.0])
     sole = np.concatenate(skin) if skin else np.array([ankle * under, ball * under]) + (0, 0, low)
     tips = np.concatenate(toes) if toes else np.array([tip * under + (0, 0, low)])
-    return Leg(side=side, **{k: tuple(v) for k, v in bones.items()}, ball_m=ball, sole_m=sole, tip_m=tips)
+    return Leg(side=side, **{k: tuple(v) for k, v in bones.items()}, ball_m=ball, sole_m=sole, tip_m=tips,
+               end_m=tips[np.argmax((tips - ankle) @ (unit((ball - ankle) * under)))])
 
 
 def level_feet(since_rest: np.ndarray, flat: np.ndarray, A: np.ndarray) -> np.ndarray:
@@ -126,10 +140,14 @@ def lowest(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
     return np.concatenate(heights, axis=1)[..., 2].min(axis=1)
 
 
+def _arm(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
+    """From the ankle to the ball (T, 3)."""
+    return R[:, leg.foot[0]] @ (rig.R_rest[leg.foot[0]].T @ (leg.ball_m - rig.head_m[leg.foot[0]]))
+
+
 def about_ball(leg: Leg, rig: Rig, R: np.ndarray, toe: np.ndarray, begin: int, end: int) -> np.ndarray:
     """s_f (end − begin, 3): how the ankle moves in a contact, about the ball where that stands and not at all where only the heel does."""
-    foot = leg.foot[0]
-    arm = R[begin:end, foot] @ (rig.R_rest[foot].T @ (leg.ball_m - rig.head_m[foot]))
+    arm = _arm(leg, rig, R)[begin:end]
     step = np.zeros_like(arm)
     step[1:] = -np.diff(arm, axis=0) * toe[begin + 1:end, None]
     return np.cumsum(step, axis=0)
@@ -137,12 +155,15 @@ def about_ball(leg: Leg, rig: Rig, R: np.ndarray, toe: np.ndarray, begin: int, e
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stand:
-    """One contact of one foot: frames [begin, end), and where the ankle is in it (n, 3), up to its place X_k in the plane."""
+    """One contact of one foot: frames [begin, end), and where the ankle is in it (n, 3), up to its place X_k in the plane; in which
+    frames (n,) only the ball stands."""
 
     side: str
     begin: int
     end: int
     path_m: np.ndarray
+    lifted: np.ndarray
+    arm_m: np.ndarray  # (n, 3) from the ankle to the ball
 
 
 def find_stands(legs: Mapping[str, Leg], contacts: Contacts, rig: Rig, R: np.ndarray, floor_m: float) -> list[Stand]:
@@ -153,58 +174,156 @@ def find_stands(legs: Mapping[str, Leg], contacts: Contacts, rig: Rig, R: np.nda
         for begin, end in runs(contacts.ankle[side] | contacts.toe[side]):
             path = about_ball(legs[side], rig, R, contacts.toe[side], begin, end)
             path[:, 2] = floor_m - low[begin:end]
-            stands.append(Stand(side=side, begin=begin, end=end, path_m=path))
+            lifted = ~contacts.ankle[side][begin:end] & bool(np.linalg.norm(legs[side].ball_m - rig.head_m[legs[side].foot[0]]) > 1e-4)
+            stands.append(Stand(side=side, begin=begin, end=end, path_m=path, lifted=lifted, arm_m=_arm(legs[side], rig, R)[begin:end]))
     return stands
 
 
-def carry_root(stands: list[Stand], ankles: Mapping[str, np.ndarray], fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """The root's correction c (T, 3) and the contacts' places X (K, 3; z is 0), from ankles (T, 3) by side.  (1)"""
+def stiffness(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
+    """W^½ (T, 3, 3): by how much the leg's directions suffer (rad × leg length) from a displacement of the ankle.  (4)"""
+    upper = R[:, leg.thigh[0]] @ (rig.R_rest[leg.thigh[0]].T @ (rig.head_m[leg.shin[0]] - rig.head_m[leg.thigh[0]]))
+    lower = R[:, leg.shin[0]] @ (rig.R_rest[leg.shin[0]].T @ (rig.head_m[leg.foot[0]] - rig.head_m[leg.shin[0]]))
+    area = np.linalg.norm(np.cross(upper, lower), axis=1)  # l₁ l₂ sin φ
+    along, reach = unit(upper + lower), np.linalg.norm(upper + lower, axis=1)
+    least = np.sin(BENT) * np.linalg.norm(upper[0]) * np.linalg.norm(lower[0])
+    k = np.maximum(reach**2 / (2.0 * np.maximum(area, least)), 1.0)
+    return np.eye(3) + (k - 1.0)[:, None, None] * along[:, :, None] * along[:, None, :]
+
+
+def carry_root(stands: list[Stand], ankles: Mapping[str, np.ndarray], hips: Mapping[str, np.ndarray], stiff: Mapping[str, np.ndarray],
+               fps: float, leg_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corrections of the root: shift c (T, 3), turn ω (T, 3) [rad], and the contacts' places X (K, 3; z is 0).  (1)
+
+    By side: ankles (T, 3), hip joints against the middle of the hips (T, 3), and W^½ (T, 3, 3).
+    """
     t, k = len(next(iter(ankles.values()))), len(stands)
     if not stands:
-        return np.zeros((t, 3)), np.zeros((0, 3))
+        return np.zeros((t, 3)), np.zeros((t, 3)), np.zeros((0, 3))
     frame = np.concatenate([np.arange(s.begin, s.end) for s in stands])
     which = np.repeat(np.arange(k), [s.end - s.begin for s in stands])
+    W = np.concatenate([_say(s) @ stiff[s.side][s.begin:s.end] for s in stands])  # (n, 3, 3)
     misfit = np.concatenate([s.path_m - ankles[s.side][s.begin:s.end] for s in stands])
-    rows = np.arange(len(frame))
-    at = sparse.csr_matrix((np.ones(len(rows)), (rows, frame)), (len(rows), t))
-    place = sparse.csr_matrix((np.ones(len(rows)), (rows, which)), (len(rows), k))
+    n = len(frame)
+    row = np.broadcast_to((3 * np.arange(n)[:, None] + np.arange(3))[:, :, None], W.shape)
+    column = np.broadcast_to((3 * frame[:, None] + np.arange(3))[:, None, :], W.shape)
+    at = sparse.csr_matrix((W.ravel(), (row.ravel(), column.ravel())), (3 * n, 3 * t))
+    column = np.broadcast_to((2 * which[:, None] + np.arange(2))[:, None, :], (n, 3, 2))
+    place = sparse.csr_matrix((W[:, :, :2].ravel(), (row[:, :, :2].ravel(), column.ravel())), (3 * n, 2 * k))
+    lever = W @ -cross_matrix(np.concatenate([hips[s.side][s.begin:s.end] for s in stands]))  # ω × h = −[h]× ω
+    column = np.broadcast_to((3 * frame[:, None] + np.arange(3))[:, None, :], W.shape)
+    turning = sparse.csr_matrix((lever.ravel(), (row.ravel(), column.ravel())), (3 * n, 3 * t))
     bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(max(t - 2, 0), t)) * (SMOOTH_S * fps) ** 2
-    hold = bend.T @ bend + HOLD * sparse.identity(t)
-    heights = spsolve((at.T @ at + hold).tocsc(), at.T @ misfit[:, 2])
-    A = sparse.hstack([at, -place])
-    N = (A.T @ A + sparse.block_diag([hold, 1e-9 * sparse.identity(k)])).tocsc()
-    plane = np.stack([spsolve(N, A.T @ misfit[:, i]) for i in range(2)], axis=1)
-    return np.column_stack([plane[:t], heights]), np.column_stack([plane[t:], np.zeros(k)])
+    smooth = bend.T @ bend
+    own = (TILT * leg_m) ** 2
+    hold = [sparse.kron(smooth + HOLD * sparse.identity(t), sparse.identity(3)),
+            sparse.kron(own * (smooth + sparse.identity(t)), sparse.identity(3)), 1e-9 * sparse.identity(2 * k)]
+    A = sparse.hstack([at, turning, -place])
+    x = spsolve((A.T @ A + sparse.block_diag(hold)).tocsc(), A.T @ np.einsum("nij,nj->ni", W, misfit).ravel())
+    return x[:3 * t].reshape(t, 3), x[3 * t:6 * t].reshape(t, 3), np.column_stack([x[6 * t:].reshape(k, 2), np.zeros(k)])
 
 
-def ankle_goals(stands: list[Stand], places: np.ndarray, ankles: Mapping[str, np.ndarray], low: Mapping[str, np.ndarray],
-                floor_m: float, blend: float) -> dict[str, np.ndarray]:
-    """Where the ankles shall be (T, 3) by side: pinned in contacts, let go over `blend` frames, and never so low that the sole is in
-    the floor."""
-    goals = {}
-    for side, ankle in ankles.items():
-        time, total, weights = np.arange(len(ankle)), np.zeros_like(ankle), np.zeros(len(ankle))
-        pinned = np.zeros(len(ankle), dtype=bool)
-        for stand, place in zip(stands, places):
-            if stand.side != side:
-                continue
-            off = stand.path_m + place - ankle[stand.begin:stand.end]
-            nearest = np.clip(time, stand.begin, stand.end - 1)
-            weight = fade(np.abs(time - nearest), blend)
-            inside = (time >= stand.begin) & (time < stand.end)
-            weight[pinned] = 0.0
-            total[inside], weights[inside] = 0.0, 0.0
-            pinned |= inside
-            total += weight[:, None] * off[nearest - stand.begin]
-            weights += weight
-        goal = ankle + total / np.maximum(weights, 1.0)[:, None]
-        goal[:, 2] += np.maximum(floor_m - (goal[:, 2] + low[side]), 0.0)
-        goals[side] = goal
-    return goals
+def _say(stand: Stand) -> np.ndarray:
+    """(n, 3, 3): all of a firm foot counts; of a lifted one what changes its distance from the ball, since it can turn."""
+    n = unit(stand.arm_m)
+    along = n[:, :, None] * n[:, None, :]
+    return np.where(stand.lifted[:, None, None], along + GIVE * (np.eye(3) - along), np.eye(3))
+
+
+def plant(leg: Leg, rig: Rig, R: np.ndarray, stand: Stand, place: np.ndarray, ankle: np.ndarray, floor_m: float, blend: float
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Ankle (n, 3), and R (n, B, 3, 3) with foot and toes turned, in a contact; `ankle` (T, 3): where the leg has it.  (2)"""
+    own, foot = R[stand.begin:stand.end].copy(), leg.foot[0]
+    pinned, free = stand.path_m + place, ankle[stand.begin:stand.end]
+    if not stand.lifted.any():
+        return pinned, own
+    firm = np.flatnonzero(~stand.lifted)
+    if len(firm):  # what a flat foot lacked is let go while the heel lifts
+        time = np.arange(len(own))
+        nearest = firm[np.abs(time[:, None] - firm).argmin(axis=1)]
+        free = free + fade(np.abs(time - nearest), blend)[:, None] * (pinned - free)[nearest]
+    arm = _arm(leg, rig, own)
+    ball, length = pinned + arm, float(np.linalg.norm(arm[0]))
+    for _ in range(3):
+        goal = ball + length * unit(free - ball)  # (2)
+        own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
+        ball[stand.lifted, 2] += (floor_m - goal[:, 2] - lowest(leg, rig, own))[stand.lifted]
+    if leg.toe:
+        ball = _over_the_tip(leg, rig, own, ball, free, length)
+    goal = ball + length * unit(free - ball)
+    own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
+    return goal, own
+
+
+def _over_the_tip(leg: Leg, rig: Rig, own: np.ndarray, ball: np.ndarray, free: np.ndarray, length: float) -> np.ndarray:
+    """The ball (n, 3), raised about the tip of the toes where the foot is too short to reach the ankle; turns the toes in `own`.
+
+    It goes forward thereby, by no more than ROLL_M.
+    """
+    toe = leg.toe[0]
+    back = -own[:, toe] @ (rig.R_rest[toe].T @ (leg.end_m - rig.head_m[toe]))
+    lack = np.linalg.norm(free - ball, axis=1) - length
+    size, toward = np.linalg.norm(back, axis=1), unit(free - ball)
+    axis = unit(np.cross(back, np.broadcast_to((0.0, 0.0, 1.0), back.shape)))
+    lift = np.sum(np.cross(axis, back) * toward, axis=1)  # how far the ball comes nearer per radian
+    steep = np.arctan2(back[:, 2], np.linalg.norm(back[:, :2], axis=1))
+    most = np.maximum(np.arccos(np.clip(np.cos(steep) - ROLL_M / np.maximum(size, ROLL_M), -1.0, 1.0)) - np.maximum(steep, 0.0), 0.0)
+    angle = np.clip(lack / np.maximum(lift, 0.1 * size), 0.0, most) * np.clip(5.0 * lift / size - 0.5, 0.0, 1.0)
+    turn = about(axis, angle)
+    own[:, toe] = turn @ own[:, toe]
+    return ball - back + rotate(turn, back)
+
+
+def step_over(leg: Leg, rig: Rig, R: np.ndarray, ankle: np.ndarray, floor_m: float, swinging: np.ndarray) -> np.ndarray:
+    """R with a swinging foot held more level where it would go through the floor, by no more than it takes."""
+    R, foot = R.copy(), leg.foot[0]
+    some = np.flatnonzero(swinging & (ankle[:, 2] + lowest(leg, rig, R) < floor_m))
+    if not len(some):
+        return R
+    base, up = R[some], (R[some, foot] @ rig.R_rest[foot].T)[:, :, 2]
+    turn = vector_from_matrix(shortest(up, np.array([0.0, 0.0, 1.0])))
+    little, much = np.zeros(len(some)), np.ones(len(some))
+    for _ in range(12):
+        part = (little + much) / 2
+        tried = _turned(base, (*leg.foot, *leg.toe), turn * part[:, None])
+        clear = ankle[some, 2] + lowest(leg, rig, tried) >= floor_m
+        little, much = np.where(clear, little, part), np.where(clear, part, much)
+    R[some] = _turned(base, (*leg.foot, *leg.toe), turn * much[:, None])
+    return R
+
+
+def _turned(R: np.ndarray, bones: tuple[int, ...], vector: np.ndarray) -> np.ndarray:
+    R, turn = R.copy(), matrix_from_vector(vector)
+    for bone in bones:
+        R[:, bone] = turn @ R[:, bone]
+    return R
+
+
+def ankle_goals(leg: Leg, rig: Rig, R: np.ndarray, stands: list[Stand], places: np.ndarray, ankle: np.ndarray, floor_m: float,
+                blend: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the ankle shall be (T, 3), and R with the foot turned: planted in contacts, let go over `blend` frames, and never so low
+    that the sole is in the floor. `ankle` (T, 3): where the leg has it."""
+    time, moving = np.arange(len(ankle)), (*leg.foot, *leg.toe)
+    off, turn, weight = np.zeros_like(ankle), np.zeros((len(ankle), len(moving), 3)), np.zeros(len(ankle))
+    for stand, place in zip(stands, places):
+        if stand.side != leg.side:
+            continue
+        goal, own = plant(leg, rig, R, stand, place, ankle, floor_m, blend / 2)
+        nearest = np.clip(time, stand.begin, stand.end - 1)
+        near = fade(np.abs(time - nearest), blend)
+        closer, there = near > weight, nearest - stand.begin
+        turned = vector_from_matrix((own @ np.swapaxes(R[stand.begin:stand.end], 2, 3))[:, moving])
+        off[closer] = (near[:, None] * (goal - ankle[stand.begin:stand.end])[there])[closer]
+        turn[closer] = (near[:, None, None] * turned[there])[closer]
+        weight = np.maximum(weight, near)
+    R, goal = R.copy(), ankle + off
+    R[:, moving] = matrix_from_vector(turn) @ R[:, moving]
+    R = step_over(leg, rig, R, goal, floor_m, weight < 1.0)
+    goal[:, 2] += np.maximum(floor_m - goal[:, 2] - lowest(leg, rig, R), 0.0)
+    return goal, R
 
 
 def bend_leg(leg: Leg, rig: Rig, R: np.ndarray, hip_m: np.ndarray, goal_m: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """R with thigh and shin turned so that the ankle is at goal (T, 3), the hip staying at (T, 3).  (2)
+    """R with thigh and shin turned so that the ankle is at goal (T, 3), the hip staying at (T, 3).  (3)
 
     `forward` (T, 3): where a straight knee would bend to. A goal out of reach is approached as far as the leg is long.
     """
@@ -223,7 +342,7 @@ def bend_leg(leg: Leg, rig: Rig, R: np.ndarray, hip_m: np.ndarray, goal_m: np.nd
     pole = rotate(shortest(before, along), unit(out + lack[:, None] * unit(ahead)))
     x = (l1**2 - l2**2 + d**2) / (2 * d)
     y = np.sqrt(np.maximum(l1**2 - x**2, 0.0))
-    knee = along * x[:, None] + pole * y[:, None]  # (2)
+    knee = along * x[:, None] + pole * y[:, None]  # (3)
     moved = np.linalg.norm(goal_m - hip_m - now, axis=1) > 1e-9
     for bones, old, new in ((leg.thigh, upper, knee), (leg.shin, lower, along * d[:, None] - knee)):
         turn = shortest(old, new)

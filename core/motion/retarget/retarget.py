@@ -17,6 +17,7 @@ from .mapping import RigMap
 from .rig import Motion, Rig, channels, head_of
 from .roles import SIDES, sided
 from .transfer import alignments, body_axes, follow, share_twist, turn
+from .turns import matrix_from_vector
 
 SHORTEST_LIMB_M = 1e-4
 
@@ -158,16 +159,30 @@ def _grounded(source: Motion, source_map: RigMap, target: Rig, target_map: RigMa
     pinning = contacts is not None and settings.mode != "off" and bool(legs)
     if pinning and contacts is not None:
         R = follow(target, feet.lock_flat(R, legs, contacts, target, settings, source.fps), driven)
-    still = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=_heads(target, R, carrier, shift))
-    shift = _travel(source, source_map, target, target_map, contacts, scale, legs, floor_m) - hip_centre(still, target_map)
+    middle = hip_centre(Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=_heads(target, R, carrier, shift)), target_map)
+    path = _travel(source, source_map, target, target_map, contacts, scale, legs, floor_m)
+    shift = path - middle
     if not pinning or contacts is None:
         return R, shift
-    heads = still.head_m + shift[:, None]
-    ankles = {side: heads[:, leg.foot[0]] for side, leg in legs.items()}
+    heads = _heads(target, R, carrier, shift)
     stands = feet.find_stands(legs, contacts, target, R, floor_m)
-    correction, places = feet.carry_root(stands, ankles, source.fps)
-    return _pinned(target, target_map, R, driven, heads + correction[:, None], legs, stands, places,
-                   floor_m, settings.blend_s * source.fps), shift + correction
+    moved, tilt, places = feet.carry_root(
+        stands, {side: heads[:, leg.foot[0]] for side, leg in legs.items()}, {s: heads[:, leg.thigh[0]] - path for s, leg in legs.items()},
+        {side: feet.stiffness(leg, target, R) for side, leg in legs.items()}, source.fps, _leg_m(target, target_map))
+    R, shift = _tilted(target, target_map, R, driven, carrier, shift, tilt, path + moved)
+    return _pinned(target, target_map, R, driven, _heads(target, R, carrier, shift), legs, stands, places, floor_m,
+                   settings.blend_s * source.fps), shift
+
+
+def _tilted(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, carrier: int, shift: np.ndarray, tilt: np.ndarray,
+            middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The hips turned by the Rodrigues vectors `tilt` (T, 3), the middle between the hip joints being at `middle` (T, 3)."""
+    R = R.copy()
+    for name in target_map.bones["hips"]:
+        R[:, target.index[name]] = matrix_from_vector(tilt) @ R[:, target.index[name]]
+    R = follow(target, R, driven)
+    now = Motion(rig=target, fps=1.0, frames=np.arange(len(R)), R=R, head_m=_heads(target, R, carrier, shift))
+    return R, shift + middle - hip_centre(now, target_map)
 
 
 def _travel(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, contacts: Contacts | None, scale: float,
@@ -185,14 +200,12 @@ def _travel(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap,
 def _pinned(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, heads: np.ndarray, legs: Mapping[str, feet.Leg],
             stands: list[feet.Stand], places: np.ndarray, floor_m: float, blend: float) -> np.ndarray:
     """R with the legs bent so that standing feet stand."""
-    ankles = {side: heads[:, leg.foot[0]] for side, leg in legs.items()}
-    low = {side: feet.lowest(leg, target, R) for side, leg in legs.items()}
-    goals = feet.ankle_goals(stands, places, ankles, low, floor_m, blend)
     front = -body_axes(target, target_map)[:, 1]
-    for side, leg in legs.items():
+    for leg in legs.values():
         thigh = leg.thigh[0]
+        goal, R = feet.ankle_goals(leg, target, R, stands, places, heads[:, leg.foot[0]], floor_m, blend)
         forward = R[:, thigh] @ (target.R_rest[thigh].T @ front)
-        R = feet.bend_leg(leg, target, R, heads[:, thigh], goals[side], forward)
+        R = feet.bend_leg(leg, target, R, heads[:, thigh], goal, forward)
     return follow(target, R, driven)
 
 
