@@ -161,7 +161,6 @@ class _Templates:
         self.f = f / np.maximum(self.contrast, 1e-6)[:, None]
         self.fx, self.fy = fx, fy
         self.q = self._project(self.f)  # Jᵀ f̂
-        self.ones = np.concatenate([fx @ self._monomials, fy @ self._monomials], axis=1)  # Jᵀ 1
         H = self._normal_matrix()
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
         eye = np.eye(6) * MIN_CONDITION
@@ -188,7 +187,7 @@ class _Templates:
         moment = (energy @ uv / total).astype(np.float64)
         return moment[:, :2], moment[:, 2:] - moment[:, :2] ** 2
 
-    def _project(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+    def _project(self, g: np.ndarray | np.float32, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Jᵀ g (m, 6)."""
         return np.concatenate([(self.fx[rows] * g) @ self._monomials, (self.fy[rows] * g) @ self._monomials], axis=1)
 
@@ -198,8 +197,8 @@ class _Templates:
         second = (m[:, :, None] * m[:, None, :]).reshape(self.n_pixels, 9)
         xx, xy, yy = ((a * b @ second).reshape(-1, 3, 3) for a, b in ((self.fx, self.fx), (self.fx, self.fy), (self.fy, self.fy)))
         H = np.concatenate([np.concatenate([xx, xy], 2), np.concatenate([xy, yy], 2)], 1).astype(np.float64)
-        ones, q = self.ones.astype(np.float64), self.q.astype(np.float64)
-        return H - ones[:, :, None] * ones[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
+        mean, q = self._project(np.float32(1.0)).astype(np.float64), self.q.astype(np.float64)
+        return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
     def find(self, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
         """Iterate (2) and (3) for all patches, then judge them."""
@@ -225,11 +224,11 @@ class _Templates:
 
     def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
         g = image.sample_patches(c, A, self._pixels)
-        mean = g.mean(axis=1)
-        power = np.maximum(np.einsum("ij,ij->i", g, g) - self.n_pixels * mean**2, 1e-6)  # |g̃|²
-        along = np.einsum("ij,ij->i", g, self.f[rows])  # f̂ is free of its mean, so g need not be
+        g -= g.mean(axis=1, keepdims=True)
+        power = np.maximum(np.einsum("ij,ij->i", g, g), 1e-6)
+        along = np.einsum("ij,ij->i", g, self.f[rows])
         gain = self.contrast[rows] * along / power  # r1
-        rhs = (self._project(g, rows) - self.ones[rows] * mean[:, None] - self.q[rows] * along[:, None]) * gain[:, None]
+        rhs = (self._project(g, rows) - self.q[rows] * along[:, None]) * gain[:, None]
         return np.einsum("nij,nj->ni", self.inverse[rows], rhs.astype(np.float64)), along / np.sqrt(power)  # (2)
 
     def _sigma(self, rho: np.ndarray, rows: np.ndarray) -> np.ndarray:
