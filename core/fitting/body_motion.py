@@ -16,7 +16,7 @@ class BodyMotion:
     """T frames of D DOFs and J joints.
 
     status: "fitted"; "partial": a limb had too few points and rests on prediction; "bridged": no points, the whole posture is predicted;
-    "suspect": the residuals are far larger than in the other frames.
+    "suspect": the residuals are far larger, or the points far fewer, than in the other frames.
     """
 
     frames: np.ndarray  # (T,) the take's frame numbers

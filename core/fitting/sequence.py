@@ -39,6 +39,7 @@ from .state import BodyState, ShapeParameters
 __all__ = ["BodyFit", "BodyMotion", "FitSettings", "fit_sequence"]
 
 SUSPICIOUS = 3.0  # times the usual sigma0
+FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
 def fit_sequence(rig: Rig, model_name: str, clouds: Sequence[Cloud], joints: Mapping[str, Mapping[str, Sequence[float]]],
@@ -142,5 +143,7 @@ def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[
     with_balls = np.unique(fit.parameters.template.metaballs.bone_index)
     enough = counts[:, with_balls] >= fit.settings.min_points
     usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
-    return tuple(BRIDGED if not e.any() else SUSPECT if s > SUSPICIOUS * usual else FITTED if e.all() else PARTIAL
-                 for e, s in zip(enough, sigma0))
+    total = counts.sum(axis=1)
+    few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))
+    strange = few | (np.nan_to_num(sigma0) > SUSPICIOUS * usual)
+    return tuple(BRIDGED if not e.any() else PARTIAL if not e.all() else SUSPECT if s else FITTED for e, s in zip(enough, strange))
