@@ -42,12 +42,16 @@ def write_report(
     monitor: Monitor,
 ) -> None:
     """Write the page and its pictures. Cancelling leaves the report of the run before."""
-    files = _pictures(footage, account, clouds, trajectories, body, monitor)
-    graphs = _graphs(clouds, trajectories, body)
-    page = _page(account, files, graphs)
+    shown = _pictures(footage, account, clouds, trajectories, body, monitor)
+    files: dict[str, tuple[str, bytes, bytes]] = {}
+    for done, (name, (caption, picture)) in enumerate(shown.items()):
+        monitor.step("report", len(shown) + done, 2 * len(shown))
+        files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
+    page = _page(account, {name: (caption, small) for name, (caption, _, small) in files.items()}, _graphs(clouds, trajectories, body))
+    monitor.step("report", 1, 1)
     results.remove("report")
-    for name, (_, picture) in files.items():
-        store.write_bytes(results.path("report", name), pictures.png(picture))
+    for name, (_, data, _) in files.items():
+        store.write_bytes(results.path("report", name), data)
     store.write_text(results.path("report", "report.html"), page)
 
 
@@ -60,35 +64,33 @@ def _pictures(
     monitor: Monitor,
 ) -> dict[str, tuple[str, np.ndarray]]:
     """File name → (caption, picture), for the first, a middle and the last frame."""
-    ref, found = footage.take.reference, {}
+    ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
-    chosen = sorted({0, len(clouds) // 2, len(clouds) - 1})
     skin = SkinSettings(**account["settings"]["skin"])
-    for done, i in enumerate(chosen):
-        monitor.step("report", done, len(chosen))
+    found: dict[str, tuple[str, np.ndarray]] = {}
+    chosen = sorted({0, len(clouds) // 2, len(clouds) - 1})
+    total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
+
+    def add(name: str, caption: str, picture: np.ndarray) -> None:
+        found[name] = (caption, picture)
+        monitor.step("report", len(found), total)
+
+    for i in chosen:
         cloud = clouds[i]
-        images = footage.read(cloud.frame)
-        sigma = 1e3 * cloud.sigma_m
+        images, sigma, frame = footage.read(cloud.frame), 1e3 * cloud.sigma_m, cloud.frame
         high = float(np.percentile(sigma, 95)) if len(sigma) else 1.0
-        found[f"surface_{cloud.frame:04d}.png"] = (
-            f"Frame {cloud.frame}, view {view}: {len(sigma)} measured points, sigma from 0 (blue) to {high:.2f} mm (red)",
-            pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high),
-        )
-        found[f"cloud_{cloud.frame:04d}.png"] = (
-            f"Frame {cloud.frame}: the cloud from the front and from its right side",
-            pictures.cloud_views(cloud, camera, account["settings"]["growing"]["spacing_px"]),
-        )
+        measured = f"{len(sigma)} measured points, sigma from 0 (blue) to {high:.2f} mm (red)"
+        on_image = pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high)
+        add(f"surface_{frame:04d}.png", f"Frame {frame}, view {view}: {measured}", on_image)
+        from_sides = pictures.cloud_views(cloud, camera, account["settings"]["growing"]["spacing_px"])
+        add(f"cloud_{frame:04d}.png", f"Frame {frame}: the cloud from the front and from its right side", from_sides)
         if trajectories is not None:
-            found[f"tracks_{cloud.frame:04d}.png"] = (
-                f"Frame {cloud.frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast",
-                pictures.tracks_over_footage(images[ref], camera, trajectories, i),
-            )
-        if body is not None:
-            for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
-                found[f"body_{cloud.frame:04d}_{name}.png"] = (
-                    f"Frame {cloud.frame}, view {name}: the fitted body",
-                    pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin),
-                )
+            caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
+            add(f"tracks_{frame:04d}.png", caption, pictures.tracks_over_footage(images[ref], camera, trajectories, i))
+        for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
+            if body is not None:
+                picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin)
+                add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body", picture)
     return found
 
 
@@ -113,13 +115,13 @@ def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, bod
     return graphs
 
 
-def _page(account: Mapping[str, Any], files: Mapping[str, tuple[str, np.ndarray]], graphs: Sequence[str]) -> str:
+def _page(account: Mapping[str, Any], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
     notes = "".join(f'<p class="note">{html.escape(w)}</p>' for w in account["warnings"])
     stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in account["stages"].items())
     shown = "".join(
-        f'<figure><img alt="" src="data:image/jpeg;base64,{base64.b64encode(pictures.jpeg(picture)).decode()}">'
+        f'<figure><img alt="" src="data:image/jpeg;base64,{base64.b64encode(small).decode()}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-        for caption, picture in files.values()
+        for caption, small in files.values()
     )
     settings = html.escape(
         "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in account["settings"].items())
