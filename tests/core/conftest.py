@@ -1,16 +1,24 @@
 """Small scenes with exact truth: an analytic texture on a plane or a cylinder, seen by cameras along exact rays."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from tricap.core import pipeline
+from tricap.core.following import track_frames
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
+from tricap.core.measuring import MeasuredFrame, measure_frames
+from tricap.core.progress import Monitor
+from tricap.core.results import Results
+from tricap.core.take import open_take, read_take
+from tricap.core.tracking.step import TrackedFrame
 
 WIDTH, HEIGHT, FOCAL_PX, DEPTH_M = 200, 150, 600.0, 2.16  # 3.6 mm a pixel
 
@@ -113,6 +121,23 @@ def write_take_toml(folder: Path, views: Sequence[str], *, more: str = "", inter
     (folder / "take.toml").write_text(text, encoding="utf-8")
 
 
+def measure(folder: Path, out: Path, overrides: Mapping[str, Any] | None = None, monitor: Monitor | None = None) -> list[MeasuredFrame]:
+    """The measured surface of a take, in the order of time; checkpoints lie in `out`."""
+    footage = open_take(read_take(folder))
+    s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
+    done = measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(out), monitor or Monitor())
+    return sorted(done, key=lambda m: m.frame)
+
+
+def track(
+    folder: Path, out: Path, measured: Sequence[MeasuredFrame], overrides: Mapping[str, Any] | None = None, monitor: Monitor | None = None
+) -> list[TrackedFrame]:
+    """The tracked points of a take that was measured."""
+    footage = open_take(read_take(folder))
+    s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
+    return list(track_frames(footage, measured, s["matching"], s["tracking"], Results(out), monitor or Monitor()))
+
+
 @dataclass(frozen=True)
 class Scenes:
     """The tools of this file, for tests."""
@@ -124,6 +149,8 @@ class Scenes:
     render: Callable[..., np.ndarray] = staticmethod(render)
     write_take: Callable[..., Path] = staticmethod(write_take)
     write_take_toml: Callable[..., None] = staticmethod(write_take_toml)
+    measure: Callable[..., list[MeasuredFrame]] = staticmethod(measure)
+    track: Callable[..., list[TrackedFrame]] = staticmethod(track)
 
 
 @pytest.fixture(scope="session")
