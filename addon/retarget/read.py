@@ -11,11 +11,9 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.rig import Motion, Rig
-from ...core.motion.retarget.turns import matrix_from_euler
 from ...core.progress import Monitor
 
 UNIFORM = 1e-3  # scales along the axes may differ by this part
-FEW_BONES = 3
 
 
 def read_rig(armature_object: bpy.types.Object) -> Rig:
@@ -105,7 +103,9 @@ def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> 
     """The rig with the points under its feet, from the skins that it moves: where they would touch a floor tilted this way and that."""
     wanted = [name for side in "LR" for part in ("foot", "toe") for name in rig_map.bones.get(f"{part}.{side}", ())]
     points: dict[str, list[np.ndarray]] = {}
-    for skin in [o for o in bpy.data.objects if o.type == "MESH" and armature_object in (m.object for m in o.modifiers if m.type == "ARMATURE")]:
+    for skin in [o for o in bpy.data.objects if o.type == "MESH"]:
+        if armature_object not in (modifier.object for modifier in skin.modifiers if modifier.type == "ARMATURE"):
+            continue
         groups = {group.index: group.name for group in skin.vertex_groups if group.name in wanted}
         if not groups:
             continue
@@ -170,8 +170,3 @@ def action_frames(armature_object: bpy.types.Object) -> range:
         return range(scene.frame_start, scene.frame_end + 1)
     first, last = data.action.frame_range
     return range(int(np.ceil(first - 1e-4)), int(np.floor(last + 1e-4)) + 1)
-
-
-def euler_rest(pose_bone: bpy.types.PoseBone) -> np.ndarray:
-    """The rotation (3, 3) of a pose bone's Euler channels, for those who need it without the depsgraph."""
-    return matrix_from_euler(np.array(pose_bone.rotation_euler), pose_bone.rotation_mode)

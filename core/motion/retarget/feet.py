@@ -5,11 +5,11 @@ c(t) of the root and a place X_k for every contact k, from
 
     Σ |r(t) + c(t) + ω(t) × h_f(t) + o_f(t) − X_k − s_f(t)|²  +  τ⁴ Σ |c̈(t)|²  +  μ Σ |c(t)|²  +  the like of ω   →  min      (1)
 
-with r the root, ω a small turn of the hips, h_f a hip joint, o_f the ankle seen from the root, and s_f how the ankle moves about the standing ball of the foot while the heel lifts. Heights
-are given: the lowest point of the sole is on the floor. The norm counts angles: a displacement e of the ankle turns a leg of length d by
-e/d across it, but along it, with the knee bent by φ, each of its two bones by e·d/(2 l₁ l₂ sin φ)                (4). Of a foot whose heel
-is lifted only the distance from the ball counts, since it can turn: its ankle goes to the point next to where the leg has it on the
-sphere about the standing ball,
+with r the root, ω a small turn of the hips, h_f a hip joint, o_f the ankle seen from the root, and s_f how the ankle moves about the
+standing ball of the foot while the heel lifts. Heights are given: the lowest point of the sole is on the floor. The norm counts angles:
+a displacement e of the ankle turns a leg of length d by e/d across it, but along it, with the knee bent by φ, each of its two bones
+by e·d/(2 l₁ l₂ sin φ)  (4). Of a foot whose heel is lifted mostly the distance from the ball counts, since it can turn: its ankle goes to
+the point next to where the leg has it on the sphere about the standing ball,
 
     a' = B + |a − B|_rest · unit(a − B)                                                                          (2)
 
@@ -36,6 +36,7 @@ HOLD = 1e-5  # μ: where nothing stands the path stays as it was
 GIVE = 0.4  # how much counts what a lifted foot can yield to by turning
 TILT = 0.2  # a turn of the hips counts as much less than one of a leg
 BENT = np.radians(8.0)  # a knee is taken to be bent at least as much in (4)
+NEAR = 0.8  # an ankle nearer to the ball than this part of the foot does not tell the foot's direction
 ROLL_M = 0.004  # the ball of a foot that rolls over its toes goes forward by at most this
 REACH = 0.9995  # a leg is not stretched beyond this part of its length
 STRAIGHT = 0.005  # a knee that is out of the line by less of the thigh's length bends forwards
@@ -244,14 +245,20 @@ def plant(leg: Leg, rig: Rig, R: np.ndarray, stand: Stand, place: np.ndarray, an
     arm = _arm(leg, rig, own)
     ball, length = pinned + arm, float(np.linalg.norm(arm[0]))
     for _ in range(3):
-        goal = ball + length * unit(free - ball)  # (2)
+        goal = ball + length * _away(ball, free, arm)  # (2)
         own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
         ball[stand.lifted, 2] += (floor_m - goal[:, 2] - lowest(leg, rig, own))[stand.lifted]
     if leg.toe:
         ball = _over_the_tip(leg, rig, own, ball, free, length)
-    goal = ball + length * unit(free - ball)
+    goal = ball + length * _away(ball, free, arm)
     own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
     return goal, own
+
+
+def _away(ball: np.ndarray, free: np.ndarray, arm: np.ndarray) -> np.ndarray:
+    """From the ball towards the ankle (n, 3), unit vectors; if that is too near the ball to tell, as the foot was."""
+    lack = np.maximum(NEAR * np.linalg.norm(arm, axis=1) - np.linalg.norm(free - ball, axis=1), 0.0)
+    return unit(free - ball - lack[:, None] * unit(arm))
 
 
 def _over_the_tip(leg: Leg, rig: Rig, own: np.ndarray, ball: np.ndarray, free: np.ndarray, length: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from ...settings import knob
 from . import feet
 from .contacts import Contacts, FeetSettings, find_contacts
 from .mapping import RigMap
+from .rest import with_person_like_rest
 from .rig import Motion, Rig, channels, head_of
 from .roles import SIDES, sided
 from .transfer import alignments, body_axes, follow, share_twist, turn
@@ -57,6 +58,7 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     """
     settings, feet_settings, monitor = settings or RetargetSettings(), feet_settings or FeetSettings(), monitor or Monitor()
     monitor.step("retargeting", 0, 4)
+    source, rest_note = with_person_like_rest(source, source_map)
     aligned = alignments(source.rig, source_map, target, target_map)
     if not aligned:
         raise InputError("Source and target have no part of the body in common; check the two mappings.")
@@ -78,9 +80,10 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
         shift = shift - (shift - shift[0]) * (1.0, 1.0, 0.0)
     head = _heads(target, R, carrier, shift)
     moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
+    notes = (*filter(None, [rest_note]), *_notes(source_map, target_map, carrier))
     monitor.step("retargeting", 4, 4)
     return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, driven=driven, scale=scale,
-                      roles=tuple(aligned), contacts=contacts, notes=_notes(source_map, target_map, carrier))
+                      roles=tuple(aligned), contacts=contacts, notes=notes)
 
 
 def _notes(source_map: RigMap, target_map: RigMap, carrier: int) -> tuple[str, ...]:
