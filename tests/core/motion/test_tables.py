@@ -51,7 +51,8 @@ def test_joints_come_back_by_name_and_frame(tmp_path: Path) -> None:
     assert np.allclose(table.sigma_m["elbow.R"], 0.002)
 
 
-@pytest.mark.parametrize(("text", "word"), [("", "empty"), ("frame,time_s\n0,0\n", "no column"), ("frame,time_s,shoulder.R x\n0,0\n", "values")])
+@pytest.mark.parametrize(("text", "word"), [("", "empty"), ("frame,time_s\n0,0\n", "no column"),
+                                            ("frame,time_s,shoulder.R x\n0,0\n", "values")])
 def test_faulty_tables_are_refused_in_a_sentence(tmp_path: Path, text: str, word: str) -> None:
     (tmp_path / "motion.csv").write_text(text)
     with pytest.raises(InputError, match=word):
