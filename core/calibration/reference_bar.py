@@ -5,7 +5,7 @@ two steps away) and of a common distortion κ are evaluated (`epipolar`); the be
 best few are adjusted shortly with f, k1 and the poses free, and the one with the smallest robust sum of squares wins.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ BARS_PER_PAIR, BARS_PER_TRIAL = 60, 120
 CANDIDATES = 4
 MIN_BARS_PER_PAIR = 6
 COARSE_CAUCHY_PX = 3.0
+GATE = 4.0  # an image point further off than this many of these widths takes no part
 TILT = np.tan(np.radians(25))
 
 Guesses = dict[tuple[int, int, int], tuple[float, np.ndarray, np.ndarray]]  # (κ, f_i, f_j) by index: score, R, t
@@ -211,9 +212,11 @@ def _chained(observations: BarObservations, tree: list[Pair], guesses: dict[tupl
 def _trial(observations: BarObservations, tree: list[Pair], network: Network) -> Adjusted:
     """A short robust adjustment of f, k1 and the poses on bars that the pairs of the tree agree on."""
     part = trial_part(observations, tree)
-    network, used = with_bars(network, part, 4 * COARSE_CAUCHY_PX)
+    network, used = with_bars(network, part, GATE * COARSE_CAUCHY_PX)
     knowledge = lens_knowledge(part.size_px, network.interior[:, 0]).only("f", "k1")
-    return adjust(network, part.xy_px, used, knowledge, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3, max_iterations=12, tolerance=1e-2)
+    done = adjust(network, part.xy_px, used, knowledge, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3, max_iterations=12, tolerance=1e-2)
+    left_out = int(part.seen.sum() - used.sum())  # what does not fit must not make a start look better
+    return replace(done, cost=done.cost + left_out * COARSE_CAUCHY_PX**2 * float(np.log1p(GATE**2)))
 
 
 def trial_part(observations: BarObservations, tree: list[Pair]) -> BarObservations:
