@@ -4,17 +4,25 @@ BARDIR holds a folder of images or a movie per camera; their names are the camer
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from . import store
+from .calibration import account, verdict
 from .calibration.observations import BarObservations
+from .calibration.pictures import pictures
+from .calibration.quality import Quality, assess
+from .calibration.self_calibration import Calibration, calibrate
 from .calibration.target_tracks import BarTrack, track_bar
 from .calibration.targets import Targets, find_targets
+from .calibration.world_frame import WorldFrame, frame_of_cameras, frame_on_floor
 from .errors import InputError
+from .geometry.rig import Rig
 from .images.fields import row_grid
-from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence
+from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence, read_image
 from .progress import Monitor
 
 MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
@@ -47,8 +55,8 @@ class MeasuredBar:
     observations: BarObservations
 
 
-def open_bar(folder: Path, interlaced: str = "none") -> BarFootage:
-    """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
+def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None) -> BarFootage:
+    """Open the sequences in BARDIR: one folder of images, or one movie, per camera. `mask` is an image, black where no target can be.
 
     Raises:
         InputError: the folder is missing, holds fewer than two views, or views of different length.
@@ -78,7 +86,8 @@ def open_bar(folder: Path, interlaced: str = "none") -> BarFootage:
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"The views in {folder} have different numbers of frames ({said}); trim them to the same instants.")
-    return BarFootage(folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced)
+    shown = None if mask is None else read_image(mask) > 0
+    return BarFootage(folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, mask=shown)
 
 
 def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor) -> MeasuredBar:
@@ -102,6 +111,8 @@ def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor) -> Measu
             if n and image.shape[::-1] != size:
                 raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
             size = (image.shape[1], image.shape[0])
+            if footage.mask is not None and footage.mask.shape != image.shape:
+                raise InputError(f"The mask has {footage.mask.shape[1]}×{footage.mask.shape[0]} pixels, view {name} {size[0]}×{size[1]}.")
             targets = find_targets(rows.rows(image), None if footage.mask is None else rows.rows(footage.mask))
             found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
         monitor.step(f"targets {name}", footage.count, footage.count)
@@ -150,3 +161,85 @@ def _check_positions(footage: BarFootage, observations: BarObservations) -> None
             f"Only {shared} bar positions in {footage.folder} are seen whole by two cameras; at least {MIN_POSITIONS} are needed "
             "and 100 or more are good: wave the bar longer, through the whole volume."
         )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CalibratedRig:
+    """The cameras and all that is known of their quality."""
+
+    rig: Rig
+    calibration: Calibration
+    quality: Quality
+    verdict: verdict.Verdict
+
+
+def calibrate_rig(
+    observations: BarObservations, monitor: Monitor, *, focal_px: float | None = None, floor_frames: tuple[int, ...] = ()
+) -> CalibratedRig:
+    """Calibrate from what was seen of the bar, judge the result, and put it into the world's frame.
+
+    `floor_frames` are frames in which the bar lies on the floor; without them up is where the cameras' tops are.
+
+    Raises:
+        InputError: the data cannot determine the rig; the sentence says what is missing.
+    """
+    calibration = calibrate(observations, monitor, focal_px)
+    verdict.refuse_if_useless(calibration)
+    calibration = in_world(calibration, floor_frames)
+    quality = assess(calibration, monitor)
+    verdict.refuse_if_undetermined(calibration, quality)
+    judged = verdict.judge(calibration, quality)
+    metadata = {
+        "unit": "m",
+        "sigma0_px": calibration.sigma0_px,
+        "bar_length_m": observations.length_m,
+        "positions": verdict.positions_used(calibration),
+        "predicted_error_m": quality.predicted.rms_m,
+        "held_out_length_rms_m": quality.held_out.rms_m,
+        "verdict": judged.sentence,
+    }
+    cameras = calibration.network.cameras(observations.names, observations.size_px)
+    return CalibratedRig(rig=Rig(cameras=cameras, metadata=metadata), calibration=calibration, quality=quality, verdict=judged)
+
+
+def in_world(calibration: Calibration, floor_frames: tuple[int, ...]) -> Calibration:
+    """The calibration turned and shifted into the world's frame. Its covariance stays: the cameras' unknowns are in their own frames.
+
+    Raises:
+        InputError: the floor frames do not show the bar, or make no plane.
+    """
+    observations, network = calibration.observations, calibration.network
+    cameras = network.cameras(observations.names, observations.size_px)
+    known = (calibration.used.sum(axis=1) >= 2).all(axis=1)
+    frame: WorldFrame
+    if floor_frames:
+        unseen = [f for f in floor_frames if f not in set(observations.frames[known].tolist())]
+        if unseen:
+            raise InputError(
+                f"Frame {unseen[0]}, in which the bar is said to lie on the floor, does not show both of its ends; choose another."
+            )
+        frame = frame_on_floor(network.ends_m[np.isin(observations.frames, floor_frames)].reshape(-1, 3), cameras)
+    else:
+        frame = frame_of_cameras(cameras, network.ends_m[known])
+    moved = network.with_cameras([frame.camera(c) for c in cameras])
+    moved = replace(moved, middle=frame.points(network.middle), direction=network.direction @ frame.R.T)
+    return replace(calibration, network=moved)
+
+
+def write_report(folder: Path, result: CalibratedRig) -> list[Path]:
+    """Write calibration.txt, calibration.json and the pictures; their paths.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    calibration, quality, judged = result.calibration, result.quality, result.verdict
+    folder = Path(folder)
+    paths = [folder / "calibration.txt", folder / "calibration.json"]
+    store.write_text(paths[0], account.page(calibration, quality, judged))
+    store.write_json(paths[1], account.figures(calibration, quality, judged))
+    for name, picture in pictures(calibration, quality).items():
+        ok, data = cv2.imencode(".png", picture)
+        if ok:
+            store.write_bytes(folder / name, data.tobytes())
+            paths.append(folder / name)
+    return paths

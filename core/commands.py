@@ -18,7 +18,7 @@ from typing import Any
 
 import cv2
 
-from . import pipeline, store
+from . import calibrate_command, pipeline, store
 from .errors import InputError
 from .geometry.rig import read_rig
 from .progress import Cancelled, Monitor
@@ -63,7 +63,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
     demo.set_defaults(run=_demo, json=False)
-    for add in adders:
+    for add in (calibrate_command.add_command, *adders):
         add(commands)
     for sub in commands.choices.values():
         sub.add_argument("--quiet", action="store_true", help="say nothing but errors")

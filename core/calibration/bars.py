@@ -1,7 +1,7 @@
 """Where the bar was, as seen by cameras that are known roughly: intersection that survives wrong rays, and which end is which.
 
-    Σ (I − d dᵀ)(X − C) = 0                                                    (1)   where the rays of an end pass each other closest
-    end in two cameras, the same or the other: Sampson's distance, and | |A − B| / L − 1 |   (2)   truncated, summed over pairs of cameras
+Σ (I − d dᵀ)(X − C) = 0                                                    (1)   where the rays of an end pass each other closest
+end in two cameras, the same or the other: Sampson's distance, and | |A − B| / L − 1 |   (2)   truncated, summed over pairs of cameras
 """
 
 from dataclasses import replace

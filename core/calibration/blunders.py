@@ -1,7 +1,7 @@
 """Redundancy of every image coordinate, for Baarda's test (Baarda 1968: data snooping).
 
-    q_vv = 1 − a Q_c aᵀ − b U⁻¹ bᵀ ,   a = j − b U⁻¹ Wᵀ                          (1)   j, b: the coordinate's rows of the design matrix
-    Σ q_vv = number of observations − number of unknowns = redundancy           (2)
+q_vv = 1 − a Q_c aᵀ − b U⁻¹ bᵀ ,   a = j − b U⁻¹ Wᵀ                          (1)   j, b: the coordinate's rows of the design matrix
+Σ q_vv = number of observations − number of unknowns = redundancy           (2)
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Self-calibrating bundle adjustment of a reference bar (Maas 1998; D'Apuzzo et al. 2000, §2.2), the points eliminated by Schur's complement.
+"""Self-calibrating bundle adjustment of a reference bar (Maas 1998; D'Apuzzo et al. 2000, §2.2), points eliminated by Schur's complement.
 
 A bar position i is a middle M_i and a unit vector d_i; its length L holds exactly, and no weight mixes millimetres with pixels:
 
@@ -21,7 +21,6 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..geometry.camera_derivatives import INTERIOR, camera_of, exterior_derivatives, image_of, image_with_derivatives, interior_of
 from ..geometry.rotation import cross_matrix, rotation_from_vector
-from .observations import BarObservations
 
 BEHIND_PX = 1e4  # residual of a point behind the camera
 DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
@@ -282,4 +281,3 @@ def adjust(
 
 def _possible(network: Network) -> bool:
     return bool(np.isfinite(network.interior).all() and (network.interior[:, 0] > 1.0).all() and np.isfinite(network.t).all())
-

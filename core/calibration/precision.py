@@ -68,7 +68,10 @@ def without_rigid_motion(D: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
 
 
 def predicted_error(cameras: Sequence[Camera], unknowns: Unknowns, covariance: np.ndarray, pairs_m: np.ndarray) -> PredictedError:
-    """The error at the ends of test bars (K, 2, 3) from the cameras' covariance (C p, C p); points that two cameras do not see are left out."""
+    """The error at the ends of test bars (K, 2, 3) from the cameras' covariance (C p, C p).
+
+    Bars with an end that fewer than two cameras see are left out.
+    """
     points = pairs_m.reshape(-1, 3)
     D = point_derivatives(cameras, unknowns, points)
     both = np.isfinite(D).all(axis=(1, 2)).reshape(-1, 2).all(axis=1)

@@ -1,8 +1,8 @@
 """Initial values from nothing but the image points and the bar's length: focal lengths, distortion, poses, scale, bar positions.
 
-Pairs of cameras that share most complete bars form a tree. For every pair all guesses of the focal lengths (f_i on a geometric grid, f_j up to
-two steps away) and of a common distortion κ are evaluated (`epipolar`); the best sum over the tree is found by dynamic programming, the
-best few are adjusted shortly with f, k1 and the poses free, and the one with the smallest robust sum of squares wins.
+Pairs of cameras that share most complete bars form a tree. For every pair all guesses of the focal lengths (f_i on a geometric grid,
+f_j up to two steps away) and of a common distortion κ are evaluated (`epipolar`); the best sum over the tree is found by dynamic
+programming, the best few are adjusted shortly with f, k1 and the poses free, and the one with the smallest robust sum of squares wins.
 """
 
 from dataclasses import dataclass, replace
@@ -165,7 +165,9 @@ def _grid(observations: BarObservations, focal_px: float | None) -> np.ndarray:
     return FOCAL_GRID * float(np.median(observations.size_px[:, 0]))
 
 
-def _starts(observations: BarObservations, tree: list[Pair], guesses: dict[tuple[int, int], Guesses], focal_px: float | None) -> list[Network]:
+def _starts(
+    observations: BarObservations, tree: list[Pair], guesses: dict[tuple[int, int], Guesses], focal_px: float | None
+) -> list[Network]:
     """Networks without bars of the best guesses, one per focal length of the first camera and κ."""
     grid = _grid(observations, focal_px)
     root = tree[0].i
@@ -178,7 +180,9 @@ def _starts(observations: BarObservations, tree: list[Pair], guesses: dict[tuple
     return [_chained(observations, tree, guesses, k, chosen, grid) for _, k, _, chosen in ranked[:CANDIDATES]]
 
 
-def _best_below(tree: list[Pair], guesses: dict[tuple[int, int], Guesses], camera: int, k: int, a: int, grid: int, chosen: dict[int, int]) -> float:
+def _best_below(
+    tree: list[Pair], guesses: dict[tuple[int, int], Guesses], camera: int, k: int, a: int, grid: int, chosen: dict[int, int]
+) -> float:
     """Smallest sum of scores of the pairs below a camera whose focal length is a; what was chosen is noted."""
     total = 0.0
     for pair in (p for p in tree if p.i == camera):
@@ -193,7 +197,14 @@ def _best_below(tree: list[Pair], guesses: dict[tuple[int, int], Guesses], camer
     return total
 
 
-def _chained(observations: BarObservations, tree: list[Pair], guesses: dict[tuple[int, int], Guesses], k: int, chosen: dict[int, int], grid: np.ndarray) -> Network:
+def _chained(
+    observations: BarObservations,
+    tree: list[Pair],
+    guesses: dict[tuple[int, int], Guesses],
+    k: int,
+    chosen: dict[int, int],
+    grid: np.ndarray,
+) -> Network:
     C = len(observations.names)
     interior = np.zeros((C, len(INTERIOR)))
     R, t = np.tile(np.eye(3), (C, 1, 1)), np.zeros((C, 3))

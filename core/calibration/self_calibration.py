@@ -74,7 +74,9 @@ def refined_start(network: Network, observations: BarObservations) -> tuple[Netw
     for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR, INTERIOR):
         part = _ordered(network, observations.part(some), 2 * cauchy)
         network, used = with_bars(network, part, 3 * cauchy)
-        done = adjust(network, part.xy_px, used, knowledge.only(*names), cauchy_px=cauchy, unit_px=0.3 * cauchy, max_iterations=8, tolerance=0.1)
+        done = adjust(
+            network, part.xy_px, used, knowledge.only(*names), cauchy_px=cauchy, unit_px=0.3 * cauchy, max_iterations=8, tolerance=0.1
+        )
         network, sigma = done.network, robust_sigma(done.residual_px, used)
         cauchy = float(np.clip(3 * sigma, 0.3, cauchy))
     return network, _ordered(network, observations, 2 * cauchy), sigma

@@ -1,7 +1,7 @@
 """Bright targets in an image: found as blobs, measured by their grey values' centre of gravity, then by least squares matching.
 
     x̄ = Σ (g − T) x / Σ (g − T)                                                (1)   over the blob (D'Apuzzo et al. 2000, §2.2)
-    q = | B (x − c) | ,   g(x) + e = g0 + g1 Φ(ρ (1 − q))                       (2)   an ellipse with a soft edge, Φ: the normal distribution
+    q = | B (x − c) | ,   g(x) + e = g0 + g1 Φ(ρ (1 − q))                       (2)   an ellipse with a soft edge, Φ: normal distribution
 
 (2) is matched by Gauss–Newton with an analytic Jacobian for many targets at once; unknowns c (2), B (3, symmetric), ρ, g0, g1. A saturated
 target only has a flat top, which (2) has as well. The sigma of c comes from the adjustment.
@@ -139,7 +139,9 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
     grid = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2).astype(np.float64)
     grey = windows.reshape(m, -1)
     B = 2 / np.maximum(start[:, 2:4], 1.0)
-    p = np.stack([start[:, 0], start[:, 1], B[:, 0], B[:, 0] * 0, B[:, 1], 1.4 / B.mean(axis=1), np.full(m, background), start[:, 4]], axis=1)
+    p = np.stack(
+        [start[:, 0], start[:, 1], B[:, 0], B[:, 0] * 0, B[:, 1], 1.4 / B.mean(axis=1), np.full(m, background), start[:, 4]], axis=1
+    )
     reach = np.hypot((grid[:, 0] - p[:, 0, None]) * p[:, 2, None], (grid[:, 1] - p[:, 1, None]) * p[:, 4, None])
     near = reach < 1.12 + 1.5 / np.sqrt(p[:, 5, None])  # what lies further out, such as the other target, takes no part
     active, converged = np.arange(m), np.zeros(m, dtype=bool)

@@ -1,0 +1,79 @@
+"""`tricap calibrate`: a rig from the images of a waved bar, or from another tool's calibration."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from .calibrating import calibrate_rig, measure_bar, open_bar, write_report
+from .calibration import account
+from .calibration.rig_files import FORMATS, read_any, write_as
+from .errors import InputError
+from .geometry.rig import write_rig
+from .progress import Monitor
+
+
+def add_command(commands: Any) -> None:
+    """Join `calibrate` to the parser's commands."""
+    parser = commands.add_parser("calibrate", help="a rig from the images of a waved bar, or from another tool's calibration")
+    parser.add_argument("bar", nargs="?", type=Path, metavar="BARDIR", help="folder with a folder of images, or a movie, per camera")
+    parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the rig to write, such as rig.toml")
+    parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
+    parser.add_argument("--interlaced", choices=("none", "odd", "even"), default="none", help="which lines to keep of interlaced video")
+    parser.add_argument("--mask", type=Path, metavar="FILE", help="image that is black where no target can be")
+    parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar lies on the floor, which becomes z = 0")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="folder for the report: text, JSON, pictures")
+    parser.add_argument("--import", dest="source", type=Path, metavar="FILE", help="read another tool's calibration instead of images")
+    parser.add_argument("--export", dest="format", choices=sorted(FORMATS), help="write the rig in another tool's format")
+    parser.add_argument("--json", action="store_true", help="print the figures")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Calibrate or convert; the lines to show.
+
+    Raises:
+        InputError: the arguments or the recording need mending.
+    """
+    if (args.bar is None) == (args.source is None):
+        raise InputError("Give either the folder of the bar's images, or --import with another tool's calibration.")
+    return _convert(args) if args.source is not None else _calibrate(args, monitor)
+
+
+def _convert(args: argparse.Namespace) -> list[str]:
+    rig = read_any(args.source)
+    written = write_as(args.out, rig, args.format) if args.format else [args.out]
+    if not args.format:
+        write_rig(args.out, rig)
+    return [f"{', '.join(map(str, written))}: {len(rig.cameras)} cameras ({', '.join(c.name for c in rig.cameras)}) from {args.source}."]
+
+
+def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    if args.bar_length is None:
+        raise InputError("The bar's length is missing; give --bar-length with the distance between its two targets in metres.")
+    if args.focal_px is not None and not 10 < args.focal_px < 1e6:
+        raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
+    floor = _frames(args.floor)
+    footage = open_bar(args.bar, args.interlaced, args.mask)
+    measured = measure_bar(footage, args.bar_length, monitor)
+    result = calibrate_rig(measured.observations, monitor, focal_px=args.focal_px, floor_frames=floor)
+    written = [args.out]
+    if args.report:
+        written += write_report(args.report, result)[:1]
+    if args.format:
+        write_as(args.out, result.rig, args.format)
+    else:
+        write_rig(args.out, result.rig)
+    if args.json:
+        return [json.dumps(account.figures(result.calibration, result.quality, result.verdict), indent=1, ensure_ascii=False)]
+    return [result.verdict.sentence, f"To do better: {result.verdict.advice}.", f"Written: {', '.join(map(str, written))}"]
+
+
+def _frames(text: str | None) -> tuple[int, ...]:
+    if not text:
+        return ()
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--floor {text} cannot be read; write frame numbers, such as 0,40,80.") from error

@@ -1,0 +1,207 @@
+"""How good a calibration is, in figures: what the covariance predicts over the volume, and what bars that took no part say.
+
+    predicted 3-D error      (`precision`) at a grid over the box in which the bar was waved
+    held-out lengths         five times a fifth of the positions is left out, the rest adjusted, the left-out ends intersected    (1)
+    direction scatter        eigenvalues of mean(d dᵀ); the smallest decides whether the focal lengths are determined            (2)
+    mirrored solution        depth reversed about the volume's middle and adjusted anew; it must fit much worse                   (3)
+
+A small residual in the images is no proof: it may hide errors a hundred times larger in space.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..geometry.camera_derivatives import INTERIOR
+from ..geometry.intersection import forward_intersection
+from ..progress import Monitor
+from .bundle import Network, adjust
+from .precision import PredictedError, predicted_error
+from .self_calibration import Calibration
+
+FOLDS = 5
+CELLS = (8, 6)
+GRID = 9
+MIRROR_POSITIONS = 80
+HIGH_CORRELATION = 0.95
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Lengths:
+    """Bar lengths less the known length, from ends intersected without using it: (n,) [m], and where the bars were (n, 3)."""
+
+    residual_m: np.ndarray
+    middle_m: np.ndarray
+    frames: np.ndarray
+
+    @property
+    def mean_m(self) -> float:
+        """Bias of the length."""
+        return float(self.residual_m.mean()) if len(self.residual_m) else np.nan
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square, bias included."""
+        return float(np.sqrt(np.mean(self.residual_m**2))) if len(self.residual_m) else np.nan
+
+    @property
+    def drift_m(self) -> np.ndarray:
+        """(3,) change of the length from one end of the volume to the other along x, y, z, by a regression."""
+        if len(self.residual_m) < 8:
+            return np.full(3, np.nan)
+        A = np.concatenate([self.middle_m - self.middle_m.mean(axis=0), np.ones((len(self.middle_m), 1))], axis=1)
+        return np.linalg.lstsq(A, self.residual_m, rcond=None)[0][:3] * np.ptp(self.middle_m, axis=0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Quality:
+    """All figures about one calibration."""
+
+    predicted: PredictedError  # over the box in which the bar was waved
+    box_m: np.ndarray  # (2, 3) smallest and largest corner
+    used_lengths: Lengths
+    held_out: Lengths
+    scatter: np.ndarray  # (3,) eigenvalues, ascending
+    missing_direction: np.ndarray  # (3,) world, along which the bar points least
+    coverage: np.ndarray  # (C, 6, 8) image points in each cell
+    depth_ratio: np.ndarray  # (C,) largest by smallest depth of the bar's ends
+    rms_px: np.ndarray  # (C,) of image coordinates
+    shared: np.ndarray  # (C, C) bars that two cameras see whole
+    mirror: float  # sum of squares of the mirrored solution by that of this one
+    correlations: tuple[tuple[str, str, str, float], ...]  # camera, unknown, unknown, correlation beyond HIGH_CORRELATION
+
+    @property
+    def covered(self) -> np.ndarray:
+        """(C,) part of each image's cells in which the bar was seen."""
+        return (self.coverage > 0).mean(axis=(1, 2))
+
+
+def assess(calibration: Calibration, monitor: Monitor) -> Quality:
+    """Work out the figures. The calibration should be in its final world frame."""
+    observations, network, used = calibration.observations, calibration.network, calibration.used
+    cameras = network.cameras(observations.names, observations.size_px)
+    ends = network.ends_m[used.any(axis=1)]
+    box = np.percentile(ends, [1, 99], axis=0)
+    values, axes = np.linalg.eigh(_scatter(network, used))
+    monitor.step("quality", 0, 3)
+    held_out = held_out_lengths(calibration)
+    monitor.step("quality", 1, 3)
+    mirror = mirrored(calibration)
+    monitor.step("quality", 2, 3)
+    count = np.maximum(used.sum(axis=(0, 2)), 1)
+    square = np.sum(np.where(used[..., None], calibration.residual_px, 0.0) ** 2, axis=(0, 2, 3))
+    depth = [cameras[c].to_camera(network.ends_m[used[:, c]])[:, 2] for c in range(len(cameras))]
+    both = used.all(axis=2).astype(int)
+    quality = Quality(
+        predicted=predicted_error(cameras, calibration.unknowns, calibration.covariance, test_bars(box, network.length_m)),
+        box_m=box,
+        used_lengths=_lengths(calibration, cameras, np.ones(len(used), dtype=bool)),
+        held_out=held_out,
+        scatter=values,
+        missing_direction=axes[:, 0],
+        coverage=np.stack([_cells(observations.xy_px[:, c][used[:, c]], observations.size_px[c]) for c in range(len(cameras))]),
+        depth_ratio=np.array([np.percentile(d, 98) / np.percentile(d, 2) if len(d) else 1.0 for d in depth]),
+        rms_px=np.sqrt(square / (2 * count)),
+        shared=both.T @ both,
+        mirror=mirror,
+        correlations=_correlations(calibration),
+    )
+    monitor.step("quality", 3, 3)
+    return quality
+
+
+def _scatter(network: Network, used: np.ndarray) -> np.ndarray:
+    d = network.direction[(used.sum(axis=1) >= 2).all(axis=1)]
+    return d.T @ d / max(len(d), 1)
+
+
+def test_bars(box_m: np.ndarray, length_m: float) -> np.ndarray:
+    """Bars (K, 2, 3) over a box: one end at a grid of points, pointing along the three axes in turn, back into the box."""
+    axes = [np.linspace(box_m[0, k], box_m[1, k], GRID) for k in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    turn = np.arange(len(points)) % 3
+    inward = np.where(points > box_m.mean(axis=0), -1.0, 1.0) * np.eye(3)[turn]
+    return np.stack([points, points + inward * length_m], axis=1)
+
+
+def _lengths(calibration: Calibration, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
+    """Lengths of the positions `which` (N,) from their ends, each intersected by itself.  (1)"""
+    observations, used = calibration.observations, calibration.used
+    rows = np.flatnonzero(which & (used.sum(axis=1) >= 2).all(axis=1))
+    xy = np.where(used[rows][..., None], observations.xy_px[rows], np.nan)
+    xy = np.moveaxis(xy, 2, 1).reshape(2 * len(rows), len(cameras), 2)
+    ends = forward_intersection(cameras, xy, np.broadcast_to(np.eye(2), (*xy.shape, 2))).xyz_m.reshape(-1, 2, 3)
+    residual = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) - observations.length_m
+    fine = np.isfinite(residual)
+    return Lengths(residual_m=residual[fine], middle_m=ends.mean(axis=1)[fine], frames=observations.frames[rows][fine])
+
+
+def held_out_lengths(calibration: Calibration) -> Lengths:
+    """Lengths of all positions, each from cameras adjusted without it.  (1)"""
+    observations = calibration.observations
+    parts = []
+    for fold in range(FOLDS):
+        out = np.arange(len(calibration.used)) % FOLDS == fold
+        rest = observations.part(~out)
+        network = _of_positions(calibration.network, ~out)
+        done = adjust(
+            network,
+            rest.xy_px,
+            calibration.used[~out],
+            calibration.unknowns,
+            unit_px=calibration.sigma0_px,
+            max_iterations=6,
+            tolerance=1e-2,
+        )
+        parts.append(_lengths(calibration, done.network.cameras(observations.names, observations.size_px), out))
+    return Lengths(
+        residual_m=np.concatenate([p.residual_m for p in parts]),
+        middle_m=np.concatenate([p.middle_m for p in parts]),
+        frames=np.concatenate([p.frames for p in parts]),
+    )
+
+
+def _of_positions(network: Network, positions: np.ndarray) -> Network:
+    return replace(network, middle=network.middle[positions], direction=network.direction[positions])
+
+
+def mirrored(calibration: Calibration) -> float:
+    """Sum of squares of the solution with reversed depth, by that of this one: far above 1 where perspective tells them apart.  (3)"""
+    some = np.unique(np.linspace(0, len(calibration.used) - 1, MIRROR_POSITIONS).astype(int))
+    part, used = calibration.observations.part(some), calibration.used[some]
+    network = _of_positions(calibration.network, some)
+    middle = network.middle[used.any(axis=(1, 2))].mean(axis=0)
+    view = network.R[:, 2].mean(axis=0)
+    view /= np.linalg.norm(view)
+    H = np.eye(3) - 2 * np.outer(view, view)
+    R = np.diag([1.0, 1.0, -1.0]) @ network.R @ H
+    start = replace(
+        network,
+        R=R,
+        t=network.R @ middle + network.t - R @ middle,
+        middle=(network.middle - middle) @ H + middle,
+        direction=network.direction @ H,
+    )
+    unknowns, sigma = calibration.unknowns.only("f"), calibration.sigma0_px
+    other = adjust(start, part.xy_px, used, unknowns, unit_px=sigma, max_iterations=15, tolerance=1.0)
+    this = adjust(network, part.xy_px, used, calibration.unknowns, unit_px=sigma, max_iterations=2)
+    return other.cost / max(this.cost, 1e-12)
+
+
+def _cells(xy_px: np.ndarray, size_px: np.ndarray) -> np.ndarray:
+    counts, _, _ = np.histogram2d(xy_px[:, 1], xy_px[:, 0], bins=(CELLS[1], CELLS[0]), range=((0, size_px[1]), (0, size_px[0])))
+    return counts.astype(int)
+
+
+def _correlations(calibration: Calibration) -> tuple[tuple[str, str, str, float], ...]:
+    free = np.flatnonzero(calibration.unknowns.free)
+    p = len(calibration.unknowns.columns)
+    found = []
+    for c, name in enumerate(calibration.observations.names):
+        Q = calibration.covariance[c * p : c * p + len(free), c * p : c * p + len(free)]
+        sigma = np.sqrt(np.maximum(np.diag(Q), 1e-30))
+        rho = Q / np.outer(sigma, sigma)
+        for i, j in zip(*np.nonzero(np.triu(np.abs(rho) > HIGH_CORRELATION, 1))):
+            found.append((name, INTERIOR[free[i]], INTERIOR[free[j]], float(rho[i, j])))
+    return tuple(found)

@@ -1,0 +1,102 @@
+"""The world's frame: metres, Z up. A calibration is free to turn and shift; here it is put where the user wants it.
+
+    X' = R X + s ,   R_cam' = R_cam Rᵀ ,   t_cam' = t_cam − R_cam' s               (1)
+
+Without anything known, up is where the cameras' tops are, the cameras look along +Y (a person who faces them faces −Y), and the origin is
+the middle of the volume in which the bar was waved.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..values import frozen
+
+MIN_FLOOR_SPREAD = 0.02  # of the largest extent: points nearer to one line than this have no plane
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class WorldFrame:
+    """A rigid motion of space: X' = R X + shift_m.  (1)"""
+
+    R: np.ndarray
+    shift_m: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "R", frozen(self.R, (3, 3), name="R"))
+        object.__setattr__(self, "shift_m", frozen(self.shift_m, (3,), name="shift_m"))
+
+    def points(self, xyz_m: np.ndarray) -> np.ndarray:
+        """Points (…, 3) in the new frame."""
+        return xyz_m @ self.R.T + self.shift_m
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera in the new frame."""
+        R = camera.R_cam_world @ self.R.T
+        return replace(camera, R_cam_world=R, t_cam_world_m=camera.t_cam_world_m - R @ self.shift_m)
+
+
+def frame_of_cameras(cameras: Sequence[Camera], points_m: np.ndarray) -> WorldFrame:
+    """The frame that needs nothing but the cameras: their tops are up, they look along +Y, the origin is the middle of the points."""
+    up = -np.mean([c.R_cam_world[1] for c in cameras], axis=0)
+    return upright(up, cameras, np.median(points_m.reshape(-1, 3), axis=0))
+
+
+def upright(up: np.ndarray, cameras: Sequence[Camera], origin_m: np.ndarray) -> WorldFrame:
+    """The frame with Z along `up`, its origin at `origin_m`, and the mean viewing direction in the plane of Y and Z."""
+    z = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    view = np.mean([c.R_cam_world[2] for c in cameras], axis=0)
+    y = view - z * (z @ view)
+    if np.linalg.norm(y) < 1e-3:  # the cameras look straight down or up
+        y = -np.mean([c.R_cam_world[1] for c in cameras], axis=0)
+        y -= z * (z @ y)
+    y /= np.linalg.norm(y)
+    R = np.stack([np.cross(y, z), y, z])
+    return WorldFrame(R=R, shift_m=-R @ origin_m)
+
+
+def frame_on_floor(floor_m: np.ndarray, cameras: Sequence[Camera]) -> WorldFrame:
+    """The frame whose plane z = 0 is that of points (n, 3) on the floor, its origin their middle; the cameras are above it.
+
+    Raises:
+        InputError: fewer than three points, or all on one line.
+    """
+    if len(floor_m) < 3:
+        raise InputError(f"{len(floor_m)} points on the floor do not make a plane; give at least three, not on one line.")
+    middle = floor_m.mean(axis=0)
+    _, size, axes = np.linalg.svd(floor_m - middle, full_matrices=False)
+    if size[1] < MIN_FLOOR_SPREAD * size[0]:
+        raise InputError("The points on the floor lie on one line; lay the bar down in two directions at least.")
+    up = axes[2] if np.mean([axes[2] @ (c.centre_m - middle) for c in cameras]) > 0 else -axes[2]
+    return upright(up, cameras, middle)
+
+
+def frame_of_level_bar(directions: np.ndarray, cameras: Sequence[Camera], origin_m: np.ndarray) -> WorldFrame:
+    """The frame in which bars of directions (n, 3) are level, as held against a spirit level in two directions at least.
+
+    Raises:
+        InputError: all bars were parallel.
+    """
+    values, axes = np.linalg.eigh(directions.T @ directions)
+    if len(directions) < 2 or values[1] < 0.02 * values[2]:
+        raise InputError("The level bars are parallel; hold the bar level in two directions across each other.")
+    tops = -np.mean([c.R_cam_world[1] for c in cameras], axis=0)
+    return upright(axes[:, 0] * np.sign(axes[:, 0] @ tops), cameras, origin_m)
+
+
+def frame_of_points(origin_m: np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> WorldFrame:
+    """The frame of three points: the origin, one on the X axis, and one in the plane of X and Y on the side of +Y.
+
+    Raises:
+        InputError: the points lie on one line.
+    """
+    x, across = x_m - origin_m, y_m - origin_m
+    z = np.cross(x, across)
+    if np.linalg.norm(z) < 1e-3 * np.linalg.norm(x) * np.linalg.norm(across) or not np.linalg.norm(x):
+        raise InputError("The origin, the point on X and the point towards Y lie on one line; choose a third one beside it.")
+    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
+    R = np.stack([x, np.cross(z, x), z])
+    return WorldFrame(R=R, shift_m=-R @ origin_m)
