@@ -1,0 +1,134 @@
+"""Tracking against exact motion: drift, sigma, false ones, fields, new points; trajectories, their kinematics and their filter."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.tracking.step import TrackStatus
+from tricap.core.tracking.trajectories import Trajectories, assemble
+
+FRAMES = 10
+
+
+def moving_plane(scenes: Any, frames: int, half_m: tuple[float, float] = (0.24, 0.18)) -> list[Any]:
+    """A plane that travels 0.25 m/s (2.8 px a frame at 25 frames/s) and turns by 40°/s about an axis across all three."""
+    plane = scenes.Body(half_m=half_m, R=rotation_from_vector(np.array([0.1, 0.25, 0.0])), t=np.array([-0.06, 0.01, 2.16]))
+    return [plane.moved(rotation_from_vector(i * np.radians(1.6) * np.array([0.3, 0.4, 0.87])), [0.009 * i, -0.003 * i, 0.004 * i])
+            for i in range(frames)]  # fmt: skip
+
+
+def errors(bodies: list[Any], tracks: Trajectories, margin_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Position (T, N, 3) less where the material point of each trajectory's first position has gone, and which started on the plane."""
+    T, N = tracks.seen.shape
+    first = tracks.seen.argmax(axis=0)
+    own = np.stack([(tracks.xyz_m[first[n], n] - bodies[first[n]].t) @ bodies[first[n]].R for n in range(N)])
+    on_it = (np.abs(own[:, :2]) < np.array(bodies[0].half_m) - margin_m).all(axis=1)
+    own[:, 2] = 0.0  # the material point is on the plane
+    return np.stack([tracks.xyz_m[t] - (own @ bodies[t].R.T + bodies[t].t) for t in range(T)]), on_it
+
+
+@pytest.mark.parametrize(("interlaced", "noise"), [("none", 1.0), ("odd", 1.0)])
+def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced: str, noise: float) -> None:
+    """Ten frames: nothing is lost in the middle, nothing is false, and what drifts does so by less than 0.3 px across the line of sight."""
+    bodies, rig = moving_plane(scenes, FRAMES), scenes.three_cameras()
+    take = scenes.write_take(tmp_path / "take", rig, [[b] for b in bodies], noise=noise, interlaced=interlaced)
+    measured = scenes.measure(take, tmp_path / "out")
+    tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 25.0)
+    error, on_it = errors(bodies, tracks, 0.035)
+    assert on_it.sum() > 50 and np.array_equal(tracks.frames, np.arange(FRAMES))
+    seen = tracks.seen[:, on_it]
+    old = on_it & tracks.seen[0]
+    assert tracks.seen[-1, old].mean() > 0.95  # the rest came too near to the edge
+    drift_px = np.linalg.norm(error[..., :2], axis=2)[:, on_it] / scenes.pixel_m
+    assert np.nanmax(drift_px) < 1.0  # no false one at all
+    assert np.nanpercentile(drift_px[-1], 99) < 0.3 and np.nanmedian(drift_px[-1]) < 0.15
+    assert np.abs(np.nanmean(error[-1][on_it][:, :2], axis=0)).max() < 0.1 * scenes.pixel_m  # no common drift
+    assert np.nanmax(np.abs(error[:, on_it, 2])) < 0.012 and np.nanstd(error[:, on_it, 2]) < 0.002
+    lateral = np.abs(error[0][tracks.seen[0] & on_it])
+    assert lateral[:, :2].max() < 0.1 * scenes.pixel_m
+    assert seen.sum(axis=0).max() == FRAMES
+
+
+def test_velocity_and_acceleration(tmp_path: Path, scenes: Any) -> None:
+    """The mean over all points of velocity against the true one; its scatter is that of the positions."""
+    bodies = moving_plane(scenes, 5)
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
+    tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out")), 25.0)
+    whole = tracks.seen.all(axis=0)
+    assert whole.sum() > 60
+    X = tracks.xyz_m[2, whole]
+    own = (X - bodies[2].t) @ bodies[2].R
+    true = (own @ bodies[3].R.T + bodies[3].t - own @ bodies[1].R.T - bodies[1].t) * 25 / 2
+    e = tracks.velocity_m_s[2, whole] - true
+    assert np.abs(np.median(e, axis=0)).max() < 0.01  # of 0.25 m/s
+    assert np.median(np.abs(e[:, :2])) < 0.01 and np.median(np.abs(e[:, 2])) < 0.03  # depth is four times less sure
+    assert np.isnan(tracks.acceleration_m_s2[[0, -1]]).all() and np.isfinite(tracks.velocity_m_s[[0, -1]][:, whole]).all()
+
+
+def test_new_points_start_where_the_surface_has_none(tmp_path: Path, scenes: Any) -> None:
+    """A plane comes into the picture: later frames have as many points per area as the first."""
+    plane = scenes.Body(half_m=(0.5, 0.18), R=rotation_from_vector(np.array([0.1, 0.15, 0.0])), t=np.array([-0.75, 0.0, 2.16]))
+    bodies = [plane.moved(np.eye(3), [0.05 * i, 0.0, 0.0]) for i in range(6)]
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
+    measured = scenes.measure(take, tmp_path / "out")
+    steps = scenes.track(take, tmp_path / "out", measured, {"tracking": {"regenerate_every": 2}})
+    growth = [len(m.cloud.xyz_m) / len(measured[0].cloud.xyz_m) for m in measured]
+    assert growth[4] > 1.4
+    assert len(steps[4].identity) > 0.75 * growth[4] * len(steps[0].identity)
+    identities = np.concatenate([s.identity for s in steps])
+    assert all((np.diff(s.identity) > 0).all() for s in steps) and identities.max() + 1 == len(np.unique(identities))
+    none = scenes.track(take, tmp_path / "none", measured, {"tracking": {"regenerate_every": 0}})
+    assert all(set(s.identity) <= set(none[0].identity) for s in none)
+    ended = np.concatenate([s.ended for s in steps])
+    assert len(ended) == len(np.unique(ended))  # nobody ends twice
+    for before, after in zip(steps, steps[1:]):
+        assert set(before.identity) - set(after.identity) == set(after.ended)
+
+
+def test_a_point_that_is_covered_ends_and_says_why(tmp_path: Path, scenes: Any) -> None:
+    """A second body hides half of the plane from one frame to the next: its points end, and none jumps onto the other texture."""
+    plane = scenes.Body(half_m=(0.24, 0.18))
+    hider = scenes.Body(half_m=(0.12, 0.3), t=np.array([0.15, 0.0, 1.8]), seed=5)
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[plane], [plane], [plane, hider]], noise=1.0)
+    steps = scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out"), {"tracking": {"regenerate_every": 0}})
+    x = dict(zip(steps[1].identity, steps[1].xyz_m[:, 0]))
+    hidden = [i for i in steps[1].identity if x[i] > 0.10]
+    assert len(hidden) > 20 and set(hidden) <= set(steps[2].ended)
+    assert set(steps[2].reason) <= {int(s) for s in TrackStatus} - {TrackStatus.ABSENT, TrackStatus.MEASURED}
+    before = steps[1].xyz_m[np.searchsorted(steps[1].identity, steps[2].identity)]
+    moved = np.linalg.norm(steps[2].xyz_m[:, :2] - before[:, :2], axis=1)
+    assert moved.max() < 0.3 * scenes.pixel_m
+
+
+def step(frame: int, identity: list[int], xyz: object, ended: list[int] | None = None) -> Any:
+    """What `assemble` reads of a tracked frame."""
+    n, gone = len(identity), ended or []
+    return SimpleNamespace(frame=frame, identity=np.array(identity, dtype=np.int64), xyz_m=np.array(xyz, dtype=float).reshape(n, 3),
+                           covariance_m2=np.tile(np.eye(3) * 1e-6, (n, 1, 1)), ended=np.array(gone, dtype=np.int64),
+                           reason=np.full(len(gone), TrackStatus.NOT_FOUND, np.int8))  # fmt: skip
+
+
+def test_assembled_trajectories() -> None:
+    steps = [step(5, [0, 1], [[0, 0, 0], [1, 0, 0]]), step(6, [1, 2], [[1.1, 0, 0], [2, 0, 0]], [0]), step(7, [2], [[2, 0.5, 0]], [1])]
+    tracks = assemble(steps, 10.0)
+    assert tracks.frames.tolist() == [5, 6, 7] and np.allclose(tracks.time_s, [0.5, 0.6, 0.7])
+    M, N, A = TrackStatus.MEASURED, TrackStatus.NOT_FOUND, TrackStatus.ABSENT
+    assert tracks.status.tolist() == [[M, M, A], [N, M, M], [A, N, M]]
+    assert np.allclose(tracks.velocity_m_s[:2, 1, 0], 1.0) and np.isnan(tracks.velocity_m_s[2, 1]).all()
+    assert np.allclose(tracks.velocity_m_s[1:, 2, 1], 5.0) and np.isnan(tracks.velocity_m_s[:, 0]).all()
+    assert np.isnan(tracks.acceleration_m_s2).all()
+    assert np.allclose(tracks.sigma_m[tracks.seen], np.sqrt(3e-6))
+    for few in ([], [0]):
+        assert assemble([step(0, few, [[0, 0, 0]] * len(few))], 25.0).xyz_m.shape == (1, len(few), 3)
+
+
+def test_kinematics_are_exact_for_a_parabola() -> None:
+    t = np.arange(8) / 25
+    path = np.stack([0.1 + 0.5 * t - 2 * t**2, 3 * t**2, 0 * t], axis=1)
+    tracks = assemble([step(i, [0], path[i]) for i in range(8)], 25.0)
+    assert np.allclose(tracks.velocity_m_s[1:-1, 0], np.stack([0.5 - 4 * t, 6 * t, 0 * t], axis=1)[1:-1])
+    assert np.allclose(tracks.acceleration_m_s2[1:-1, 0], [-4, 6, 0])
