@@ -24,7 +24,7 @@ BARS_PER_PAIR, BARS_PER_TRIAL = 60, 120
 CANDIDATES = 4
 MIN_BARS_PER_PAIR = 6
 COARSE_CAUCHY_PX = 3.0
-GATE = 4.0  # an image point further off than this many of these widths takes no part
+WIDE_GATE, GATE = 12.0, 4.0  # image points further off than this many of these widths take no part, first and then
 TILT = np.tan(np.radians(25))
 
 Guesses = dict[tuple[int, int, int], tuple[float, np.ndarray, np.ndarray]]  # (κ, f_i, f_j) by index: score, R, t
@@ -223,9 +223,11 @@ def _chained(
 def _trial(observations: BarObservations, tree: list[Pair], network: Network) -> Adjusted:
     """A short robust adjustment of f, k1 and the poses on bars that the pairs of the tree agree on."""
     part = trial_part(observations, tree)
-    network, used = with_bars(network, part, GATE * COARSE_CAUCHY_PX)
     knowledge = lens_knowledge(part.size_px, network.interior[:, 0]).only("f", "k1")
-    done = adjust(network, part.xy_px, used, knowledge, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3, max_iterations=12, tolerance=1e-2)
+    for gate in (WIDE_GATE, GATE):
+        network, used = with_bars(network, part, gate * COARSE_CAUCHY_PX)
+        done = adjust(network, part.xy_px, used, knowledge, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3, max_iterations=8, tolerance=1e-2)
+        network = done.network
     left_out = int(part.seen.sum() - used.sum())  # what does not fit must not make a start look better
     return replace(done, cost=done.cost + left_out * COARSE_CAUCHY_PX**2 * float(np.log1p(GATE**2)))
 

@@ -24,7 +24,7 @@ from .pseudo import lens_knowledge
 from .reference_bar import COARSE_CAUCHY_PX, initial_network
 
 GROUPS = (("k3",), ("b1", "b2"), ("p1", "p2"), ("k2",), ("cx", "cy"), ("k1",))  # in the order in which they are doubted
-SIGNIFICANCE = 0.02  # α of (2)
+SIGNIFICANCE = 0.05  # α of (2)
 CRITICAL_W = 4.1  # |w| beyond it: 1 good point in 5000 (two coordinates)
 PART = 400
 GROSS = 6.5  # sigmas
