@@ -6,9 +6,10 @@ import sys
 def main(argv: list[str] | None = None) -> int:
     """Run one command of the `tricap` command line; its exit code (see docs/formats.md)."""
     from .addon import command
+    from .addon.retarget import command as retargeting
     from .core import commands
 
-    return commands.main(argv, (command.add_commands,))
+    return commands.main(argv, (command.add_commands, retargeting.add_commands))
 
 
 if __name__ == "__main__":

@@ -81,7 +81,10 @@ def orthonormal(M: np.ndarray) -> np.ndarray:
 
 
 def humanoid_roles(armature_object: bpy.types.Object) -> dict[str, str]:
-    """What a VRM file says its bones are, if the importer of VRM files kept it."""
+    """What a VRM file says its bones are, as kept by our own import or by the add-on for VRM files."""
+    known = armature_object.data.get("tricap_roles")
+    if known is not None:
+        return {str(role): str(name) for role, name in known.items() if name in armature_object.data.bones}
     extension = getattr(armature_object.data, "vrm_addon_extension", None)
     bones = getattr(getattr(getattr(extension, "vrm1", None), "humanoid", None), "human_bones", None)
     found = {}

@@ -92,7 +92,7 @@ def _joints(text: str, path: Path) -> list[_Joint]:
 
 
 def _until(words: Iterator[str], stop: str, path: Path) -> list[str]:
-    found = []
+    found: list[str] = []
     for word in words:
         if word == stop:
             return found
@@ -129,10 +129,10 @@ def _values(body: str, columns: int, path: Path) -> tuple[np.ndarray, float]:
     frames, frame_time = int(_number(words[1], path)), _number(words[4], path)
     if frames < 1 or frame_time <= 0:
         raise InputError(f"{path} has {frames} frames of {frame_time:g} s; a motion needs some.")
-    table = np.fromstring(words[5], sep=" ") if len(words) > 5 and _is_plain(words[5]) else np.zeros(0)
-    if len(table) < frames * columns:
-        raise InputError(f"{path} promises {frames} frames of {columns} values but holds {len(table)} good values; export it again.")
-    table = table[:frames * columns].reshape(frames, columns)
+    values = np.fromstring(words[5], sep=" ") if len(words) > 5 and _is_plain(words[5]) else np.zeros(0)
+    if len(values) < frames * columns:
+        raise InputError(f"{path} promises {frames} frames of {columns} values but holds {len(values)} good values; export it again.")
+    table = values[:frames * columns].reshape(frames, columns)
     if not np.isfinite(table).all():
         raise InputError(f"{path} holds values that are no finite numbers; export it again.")
     return table, 1.0 / frame_time

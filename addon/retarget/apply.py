@@ -1,0 +1,130 @@
+"""A motion onto an armature of the open file: read the rig, map, transfer, write the action, and see that Blender plays what was meant."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...core.errors import InputError
+from ...core.motion.retarget.contacts import FeetSettings
+from ...core.motion.retarget.mapping import Preset, RigMap, apply_preset, find_map, read_preset
+from ...core.motion.retarget.measure import Figures, measure
+from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
+from ...core.motion.retarget.rig import Motion, Rig
+from ...core.motion.retarget.turns import angle_of, transposed
+from ...core.progress import Monitor
+from .read import read_motion, read_rig, with_soles
+from .write import Written, write_action
+
+PRESETS = Path(__file__).resolve().parent.parent / "presets"
+LOW = 0.1  # a rig whose feet are farther than this part of its height from its origin has its floor under its feet instead
+SAMPLES = 9
+BENT_DEG = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """An armature as plain values, with its mapping."""
+
+    rig: Rig
+    rig_map: RigMap
+    floor_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a retargeting made, in figures and sentences."""
+
+    result: Retargeted
+    written: Written
+    figures: Figures
+    notes: tuple[str, ...]
+
+
+def presets() -> list[Preset]:
+    """The mappings that come with Tricap.
+
+    Raises:
+        InputError: one of them was edited and is damaged.
+    """
+    return [read_preset(path) for path in sorted(PRESETS.glob("*.json"))]
+
+
+def map_of(rig: Rig, map_file: Path | None = None) -> RigMap:
+    """The mapping from a file, or as found.
+
+    Raises:
+        InputError: the file is no mapping of this rig, or nothing was recognised.
+    """
+    return apply_preset(rig, read_preset(map_file)) if map_file is not None else find_map(rig, presets())
+
+
+def read_target(armature_object: bpy.types.Object, map_file: Path | None = None) -> Target:
+    """Read an armature for retargeting. Main thread.
+
+    Raises:
+        InputError: it is no armature that can be mapped.
+    """
+    rig = read_rig(armature_object)
+    rig_map = map_of(rig, map_file)
+    rig = with_soles(rig, armature_object, rig_map)
+    low = min([float(points[:, 2].min()) for points in rig.sole_m.values()] or [float(rig.head_m[:, 2].min())])
+    origin = float(armature_object.matrix_world.translation.z)
+    return Target(rig=rig, rig_map=rig_map, floor_m=origin if abs(low - origin) < LOW * rig.height_m else low)
+
+
+def transfer(source: Motion, source_map: RigMap, target: Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor
+             ) -> Retargeted:
+    """The computation alone; any thread."""
+    return retarget(source, source_map, target.rig, target.rig_map, settings, feet, monitor, target.floor_m)
+
+
+def apply(armature_object: bpy.types.Object, source: Motion, source_map: RigMap, target: Target, result: Retargeted, name: str,
+          tolerance_deg: float = 0.0) -> Outcome:
+    """Write the action and play some frames of it. Main thread."""
+    written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg)
+    figures = measure(source, source_map, result.motion, target.rig_map, result.contacts, target.floor_m)
+    notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source_map.missing]
+    if written.muted:
+        notes.append(f"{len(written.muted)} constraints on driven bones were muted: {', '.join(written.muted[:3])} …")
+    notes += check_played(armature_object, result, max(BENT_DEG, 1.5 * tolerance_deg))
+    return Outcome(result=result, written=written, figures=figures, notes=tuple(dict.fromkeys(notes)))
+
+
+def check_played(armature_object: bpy.types.Object, result: Retargeted, tolerance_deg: float) -> list[str]:
+    """A sentence if Blender plays something else than what was keyed, because something else steers the bones."""
+    wanted = result.motion
+    some = np.unique(np.linspace(0, len(wanted.frames) - 1, SAMPLES).round().astype(int))
+    whole = [i for i in some if float(wanted.frames[i]).is_integer()]
+    if not whole:
+        return []
+    played = read_motion(armature_object, wanted.rig, [int(wanted.frames[i]) for i in whole])
+    off = np.degrees(angle_of(transposed(played.R) @ wanted.R[whole]))[:, result.driven].max(axis=0)
+    if off.max() <= tolerance_deg:
+        return []
+    worst = wanted.rig.names[int(np.flatnonzero(result.driven)[off.argmax()])]
+    return [f"something else steers the rig, too: “{worst}” plays up to {off.max():.0f}° off what was keyed"]
+
+
+def set_range(scene: bpy.types.Scene, motion: Motion) -> None:
+    """The scene's frames are the motion's, at its rate."""
+    whole = max(1, int(np.ceil(motion.fps - 1e-3)))
+    scene.render.fps, scene.render.fps_base = whole, whole / motion.fps
+    scene.frame_start, scene.frame_end = int(np.floor(motion.frames[0])), int(np.ceil(motion.frames[-1]))
+
+
+def names_of(armatures: Sequence[bpy.types.Object]) -> str:
+    """For sentences."""
+    return ", ".join(o.name for o in armatures) or "none"
+
+
+def check_distinct(source: bpy.types.Object, target: bpy.types.Object) -> None:
+    """See that a rig is not retargeted onto itself.
+
+    Raises:
+        InputError: it is.
+    """
+    if source == target:
+        raise InputError(f"“{source.name}” is source and target at once; choose two armatures.")

@@ -1,0 +1,97 @@
+"""`tricap retarget …` and `tricap export …`; importing this module does not need bpy, running the commands mostly does."""
+
+import argparse
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+from ...core import store
+from ...core.errors import InputError
+from ...core.progress import Monitor
+from ...core.settings import from_table
+
+FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add `retarget` and `export` to an argparse sub-parsers object."""
+    about = "put a motion onto a rig"
+    parser: argparse.ArgumentParser = subparsers.add_parser("retarget", help=about, description=about.capitalize())
+    parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
+    parser.add_argument("--rig", metavar="FILE", type=Path, required=True, help="the rig: .blend, .glb, .gltf, .vrm, .fbx or .bvh")
+    parser.add_argument("--out", dest="blend", metavar="FILE.blend", type=Path, required=True, help="the file to write")
+    parser.add_argument("--map", metavar="FILE.json", type=Path, help="which bones are which; default: found by names and shape")
+    parser.add_argument("--armature", metavar="NAME", default="", help="which armature, if the rig's file has several")
+    parser.add_argument("--root", choices=("travel", "in place", "still"), default="travel", help="how the body moves through the room")
+    parser.add_argument("--feet", choices=("off", "auto", "always"), default="auto", help="when feet are held on the floor")
+    parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0, help="leave out keys within this tolerance")
+    parser.add_argument("--report", action="store_true", help="also write figures (JSON) and a picture beside FILE.blend")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    parser.set_defaults(run=retarget)
+    about = "write a run's motion or points in another format"
+    parser = subparsers.add_parser("export", help=about, description=about.capitalize())
+    parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion file")
+    parser.add_argument("--format", choices=FORMATS, required=True)
+    parser.add_argument("--out", dest="file", metavar="FILE", type=Path, required=True, help="the file to write (for ply: a folder)")
+    parser.add_argument("--preset", choices=("plain", "mixamo", "unreal", "unity", "maya", "opensim"), default="plain",
+                        help="names, units and axes for a program")
+    parser.set_defaults(run=export)
+
+
+def _need_blender(what: str) -> None:
+    if importlib.util.find_spec("bpy") is None:
+        raise InputError(f"`tricap {what}` needs Blender: install bpy in this Python, or use `blender --command tricap {what} …`.")
+
+
+def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Retarget args.out onto args.rig and save args.blend; the lines to show.
+
+    Raises:
+        InputError: there is no Blender in this Python, or the input needs mending.
+        Cancelled: the monitor was cancelled; no file was written.
+    """
+    _need_blender("retarget")
+    import bpy
+
+    from ...core.motion.retarget.contacts import FeetSettings
+    from ...core.motion.retarget.retarget import RetargetSettings
+    from ..scene.build import save_blend
+    from . import apply, files, source
+
+    if args.blend.suffix != ".blend":
+        raise InputError(f"{args.blend.name} is no name of a Blender file; let it end in .blend.")
+    settings = from_table(RetargetSettings, {"root": args.root}, "--root")
+    feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
+    motion = source.open_source(args.out, monitor)
+    motion_map = apply.map_of(motion.rig)
+    files.open_rig(args.rig)
+    armature_object = files.the_armature(args.armature, str(args.rig))
+    target = apply.read_target(armature_object, args.map)
+    result = apply.transfer(motion, motion_map, target, settings, feet, monitor)
+    apply.set_range(bpy.context.scene, motion)
+    outcome = apply.apply(armature_object, motion, motion_map, target, result, args.out.stem or "Retargeted", args.simplify)
+    bpy.context.scene.frame_set(bpy.context.scene.frame_start)
+    table = source.account(outcome, motion_map, target.rig_map)
+    if args.report:
+        from .picture import draw
+        draw(args.blend.with_suffix(".png"), motion, motion_map, armature_object, result.motion, target.rig_map)
+        store.write_json(args.blend.with_suffix(".json"), table)
+    save_blend(args.blend)
+    if args.json:
+        import json
+        return [json.dumps(table, indent=1, ensure_ascii=False)]
+    return [f"{args.blend}: {outcome.figures}", *(f"Note: {note}" for note in outcome.notes)]
+
+
+def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Write args.file in args.format; the lines to show.
+
+    Raises:
+        InputError: what is asked for is not in OUT, or the input needs mending.
+        Cancelled: the monitor was cancelled.
+    """
+    from .export import export_file
+
+    if args.format in ("fbx", "glb", "usd", "abc"):
+        _need_blender("export")
+    return [f"{args.file}: {export_file(args.out, args.format, args.file, args.preset, monitor)}"]

@@ -1,0 +1,93 @@
+"""Rigs and motions from files: .blend, glTF, VRM, FBX and BVH through Blender's importers, the rest through core's readers."""
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.motion.retarget.vrm import read_humanoid
+
+RIG_FILES = (".blend", ".glb", ".gltf", ".vrm", ".fbx", ".bvh")
+ROLES_KEY = "tricap_roles"  # custom property of an armature: what its file says its bones are
+
+
+def open_rig(path: Path) -> None:
+    """Open or import a file into an empty scene: afterwards it is the open file.
+
+    Raises:
+        InputError: there is no such file, it is of an unknown kind, or Blender cannot read it.
+    """
+    path = Path(path).resolve()
+    if not path.is_file():
+        raise InputError(f"There is no file {path}; check its name.")
+    kind = path.suffix.lower()
+    if kind not in RIG_FILES:
+        raise InputError(f"{path.name} is no file with a rig that can be read; choose one of {', '.join(RIG_FILES)}.")
+    if kind == ".blend":
+        _try(lambda: bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False), path)
+        return
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    import_rig(path)
+
+
+def import_rig(path: Path) -> list[bpy.types.Object]:
+    """Import a file into the open scene; the armatures that came in.
+
+    Raises:
+        InputError: Blender cannot read it.
+    """
+    before = set(bpy.data.objects)
+    kind = path.suffix.lower()
+    if kind == ".vrm":
+        humanoid = read_humanoid(path)
+        with tempfile.TemporaryDirectory() as folder:
+            shutil.copy(path, Path(folder) / f"{path.stem}.glb")
+            _try(lambda: bpy.ops.import_scene.gltf(filepath=str(Path(folder) / f"{path.stem}.glb")), path)
+    elif kind in (".glb", ".gltf"):
+        humanoid = read_humanoid(path) if kind == ".glb" else {}
+        _try(lambda: bpy.ops.import_scene.gltf(filepath=str(path)), path)
+    elif kind == ".fbx":
+        humanoid = {}
+        _try(lambda: bpy.ops.import_scene.fbx(filepath=str(path)), path)
+    else:
+        humanoid = {}
+        _try(lambda: bpy.ops.import_anim.bvh(filepath=str(path), update_scene_fps=False, update_scene_duration=False), path)
+    armatures = [o for o in bpy.data.objects if o not in before and o.type == "ARMATURE"]
+    for armature_object in armatures:
+        known = {role: name for role, name in humanoid.items() if name in armature_object.data.bones}
+        if known:
+            armature_object.data[ROLES_KEY] = known
+    return armatures
+
+
+def _try(load: Callable[[], object], path: Path) -> None:
+    """Importers fail in their own ways; whatever they raise over a file is the file's fault."""
+    try:
+        load()
+    except Exception as error:  # noqa: BLE001  importers raise anything, from struct.error to RuntimeError with a traceback as text
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        reason = lines[-1][:200] if lines else type(error).__name__
+        raise InputError(f"Blender cannot read {path} ({reason}); it is damaged or of another kind, export it again.") from error
+
+
+def the_armature(name: str, what: str) -> bpy.types.Object:
+    """The one armature of the open file, or the one called `name`.
+
+    Raises:
+        InputError: there is none, or there are several and none was named.
+    """
+    armatures = [o for o in bpy.data.objects if o.type == "ARMATURE" and o.users_scene]
+    if name:
+        found = next((o for o in armatures if o.name == name), None)
+        if found is None:
+            known = ", ".join(o.name for o in armatures) or "none"
+            raise InputError(f"{what} has no armature “{name}”; it has: {known}.")
+        return found
+    if not armatures:
+        raise InputError(f"{what} has no armature; choose a file with a rig.")
+    if len(armatures) > 1:
+        raise InputError(f"{what} has {len(armatures)} armatures ({', '.join(o.name for o in armatures)}); name one with --armature.")
+    return armatures[0]

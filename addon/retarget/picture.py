@@ -1,0 +1,104 @@
+"""Source and target side by side, as a picture: lines from joint to joint, the target with the points of its skin."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import bpy
+import cv2
+import numpy as np
+
+from ...core import store
+from ...core.errors import InputError
+from ...core.motion.retarget.mapping import RigMap
+from ...core.motion.retarget.rig import Motion
+from ...core.motion.retarget.roles import ARM, LEG, SIDES, sided
+from ...core.motion.retarget.transfer import body_axes
+
+COLUMNS = 8
+CELL_PX = (150, 240)
+MOST_POINTS = 6000
+PAPER, INK, LEFT, RIGHT, SKIN, FLOOR = (255, 255, 255), (60, 60, 60), (40, 90, 220), (210, 120, 30), (205, 205, 205), (160, 160, 160)
+
+
+def draw(path: Path, source: Motion, source_map: RigMap, target: bpy.types.Object, motion: Motion, target_map: RigMap) -> None:
+    """Write a PNG: a row of frames of the source, below it the target, obliquely from the front; left limbs are red, right ones blue.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    some = np.unique(np.linspace(0, len(motion.frames) - 1, COLUMNS).round().astype(int))
+    rows = []
+    for moved, rig_map, skinned in ((source, source_map, None), (motion, target_map, target)):
+        size = max(float(np.percentile(np.ptp(moved.head_m[..., 2], axis=1), 90)) * 1.35, 1e-3)
+        view = _view(moved, rig_map)
+        rows.append(np.concatenate([_cell(moved, rig_map, int(i), size, view, skinned) for i in some], axis=1))
+    done, data = cv2.imencode(".png", np.concatenate(rows, axis=0))
+    if not done:
+        raise InputError(f"The picture {path} could not be made; leave --report out.")
+    store.write_bytes(path, data.tobytes())
+
+
+def _view(motion: Motion, rig_map: RigMap) -> np.ndarray:
+    """Right and up (2, 3) of the picture, from where the body faces at first: 40° from its front."""
+    hips = rig_map.first("hips")
+    axes = body_axes(motion.rig, rig_map)
+    if hips is not None:
+        b = motion.rig.index[hips]
+        axes = motion.R[0, b] @ motion.rig.R_rest[b].T @ axes
+    heading = np.arctan2(-axes[1, 1], -axes[0, 1]) + np.radians(40.0)
+    right = np.array([-np.sin(heading), np.cos(heading), 0.0])
+    return np.stack([right, np.array([0.12 * np.cos(heading), 0.12 * np.sin(heading), -1.0])])
+
+
+def _cell(motion: Motion, rig_map: RigMap, i: int, size: float, view: np.ndarray, skinned: bpy.types.Object | None) -> np.ndarray:
+    image = np.full((CELL_PX[1], CELL_PX[0], 3), PAPER, dtype=np.uint8)
+    head = motion.head_m[i]
+    hips = rig_map.first("hips")
+    middle = head[motion.rig.index[hips]] if hips else head.mean(axis=0)
+    low = min(0.0, float(motion.head_m[..., 2].min()))
+
+    def pixel(X: np.ndarray) -> np.ndarray:
+        flat = (X - (middle[0], middle[1], low)) @ view.T / size * CELL_PX[1]
+        return np.asarray(flat + (CELL_PX[0] / 2, 0.93 * CELL_PX[1]))
+
+    floor = int(pixel(np.array([middle[0], middle[1], 0.0]))[1])
+    cv2.line(image, (0, floor), (CELL_PX[0], floor), FLOOR, 1)
+    if skinned is not None:
+        for x, y in pixel(_skin_points(skinned, float(motion.frames[i]))).round().astype(int):
+            if 0 <= x < CELL_PX[0] and 0 <= y < CELL_PX[1]:
+                image[y, x] = SKIN
+    for line, colour in _lines(rig_map):
+        places = pixel(np.array([head[motion.rig.index[name]] for name in line])).round().astype(np.int32)
+        cv2.polylines(image, [places.reshape(-1, 1, 2)], False, colour, 2, cv2.LINE_AA)
+    return image
+
+
+def _lines(rig_map: RigMap) -> list[tuple[list[str], tuple[int, int, int]]]:
+    trunk = [name for role in ("hips", "spine", "neck", "head") for name in rig_map.bones.get(role, ())]
+    lines: list[tuple[list[str], tuple[int, int, int]]] = [(trunk, INK)]
+    for side, colour in zip(SIDES, (LEFT, RIGHT)):
+        for parts, start in ((ARM, rig_map.bones.get("spine", ())[-1:]), (LEG, rig_map.bones.get("hips", ())[-1:])):
+            line = [*start, *_chain(rig_map.bones, [sided(part, side) for part in parts])]
+            lines.append((line, colour))
+    return [(line, colour) for line, colour in lines if len(line) > 1]
+
+
+def _chain(bones: Mapping[str, tuple[str, ...]], roles: list[str]) -> list[str]:
+    return [name for role in roles for name in bones.get(role, ())]
+
+
+def _skin_points(armature_object: bpy.types.Object, frame: float) -> np.ndarray:
+    """Some vertices (N, 3) of what the armature moves, in a frame."""
+    scene = bpy.context.scene
+    scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1.0))
+    graph, found = bpy.context.evaluated_depsgraph_get(), [np.zeros((0, 3))]
+    for skin in [o for o in scene.objects if o.type == "MESH"]:
+        if armature_object not in (m.object for m in skin.modifiers if m.type == "ARMATURE"):
+            continue
+        mesh = skin.evaluated_get(graph).data
+        place = np.empty(3 * len(mesh.vertices))
+        mesh.vertices.foreach_get("co", place)
+        world = np.array(skin.matrix_world)
+        found.append(place.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3])
+    points = np.concatenate(found)
+    return points[:: max(1, len(points) // MOST_POINTS)]

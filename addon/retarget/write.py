@@ -1,0 +1,125 @@
+"""A retargeted motion as an action of the target: all keys of a curve at once, in the bones' own rotation modes."""
+
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from ...core.motion.retarget.keys import needed_keys
+from ...core.motion.retarget.retarget import Retargeted
+from ...core.motion.retarget.turns import continuous, euler_from_matrix, quaternion_from_matrix, transposed
+from .read import scale_of, world_matrix
+
+CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_axis_angle", 4)}
+REST = {"rotation_quaternion": (1, 0, 0, 0), "rotation_axis_angle": (0, 0, 1, 0), "rotation_euler": (0, 0, 0), "location": (0, 0, 0),
+        "scale": (1, 1, 1)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """The new action, its number of keys, and the constraints that had to be muted because they would overrule it."""
+
+    action: bpy.types.Action
+    keys: int
+    muted: tuple[str, ...]
+
+
+def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tolerance_deg: float = 0.0) -> Written:
+    """Give the target a new action with the motion; its former one is kept in the file. Main thread only.
+
+    `tolerance_deg`: leave out keys as long as no rotation is off by more; 0 keys every frame.
+    """
+    former = target.animation_data.action if target.animation_data else None
+    if former is not None:
+        former.use_fake_user = True
+    action = bpy.data.actions.new(name)
+    target.animation_data_create().action = action
+    frames, rig = result.motion.frames, result.motion.rig
+    keys = 0
+    for b in np.flatnonzero(result.driven):
+        bone = target.pose.bones[rig.names[b]]
+        channel, values = rotation_values(bone, result.basis[:, b])
+        keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2)
+        keys += _key(action, target, f"{bone.path_from_id()}.{channel}", frames[keep], values[keep], bone.name)
+    if result.carrier >= 0:
+        bone = target.pose.bones[rig.names[result.carrier]]
+        values = location_values(target, bone, result)
+        keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2 * float(np.ptp(rig.head_m, axis=0).max()) / scale_of(target))
+        keys += _key(action, target, f"{bone.path_from_id()}.location", frames[keep], values[keep], bone.name)
+    keys += _rest_of_the_rest(action, target, result)
+    return Written(action=action, keys=keys, muted=_mute(target, result))
+
+
+def rotation_values(bone: bpy.types.PoseBone, basis: np.ndarray) -> tuple[str, np.ndarray]:
+    """Name and values (T, 3 or 4) of the rotation channels of a bone, in its mode, without jumps."""
+    if bone.rotation_mode not in CHANNEL:
+        return "rotation_euler", euler_from_matrix(basis, bone.rotation_mode)
+    q = continuous(quaternion_from_matrix(basis))
+    if bone.rotation_mode == "QUATERNION":
+        return "rotation_quaternion", q
+    sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
+    axis = np.divide(q[:, 1:], sine, out=np.tile([0.0, 1.0, 0.0], (len(q), 1)), where=sine > 1e-9)
+    return "rotation_axis_angle", np.concatenate([2 * np.arctan2(sine, q[:, :1]), axis], axis=1)
+
+
+def location_values(target: bpy.types.Object, bone: bpy.types.PoseBone, result: Retargeted) -> np.ndarray:
+    """The location channels (T, 3) of the carrier."""
+    b, shift = result.carrier, result.shift_m / scale_of(target)
+    if bone.bone.use_local_location:
+        carried = result.motion.R[:, b] @ transposed(result.basis[:, b])
+        return np.einsum("tji,tj->ti", carried, shift)
+    world = world_matrix(target)[:3, :3] / scale_of(target)
+    return shift @ world
+
+
+def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, frames: np.ndarray, values: np.ndarray, group: str) -> int:
+    linear = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
+    for i in range(values.shape[1]):
+        curve = action.fcurve_ensure_for_datablock(owner, path, index=i)
+        points = curve.keyframe_points
+        points.add(len(frames))
+        points.foreach_set("co", np.stack([frames, values[:, i]], axis=1).astype(np.float32).ravel())
+        points.foreach_set("interpolation", np.full(len(frames), linear, dtype=np.int32))
+        curve.update()
+    return len(frames) * values.shape[1]
+
+
+def _rest_of_the_rest(action: bpy.types.Action, target: bpy.types.Object, result: Retargeted) -> int:
+    """One key that puts to rest what the motion does not drive but an earlier pose has left turned or shifted."""
+    rig, keys = result.motion.rig, 0
+    for b, name in enumerate(rig.names):
+        bone = target.pose.bones[name]
+        rotation = CHANNEL.get(bone.rotation_mode, ("rotation_euler", 3))[0]
+        for channel in (rotation, "location", "scale"):
+            if (channel == rotation and result.driven[b]) or (channel == "location" and b == result.carrier):
+                continue
+            now, rest = np.array(getattr(bone, channel)), np.array(REST[channel], dtype=float)
+            moved = abs(now[0]) > 1e-6 if channel == "rotation_axis_angle" else np.abs(now - rest).max() > 1e-6
+            if moved:
+                setattr(bone, channel, rest)
+                keys += _key(action, target, f"{bone.path_from_id()}.{channel}", result.motion.frames[:1], rest[None], bone.name)
+    return keys
+
+
+def _mute(target: bpy.types.Object, result: Retargeted) -> tuple[str, ...]:
+    """Constraints on driven bones would bend the motion: mute them."""
+    muted = []
+    for b in np.flatnonzero(result.driven):
+        for constraint in target.pose.bones[result.motion.rig.names[b]].constraints:
+            if not constraint.mute:
+                constraint.mute = True
+                muted.append(f"{result.motion.rig.names[b]}: {constraint.name}")
+    return tuple(muted)
+
+
+def push_to_strip(target: bpy.types.Object, action: bpy.types.Action) -> bpy.types.NlaStrip:
+    """Put the action into a strip of its own on a new NLA track, so that corrections can be layered over it."""
+    data = target.animation_data
+    slot = getattr(data, "action_slot", None)
+    data.action = None
+    track = data.nla_tracks.new()
+    track.name = action.name
+    strip = track.strips.new(action.name, int(np.floor(action.frame_range[0])), action)
+    if slot is not None and getattr(strip, "action_slot", None) is None:
+        strip.action_slot = slot
+    return strip

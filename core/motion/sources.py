@@ -1,0 +1,62 @@
+"""Motions from anywhere: a run's folder, BVH, TRC, C3D and CSV."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ..body.shape import read_body
+from ..body.skeleton import bone_frames
+from ..errors import InputError
+from .bvh import read_bvh
+from .c3d import read_c3d
+from .points_csv import rate, read_points_csv
+from .retarget.points import motion_from_points
+from .retarget.rig import Motion, Rig
+from .tables import read_motion
+from .trc import read_trc
+
+FILES = (".bvh", ".trc", ".c3d", ".csv")
+
+
+def read_motion_source(path: Path) -> Motion:
+    """The motion in a run's folder or a file; frame numbers are the file's own, a BVH file's begin at 1 as in Blender.
+
+    Raises:
+        InputError: it cannot be read, or holds no motion.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return from_run(path)
+    if not path.exists():
+        raise InputError(f"There is no motion {path}; check its name.")
+    kind = path.suffix.lower()
+    if kind == ".bvh":
+        motion = read_bvh(path)
+        return Motion(rig=motion.rig, fps=motion.fps, frames=motion.frames + 1, R=motion.R, head_m=motion.head_m)
+    if kind in (".trc", ".c3d", ".csv"):
+        read = {".trc": read_trc, ".c3d": read_c3d, ".csv": read_points_csv}[kind]
+        return motion_from_points(read(path))
+    raise InputError(f"{path.name} is no motion that can be read; give a run's folder or one of {', '.join(FILES)}.")
+
+
+def from_run(out: Path) -> Motion:
+    """The motion of the body in a run's folder; frames that were not solved are filled on straight lines.
+
+    Raises:
+        InputError: body.toml or motion.csv are missing or damaged, or no frame was solved.
+    """
+    shape = read_body(out / "body.toml")
+    table = read_motion(out / "motion.csv", shape.skeleton)
+    known = np.isfinite(table.values).all(axis=1)
+    if not known.any():
+        raise InputError(f"{out / 'motion.csv'} has no frame that was solved; run the fit again.")
+    first, last = np.flatnonzero(known)[[0, -1]]
+    frames = table.frames[first:last + 1]
+    values = np.stack([np.interp(frames, table.frames[known], column) for column in table.values[known].T], axis=1)
+    skeleton = shape.skeleton
+    R_rest, head = bone_frames(skeleton, shape.lengths_m, np.zeros(len(skeleton.dof_names)))
+    R, places = bone_frames(skeleton, shape.lengths_m, values)
+    names = tuple(bone.name for bone in skeleton.bones)
+    rig = Rig(names=names, parents=skeleton.parents, R_rest=R_rest, head_m=head, tail_m=head + shape.lengths_m[:, None] * R_rest[..., 1],
+              connected=skeleton.starts_at_tail, inherits_rotation=np.ones(len(names), dtype=bool))
+    return Motion(rig=rig, fps=rate(table.frames, table.time_s), frames=frames, R=R, head_m=places)
