@@ -14,6 +14,20 @@ from ..errors import InputError
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
 MAX_PIXELS, MAX_SIDE_PX = 64_000_000, 8191  # the side: four times as many are still looked up by OpenCV
+SIGNATURES = (
+    b"\x89PNG\r\n\x1a\n",
+    b"\xff\xd8\xff",
+    b"II*\0",
+    b"MM\0*",
+    b"II+\0",
+    b"BM",
+    b"RIFF",
+    b"P2",
+    b"P3",
+    b"P5",
+    b"P6",
+    b"\x76\x2f\x31\x01",
+)
 KINDS = ("uint8", "uint16", "float32", "float64")
 
 
@@ -134,6 +148,8 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
     if not paths:
         raise InputError(f"View {view} has no images: nothing in {folder} agrees with “{pattern}”. Mend `images` in take.toml.")
     _check_numbering(paths, view)
+    for path in paths:
+        _check_signature(path)
     return ImageFiles(paths, pattern)
 
 
@@ -171,6 +187,17 @@ def grey(image: np.ndarray) -> np.ndarray:
     if image.dtype.kind == "f":
         return np.ascontiguousarray(np.nan_to_num(image, nan=0.0) * 255.0, dtype=np.float32)
     return image.astype(np.float32)
+
+
+def _check_signature(path: Path) -> None:
+    """What is no image by its first bytes is told before anything is computed, not when its turn comes."""
+    try:
+        with open(path, "rb") as file:
+            first = file.read(8)
+    except OSError as error:
+        raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
+    if not first.startswith(SIGNATURES):
+        raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
