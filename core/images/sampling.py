@@ -1,8 +1,9 @@
 """Sub-pixel sampling: the cubic B-spline through the grey values (Unser 1999, doi:10.1109/79.799930).
 
 Prepared once per image (`noise` is the standard deviation of its grey values' noise): the exact spline on a grid four times as fine.
-A sample is a bilinear look-up in that grid, whose peak interpolation bias is 0.0009 px (texture of 1 px blur); bilinear sampling of the image itself would have 0.012 px. OpenCV 4 rounds the
-place of a look-up to 1/32 of the fine grid, at most 0.0039 px; a patch of samples at unlike places averages that away. OpenCV 5 is exact.
+A sample is a bilinear look-up in that grid, whose peak interpolation bias is 0.0009 px (texture of 1 px blur); bilinear sampling of the
+image itself would have 0.012 px. OpenCV 4 rounds the place of a look-up to 1/32 of the fine grid, at most 0.0039 px; a patch of samples
+at unlike places averages that away. OpenCV 5 is exact.
 """
 
 import cv2
