@@ -1,0 +1,81 @@
+"""Graphs and pictures of the report, also of what is empty, single or not finite."""
+
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.report import pictures
+from tricap.core.report.graphs import curve_graph
+from tricap.core.surface.cloud import PointCloud
+from tricap.core.tracking.trajectories import Trajectories
+
+GREY = np.full((150, 200), 90, np.float32)
+
+
+def lines(svg: str) -> list[str]:
+    return [e.attrib["points"] for e in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}polyline")]
+
+
+def test_a_graph_is_a_picture_of_its_curve() -> None:
+    frames = np.arange(10, 14)
+    svg = curve_graph('Angle of "a" & <b>', "°", frames, {"angle": np.array([0.0, 10, 20, 30])}, np.full(4, 2.0))
+    (points,) = lines(svg)
+    x, y = np.array([p.split(",") for p in points.split()], dtype=float).T
+    assert np.allclose(np.diff(x), np.diff(x)[0], atol=0.2) and np.allclose(np.diff(y), np.diff(y)[0], atol=0.2) and np.diff(y)[0] < 0
+    assert "frame 10" in svg and "&lt;b&gt;" in svg and svg.count("<polygon") == 1
+
+
+def test_gaps_interrupt_a_curve() -> None:
+    svg = curve_graph("g", "", np.arange(6), {"c": np.array([1.0, 2, np.nan, 3, np.inf, 5])})
+    assert [len(p.split()) for p in lines(svg)] == [2, 1, 1] and "nan" not in svg and "inf" not in svg
+
+
+@pytest.mark.parametrize("values", [[3.0], [0.0, 0.0], [1e-12, 1e-12], [-5.0, np.nan]])
+def test_single_and_constant_curves(values: list[float]) -> None:
+    svg = curve_graph("g", "mm", np.arange(len(values)), {"c": np.array(values)}, np.zeros(len(values)))
+    assert ET.fromstring(svg) is not None and "nan" not in svg
+
+
+def test_nothing_gives_no_graph() -> None:
+    assert curve_graph("g", "", np.arange(3), {"c": np.full(3, np.nan)}) == ""
+    assert curve_graph("g", "", np.arange(0), {"c": np.zeros(0)}) == ""
+
+
+def cloud(n: int) -> PointCloud:
+    random = np.random.default_rng(0)
+    return PointCloud(frame=0, xyz_m=random.uniform(-0.1, 0.1, (n, 3)) + [0, 0, 2.16], covariance_m2=np.tile(np.eye(3) * 1e-6, (n, 1, 1)),
+                      normals=np.tile([0, 0, -1.0], (n, 1)), intensity=np.full(n, 100), xy_px=random.uniform(0, 150, (n, 3, 2)),
+                      residual_px=np.zeros(n))  # fmt: skip
+
+
+@pytest.mark.parametrize("n", [0, 1, 50])
+def test_clouds_are_drawn(scenes: Any, n: int) -> None:
+    camera, c = scenes.three_cameras()["C"], cloud(n)
+    over = pictures.points_over_footage(GREY, c.xy_px[:, 1], 1e3 * c.sigma_m, 0.0, 1.0)
+    assert over.shape == (150, 200, 3) and over.dtype == np.uint8
+    assert (np.ptp(over, axis=2) > 0).any() == (n > 0)  # colour is what is measured
+    front_and_side = pictures.cloud_views(c, camera, 4)
+    assert front_and_side.shape == (pictures.PANEL_PX, 2 * pictures.PANEL_PX, 3)
+    assert front_and_side.max() > 28 if n else True
+
+
+@pytest.mark.parametrize("n", [0, 1, 20])
+def test_tracks_are_drawn(scenes: Any, n: int) -> None:
+    random = np.random.default_rng(1)
+    xyz = np.cumsum(random.normal(0, 0.01, (5, n, 3)), axis=0) + [0, 0, 2.16]
+    xyz[:2, : n // 2] = np.nan
+    velocity = np.where(np.isnan(xyz), np.nan, 0.3)
+    tracks = Trajectories(frames=np.arange(5), time_s=np.arange(5) / 25, xyz_m=xyz, velocity_m_s=velocity, acceleration_m_s2=velocity,
+                          sigma_m=xyz[..., 0] * 0 + 1e-3, status=np.isfinite(xyz[..., 0]))  # fmt: skip
+    for index in (0, 4):
+        picture = pictures.tracks_over_footage(GREY, scenes.three_cameras()["C"], tracks, index)
+        assert picture.shape == (150, 200, 3) and (np.ptp(picture, axis=2) > 0).any() == bool(tracks.seen[index].any())
+
+
+def test_png_and_grey() -> None:
+    picture = pictures.colour(np.array([[-5.0, 300.0]]))
+    assert picture[0].tolist() == [[0, 0, 0], [255, 255, 255]]
+    assert np.array_equal(cv2.imdecode(np.frombuffer(pictures.png(picture), np.uint8), cv2.IMREAD_COLOR), picture)
