@@ -14,6 +14,7 @@ from .errors import InputError
 from .geometry.intersection import forward_intersection
 from .images.sampling import SplineImage
 from .matching import foreground as fg
+from .matching.constraints import constrain
 from .matching.grid import TemplateGrid, template_grid
 from .matching.growing import GrowingSettings, TripletField, grow
 from .matching.least_squares import MatchingSettings
@@ -23,7 +24,7 @@ from .results import Results
 from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 from .take import Clicks, Footage
 
-ALGORITHM = "surface 1"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 2"  # part of every key: raise it when the same input gives other numbers
 CLICK_SIGMA_PX = 4.0
 CLICK_MISS_PX = 25.0
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
@@ -142,6 +143,7 @@ def _measure(
             monitor=monitor,
         )
     field = grow(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
+    field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor)
     field = clean_field(_single(field), cameras[ref], ref, surface)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):

@@ -53,6 +53,11 @@ class MatchingSettings:
     max_sigma_px: float = knob(0.25, "Largest standard deviation of a matched position.", unit="px", low=0.01, high=2.0)
     min_correlation: float = knob(0.75, "Smallest correlation of the matched patches.", low=0.0, high=0.999)
     max_sigma0: float = knob(35.0, "Largest sigma0, in grey values of a patch whose contrast is set to 50.", low=1.0, high=100.0)
+    constraint: str = knob(
+        "object",
+        "Geometry in the matching: none, collinearity observations (epipolar), or one piece of surface seen by all views (object).",
+        choices=("none", "epipolar", "object"),
+    )
     max_shear: float = knob(0.75, "Largest change of the patch's shape from its start.", low=0.1, high=3.0)
 
 

@@ -25,7 +25,7 @@ class NeighbourFit:
 
     coefficients: np.ndarray  # (M, P)
     scatter: np.ndarray  # (M,) robust scatter of the neighbours about (1)
-    neighbours: np.ndarray  # (M,) how many support it
+    support: np.ndarray  # (M,) the share of the neighbourhood's cells that lie on (1); at an outline half of them or less
 
 
 def neighbours_of(
@@ -47,7 +47,8 @@ def fit_neighbours(
 ) -> NeighbourFit:
     """Fit (1) about `query_xy` (M, 2) to `values` (N,) at `xy` (N, 2) of the rows `neighbour` (M, m), by Tukey's weights.
 
-    Residuals below `min_scale` (M,) count fully; `radius_px` is the reach of the neighbourhood. Where there is no neighbour, coefficients are zero.
+    Residuals below `min_scale` (M,) count fully; `radius_px` is the reach of the neighbourhood. Where there is no neighbour,
+    coefficients are zero.
     """
     valid = neighbour >= 0
     a, b = np.moveaxis(np.where(valid[..., None], xy[neighbour] - query_xy[:, None], 0.0) / radius_px, -1, 0)
@@ -68,7 +69,7 @@ def fit_neighbours(
             robust = valid * np.clip(1 - ratio**2, 0, 1) ** 2
     c[:, 0] += base
     power = np.array([0, 1, 1, 2, 2, 2])[: m.shape[2]]
-    return NeighbourFit(coefficients=c / radius_px**power, scatter=scatter, neighbours=valid.sum(axis=1))
+    return NeighbourFit(coefficients=c / radius_px**power, scatter=scatter, support=robust.mean(axis=1))
 
 
 def unlike_neighbours(grid: TemplateGrid, cell: np.ndarray, parameters: np.ndarray, *, sigmas: float, least: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
-from .template_patches import GRADIENT_NOISE, TemplatePatches
+from .template_patches import GRADIENT_NOISE, TemplatePatches, monomials
 
 MIN_NOISE = 1.0  # grey values: no image is better than its quantisation and interpolation
 CONVERGED_SIGMAS = 0.05
@@ -121,9 +121,10 @@ def match_surface(
 ) -> SurfacePatch:
     """Fit the surface (1) at the reference view's points `xy` (N, 2) (rows' pixels) to all images at once.
 
-    `start` (N, 3) or (N, 6) holds approximate θ; its width chooses planes or quadrics. `sigma_across_px` is σ_c, in full-frame pixels: 0.001 holds the patches on their
-    epipolar lines. `weight` (N, n) of the patch's pixels. A search image that does not hold a point makes it OUT_OF_IMAGE.
-    Cost: about 12 µs per point of 13×13 and search image.
+    `start` (N, 3) or (N, 6) holds approximate θ; its width chooses planes or quadrics. `sigma_across_px` is σ_c, in rows' pixels: 0.001
+    holds the patches on their epipolar lines. `weight` (N, n) is that of the patch's pixels. A search image that does not hold a point
+    makes it OUT_OF_IMAGE.
+    Cost: about 30 µs per point of 13×13 and search image.
     """
     n = len(xy)
 
@@ -151,6 +152,27 @@ def match_surface(
     return SurfacePatch(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in SurfacePatch.__dataclass_fields__})
 
 
+@dataclass(eq=False, kw_only=True, slots=True)
+class _Linear:
+    """What the adjustment of m points is made of, at one place. S search views."""
+
+    along: np.ndarray  # (m, S, 2) s_k
+    side: np.ndarray  # (m, S, 2) n'_k
+    weight: np.ndarray  # (m, S) P_k
+    correlation: np.ndarray  # (m, S)
+    speed: np.ndarray  # (m,) largest |∂x_k/∂w|
+    seen: np.ndarray  # (m,) by all search views
+
+    @classmethod
+    def empty(cls, m: int, S: int) -> "_Linear":
+        z = np.zeros
+        return cls(along=z((m, S, 2)), side=z((m, S, 2)), weight=z((m, S)), correlation=z((m, S)), speed=z(m), seen=np.ones(m, dtype=bool))
+
+    def put(self, rows: np.ndarray, other: "_Linear") -> None:
+        for name in self.__slots__:
+            getattr(self, name)[rows] = getattr(other, name)
+
+
 class _Adjustment:
     """The adjustment (4) of a chunk of points."""
 
@@ -173,63 +195,87 @@ class _Adjustment:
         status = np.full(n, MatchStatus.NOT_CONVERGED, dtype=np.int8)
         status[~self._patches.textured] = MatchStatus.NO_TEXTURE
         status[~(self._patches.inside & np.isfinite(theta).all(axis=1))] = MatchStatus.OUT_OF_IMAGE
-        correlation, K = np.zeros((n, S)), np.zeros((n, P + S, P + S))
-        iterations, pixels_per_w = np.zeros(n, dtype=np.int16), np.ones(n)
+        state, iterations = _Linear.empty(n, S), np.zeros(n, dtype=np.int16)
         active = np.flatnonzero(status == MatchStatus.NOT_CONVERGED)
         for iteration in range(1, s.max_iterations + 1):
             if not len(active):
                 break
-            N, rhs, K[active], correlation[active], speed, seen = self._equations(theta[active], across[active], active)
-            step = _solve(N, rhs)
-            length = np.abs(step[:, 0]) * speed
+            linear, rhs = self._linearise(theta[active], across[active], active)
+            pseudo, wish = self._pseudo(theta[active], across[active], active)
+            N = self._normal(linear, active) + pseudo[:, :, None] * np.eye(P + S)
+            step = solve_normals(N, rhs + pseudo * wish)
+            length = np.abs(step[:, 0]) * linear.speed
             shrink = np.minimum(1.0, MAX_STEP_PX / np.maximum(length, 1e-12))[:, None]
             theta[active] += step[:, :P] * shrink
             across[active] += step[:, P:] * shrink
-            iterations[active], pixels_per_w[active] = iteration, speed
-            away = np.abs(theta[active, 0] - start[active, 0]) * speed > 2 * s.max_shift_px
-            sigma = speed * np.sqrt(np.maximum(K[active, 0, 0], 0.0))
-            done = length < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * sigma)
+            iterations[active] = iteration
+            state.put(active, linear)
+            away = (np.abs(theta[active, 0] - start[active, 0]) * linear.speed > 2 * s.max_shift_px) | ~np.isfinite(length)
+            done = length < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * linear.speed / np.sqrt(N[:, 0, 0]))
             status[active[done]] = MatchStatus.OK
-            status[active[away | ~np.isfinite(length)]] = MatchStatus.SHIFT_TOO_LARGE
-            status[active[~seen]] = MatchStatus.OUT_OF_IMAGE
-            active = active[~(done | away | ~seen | ~np.isfinite(length))]
-        return self._judge(start, theta, across, K, correlation, iterations, pixels_per_w, status)
+            status[active[away]] = MatchStatus.SHIFT_TOO_LARGE
+            status[active[~linear.seen]] = MatchStatus.OUT_OF_IMAGE
+            active = active[~(done | away | ~linear.seen)]
+        return self._judge(start, theta, across, state, iterations, status)
 
-    def _equations(
-        self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """N, right side, covariance (5), correlations (m, S), px per w (m,) and whether all views see the points."""
-        m, P, S, patches = len(rows), self._P, self._S, self._patches
-        N, rhs, noise = np.zeros((m, P + S, P + S)), np.zeros((m, P + S)), np.zeros((m, P + S, P + S))
-        rho, seen, speed = np.zeros((m, S)), np.ones(m, dtype=bool), np.zeros(m)
-        weights, along, side = np.zeros((m, S)), np.zeros((m, S, 2)), np.zeros((m, S, 2))
-        variance = np.full(m, np.inf)
+    def _linearise(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray) -> tuple["_Linear", np.ndarray]:
+        """The directions, weights and correlations at θ, and the right side (m, P + S) of (4) without pseudo-observations."""
+        P, patches = self._P, self._patches
+        state, rhs = _Linear.empty(len(rows), self._S), np.zeros((len(rows), P + self._S))
         for k, (image, line) in enumerate(zip(self._images, self._lines)):
             c, e, A, L = line.centre(theta, rows)
-            length = np.linalg.norm(e, axis=1)
-            normal = np.stack([-e[:, 1], e[:, 0]], axis=1) / np.maximum(length, 1e-12)[:, None]
+            normal = normal_to(e)
             c = c + across[:, k, None] * normal
             visible = image.inside(c, np.array(patches.half) * 0.5)
-            seen &= visible
             x, y = line.warp(theta, patches.monomials, rows, np.where(visible[:, None], c, 0.0), L)
-            rho[:, k], _, (gx, gy) = patches.compare(image.sample(x, y), rows)
+            rho, (gx, gy) = patches.compare(image.sample(x, y), rows)
             s, t = _apply_inverse(A, e), _apply_inverse(A, normal)
-            sigma2 = np.maximum(patches.residual_variance(rho[:, k], P + 2, rows), MIN_NOISE**2)
-            weights[:, k], along[:, k], side[:, k] = 1 / sigma2, s, t
-            variance, speed = np.minimum(variance, sigma2), np.maximum(speed, length)
-            J = _blocks(patches, rows, s, t, k, P, S)
-            N += J * weights[:, k, None, None]
-            noise += _noise_blocks(patches, rows, s, t, k, P, S) * weights[:, k, None, None] * sigma2[:, None, None]
-            rhs[:, :P] -= weights[:, k, None] * (s[:, :1] * gx + s[:, 1:] * gy)
-            rhs[:, P + k] -= weights[:, k] * (t[:, 0] * gx[:, 0] + t[:, 1] * gy[:, 0])
-        spread = 0.5 * N + 0.5 * variance[:, None, None] * _sum_blocks(patches, rows, weights, along, side, P)
-        texture = _without_noise(N, 0.5 * GRADIENT_NOISE * noise)
-        pseudo, wish = self._pseudo(theta, across, rows)
-        diagonal = np.arange(P + S)
-        for M in (N, spread, texture):
+            weight = 1 / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
+            rhs[:, :P] -= weight[:, None] * (s[:, :1] * gx + s[:, 1:] * gy)
+            rhs[:, P + k] -= weight * (t[:, 0] * gx[:, 0] + t[:, 1] * gy[:, 0])
+            state.along[:, k], state.side[:, k], state.weight[:, k], state.correlation[:, k] = s, t, weight, rho
+            np.maximum(state.speed, np.linalg.norm(e, axis=1), out=state.speed)
+            state.seen &= visible
+        return state, rhs
+
+    def _normal(self, a: "_Linear", rows: np.ndarray | slice) -> np.ndarray:
+        """Σ P_k J_kᵀ M J_k (m, P + S, P + S)."""
+        P, N = self._P, np.zeros((len(a.speed), self._P + self._S, self._P + self._S))
+        for k in range(self._S):
+            s, t, weight = a.along[:, k], a.side[:, k], a.weight[:, k]
+            N[:, :P, :P] += weight[:, None, None] * self._patches.normal(s, s, rows)
+            self._cross(N, k, weight[:, None] * self._patches.normal_to_shift(s, t, rows))
+            N[:, P + k, P + k] = weight * self._patches.normal_of_shift(t, t, rows)
+        return N
+
+    def _cross(self, N: np.ndarray, k: int, block: np.ndarray) -> None:
+        N[:, : self._P, self._P + k] = N[:, self._P + k, : self._P] = block
+
+    def _covariance(self, a: "_Linear", pseudo: np.ndarray) -> np.ndarray:
+        """(5) for all points of the chunk (n, P + S, P + S)."""
+        P, patches, every = self._P, self._patches, slice(None)
+        N, noise, common = (
+            self._normal(a, every),
+            np.zeros((len(pseudo), P + self._S, P + self._S)),
+            np.zeros_like(pseudo[:, :, None] * pseudo[:, None]),
+        )
+        total = np.einsum("nk,nki->ni", a.weight, a.along)
+        common[:, :P, :P] = patches.normal(total, total)
+        for k in range(self._S):
+            s, t = a.along[:, k], a.side[:, k]
+            noise[:, :P, :P] += np.einsum("ni,ni->n", s, s)[:, None, None] * patches.noise_moment
+            self._cross(noise, k, np.einsum("ni,ni->n", s, t)[:, None] * patches.noise_moment[:, 0])
+            noise[:, P + k, P + k] = np.einsum("ni,ni->n", t, t) * patches.noise_moment[:, 0, 0]
+            self._cross(common, k, patches.normal_to_shift(total, a.weight[:, k, None] * t))
+            for j in range(self._S):
+                common[:, P + k, P + j] = patches.normal_of_shift(a.weight[:, k, None] * t, a.weight[:, j, None] * a.side[:, j])
+        middle = 0.5 * N + 0.5 * common / np.maximum(a.weight.max(axis=1), 1e-12)[:, None, None]
+        diagonal = np.arange(P + self._S)
+        texture = without_noise(N, 0.5 * GRADIENT_NOISE * noise)
+        for M in (middle, texture):
             M[:, diagonal, diagonal] += pseudo
-        half = _inverse(texture)
-        return N, rhs + pseudo * wish, half @ spread @ half, rho, speed, seen
+        half = inverse_normals(texture)
+        return half @ middle @ half
 
     def _pseudo(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weights (m, P + S) of the pseudo-observations and what they wish to be added."""
@@ -245,18 +291,13 @@ class _Adjustment:
         start: np.ndarray,
         theta: np.ndarray,
         across: np.ndarray,
-        K: np.ndarray,
-        correlation: np.ndarray,
+        state: "_Linear",
         iterations: np.ndarray,
-        speed: np.ndarray,
         status: np.ndarray,
     ) -> SurfacePatch:
-        s, P, patches = self._settings, self._P, self._patches
-        at = np.zeros((len(theta), P))
-        at[:, 0], at[:, 1:3] = 1.0, patches.offset
-        if P == 6:
-            o = patches.offset
-            at[:, 3:] = np.stack([0.5 * o[:, 0] ** 2, o[:, 0] * o[:, 1], 0.5 * o[:, 1] ** 2], axis=1)
+        s, P, patches, speed, correlation = self._settings, self._P, self._patches, state.speed, state.correlation
+        K = self._covariance(state, self._pseudo(theta, across, np.arange(len(theta)))[0])
+        at = monomials(patches.offset[:, 0], patches.offset[:, 1], 1 if P == 3 else 2)
         sigma = speed * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", at, K[:, :P, :P], at), 0.0))
         lost = np.clip(1 - correlation.min(axis=1) ** 2, 0, 1)
         pixels = np.maximum(patches.pixels, P + 3.0)
@@ -284,40 +325,12 @@ class _Adjustment:
         )
 
 
-def _blocks(patches: TemplatePatches, rows: np.ndarray, s: np.ndarray, t: np.ndarray, k: int, P: int, S: int) -> np.ndarray:
-    """JᵀMJ (m, P + S, P + S) of search image k: the surface's unknowns along s, its own shift across along t."""
-    J = np.zeros((len(rows), P + S, P + S))
-    J[:, :P, :P] = patches.normal(s, s, rows)
-    J[:, :P, P + k] = J[:, P + k, :P] = patches.normal(s, t, rows)[:, :, 0]
-    J[:, P + k, P + k] = patches.normal(t, t, rows)[:, 0, 0]
-    return J
+def normal_to(direction: np.ndarray) -> np.ndarray:
+    """Unit vectors (…, 2) at right angles to directions (…, 2)."""
+    return np.stack([-direction[..., 1], direction[..., 0]], axis=-1) / np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-12)
 
 
-def _noise_blocks(patches: TemplatePatches, rows: np.ndarray, s: np.ndarray, t: np.ndarray, k: int, P: int, S: int) -> np.ndarray:
-    """What gradients that are noise of variance 1 add to `_blocks`, in expectation."""
-    J, M = np.zeros((len(rows), P + S, P + S)), patches.noise_moment[rows]
-    st = np.einsum("ni,ni->n", s, t)
-    J[:, :P, :P] = np.einsum("ni,ni->n", s, s)[:, None, None] * M
-    J[:, :P, P + k] = J[:, P + k, :P] = st[:, None] * M[:, 0]
-    J[:, P + k, P + k] = np.einsum("ni,ni->n", t, t) * M[:, 0, 0]
-    return J
-
-
-def _sum_blocks(patches: TemplatePatches, rows: np.ndarray, weights: np.ndarray, along: np.ndarray, side: np.ndarray, P: int) -> np.ndarray:
-    """(Σ P_k J_k)ᵀ (Σ P_k J_k): how the template's noise, common to all search images, acts."""
-    m, S = weights.shape
-    total = np.einsum("nk,nki->ni", weights, along)
-    J = np.zeros((m, P + S, P + S))
-    J[:, :P, :P] = patches.normal(total, total, rows)
-    for k in range(S):
-        t = weights[:, k, None] * side[:, k]
-        J[:, :P, P + k] = J[:, P + k, :P] = patches.normal(total, t, rows)[:, :, 0]
-        for j in range(S):
-            J[:, P + k, P + j] = patches.normal(t, weights[:, j, None] * side[:, j], rows)[:, 0, 0]
-    return J
-
-
-def _without_noise(N: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def without_noise(N: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """N without the gradients' noise, of which each unknown keeps at least MIN_REMAINING of its own."""
     d = np.einsum("nii->ni", N)
     share = np.einsum("nii->ni", noise) / np.maximum(d, 1e-300)
@@ -338,11 +351,13 @@ def _scaled(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.nan_to_num(N * scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(N.shape[1]), scale
 
 
-def _solve(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+def solve_normals(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+    """x (m, P) of N x = rhs, for normal matrices (m, P, P) whose unknowns have unlike units."""
     M, scale = _scaled(N)
     return scale * np.linalg.solve(M, (scale * rhs)[..., None])[..., 0]
 
 
-def _inverse(N: np.ndarray) -> np.ndarray:
+def inverse_normals(N: np.ndarray) -> np.ndarray:
+    """N⁻¹ (m, P, P), for normal matrices whose unknowns have unlike units."""
     M, scale = _scaled(N)
     return np.linalg.inv(M) * scale[:, :, None] * scale[:, None, :]

@@ -81,21 +81,26 @@ class TemplatePatches:
             + (s[:, 1] * t[:, 1])[:, None, None] * M[:, 2]
         )
 
-    def compare(
-        self, g: np.ndarray, rows: np.ndarray | slice = slice(None)
-    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Correlation (m,), gain r1 (m,) and the products of M r1 g (m, P), for both directions, of search patches g (m, n)."""
+    def normal_to_shift(self, s: np.ndarray, t: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """The column of `normal` (m, P) for a mere shift along t."""
+        M = self._moment[rows]
+        xx, xy, yx, yy = M[:, 0, :, 0], M[:, 1, :, 0], M[:, 1, 0, :], M[:, 2, :, 0]
+        return s[:, :1] * (t[:, :1] * xx + t[:, 1:] * xy) + s[:, 1:] * (t[:, :1] * yx + t[:, 1:] * yy)
+
+    def normal_of_shift(self, s: np.ndarray, t: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """The element of `normal` (m,) for mere shifts along s and t."""
+        M = self._moment[rows, :, 0, 0]
+        return s[:, 0] * t[:, 0] * M[:, 0] + (s[:, 0] * t[:, 1] + s[:, 1] * t[:, 0]) * M[:, 1] + s[:, 1] * t[:, 1] * M[:, 2]
+
+    def compare(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Correlation (m,) and the products of M r1 g (m, P), for both directions, of search patches g (m, n)."""
         g = g - np.einsum("ij,ij->i", g, self.mean_weight[rows])[:, None]
         power = np.maximum(np.einsum("ij,ij,ij->i", g, g, self._weight[rows]), 1e-6).astype(np.float64)
         along = np.einsum("ij,ij->i", g, self.weighted_f[rows]).astype(np.float64)
         gain = self.contrast[rows] * along / power
         px, py = self.project(g, rows)
-        q = self.q[rows]
-        return (
-            along / np.sqrt(power),
-            gain,
-            (gain[:, None] * (px - q[:, 0] * along[:, None]), gain[:, None] * (py - q[:, 1] * along[:, None])),
-        )
+        q, gain = self.q[rows], gain[:, None]
+        return along / np.sqrt(power), (gain * (px - q[:, 0] * along[:, None]), gain * (py - q[:, 1] * along[:, None]))
 
     def residual_variance(self, rho: np.ndarray, parameters: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Variance [grey values²] of a pixel after the adjustment, at correlation rho (m,)."""

@@ -1,0 +1,267 @@
+"""Geometric constraints over a field of triplets: every point is measured again in all views at once, and only what then agrees is kept.
+
+`constraint = "epipolar"`: affine patches with collinearity observations (`multi_image`, Gruen & Baltsavias 1988).
+`constraint = "object"`: one curved piece of surface per point (`object_space`). What the neighbours say, a quadric of inverse depth through
+the cells around, gives the starts, and its slopes and curvatures are pseudo-observations: the neighbourhood constraint. It is the curvature
+that an affine patch averages away (SCIENCE §4), so that a round body is measured where it is, with a patch large enough to be precise. The
+patch is wider than the unconstrained one and fades out (Gaussian window): its precision is that of the middle, not that of its rim.
+
+What the rig does not know is estimated from the points themselves: σ_c² = median of the squared shifts across the epipolar lines − their
+own variance (of a first adjustment in which these shifts are free).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..images.sampling import SplineImage
+from ..progress import Monitor
+from .foreground import Foreground
+from .growing import TEMPLATE_SIGMA_PX, TripletField
+from .least_squares import MatchingSettings, MatchStatus, patch_offsets
+from .multi_image import MultiImageMatches, match_multi_image
+from .neighbourhood import RADIUS_CELLS, NeighbourFit, fit_neighbours, neighbours_of
+from .object_space import Epipolar, SurfacePatch, SurfacePrior, match_surface, normal_to
+from .template_patches import monomials
+
+WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
+SLOPE_SIGMA, CURVATURE_SIGMA, STIFF = 0.1, 0.01, 0.1  # px/px and px/px² in the search view that moves fastest; the second try
+FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
+SAMPLE = 1000  # points that tell the rig's quality
+NEIGHBOUR_NOISE_PX = 0.05
+MEDIAN_OF_CHI2 = 0.4549
+SCATTER_SHARE = 0.3  # of the neighbours' scatter about their quadric: what the model does not follow
+MAX_STEEPNESS = 5.0  # change of depth per distance across
+OUTLINE_SIGMA_PX = 1.3  # across the ray, where no neighbour supports a point: at an outline the patch hangs over the body's edge
+
+
+def constrain(
+    field: TripletField,
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    settings: MatchingSettings,
+    *,
+    foreground: Foreground,
+    monitor: Monitor,
+    neighbours: bool = True,
+) -> TripletField:
+    """The field measured again under `settings.constraint`; points that fail are left out. "none" returns the field as it is.
+
+    Without `neighbours` what the cells around say is used for the starts only.
+    """
+    if settings.constraint == "none" or not len(field.cell):
+        return field
+    measure = _object_space if settings.constraint == "object" else _epipolar
+    return measure(field, images, cameras, reference, settings, foreground, monitor, neighbours)
+
+
+def _surface_of(field: TripletField, camera: Camera, reference: int, speed: float) -> NeighbourFit:
+    """The quadric of inverse depth about every cell of the field."""
+    w = 1 / camera.to_camera(field.xyz_m)[:, 2]
+    return fit_neighbours(
+        neighbours_of(field.grid, field.cell, field.cell),
+        field.xy[:, reference],
+        w,
+        field.grid.xy(field.cell),
+        degree=2,
+        min_scale=np.full(len(w), NEIGHBOUR_NOISE_PX / speed),
+        radius_px=RADIUS_CELLS * field.grid.spacing_px,
+    )
+
+
+def _px_per_inverse_metre(cameras: Sequence[Camera], reference: int) -> float:
+    """How fast the fastest search view moves with inverse depth [px m], for cameras that look alike."""
+    base = cameras[reference]
+    return max(base.focal_px * float(np.linalg.norm(c.centre_m - base.centre_m)) for c in cameras if c is not base)
+
+
+def _object_space(
+    field: TripletField,
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    settings: MatchingSettings,
+    foreground: Foreground,
+    monitor: Monitor,
+    neighbours: bool,
+) -> TripletField:
+    rows, speed = field.grid.rows, _px_per_inverse_metre(cameras, reference)
+    around = _surface_of(field, cameras[reference], reference, speed)
+    xy, start = field.grid.xy(field.cell), around.coefficients[:, : 6 if neighbours else 3]
+    prior = _prior(start, speed)
+    wide = replace(settings, patch_px=settings.patch_px + WINDOW_EXTRA_PX)
+    weight = _window(wide.patch_px, rows.step)
+
+    def match(which: np.ndarray, prior: SurfacePrior, sigma_c: float) -> SurfacePatch:
+        return match_surface(
+            images,
+            cameras,
+            reference,
+            rows,
+            xy[which],
+            start[which],
+            wide,
+            sigma_across_px=sigma_c,
+            prior=SurfacePrior(value=prior.value[which], sigma=prior.sigma[which]),
+            weight=np.broadcast_to(weight, (len(which), len(weight))),
+            monitor=monitor,
+        )
+
+    every = np.arange(len(xy))
+    sample = match(every[:: max(1, len(xy) // SAMPLE)], prior, FREE_SIGMA_PX)
+    rig_sigma_px = _rig_sigma(sample.across_px[sample.ok], sample.across_sigma_px[sample.ok])
+    found = match(every, prior, max(MIN_SIGMA_C_PX, rig_sigma_px))
+    again = np.flatnonzero(~found.ok)
+    if neighbours and len(again):
+        stiff = SurfacePrior(value=prior.value, sigma=prior.sigma * np.array([1, STIFF, STIFF, STIFF, STIFF, STIFF]))
+        _replace(found, again, match(again, stiff, max(MIN_SIGMA_C_PX, rig_sigma_px)))
+    return _kept(_from_surface(field, found, around, cameras, reference, rig_sigma_px), found.ok, foreground, cameras[reference])
+
+
+def _prior(start: np.ndarray, speed: float) -> SurfacePrior:
+    """What the neighbours say of slopes and curvatures; of planes (N, 3) they say nothing."""
+    said = np.array([SLOPE_SIGMA, SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SIGMA, CURVATURE_SIGMA]) / speed
+    sigma = np.array([np.inf, *said]) if start.shape[1] == 6 else np.full(3, np.inf)
+    return SurfacePrior(value=start, sigma=np.tile(sigma, (len(start), 1)))
+
+
+def _window(patch_px: int, row_step: int) -> np.ndarray:
+    """Weights (n,) of a patch's pixels: a Gaussian about its middle."""
+    u, v, _ = patch_offsets(patch_px, row_step)
+    return np.exp(-0.5 * (u**2 + (v * row_step) ** 2) / (WINDOW_SIGMA * (patch_px - WINDOW_EXTRA_PX)) ** 2)
+
+
+def _rig_sigma(across_px: np.ndarray, sigma_px: np.ndarray) -> float:
+    """Standard deviation [px] of what the rig does not know, from the shifts across the epipolar lines."""
+    if not len(across_px):
+        return 0.0
+    return float(np.sqrt(max(0.0, float(np.median(across_px**2)) / MEDIAN_OF_CHI2 - float(np.median(sigma_px**2)))))
+
+
+def _replace(found: SurfacePatch, rows: np.ndarray, other: SurfacePatch) -> None:
+    """Put the good ones of `other` in the rows of `found`."""
+    for name in SurfacePatch.__dataclass_fields__:
+        if name != "status":
+            getattr(found, name)[rows[other.ok]] = getattr(other, name)[other.ok]
+    found.status[rows[other.ok]] = other.status[other.ok]
+
+
+def _from_surface(
+    field: TripletField, found: SurfacePatch, around: NeighbourFit, cameras: Sequence[Camera], reference: int, rig_sigma_px: float
+) -> TripletField:
+    """The field with the positions, shapes and covariances of pieces of surface, at the texture's centre of gravity."""
+    base, rows, o = cameras[reference], field.grid.rows, found.offset
+    curved = found.theta.shape[1] == 6
+    m = monomials(o[:, 0], o[:, 1], 2 if curved else 1).astype(np.float64)
+    w = np.maximum(np.einsum("ni,ni->n", m, found.theta), 1e-6)
+    at, slope = field.grid.xy(field.cell) + o, found.theta[:, 1:3]
+    if curved:
+        slope = slope + np.einsum("nij,nj->ni", found.theta[:, [3, 4, 4, 5]].reshape(-1, 2, 2), o)
+    steepness = np.linalg.norm(slope / (1.0, rows.step), axis=1) * base.focal_px / w
+    variance = np.einsum("ni,nij,nj->n", m, found.covariance, m)
+    xy, shape, K = field.xy.copy(), field.shape.copy(), field.covariance.copy()
+    xy[:, reference] = at
+    square, speed = np.zeros(len(w)), np.zeros(len(w))
+    views = [k for k in range(len(cameras)) if k != reference]
+    for i, k in enumerate(views):
+        c, e, A, _ = Epipolar(base, cameras[k], rows, at).centre(np.column_stack([w, slope]))
+        n = normal_to(e)
+        xy[:, k], shape[:, k] = c + found.across_px[:, i, None] * n, A
+        K[:, k] = (
+            variance[:, None, None] * e[:, :, None] * e[:, None]
+            + (found.across_sigma_px[:, i] ** 2)[:, None, None] * n[:, :, None] * n[:, None]
+        )
+        square += np.sum((found.across_px[:, i, None] * n * (1.0, rows.step)) ** 2, axis=1)
+        speed = np.maximum(speed, np.linalg.norm(e, axis=1))
+    found.status[(found.status == MatchStatus.OK) & (steepness > MAX_STEEPNESS)] = MatchStatus.SHAPE_TOO_LARGE
+    ray = base.rays(rows.to_frame(at))
+    excess = found.across_px / np.sqrt(found.across_sigma_px**2 + max(rig_sigma_px, MIN_SIGMA_C_PX) ** 2)
+    return replace(
+        field,
+        xy=xy,
+        shape=shape,
+        covariance=K,
+        correlation=found.correlation.min(axis=1),
+        xyz_m=base.centre_m + ray / w[:, None],
+        covariance_m2=ray[:, :, None] * ray[:, None] * (variance / w**4)[:, None, None]
+        + _model_covariance(ray, w, speed, around, rig_sigma_px, base),
+        residual_px=np.sqrt(square / len(cameras)),
+        sigma0=np.sqrt(np.sum(excess**2, axis=1) / len(views)),
+        spread=np.zeros_like(field.spread) if curved else found.spread,  # with curvatures adjusted nothing is left to correct
+    )
+
+
+def _model_covariance(
+    ray: np.ndarray, w: np.ndarray, speed: np.ndarray | float, around: NeighbourFit, rig_sigma_px: float, base: Camera
+) -> np.ndarray:
+    """What matching cannot know of itself (N, 3, 3): the rig's own quality, what a quadric does not follow, and the body's outline."""
+    along = (rig_sigma_px / np.maximum(speed, 1e-9)) ** 2 + (SCATTER_SHARE * around.scatter) ** 2
+    side_px2 = TEMPLATE_SIGMA_PX**2 + rig_sigma_px**2 + (OUTLINE_SIGMA_PX * (1 - around.support)) ** 2
+    return ray[:, :, None] * ray[:, None] * (along / w**4)[:, None, None] + (side_px2 / (base.focal_px * w) ** 2)[:, None, None] * np.eye(3)
+
+
+def _epipolar(
+    field: TripletField,
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    settings: MatchingSettings,
+    foreground: Foreground,
+    monitor: Monitor,
+    neighbours: bool,
+) -> TripletField:
+    rows, base, xy = field.grid.rows, cameras[reference], field.grid.xy(field.cell)
+    views = [k for k in range(len(cameras)) if k != reference]
+    speed = _px_per_inverse_metre(cameras, reference)
+    around = _surface_of(field, base, reference, speed)
+    theta, ray = around.coefficients[:, :3], base.rays(rows.to_frame(xy))
+    lines = [Epipolar(base, cameras[k], rows, xy).centre(theta) for k in views]
+    middle, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
+    X = base.points_at_depth(rows.to_frame(xy), 1 / theta[:, 0])
+
+    def match(which: np.ndarray, sigma_c: float) -> MultiImageMatches:
+        a, b, c, d = xy[which], middle[which], shape[which], X[which]
+        return match_multi_image(
+            images, cameras, reference, rows, a, b, c, d, settings, sigma_c_px=sigma_c, neighbours=neighbours, monitor=monitor
+        )
+
+    sample = match(np.arange(len(xy))[:: max(1, len(xy) // SAMPLE)], FREE_SIGMA_PX)
+    known = sample.ok
+    residual = sample.residual_px[known][:, 1:, 1]
+    rig_sigma_px = _rig_sigma(residual, np.sqrt(sample.covariance[known][:, :, 1, 1]) * rows.step)
+    found = match(np.arange(len(xy)), max(MIN_SIGMA_C_PX, rig_sigma_px))
+    order = [reference, *views]
+    at, A, K = field.xy.copy(), field.shape.copy(), field.covariance.copy()
+    at[:, reference] = xy + found.offset
+    at[:, views], A[:, views], K[:, views] = found.xy, found.shape, found.covariance
+    square = np.sum(found.residual_px**2, axis=(1, 2))
+    result = replace(
+        field,
+        xy=at,
+        shape=A,
+        covariance=K,
+        correlation=found.correlation.min(axis=1),
+        xyz_m=found.xyz_m,
+        covariance_m2=found.covariance_m2 + _model_covariance(ray, theta[:, 0], speed, around, rig_sigma_px, base),
+        residual_px=np.sqrt(square / len(order)),
+        sigma0=np.sqrt(square / (2 * len(order) - 3)) / max(MIN_SIGMA_C_PX, rig_sigma_px),
+        spread=found.spread,
+    )
+    return _kept(result, found.ok, foreground, base)
+
+
+def _kept(field: TripletField, ok: np.ndarray, foreground: Foreground, base: Camera) -> TripletField:
+    """The points that were found, whose rays meet, and that lie where the foreground is."""
+    near, far = foreground.depth_range_m
+    depth = base.to_camera(field.xyz_m)[:, 2]
+    with np.errstate(invalid="ignore"):
+        inside = (
+            (depth >= near)
+            & (depth <= far)
+            & (field.residual_px <= field.limit_px)
+            & ~foreground.excludes(field.xyz_m, field.covariance_m2)
+        )
+    return field.select(ok & inside)
