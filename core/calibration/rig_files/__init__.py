@@ -1,21 +1,62 @@
-"""Other tools' calibration files."""
+"""Other tools' calibration files, read and written: Anipose, Pose2Sim, caliscope, OpenCV, EasyMocap, COLMAP, OpenPTV, Agisoft."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from ...errors import InputError
-from ...geometry.rig import Rig, read_rig, write_rig
+from ...geometry.rig import Rig
+from . import agisoft, colmap, opencv_files, openptv, toml_files
 
-FORMATS = {"anipose": (read_rig, write_rig)}
+FORMATS: dict[str, Callable[[Path, Rig], list[Path]]] = {
+    "agisoft": agisoft.write,
+    "anipose": toml_files.write_anipose,
+    "caliscope": toml_files.write_caliscope,
+    "colmap": colmap.write,
+    "easymocap": opencv_files.write_easymocap,
+    "opencv": opencv_files.write,
+    "openptv": openptv.write,
+    "pose2sim": toml_files.write_pose2sim,
+}
+FOLDERS = ("colmap", "easymocap", "openptv")  # written as several files into a folder
 
 
 def read_any(path: Path) -> Rig:
-    """Read a rig."""
-    return read_rig(path)
+    """Read another tool's calibration, told apart by the file's or folder's content.
+
+    Raises:
+        InputError: it is missing, of no known kind, or damaged.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"The calibration {path} is missing; check the path.")
+    folder, ending = path if path.is_dir() else path.parent, path.suffix.lower()
+    if ending == ".toml":
+        return toml_files.read(path)
+    if ending in (".ori", ".addpar", ".par") or (path.is_dir() and any(folder.glob("*.ori"))):
+        return openptv.read(path)
+    if path.name in ("cameras.txt", "images.txt") or (path.is_dir() and (folder / "cameras.txt").exists()):
+        return colmap.read(path)
+    if path.name in ("intri.yml", "extri.yml") or (path.is_dir() and (folder / "intri.yml").exists()):
+        return opencv_files.read_easymocap(path)
+    if ending == ".xml":
+        return (
+            opencv_files.read(path)
+            if path.read_text(encoding="utf-8", errors="replace").find("opencv_storage") >= 0
+            else agisoft.read(path)
+        )
+    if ending in (".yml", ".yaml"):
+        return opencv_files.read(path)
+    raise InputError(f"{path} is of no known kind; give a file or folder of {', '.join(sorted(FORMATS))}.")
 
 
 def write_as(path: Path, rig: Rig, name: str) -> list[Path]:
-    """Write a rig."""
+    """Write a rig in another tool's format; the files that were written.
+
+    Raises:
+        InputError: the format is unknown, or cannot hold this rig.
+    """
     if name not in FORMATS:
-        raise InputError(f"unknown format {name}")
-    write_rig(path, rig)
-    return [path]
+        raise InputError(f"The format “{name}” is unknown; choose one of {', '.join(sorted(FORMATS))}.")
+    if name in FOLDERS and Path(path).is_file():
+        raise InputError(f"{path} is a file; {name} needs a folder.")
+    return FORMATS[name](Path(path), rig)

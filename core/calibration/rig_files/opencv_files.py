@@ -1,0 +1,197 @@
+"""OpenCV's FileStorage (YAML or XML), and EasyMocap's pair of such files.
+
+OpenCV's calibration sample writes camera_matrix, distortion_coefficients, image_width, image_height of one camera; its stereo sample M1 D1 M2
+D2 and R T (of the second camera). For a rig we write `names` and, for each name n, camera_matrix_n, distortion_coefficients_n, image_width_n,
+image_height_n, R_n (3×3), T_n. EasyMocap: intri.yml with names, K_n, dist_n, and H_n, W_n in newer files; extri.yml with R_n (Rodrigues),
+Rot_n, T_n in metres.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ... import store
+from ...errors import InputError
+from ...geometry.camera import Camera
+from ...geometry.rig import Rig
+from ...geometry.rotation import rotation_from_vector, vector_from_rotation
+from .reading import five, make_camera, numbers, text_of
+from .refit import plain
+
+
+class Nodes:
+    """The top-level entries of a FileStorage."""
+
+    def __init__(self, path: Path) -> None:
+        text = text_of(path)
+        try:
+            self._storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+            opened = self._storage.isOpened()
+        except (cv2.error, SystemError):
+            opened = False
+        if not opened:
+            raise InputError(f"{path} is no YAML or XML that OpenCV can read; write it with cv2.FileStorage.")
+        self._path = path
+
+    def _node(self, key: str) -> Any:
+        return self._storage.getNode(key)
+
+    def has(self, key: str) -> bool:
+        """Whether there is such an entry."""
+        return not self._node(key).empty()
+
+    def matrix(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """An entry that is a matrix.
+
+        Raises:
+            InputError: it is missing or has another shape.
+        """
+        try:
+            value = self._node(key).mat() if self.has(key) else None
+        except (cv2.error, SystemError):
+            value = None
+        if value is None:
+            raise InputError(f"{self._path} lacks the matrix “{key}”; it is no complete calibration.")
+        return numbers(value, shape, f"“{key}” in {self._path}")
+
+    def number(self, *keys: str) -> float | None:
+        """The first of some entries that is a number."""
+        for key in keys:
+            if self.has(key) and (self._node(key).isReal() or self._node(key).isInt()):
+                return float(self._node(key).real())
+        return None
+
+    def names(self) -> list[str]:
+        """The sequence of texts `names`."""
+        node = self._node("names")
+        return [node.at(n).string() for n in range(node.size())] if self.has("names") and node.isSeq() else []
+
+
+def read(path: Path) -> Rig:
+    """Read one camera, a stereo pair, a rig, or EasyMocap's intri.yml with extri.yml beside it.
+
+    Raises:
+        InputError: an entry is missing or damaged.
+    """
+    nodes = Nodes(path)
+    names = nodes.names()
+    if names and nodes.has(f"K_{names[0]}"):
+        return read_easymocap(path)
+    if names:
+        return Rig(cameras=tuple(_of_rig(nodes, name) for name in names))
+    if nodes.has("M1") and nodes.has("M2"):
+        return Rig(cameras=_stereo(path, nodes))
+    K = nodes.matrix("camera_matrix" if nodes.has("camera_matrix") else "K", (3, 3))
+    D = nodes.matrix("distortion_coefficients" if nodes.has("distortion_coefficients") else "D", (-1,))
+    size = _size(K, nodes.number("image_width", "image_Width"), nodes.number("image_height", "image_Height"))
+    return Rig(cameras=(make_camera(path.stem, size, K, five(D, f"The distortion in {path}"), np.eye(3), np.zeros(3)),))
+
+
+def _size(K: np.ndarray, width: float | None, height: float | None) -> tuple[float, float]:
+    """The image's size; if it is not said, the principal point is taken for the middle."""
+    return (width or round(2 * K[0, 2] + 1), height or round(2 * K[1, 2] + 1))
+
+
+def _of_rig(nodes: Nodes, name: str) -> Camera:
+    K = nodes.matrix(f"camera_matrix_{name}", (3, 3))
+    return make_camera(
+        name,
+        _size(K, nodes.number(f"image_width_{name}"), nodes.number(f"image_height_{name}")),
+        K,
+        five(nodes.matrix(f"distortion_coefficients_{name}", (-1,)), f"The distortion of {name}"),
+        nodes.matrix(f"R_{name}", (3, 3)),
+        nodes.matrix(f"T_{name}", (3,)),
+    )
+
+
+def _stereo(path: Path, nodes: Nodes) -> tuple[Camera, Camera]:
+    """M1 D1 M2 D2, and R T here or in extrinsics.yml beside it."""
+    pose = nodes if nodes.has("R") else Nodes(path.with_name("extrinsics" + path.suffix))
+    width, height = nodes.number("image_width", "width"), nodes.number("image_height", "height")
+    poses = ((np.eye(3), np.zeros(3)), (pose.matrix("R", (3, 3)), pose.matrix("T", (3,))))
+    made = []
+    for n, (R, t) in enumerate(poses, start=1):
+        K, D = nodes.matrix(f"M{n}", (3, 3)), five(nodes.matrix(f"D{n}", (-1,)), f"“D{n}” in {path}")
+        made.append(make_camera(f"cam_{n}", _size(K, width, height), K, D, R, t))
+    return made[0], made[1]
+
+
+def write(path: Path, rig: Rig) -> list[Path]:
+    """Write a rig as OpenCV YAML, or XML if the file's name ends so."""
+
+    def fill(storage: Any) -> None:
+        _write_names(storage, rig)
+        for camera in map(plain, rig.cameras):
+            storage.write(f"image_width_{camera.name}", camera.size_px[0])
+            storage.write(f"image_height_{camera.name}", camera.size_px[1])
+            storage.write(f"camera_matrix_{camera.name}", camera.matrix.copy())
+            storage.write(f"distortion_coefficients_{camera.name}", camera.distortions.reshape(1, 5).copy())
+            storage.write(f"R_{camera.name}", camera.R_cam_world.copy())
+            storage.write(f"T_{camera.name}", camera.t_cam_world_m.reshape(3, 1).copy())
+
+    store.write_text(path, _storage_text(".xml" if path.suffix == ".xml" else ".yml", rig, fill))
+    return [path]
+
+
+def read_easymocap(path: Path) -> Rig:
+    """Read intri.yml and extri.yml of a folder (or of either file's folder).
+
+    Raises:
+        InputError: one of them is missing, or an entry is missing or damaged.
+    """
+    folder = path if path.is_dir() else path.parent
+    inner, outer = Nodes(folder / "intri.yml"), Nodes(folder / "extri.yml")
+    cameras = []
+    for name in inner.names():
+        K = inner.matrix(f"K_{name}", (3, 3))
+        D = inner.matrix(f"dist_{name}" if inner.has(f"dist_{name}") else f"D_{name}", (-1,))
+        size = _size(K, inner.number(f"W_{name}"), inner.number(f"H_{name}"))
+        R = outer.matrix(f"Rot_{name}", (3, 3)) if outer.has(f"Rot_{name}") else rotation_from_vector(outer.matrix(f"R_{name}", (3,)))
+        cameras.append(make_camera(name, size, K, five(D, f"The distortion of {name}"), R, outer.matrix(f"T_{name}", (3,))))
+    if not cameras:
+        raise InputError(f"{folder / 'intri.yml'} names no cameras; it needs the list “names”.")
+    return Rig(cameras=tuple(cameras))
+
+
+def write_easymocap(folder: Path, rig: Rig) -> list[Path]:
+    """Write intri.yml and extri.yml into a folder."""
+    cameras = [plain(camera) for camera in rig.cameras]
+
+    def fill_inner(storage: Any) -> None:
+        _write_names(storage, rig)
+        for camera in cameras:
+            storage.write(f"K_{camera.name}", camera.matrix.copy())
+            storage.write(f"dist_{camera.name}", camera.distortions.reshape(1, 5).copy())
+            storage.write(f"H_{camera.name}", camera.size_px[1])
+            storage.write(f"W_{camera.name}", camera.size_px[0])
+
+    def fill_outer(storage: Any) -> None:
+        _write_names(storage, rig)
+        for camera in cameras:
+            storage.write(f"R_{camera.name}", vector_from_rotation(camera.R_cam_world).reshape(3, 1))
+            storage.write(f"Rot_{camera.name}", camera.R_cam_world.copy())
+            storage.write(f"T_{camera.name}", camera.t_cam_world_m.reshape(3, 1).copy())
+
+    paths = [folder / "intri.yml", folder / "extri.yml"]
+    for path, fill in zip(paths, (fill_inner, fill_outer)):
+        store.write_text(path, _storage_text(".yml", rig, fill))
+    return paths
+
+
+def _write_names(storage: Any, rig: Rig) -> None:
+    storage.startWriteStruct("names", cv2.FileNode_SEQ)
+    for camera in rig.cameras:
+        storage.write("", camera.name)
+    storage.endWriteStruct()
+
+
+def _storage_text(ending: str, rig: Rig, fill: Callable[[Any], None]) -> str:
+    bad = [c.name for c in rig.cameras if not c.name.replace("_", "").replace("-", "").isalnum() or not c.name.isascii()]
+    if bad:
+        raise InputError(f"OpenCV's files cannot hold the camera name “{bad[0]}”; use letters, digits, - and _.")
+    storage = cv2.FileStorage(ending, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    fill(storage)
+    return str(storage.releaseAndGetString())

@@ -1,0 +1,114 @@
+"""TOML calibrations: aniposelib (and FreeMoCap), Pose2Sim, caliscope.
+
+aniposelib `CameraGroup.dump`: tables [cam_0], [cam_1], … of name, size, matrix, distortions (k1 k2 p1 p2 k3), rotation (Rodrigues, world →
+camera), translation, in the unit of its board; it sorts the tables' names as text (cam_10 before cam_2).
+Pose2Sim: a table per camera's name, distortions (k1 k2 p1 p2), fisheye, metres.
+caliscope `camera_array.toml`: [cameras.0], … with cam_id, rotation (Rodrigues, or 3×3 in older files), metres; a missing key is None.
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ... import store
+from ...errors import InputError
+from ...geometry.camera import Camera
+from ...geometry.rig import Rig
+from ...geometry.rotation import rotation_from_vector, vector_from_rotation
+from .reading import five, make_camera, numbers, text_of
+from .refit import plain
+
+UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+
+
+def read(path: Path) -> Rig:
+    """Read any of the three layouts.
+
+    Raises:
+        InputError: it is none of them, or a camera is incomplete.
+    """
+    try:
+        table = tomllib.loads(text_of(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a TOML file: {error}.") from error
+    metadata = table.get("metadata", {})
+    unit_m = UNITS_M.get(str(metadata.get("unit", "m")) if isinstance(metadata, dict) else "m", 1.0)
+    entries = table["cameras"] if isinstance(table.get("cameras"), dict) else table
+    cameras = [
+        _camera(key, entry, path, unit_m)
+        for key, entry in entries.items()
+        if isinstance(entry, dict) and "matrix" in entry and entry.get("rotation") is not None
+    ]
+    if not cameras:
+        raise InputError(f"{path} holds no calibrated camera with matrix, rotation and translation; choose the file of the finished rig.")
+    return Rig(cameras=tuple(cameras))
+
+
+def _camera(key: str, entry: dict[str, Any], path: Path, unit_m: float) -> Camera:
+    name = str(entry.get("name", f"cam_{entry['cam_id']}" if "cam_id" in entry else key))
+    label = f"of camera “{name}” in {path}"
+    missing = [k for k in ("size", "rotation", "translation") if k not in entry]
+    if missing:
+        raise InputError(f"Camera “{name}” in {path} lacks “{missing[0]}”; choose the file of the finished rig.")
+    if entry.get("fisheye"):
+        raise InputError(f"Camera “{name}” in {path} is a fisheye camera, which is not supported; calibrate it with k1, k2, p1, p2, k3.")
+    rotation = np.asarray(entry["rotation"], dtype=object)
+    R = numbers(entry["rotation"], (3, 3), f"“rotation” {label}") if rotation.shape == (3, 3) else None
+    affinity = numbers(entry["affinity"], (2,), f"“affinity” {label}") if "affinity" in entry else None
+    return make_camera(
+        name,
+        numbers(entry["size"], (2,), f"“size” {label}").tolist(),
+        numbers(entry["matrix"], (3, 3), f"“matrix” {label}"),
+        five(entry.get("distortions", []), f"“distortions” {label}"),
+        rotation_from_vector(numbers(entry["rotation"], (3,), f"“rotation” {label}")) if R is None else R,
+        numbers(entry["translation"], (3,), f"“translation” {label}") * unit_m,
+        affinity,
+    )
+
+
+def write_anipose(path: Path, rig: Rig) -> list[Path]:
+    """Write as aniposelib does, in metres, cameras without affinity."""
+    parts = [_table(f"cam_{n}", plain(camera), 5, ()) for n, camera in enumerate(rig.cameras)]
+    store.write_text(path, "\n".join([*parts, "[metadata]\nadjusted = true\nerror = 0.0\n"]))
+    return [path]
+
+
+def write_pose2sim(path: Path, rig: Rig) -> list[Path]:
+    """Write as Pose2Sim does: a table per camera's name, four distortions, metres; k3 is fitted into the others."""
+    parts = [_table(_key(camera.name), plain(camera, k3=False), 4, ("fisheye = false",)) for camera in rig.cameras]
+    store.write_text(path, "\n".join([*parts, "[metadata]\nadjusted = false\nerror = 0.0\n"]))
+    return [path]
+
+
+def write_caliscope(path: Path, rig: Rig) -> list[Path]:
+    """Write caliscope's camera_array.toml: cameras numbered from 0, metres."""
+    parts = []
+    for n, camera in enumerate(rig.cameras):
+        extra = (f"cam_id = {n}", "rotation_count = 0", "fisheye = false")
+        parts.append(_table(f"cameras.{n}", plain(camera), 5, extra))
+    store.write_text(path, "\n".join(parts))
+    return [path]
+
+
+def _table(key: str, camera: Camera, distortions: int, extra: tuple[str, ...]) -> str:
+    lines = [
+        f"[{key}]",
+        f"name = {_quoted(camera.name)}",
+        f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
+        f"matrix = {camera.matrix.tolist()!r}",
+        f"distortions = {camera.distortions[:distortions].tolist()!r}",
+        f"rotation = {vector_from_rotation(camera.R_cam_world).tolist()!r}",
+        f"translation = {camera.t_cam_world_m.tolist()!r}",
+        *extra,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if name and all(c.isascii() and (c.isalnum() or c in "-_") for c in name) and name != "metadata" else _quoted(name)
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ") + '"'

@@ -1,0 +1,229 @@
+"""Other tools' files: what is written is read again; files as those tools write them are understood; broken ones are refused."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
+from tricap.core.calibration.rig_files.openptv import image
+from tricap.core.errors import InputError
+from tricap.core.geometry.camera import Camera
+from tricap.core.geometry.rig import Rig, read_rig
+from tricap.core.synthetic.bar import bar_ends, benchmark_cameras
+
+ENDING = {"agisoft": "rig.xml", "opencv": "rig.yml"}
+# Half of a shear is a turn, the other half cannot be said without b2: b2 / 2 × half the diagonal = 1e-4 × 480 px = 0.048 px at the corner of
+# camera C; without k3 another 0.02 px. Agisoft's format holds everything.
+TOLERANCE_PX = {"agisoft": 1e-9}
+FITTED_PX = 0.08
+
+
+def target(folder: Path, name: str) -> Path:
+    return folder / name if name in FOLDERS else folder / ENDING.get(name, "rig.toml")
+
+
+def without_shear(camera: Camera) -> Camera:
+    return Camera(
+        name=camera.name,
+        size_px=camera.size_px,
+        matrix=camera.matrix,
+        distortions=camera.distortions,
+        R_cam_world=camera.R_cam_world,
+        t_cam_world_m=camera.t_cam_world_m,
+    )
+
+
+def distance(a: Rig, b: Rig) -> float:
+    points = bar_ends(50, np.random.default_rng(0), 0.5).reshape(-1, 3)
+    return max(float(np.nanmax(np.linalg.norm(p.project(points) - q.project(points), axis=1))) for p, q in zip(a.cameras, b.cameras))
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_what_is_written_is_read_again(name: str, tmp_path: Path) -> None:
+    rig = Rig(cameras=benchmark_cameras())
+    path = target(tmp_path, name)
+    write_as(path, rig, name)
+    again = read_any(path)
+    assert [c.size_px for c in again.cameras] == [c.size_px for c in rig.cameras]
+    by_name = Rig(cameras=tuple(again[c.name] for c in rig.cameras))
+    assert distance(rig, by_name) < TOLERANCE_PX.get(name, FITTED_PX)
+
+
+@pytest.mark.parametrize("name", ["anipose", "caliscope", "opencv", "easymocap", "colmap", "agisoft"])
+def test_cameras_without_shear_are_exact(name: str, tmp_path: Path) -> None:
+    rig = Rig(cameras=tuple(without_shear(c) for c in benchmark_cameras()))
+    path = target(tmp_path, name)
+    write_as(path, rig, name)
+    again = read_any(path)
+    assert distance(rig, Rig(cameras=tuple(again[c.name] for c in rig.cameras))) < 1e-6
+
+
+def test_opencv_xml(tmp_path: Path) -> None:
+    rig = Rig(cameras=tuple(without_shear(c) for c in benchmark_cameras()))
+    write_as(tmp_path / "rig.xml", rig, "opencv")
+    assert distance(rig, read_any(tmp_path / "rig.xml")) < 1e-6
+
+
+def test_our_rig_is_read_by_the_anipose_reader(tmp_path: Path) -> None:
+    rig = Rig(cameras=tuple(without_shear(c) for c in benchmark_cameras()))
+    write_as(tmp_path / "rig.toml", rig, "anipose")
+    assert distance(rig, read_rig(tmp_path / "rig.toml")) < 1e-6
+
+
+def test_pose2sim_file(tmp_path: Path) -> None:
+    """Pose2Sim's documented layout: a table per camera, sizes as floats, four distortions, [metadata]."""
+    text = """
+[cam_01]
+name = "cam_01"
+size = [ 1088.0, 1920.0]
+matrix = [ [ 1681.24, 0.0, 532.04], [ 0.0, 1681.07, 948.93], [ 0.0, 0.0, 1.0]]
+distortions = [ -0.0474, 0.0464, -0.0001, 0.0]
+rotation = [ 1.1, -1.3, 1.2]
+translation = [ 0.31, 0.80, 4.57]
+fisheye = false
+
+[metadata]
+adjusted = false
+error = 0.0
+"""
+    (tmp_path / "Calib.toml").write_text(text)
+    camera = read_any(tmp_path / "Calib.toml")["cam_01"]
+    assert camera.size_px == (1088, 1920) and camera.distortions.tolist() == [-0.0474, 0.0464, -0.0001, 0.0, 0.0]
+    R, _ = cv2.Rodrigues(np.array([1.1, -1.3, 1.2]))
+    assert np.allclose(camera.R_cam_world, R) and camera.t_cam_world_m.tolist() == [0.31, 0.80, 4.57]
+
+
+def test_caliscope_file(shared_takes: Path) -> None:
+    """A file that caliscope wrote, with rotations as matrices."""
+    rig = read_any(shared_takes / "upperbody_4cam_charuco_caliscope" / "camera_array.toml")
+    assert [c.name for c in rig.cameras] == ["cam_0", "cam_1", "cam_2", "cam_3"]
+    assert rig.cameras[0].matrix[0, 0] == pytest.approx(903.5501) and rig.cameras[0].size_px == (1280, 720)
+
+
+def test_opencv_stereo_sample(tmp_path: Path) -> None:
+    """What OpenCV's stereo_calib sample writes: M1 D1 M2 D2 in intrinsics.yml, R T in extrinsics.yml."""
+
+    def matrix(name: str, rows: int, cols: int, data: list[float]) -> str:
+        return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {data}\n"
+
+    K = [534.0, 0.0, 341.5, 0.0, 534.5, 234.5, 0.0, 0.0, 1.0]
+    D = [-0.28, 0.07, 0.0012, -0.0001, 0.02]
+    head = "%YAML:1.0\n---\n"
+    (tmp_path / "intrinsics.yml").write_text(head + "".join(matrix(f"M{n}", 3, 3, K) + matrix(f"D{n}", 1, 5, D) for n in (1, 2)))
+    eye = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    (tmp_path / "extrinsics.yml").write_text(head + matrix("R", 3, 3, eye) + matrix("T", 3, 1, [-3.3, 0.0, 0.1]))
+    rig = read_any(tmp_path / "intrinsics.yml")
+    assert rig["cam_2"].centre_m == pytest.approx([3.3, 0.0, -0.1]) and rig["cam_1"].distortions.tolist() == D
+
+
+def test_easymocap_file(tmp_path: Path) -> None:
+    """EasyMocap's intri.yml and extri.yml: `names`, K_, dist_, R_ as a rotation vector, Rot_, T_; no image size in older ones."""
+    head = '%YAML:1.0\n---\nnames:\n  - "01"\n'
+    matrix = "{}: !!opencv-matrix\n  rows: {}\n  cols: {}\n  dt: d\n  data: {}\n"
+    K = matrix.format("K_01", 3, 3, "[1000.0, 0.0, 511.5, 0.0, 1001.0, 511.5, 0.0, 0.0, 1.0]")
+    (tmp_path / "intri.yml").write_text(head + K + matrix.format("dist_01", 1, 5, "[-0.1, 0.02, 0.001, 0.002, 0.003]"))
+    R, t = matrix.format("R_01", 3, 1, "[0.1, 0.2, 0.3]"), matrix.format("T_01", 3, 1, "[1.0, 2.0, 3.0]")
+    (tmp_path / "extri.yml").write_text(head + R + t)
+    camera = read_any(tmp_path)["01"]
+    assert camera.size_px == (1024, 1024) and camera.distortions.tolist() == [-0.1, 0.02, 0.001, 0.002, 0.003]
+    assert np.allclose(camera.R_cam_world, cv2.Rodrigues(np.array([0.1, 0.2, 0.3]))[0])
+
+
+def test_colmap_file(tmp_path: Path) -> None:
+    """COLMAP's documented example: https://colmap.github.io/format.html; its first pixel's middle is (0.5, 0.5)."""
+    (tmp_path / "cameras.txt").write_text("# comment\n1 SIMPLE_RADIAL 3072 2304 2559.81 1536 1152 -0.0218531\n")
+    pose = "0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354"
+    (tmp_path / "images.txt").write_text(f"# comment\n1 {pose} 1 P1180141.JPG\n2362.39 248.498 58396 1784.7 268.254 59027\n")
+    camera = read_any(tmp_path)["P1180141"]
+    assert camera.matrix[0].tolist() == [2559.81, 0.0, 1535.5] and camera.distortions[0] == -0.0218531
+    w, x, y, z = (float(v) for v in pose.split()[:4])
+    assert camera.R_cam_world[0, 1] == pytest.approx(2 * (x * y - w * z), abs=1e-5)
+
+
+ORI = """  101.6620   -54.7000   -70.0000
+    -0.05 0.03 0.02
+
+      0.0000   0.0000   0.0000
+      0.0000   0.0000   0.0000
+      0.0000   0.0000   0.0000
+
+      0.0500   -0.0300
+      8.5000
+
+    0.0 0.0 1.0
+"""
+
+
+def test_openptv_file(tmp_path: Path) -> None:
+    """OpenPTV's documented layout (.ori, .addpar, ptv.par); its own equations give the same pixels."""
+    from tricap.core.geometry.rotation import axis_rotation
+
+    R = axis_rotation("x", -0.05) @ axis_rotation("y", 0.03) @ axis_rotation("z", 0.02)
+    rows = "\n".join(" ".join(f"{v:.15f}" for v in row) for row in R)
+    start, end = ORI.index("      0.0000   0.0000   0.0000"), ORI.index("\n\n      0.0500")
+    (tmp_path / "cam1.tif.ori").write_text(ORI[:start] + rows + ORI[end:])
+    p = [-0.0012, 0.00001, 0.0, 0.0001, -0.00005, 1.0005, 0.0002]
+    (tmp_path / "cam1.tif.addpar").write_text(" ".join(map(str, p)) + "\n")
+    par = [1, "img/cam1.", "cal/cam1.tif", 1, 0, 1, 768, 576, 0.0083, 0.0083, 0, 1, 1, 1, 0]
+    (tmp_path / "ptv.par").write_text("\n".join(map(str, par)) + "\n")
+    camera = read_any(tmp_path)["cam1"]
+    X = np.random.default_rng(0).uniform([-400, -300, -2500], [400, 300, -1500], (200, 3))
+    d = (X - [101.662, -54.7, -70.0]) @ R * [1, -1, -1]
+    expected = image(np.array([0.05, -0.03, 8.5, *p]), d, (768, 576), (0.0083, 0.0083))
+    inside = camera.sees(expected)
+    assert inside.sum() > 50
+    assert np.linalg.norm(camera.project(X / 1000) - expected, axis=1)[inside].max() < 0.05
+
+
+def test_openptv_cameras_that_look_into_water_are_refused(shared_takes: Path) -> None:
+    with pytest.raises(InputError, match="only air"):
+        read_any(shared_takes / "calibbody_4cam_openptv_cavity")
+
+
+def test_agisoft_file(tmp_path: Path) -> None:
+    """Metashape's documented layout; the image's middle is (w/2, h/2), P1 and P2 are swapped against OpenCV's."""
+    text = """<?xml version="1.0" encoding="UTF-8"?>
+<document version="1.4.0"><chunk label="Chunk 1" enabled="true"><sensors next_id="1">
+<sensor id="0" label="unknown" type="frame"><resolution width="4000" height="3000"/>
+<calibration type="frame" class="adjusted"><resolution width="4000" height="3000"/><f>3000.5</f><cx>10.5</cx><cy>-4.5</cy>
+<b1>1.5</b1><b2>-0.5</b2><k1>-0.05</k1><k2>0.02</k2><p1>0.001</p1><p2>-0.0005</p2></calibration></sensor></sensors>
+<cameras next_id="2"><camera id="0" sensor_id="0" label="IMG_1"><transform>1 0 0 2 0 1 0 3 0 0 1 4 0 0 0 1</transform></camera>
+<camera id="1" sensor_id="0" label="IMG_2"/></cameras></chunk></document>"""
+    (tmp_path / "cameras.xml").write_text(text)
+    rig = read_any(tmp_path / "cameras.xml")
+    (camera,) = rig.cameras
+    assert camera.centre_m.tolist() == [2, 3, 4] and camera.distortions[2:4].tolist() == [-0.0005, 0.001]
+    a, b = 0.2, 0.1
+    r2 = a * a + b * b
+    L = 1 - 0.05 * r2 + 0.02 * r2**2
+    x = a * L + 0.001 * (r2 + 2 * a * a) - 2 * 0.0005 * a * b
+    y = b * L - 0.0005 * (r2 + 2 * b * b) + 2 * 0.001 * a * b
+    expected = [2000 + 10.5 + x * 3000.5 + x * 1.5 - y * 0.5 - 0.5, 1500 - 4.5 + y * 3000.5 - 0.5]
+    assert camera.project(np.array([2 + a, 3 + b, 5.0])) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("rig.toml", "[cam_0]\nname = 'a'\n"),
+        ("rig.toml", "[cam_0\n"),
+        ("rig.yml", "nonsense"),
+        ("rig.xml", "<document><chunk/></document>"),
+        ("rig.xml", "<broken"),
+        ("cameras.txt", "1 FISHEYE 10 10 1 2 3 4\n"),
+        ("rig.ori", "1 2 3"),
+        ("rig.dat", "1 2 3"),
+    ],
+)
+def test_broken_files_are_refused_with_a_sentence(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError):
+        read_any(tmp_path / name)
+
+
+def test_an_entity_bomb_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rig.xml").write_text('<!DOCTYPE a [<!ENTITY b "c">]><document>&b;</document>')
+    with pytest.raises(InputError, match="entities"):
+        read_any(tmp_path / "rig.xml")
