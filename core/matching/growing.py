@@ -19,7 +19,7 @@ from ..progress import Monitor
 from ..settings import knob
 from .foreground import Foreground
 from .grid import TemplateGrid
-from .least_squares import Matches, MatchingSettings, match_patches
+from .least_squares import Matches, MatchingSettings, MatchStatus, match_patches
 from .seeds import Approximations
 
 NEIGHBOURS = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
@@ -46,12 +46,13 @@ class GrowingSettings:
         high=10.0,
     )
     max_ray_sigma0: float = knob(3.0, "Largest distance by which rays may miss, in units of its own sigma.", low=1.0, high=100.0)
+    pairs: bool = knob(False, "Keep points that only two views can see, because they lie outside the images of the others.")
     max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across.", low=0.5, high=20.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TripletField:
-    """The points that were matched in all K views: one row per accepted cell of the grid. Rows' pixels, metres."""
+    """The points that were matched: one row per accepted cell of the grid. Rows' pixels, metres; NaN in a view that does not see a point."""
 
     grid: TemplateGrid
     cell: np.ndarray  # (N,) flat cell numbers, ascending
@@ -66,6 +67,11 @@ class TripletField:
     spread: np.ndarray  # (N, 2) variance of the texture's energy in the patch of the reference view
     tried: int  # how many cells were tried
     limit_px: float  # the residual that was allowed
+
+    @property
+    def complete(self) -> np.ndarray:
+        """(N,) which points all views see."""
+        return np.isfinite(self.xy).all(axis=(1, 2))
 
     def select(self, rows: np.ndarray) -> "TripletField":
         """The field with only these rows (a mask or indices)."""
@@ -99,15 +105,16 @@ def grow(
     foreground: Foreground,
     monitor: Monitor,
 ) -> TripletField:
-    """Grow the field of triplets from the seeds until no neighbour can be matched any more.
+    """Grow the field from the seeds until no neighbour can be matched any more.
 
+    A point needs three rays, or all of them where there are two views; with `pairs`, two rays will do where the other views cannot see it.
     Only points that the foreground allows are accepted.
     """
     n_cells = grid.shape[0] * grid.shape[1]
     state = _State(n_cells, len(cameras))
     camera = cameras[reference]
     cells, start, shape, parent_depth = _seed_front(grid, seeds, reference)
-    matched, point, _ = _measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching, EQUAL_SIGMA_PX)
+    matched, point, _ = _measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching, EQUAL_SIGMA_PX, pairs=False)
     limit_px, rig_sigma_px = _rig_quality(matched, point, growing)
     for enlarged in range(growing.bigger_patches + 1):
         settings = replace(matching, patch_px=matching.patch_px + PATCH_STEP_PX * enlarged)
@@ -118,9 +125,9 @@ def grow(
             monitor.step("surface", int(state.accepted.sum()), n_cells)
             state.attempts[cells] += 1
             xy = grid.xy(cells)
-            matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px)
+            matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px, growing.pairs)
             good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, foreground)
-            _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], reference)
+            _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], grid, cameras, reference)
             cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
     return _field(state, grid, limit_px)
 
@@ -170,6 +177,7 @@ def _measure(
     shape: np.ndarray,
     matching: MatchingSettings,
     rig_sigma_px: float,
+    pairs: bool,
 ) -> tuple[list[Matches], Intersection, np.ndarray]:
     """Match points in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
     views = [k for k in range(len(cameras)) if k != reference]
@@ -186,13 +194,19 @@ def _measure(
     rig = np.diag([1.0, 1 / grid.rows.step**2]) * rig_sigma_px**2
     K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(cameras), 1, 1))
     image_xy[:, reference] = xy + matched[0].offset
-    every = np.all([m.ok for m in matched], axis=0)
     for k, m in zip(views, matched):
-        image_xy[every, k] = m.transfer_xy[every]
-        K[every, k] = m.transfer_covariance[every] + rig
-    image_xy[~every] = np.nan
+        image_xy[m.ok, k] = m.transfer_xy[m.ok]
+        K[m.ok, k] = m.transfer_covariance[m.ok] + rig
+    image_xy[~_enough_rays(matched, pairs)] = np.nan
     point = forward_intersection(cameras, grid.rows.to_frame(image_xy), grid.rows.covariance_to_frame(K))
     return matched, point, cameras[reference].to_camera(point.xyz_m)[:, 2]
+
+
+def _enough_rays(matched: Sequence[Matches], pairs: bool) -> np.ndarray:
+    """(N,) whether three rays were found (or all there are), or with `pairs` two, where the point lies outside all other views."""
+    rays = 1 + np.sum([m.ok for m in matched], axis=0)
+    found_or_outside = np.all([m.ok | (m.status == MatchStatus.OUT_OF_IMAGE) for m in matched], axis=0)
+    return (rays >= min(3, 1 + len(matched))) | (pairs & (rays == 2) & found_or_outside)
 
 
 def _acceptable(
@@ -212,7 +226,7 @@ def _acceptable(
     with np.errstate(invalid="ignore"):
         continues = ~(np.abs(depth - parent_depth) > growing.max_slope * across + NOISE_SIGMAS * sigma)  # NaN parents bind nothing
         return (
-            np.all([m.ok for m in matched], axis=0)
+            _enough_rays(matched, growing.pairs)
             & (point.rms_residual_px <= limit_px)
             & (point.sigma0 <= growing.max_ray_sigma0)
             & (depth >= near)
@@ -227,7 +241,15 @@ def _rows(m: Matches, rows: np.ndarray) -> Matches:
 
 
 def _store(
-    state: _State, cells: np.ndarray, matched: Sequence[Matches], point: Intersection, good: np.ndarray, xy: np.ndarray, reference: int
+    state: _State,
+    cells: np.ndarray,
+    matched: Sequence[Matches],
+    point: Intersection,
+    good: np.ndarray,
+    xy: np.ndarray,
+    grid: TemplateGrid,
+    cameras: Sequence[Camera],
+    reference: int,
 ) -> None:
     views = [k for k in range(state.xy.shape[1]) if k != reference]
     state.accepted[cells] = True
@@ -235,9 +257,12 @@ def _store(
     state.shape[cells, reference], state.spread[cells] = np.eye(2), matched[0].spread
     state.covariance[cells, reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
     for k, m in zip(views, matched):
-        state.middle[cells, k], state.xy[cells, k] = m.xy, m.transfer_xy
+        # a view that does not see the point goes on from where the point would be
+        unseen = grid.rows.from_frame(cameras[k].project(point.xyz_m[good]))
+        state.middle[cells, k] = np.where(m.ok[:, None], m.xy, unseen)
+        state.xy[cells, k] = np.where(m.ok[:, None], m.transfer_xy, np.nan)
         state.shape[cells, k], state.covariance[cells, k] = m.shape, m.transfer_covariance
-    state.correlation[cells] = np.min([m.correlation for m in matched], axis=0)
+    state.correlation[cells] = np.min([np.where(m.ok, m.correlation, 1.0) for m in matched], axis=0)
     state.xyz[cells], state.covariance_m2[cells] = point.xyz_m[good], point.covariance_m2[good]
     state.residual[cells], state.sigma0[cells] = point.rms_residual_px[good], point.sigma0[good]
 
@@ -252,7 +277,7 @@ def _next_front(state: _State, fresh: np.ndarray, grid: TemplateGrid, attempts: 
     cells, parents = cells[usable], parents[usable]
     open_ = ~state.accepted[cells] & (state.attempts[cells] < attempts)
     cells, parents = cells[open_], parents[open_]
-    quality = np.trace(state.covariance[parents].sum(axis=1), axis1=1, axis2=2)
+    quality = np.trace(state.covariance_m2[parents], axis1=1, axis2=2)
     order = np.lexsort((parents, quality, cells))
     cells, first = np.unique(cells[order], return_index=True)
     return cells, parents[order][first]
