@@ -52,7 +52,7 @@ class GrowingSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TripletField:
-    """The points that were matched: one row per accepted cell of the grid. Rows' pixels, metres; NaN in a view that does not see a point."""
+    """The points that were matched: one row per accepted cell of the grid. Rows' pixels, metres; NaN in views that do not see it."""
 
     grid: TemplateGrid
     cell: np.ndarray  # (N,) flat cell numbers, ascending
