@@ -50,7 +50,7 @@ def track_bar(frames: Sequence[Targets], width_px: float) -> BarTrack:
     chosen = usable if still else moving
     xy = [t.xy_px[c[:MOST_SPOTS]] for t, c in zip(frames, chosen)]
     area = [t.area_px[c[:MOST_SPOTS]] for t, c in zip(frames, chosen)]
-    track = _best_sequence(xy, area, width_px)
+    track = _in_one_order(_best_sequence(xy, area, width_px))
     return BarTrack(xy_px=_with_singles(track, xy, width_px), spots=spots, still=still)
 
 
@@ -90,6 +90,17 @@ def _best_sequence(xy: list[np.ndarray], area: list[np.ndarray], width_px: float
             track[n] = xy[n][list(states[n][state])]
         state = int(back[n][state])
     return track
+
+
+def _in_one_order(track: np.ndarray) -> np.ndarray:
+    """The track with its pairs turned round where that is the shorter way across a gap."""
+    ordered = track.copy()
+    known = np.flatnonzero(np.isfinite(track).all(axis=(1, 2)))
+    for before, n in zip(known[:-1], known[1:]):
+        straight, crossed = (np.linalg.norm(pair - ordered[before], axis=1).sum() for pair in (ordered[n], ordered[n, ::-1]))
+        if crossed < straight:
+            ordered[n] = ordered[n, ::-1].copy()
+    return ordered
 
 
 def _own_cost(size: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:

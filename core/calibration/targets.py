@@ -23,11 +23,11 @@ RELATIVE_THRESHOLD = 0.5  # of a blob's own contrast, where its outline is
 BRIGHTNESS = 0.35  # a target has at least this part of the contrast of the brightest blob
 MIN_AREA, MAX_AREA_PART = 4, 0.02  # pixels; part of the image
 MIN_FILL, MAX_ELONGATION = 0.72, 3.5
-MOST_BLOBS = 40
+MOST_BLOBS = 64
 WINDOW_SIDES = (9, 13, 19, 27, 39, 57, 83, 121)
 ITERATIONS, CONVERGED_PX = 12, 1e-3
 ROBUST = 3.0  # sigmas of the grey values
-MAX_MISFIT = 0.08  # sigma0 of the match as a part of g1
+MAX_MISFIT = 0.08  # RMS of the grey values as a part of g1
 
 
 class TargetStatus(IntEnum):
@@ -145,9 +145,10 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
     reach = np.hypot((grid[:, 0] - p[:, 0, None]) * p[:, 2, None], (grid[:, 1] - p[:, 1, None]) * p[:, 4, None])
     near = reach < 1.12 + 1.5 / np.sqrt(p[:, 5, None])  # what lies further out, such as the other target, takes no part
     active, converged = np.arange(m), np.zeros(m, dtype=bool)
-    covariance, sigma0 = np.full((m, 2), np.inf), np.full(m, np.inf)
+    covariance, sigma0, misfit = np.full((m, 2), np.inf), np.full(m, np.inf), np.full(m, np.inf)
     for _ in range(ITERATIONS):
         v, J = _disc(p[active], grid, grey[active])
+        misfit[active] = np.sqrt(np.sum(v * v * near[active], axis=1) / np.maximum(near[active].sum(axis=1) - 8, 1))
         weight = near[active] / (1 + (v / (ROBUST * 1.4826 * _median_of_near(np.abs(v), near[active]))) ** 2)  # the bar takes no part
         J *= weight[:, :, None] ** 0.5
         v *= weight**0.5
@@ -166,7 +167,7 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
         if not len(active):
             break
     bad = ~converged | (np.abs(p[:, :2] - start[:, :2]) > 0.25 * start[:, 2:4] + 1.0).any(axis=1)
-    status = np.where(bad, TargetStatus.NOT_CONVERGED, np.where(sigma0 > MAX_MISFIT * p[:, 7], TargetStatus.NO_DISC, TargetStatus.OK))
+    status = np.where(bad, TargetStatus.NOT_CONVERGED, np.where(misfit > MAX_MISFIT * p[:, 7], TargetStatus.NO_DISC, TargetStatus.OK))
     return np.where(bad[:, None], start[:, :2], p[:, :2]), sigma0 * np.sqrt(covariance.mean(axis=1)), status.astype(np.int8)
 
 

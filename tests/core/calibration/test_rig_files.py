@@ -14,8 +14,8 @@ from tricap.core.geometry.rig import Rig, read_rig
 from tricap.core.synthetic.bar import bar_ends, benchmark_cameras
 
 ENDING = {"agisoft": "rig.xml", "opencv": "rig.yml"}
-# Half of a shear is a turn, the other half cannot be said without b2: b2 / 2 × half the diagonal = 1e-4 × 480 px = 0.048 px at the corner of
-# camera C; without k3 another 0.02 px. Agisoft's format holds everything.
+# Half of a shear is a turn, the other half cannot be said without b2: b2 / 2 × half the diagonal = 1e-4 × 480 px = 0.048 px at the corner
+# of camera C; without k3 another 0.02 px. Agisoft's format holds everything.
 TOLERANCE_PX = {"agisoft": 1e-9}
 FITTED_PX = 0.08
 

@@ -1,0 +1,116 @@
+"""The adjustment: derivatives, datum, precision at the bound, residuals that mean something."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tricap.core.calibration.blunders import redundant_parts
+from tricap.core.calibration.bundle import (
+    Unknowns,
+    adjust,
+    design,
+    free_network,
+    moved,
+    normal_equations,
+    reduce_to_cameras,
+    residuals,
+)
+from tricap.core.geometry.camera_derivatives import EXTERIOR, INTERIOR, camera_of, image_with_derivatives, interior_of
+from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, random_cameras, waved_bar
+
+from .conftest import true_network
+
+ALL = np.ones(10, dtype=bool)
+
+
+def unknowns_of(network, free=ALL) -> Unknowns:
+    return Unknowns(free=free, expected=network.interior, sigma=np.full(network.interior.shape, 1e6))
+
+
+@pytest.fixture(scope="module")
+def waved():
+    return waved_bar(benchmark_cameras(), 60, np.random.default_rng(0), BarNoise(sigma_px=0.0, gross=0.0))
+
+
+def test_the_interior_unknowns_are_the_camera() -> None:
+    for camera in benchmark_cameras():
+        X = np.random.default_rng(0).uniform([-0.5, -0.7, 2], [0.5, 0.7, 3], (50, 3))
+        again = camera_of(camera.name, camera.size_px, interior_of(camera), camera.R_cam_world, camera.t_cam_world_m)
+        image, _, _ = image_with_derivatives(interior_of(camera), camera.to_camera(X))
+        assert np.abs(again.project(X) - camera.project(X)).max() < 1e-9
+        assert np.abs(image - camera.project(X)).max() < 1e-9
+
+
+def test_every_derivative_agrees_with_differences(waved) -> None:
+    network = true_network(waved)
+    unknowns = unknowns_of(network)
+    image, J, B = design(network, unknowns)
+    names = [*INTERIOR, *EXTERIOR]
+    sizes = [1e-2, 1e-2, 1e-2, 1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, *[1e-5] * 6]
+    for n, size in enumerate(sizes):
+        step = np.zeros((3, 16))
+        step[:, n] = size
+        ahead = design(moved(network, unknowns, step.ravel(), np.zeros((60, 5))), unknowns)[0]
+        back = design(moved(network, unknowns, -step.ravel(), np.zeros((60, 5))), unknowns)[0]
+        numeric = ((ahead - back) / (2 * size)).reshape(3, 60, 4)
+        assert np.abs(numeric - J[..., n]).max() < 1e-5 * max(1.0, np.abs(J[..., n]).max()), names[n]
+    for n in range(5):
+        step = np.zeros((60, 5))
+        step[:, n] = 1e-5
+        ahead = design(moved(network, unknowns, np.zeros(48), step), unknowns)[0]
+        back = design(moved(network, unknowns, np.zeros(48), -step), unknowns)[0]
+        numeric = ((ahead - back) / 2e-5).reshape(3, 60, 4)
+        assert np.abs(numeric - B[..., n]).max() < 1e-5 * np.abs(B[..., n]).max(), f"bar {n}"
+
+
+def test_turning_and_shifting_everything_changes_no_image(waved) -> None:
+    network = true_network(waved)
+    normals = normal_equations(network, residuals(network, waved.xy_px), np.isfinite(waved.xy_px).all(-1) * 1.0, unknowns_of(network), 1.0)
+    S = reduce_to_cameras(normals)[0]
+    assert np.abs(S @ free_network(network, unknowns_of(network))).max() < 1e-6 * np.abs(S).max()
+
+
+def test_it_finds_the_truth_without_noise(waved) -> None:
+    network = true_network(waved)
+    unknowns = unknowns_of(network)
+    used = np.isfinite(waved.xy_px).all(-1)
+    used &= used.sum(axis=1, keepdims=True) >= 2
+    rng = np.random.default_rng(1)
+    step = rng.normal(0, 1, (3, 16)) * [5, 3, 3, 0.01, 0.01, 0.001, 1e-4, 1e-4, 1e-4, 1e-4, *[0.003] * 6]
+    start = moved(network, unknowns, step.ravel(), rng.normal(0, 0.01, (60, 5)))
+    done = adjust(start, waved.xy_px, used, unknowns, unit_px=1e-4, max_iterations=30)
+    assert done.converged and np.abs(done.residual_px[used]).max() < 1e-5
+    assert np.abs(done.network.interior[:, :3] - network.interior[:, :3]).max() < 0.02
+
+
+def test_redundant_parts_sum_to_the_redundancy(waved) -> None:
+    network = true_network(waved)
+    used = np.isfinite(waved.xy_px).all(-1)
+    used &= used.sum(axis=1, keepdims=True) >= 2
+    parts = redundant_parts(network, used, unknowns_of(network), 1.0)
+    bars = 5 * used.any(axis=2).any(axis=1).sum() - 2 * (used.any(axis=1).sum(axis=1) == 1).sum()
+    assert parts[used].sum() == pytest.approx(2 * used.sum() - bars - (48 - 6), abs=0.1)
+
+
+def test_the_residuals_have_the_redundancy_of_the_model() -> None:
+    """Mean of v² / (σ² q_vv) over one adjustment of 200 positions is 1 within 4 sigma of its own scatter (≈ √(2/n))."""
+    noisy = waved_bar(
+        random_cameras(np.random.default_rng(3), "triangle"), 200, np.random.default_rng(4), BarNoise(sigma_px=0.1, gross=0.0)
+    )
+    network = true_network(noisy)
+    used = np.isfinite(noisy.xy_px).all(-1)
+    used &= used.sum(axis=1, keepdims=True) >= 2
+    done = adjust(network, noisy.xy_px, used, unknowns_of(network), unit_px=0.1)
+    parts = redundant_parts(done.network, used, unknowns_of(network), 0.1)
+    ratio = np.sum(done.residual_px[used] ** 2) / (0.01 * parts[used].sum())
+    assert ratio == pytest.approx(1.0, abs=4 * np.sqrt(2 / parts[used].sum()))
+
+
+def test_a_frozen_unknown_stays(waved) -> None:
+    network = true_network(waved)
+    changed = replace(network, interior=network.interior + [0, 0, 0, 0, 0.01, 0, 0, 0, 0, 0])
+    unknowns = unknowns_of(network).only("f", "k1")
+    used = np.isfinite(waved.xy_px).all(-1)
+    done = adjust(changed, waved.xy_px, used, unknowns, unit_px=0.1)
+    assert (done.network.interior[:, 4] == changed.interior[:, 4]).all() and (done.network.interior[:, 0] != network.interior[:, 0]).all()

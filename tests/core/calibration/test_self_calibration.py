@@ -1,0 +1,138 @@
+"""From image points alone to the bound: starts, blunders, mixed-up ends, gaps, small lenses; and when the data cannot do it."""
+
+import numpy as np
+import pytest
+
+from tricap.core.calibrating import calibrate_rig
+from tricap.core.calibration.self_calibration import calibrate
+from tricap.core.errors import InputError
+from tricap.core.geometry.camera_derivatives import INTERIOR
+from tricap.core.progress import Cancelled, Monitor
+from tricap.core.synthetic.bar import RIG_KINDS, BarNoise, WavedBar, bar_ends, benchmark_cameras, random_cameras, waved_bar
+
+from .conftest import bound, error_m, observed
+
+# Ratio of the error to the bound: its median over seeds must be near 1; a single one has measured up to 1.9 (one eigen-direction dominates).
+WORST_RATIO = 2.5
+
+
+def ratio(waved: WavedBar, sigma_px: float, labelled: bool = True, free: np.ndarray | None = None) -> float:
+    done = calibrate(observed(waved, labelled), Monitor())
+    cameras = done.network.cameras(done.observations.names, done.observations.size_px)
+    return error_m(waved.cameras, cameras) / bound(waved, sigma_px, free).rms_m
+
+
+def drawn(seed: int, positions: int, noise: BarNoise) -> WavedBar:
+    rng = np.random.default_rng(seed)
+    return waved_bar(random_cameras(rng, RIG_KINDS[seed % len(RIG_KINDS)]), positions, rng, noise)
+
+
+def test_the_bound_is_reached_on_the_benchmark() -> None:
+    ratios = [ratio(waved_bar(benchmark_cameras(), 300, np.random.default_rng(s), BarNoise(sigma_px=0.05)), 0.05) for s in range(3)]
+    assert np.median(ratios) < 1.15 and max(ratios) < WORST_RATIO
+
+
+def test_a_simple_lens_gets_the_small_model() -> None:
+    small = np.isin(INTERIOR, ("f", "k1"))
+    cameras = benchmark_cameras(simple_lens=True)
+    ratios = [ratio(waved_bar(cameras, 300, np.random.default_rng(s), BarNoise(sigma_px=0.1)), 0.1, free=small) for s in range(3)]
+    assert np.median(ratios) < 1.3
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        BarNoise(sigma_px=0.1, gross=0.30),
+        BarNoise(sigma_px=0.1, missing=0.50),
+        BarNoise(sigma_px=0.1, gross=0.05, unlabelled=True),
+    ],
+    ids=["30 % wrong", "50 % missing", "unlabelled"],
+)
+def test_random_rigs_converge(noise: BarNoise) -> None:
+    ratios = [ratio(drawn(seed, 200, noise), 0.1, labelled=not noise.unlabelled) for seed in range(2, 5)]
+    assert max(ratios) < WORST_RATIO, ratios
+
+
+@pytest.mark.slow
+def test_three_hundred_random_rigs_converge() -> None:
+    far = []
+    for seed in range(300):
+        sigma = float(np.random.default_rng(seed).uniform(0.05, 0.3))
+        if ratio(drawn(seed, 200, BarNoise(sigma_px=sigma, gross=0.03)), sigma) > WORST_RATIO:
+            far.append(seed)
+    assert not far
+
+
+def test_blunders_are_found_and_the_rest_kept() -> None:
+    waved = waved_bar(benchmark_cameras(), 300, np.random.default_rng(0), BarNoise(sigma_px=0.05, gross=0.05))
+    done = calibrate(observed(waved), Monitor())
+    seen = np.isfinite(waved.xy_px).all(axis=-1)
+    assert not (done.used & waved.wrong).any()
+    good = seen & ~waved.wrong
+    good &= good.sum(axis=1, keepdims=True) >= 2
+    assert (good & ~done.used).sum() < 0.03 * good.sum()
+    assert done.sigma0_px == pytest.approx(0.05, rel=0.05)
+
+
+def test_ends_come_out_in_one_order() -> None:
+    waved = drawn(3, 150, BarNoise(sigma_px=0.1, gross=0.0, unlabelled=True))
+    done = calibrate(observed(waved, labelled=False), Monitor())
+    first = done.observations.xy_px
+    true = np.stack([c.project(waved.ends_m) for c in waved.cameras], axis=1)
+    swapped = np.linalg.norm(first[:, :, 0] - true[:, :, 0], axis=-1) > np.linalg.norm(first[:, :, 0] - true[:, :, 1], axis=-1)
+    both = done.used.all(axis=(1, 2))
+    assert both.sum() > 50 and (swapped[both] == swapped[both][:, :1]).all()
+
+
+def test_cancelling() -> None:
+    monitor = Monitor()
+    monitor.cancel()
+    with pytest.raises(Cancelled):
+        calibrate(observed(drawn(0, 50, BarNoise())), monitor)
+
+
+def with_directions(weights: tuple[float, float, float]) -> WavedBar:
+    """The benchmark with the bar's directions flattened along some axes."""
+    waved = waved_bar(benchmark_cameras(), 120, np.random.default_rng(0), BarNoise(gross=0.0, missing=0.0))
+    ends = bar_ends(120, np.random.default_rng(3), 0.5)
+    middle, d = ends.mean(axis=1), (ends[:, 0] - ends[:, 1]) * weights
+    half = 0.25 * d / np.linalg.norm(d, axis=1, keepdims=True)
+    ends = np.stack([middle + half, middle - half], axis=1)
+    xy = np.stack([np.where(c.sees(c.project(ends))[..., None], c.project(ends), np.nan) for c in waved.cameras], axis=1)
+    xy += np.random.default_rng(1).normal(0, 0.05, xy.shape)
+    return WavedBar(cameras=waved.cameras, length_m=0.5, ends_m=ends, xy_px=xy, wrong=waved.wrong, swapped=waved.swapped)
+
+
+@pytest.mark.parametrize(
+    ("weights", "says"),
+    [((1, 1, 0), "tilt the bar towards the cameras"), ((1, 0, 1), "hold the bar upright"), ((0, 1, 1), "hold the bar crosswise")],
+)
+def test_bars_in_a_plane_are_refused_with_what_is_missing(weights: tuple[float, float, float], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        calibrate_rig(observed(with_directions(weights)), Monitor())
+
+
+def test_the_report_knows_how_good_it_is() -> None:
+    """Predicted over measured error: between 0.6 and 1.7 for one seed; the held-out lengths agree with the prediction and the noise."""
+    waved = waved_bar(benchmark_cameras(), 200, np.random.default_rng(2), BarNoise(sigma_px=0.1))
+    done = calibrate_rig(observed(waved), Monitor())
+    actual = error_m(waved.cameras, done.rig.cameras)
+    assert 0.6 < done.quality.predicted.rms_m / actual < 1.7
+    assert done.verdict.light == "green" and done.quality.mirror > 100
+    assert done.quality.held_out.rms_m < 3e-3 and len(done.quality.held_out.residual_m) > 150
+    up = np.mean([c.R_cam_world[1] for c in done.rig.cameras], axis=0)
+    assert up @ [0, 0, -1] > 0.99  # the cameras' y axes point down, which is -Z
+
+
+def test_two_cameras_suffice() -> None:
+    waved = waved_bar(benchmark_cameras()[:2], 200, np.random.default_rng(2), BarNoise(sigma_px=0.05))
+    done = calibrate(observed(waved), Monitor())
+    assert error_m(waved.cameras, done.network.cameras("LC", done.observations.size_px)) < 2.5 * bound(waved, 0.05).rms_m
+
+
+def test_cameras_that_saw_different_things_are_refused() -> None:
+    waved = waved_bar(benchmark_cameras(), 100, np.random.default_rng(2), BarNoise(sigma_px=0.05))
+    xy = waved.xy_px.copy()
+    xy[:, 2] = xy[np.random.default_rng(0).permutation(100), 2]
+    with pytest.raises(InputError, match="Camera R|camera R"):
+        calibrate_rig(observed(waved).changed(xy), Monitor())
