@@ -5,8 +5,9 @@ from types import ModuleType
 
 def _modules() -> tuple[ModuleType, ...]:
     from . import command, jobs, operators, panels, properties
+    from .retarget import registration
 
-    return jobs, properties, operators, panels, command
+    return jobs, properties, operators, panels, registration, command
 
 
 def register() -> None:

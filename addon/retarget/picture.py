@@ -15,9 +15,9 @@ from ...core.motion.retarget.roles import ARM, LEG, SIDES, sided
 from ...core.motion.retarget.transfer import body_axes
 
 COLUMNS = 8
-CELL_PX = (150, 240)
-MOST_POINTS = 6000
-PAPER, INK, LEFT, RIGHT, SKIN, FLOOR = (255, 255, 255), (60, 60, 60), (40, 90, 220), (210, 120, 30), (205, 205, 205), (160, 160, 160)
+CELL_PX = (190, 270)
+MOST_POINTS = 15000
+PAPER, INK, LEFT, RIGHT, SKIN, FLOOR = (255, 255, 255), (60, 60, 60), (40, 90, 220), (210, 120, 30), (185, 185, 185), (160, 160, 160)
 
 
 def draw(path: Path, source: Motion, source_map: RigMap, target: bpy.types.Object, motion: Motion, target_map: RigMap) -> None:

@@ -146,7 +146,8 @@ def _read(data: bytes, path: Path, rotation: np.ndarray) -> Markers:
     unit = metres_per(table.get(("POINT", "UNITS"), "mm") or "mm", path)
     xyz = raw[..., :3] * (1.0 if scale < 0 else scale) * unit
     known = (raw[..., 3] >= 0) & np.isfinite(xyz).all(axis=2)
-    sigma = np.where(known, (np.nan_to_num(raw[..., 3]).astype(np.int64) & 0xFF) * abs(scale) * unit, np.nan)
+    residual = np.clip(np.nan_to_num(raw[..., 3]), 0, MOST_WORD).astype(np.int64) & 0xFF
+    sigma = np.where(known, residual * abs(scale) * unit, np.nan)
     xyz[~known] = np.nan
     return Markers(names=_labels(table, n), fps=fps, frames=first + np.arange(t), xyz_m=xyz @ rotation, sigma_m=sigma)
 

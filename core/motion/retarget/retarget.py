@@ -16,7 +16,7 @@ from .contacts import Contacts, FeetSettings, find_contacts
 from .mapping import RigMap
 from .rest import with_person_like_rest
 from .rig import Motion, Rig, channels, head_of
-from .roles import SIDES, sided
+from .roles import SEGMENTS, SIDES, sided
 from .transfer import alignments, body_axes, follow, share_twist, turn
 from .turns import matrix_from_vector
 
@@ -59,10 +59,12 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     settings, feet_settings, monitor = settings or RetargetSettings(), feet_settings or FeetSettings(), monitor or Monitor()
     monitor.step("retargeting", 0, 4)
     source, rest_note = with_person_like_rest(source, source_map)
+    for rig, rig_map, which in ((source.rig, source_map, "source"), (target, target_map, "target")):
+        _check_lengths(rig, rig_map, which)
     aligned = alignments(source.rig, source_map, target, target_map)
     if not aligned:
         raise InputError("Source and target have no part of the body in common; check the two mappings.")
-    scale = settings.scale or _scale(source.rig, source_map, target, target_map)
+    scale = settings.scale or leg_ratio(source.rig, source_map, target, target_map)
     contacts = find_contacts(source, source_map, feet_settings, _leg_m(source.rig, source_map) or source.rig.height_m / 2)
     legs = feet.find_legs(target, target_map, floor_m) if "hips" in aligned else {}
     if contacts is not None:
@@ -107,7 +109,12 @@ def _leg_m(rig: Rig, rig_map: RigMap) -> float:
     return float(np.mean(lengths)) if lengths else 0.0
 
 
-def _scale(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap) -> float:
+def leg_ratio(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap) -> float:
+    """The target's size against the source's: of the legs if both have some, else of the heights.
+
+    Raises:
+        InputError: the legs have no length.
+    """
     own, other = _leg_m(source, source_map), _leg_m(target, target_map)
     if own > SHORTEST_LIMB_M and other > SHORTEST_LIMB_M:
         return other / own
@@ -143,6 +150,15 @@ def _heads(target: Rig, R: np.ndarray, carrier: int, shift: np.ndarray) -> np.nd
     for b in range(len(target.names)):
         head[:, b] = head_of(target, R, head, b) + (shift if b == carrier else 0.0)
     return head
+
+
+def _check_lengths(rig: Rig, rig_map: RigMap, which: str) -> None:
+    for side in SIDES:
+        for part, after in SEGMENTS:
+            a, b = _place(rig, rig_map, part, side), _place(rig, rig_map, after, side)
+            if a is not None and b is not None and np.linalg.norm(b - a) < SHORTEST_LIMB_M * max(rig.height_m, 1e-9):
+                name = rig_map.first(sided(part, side))
+                raise InputError(f"The bone “{name}” of the {which} has no length; mend the rig's rest pose or map another bone.")
 
 
 def hip_centre(motion: Motion, rig_map: RigMap) -> np.ndarray:

@@ -1,0 +1,54 @@
+"""An armature with its motion made from plain values: what exporters need of a motion that is no armature yet."""
+
+import bpy
+import numpy as np
+from mathutils import Vector
+
+from ...core.errors import InputError
+from ...core.motion.retarget.retarget import Retargeted
+from ...core.motion.retarget.rig import Motion, channels, head_of
+from .apply import set_range
+from .write import write_action
+
+SHORTEST_M = 1e-4
+
+
+def build_armature(motion: Motion, name: str) -> bpy.types.Object:
+    """An armature object in the open scene that plays the motion; the scene gets its frames and rate.
+
+    Raises:
+        InputError: a bone has no length.
+    """
+    rig = motion.rig
+    roots = np.flatnonzero(rig.parents < 0)
+    armature = bpy.data.armatures.new(name)
+    armature_object = bpy.data.objects.new(name, armature)
+    scene = bpy.context.scene
+    scene.collection.objects.link(armature_object)
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    for b, bone_name in enumerate(rig.names):
+        length = float(np.linalg.norm(rig.tail_m[b] - rig.head_m[b]))
+        if length < SHORTEST_M:
+            bpy.ops.object.mode_set(mode="OBJECT")
+            raise InputError(f"The bone “{bone_name}” has no length; give it one in the source.")
+        bone = armature.edit_bones.new(bone_name)
+        bone.head, bone.tail = rig.head_m[b], rig.head_m[b] + length * rig.R_rest[b][:, 1]
+        bone.align_roll(Vector(rig.R_rest[b][:, 2]))
+        if rig.parents[b] >= 0:
+            bone.parent = armature.edit_bones[rig.names[rig.parents[b]]]
+    bpy.ops.object.mode_set(mode="OBJECT")
+    set_range(scene, motion)
+    basis, driven = channels(rig, motion.R), np.ones(len(rig.names), dtype=bool)
+    first = int(roots[0])
+    shift_m = motion.head_m[:, first] - rig.head_m[first]
+    write_action(armature_object, Retargeted(motion=motion, basis=basis, shift_m=shift_m, carrier=first, driven=driven, scale=1.0, roles=(),
+                                             contacts=None, notes=()), name)
+    return armature_object
+
+
+def loose_bones(motion: Motion) -> list[str]:
+    """Bones whose heads move against their parents, by more than 0.1 mm: an armature built here would not show that."""
+    rig = motion.rig
+    return [name for b, name in enumerate(rig.names) if rig.parents[b] >= 0
+            and float(np.abs(head_of(rig, motion.R, motion.head_m, b) - motion.head_m[:, b]).max()) > SHORTEST_M]

@@ -1,0 +1,208 @@
+"""bpy.ops.tricap.retarget(), .retarget_find_map(), .retarget_save_map(), .retarget_preview(), .retarget_end_preview()"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.motion.retarget.contacts import FeetSettings
+from ...core.motion.retarget.mapping import RigMap, write_map
+from ...core.motion.retarget.resample import resampled
+from ...core.motion.retarget.retarget import Retargeted, RetargetSettings
+from ...core.motion.retarget.rig import Motion
+from ...core.motion.sources import read_motion_source
+from ...core.progress import Monitor
+from ..jobs import JobOperator
+from ..properties import snapshot
+from . import apply, preview, properties
+from .read import action_frames, read_motion, read_rig
+from .write import push_to_strip
+
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Made:
+    """What the worker hands back."""
+
+    source: Motion
+    source_map: RigMap
+    result: Retargeted
+
+
+class Retarget(JobOperator, bpy.types.Operator):
+    """Put the motion of an armature or a file onto the target, as a new action; the source is left alone"""
+
+    bl_idname = "tricap.retarget"
+    bl_label = "Retarget"
+    bl_options = {"UNDO"}
+
+    source: bpy.props.StringProperty(name="Source", description="Armature that moves; empty: the panel's")  # type: ignore[valid-type]
+    file: bpy.props.StringProperty(name="Motion", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                   description="A run's folder, BVH, TRC, C3D or CSV instead of an armature; empty: the panel's")
+    target: bpy.props.StringProperty(name="Target", description="Armature that shall move; empty: the panel's")  # type: ignore[valid-type]
+    map: bpy.props.StringProperty(name="Mapping", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="Mapping of the target (JSON); empty: the panel's, or found")
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Made]:
+        """Read both rigs and, from an armature, its motion."""
+        props = context.scene.tricap_retarget
+        settings, feet = snapshot(props.settings, RetargetSettings), snapshot(props.feet, FeetSettings)
+        self._target = armature_of(self.target, props.target, "target")
+        moving = None if self.file else armature_of(self.source, props.source, "source", needed=not props.file)
+        if moving is not None:
+            apply.check_distinct(moving, self._target)
+        self._goal = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None)
+        edited = properties.edited_map(props) if not self.map and props.target == self._target else None
+        if edited is not None:
+            self._goal = with_map(self._goal, edited)
+        goal, scene = self._goal, context.scene
+        fps, start = scene.render.fps / scene.render.fps_base, scene.frame_start
+        if moving is not None:
+            self._name = f"{moving.name} on {self._target.name}"
+            motion = read_motion(moving, read_rig(moving), action_frames(moving))
+            return lambda monitor: compute(lambda: motion, goal, settings, feet, monitor)
+        path = Path(bpy.path.abspath(self.file or props.file))
+        self._name = path.stem
+        return lambda monitor: compute(lambda: resampled(read_motion_source(path), fps, start), goal, settings, feet, monitor)
+
+    def finish(self, context: bpy.types.Context, result: Made) -> set[str]:
+        """Write the action."""
+        props = context.scene.tricap_retarget
+        preview.remove_preview(self._target)
+        outcome = apply.apply(self._target, result.source, result.source_map, self._goal, result.result, self._name, props.tolerance_deg)
+        if props.strip:
+            push_to_strip(self._target, outcome.written.action)
+        props.last = "\n".join([str(outcome.figures), *outcome.notes])
+        for note in outcome.notes:
+            self.report({"INFO"}, note)
+        self.report({"INFO"}, f"{self._target.name}: {outcome.figures}")
+        return {"FINISHED"}
+
+
+def compute(read: Callable[[], Motion], goal: apply.Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor) -> Made:
+    """The computation, free of bpy."""
+    source = read()
+    source_map = apply.map_of(source.rig)
+    return Made(source=source, source_map=source_map, result=apply.transfer(source, source_map, goal, settings, feet, monitor))
+
+
+def with_map(goal: apply.Target, rig_map: RigMap) -> apply.Target:
+    """The target with an edited mapping.
+
+    Raises:
+        InputError: it names bones that are not there.
+    """
+    unknown = [name for chain in (*rig_map.bones.values(), *rig_map.twist.values()) for name in chain if name not in goal.rig.index]
+    if unknown:
+        raise InputError(f"The target has no bone “{unknown[0]}”; choose another in the mapping.")
+    return apply.Target(rig=goal.rig, rig_map=rig_map, floor_m=goal.floor_m)
+
+
+def armature_of(name: str, chosen: bpy.types.Object | None, which: str, *, needed: bool = True) -> Any:
+    """The armature object called `name`, or the chosen one.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = bpy.data.objects.get(name) if name else chosen
+    if found is None and (needed or name):
+        raise InputError(f"There is no armature “{name}” for the {which}." if name else f"Choose the {which}: an armature.")
+    return found
+
+
+class FindMap(bpy.types.Operator):
+    """Recognise the target's bones by their names and the rig's shape, and show the mapping for editing"""
+
+    bl_idname = "tricap.retarget_find_map"
+    bl_label = "Recognise"
+    bl_options = {"UNDO"}
+
+    file: bpy.props.StringProperty(name="Mapping", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                   description="Read the mapping from this file instead")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Fill the editor."""
+        props = context.scene.tricap_retarget
+        try:
+            rig = read_rig(armature_of("", props.target, "target"))
+            rig_map = apply.map_of(rig, Path(bpy.path.abspath(self.file)) if self.file else None)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        properties.fill_rows(props, rig_map)
+        for line in (*rig_map.missing, *rig_map.notes):
+            self.report({"INFO"}, line)
+        return {"FINISHED"}
+
+
+class SaveMap(bpy.types.Operator):
+    """Save the mapping as a file that can be edited, shared and used again"""
+
+    bl_idname = "tricap.retarget_save_map"
+    bl_label = "Save Mapping"
+
+    filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the file."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Write it."""
+        rig_map = properties.edited_map(context.scene.tricap_retarget)
+        try:
+            if rig_map is None:
+                raise InputError("There is no mapping to save; recognise the target first.")
+            write_map(Path(bpy.path.abspath(self.filepath)), rig_map, Path(self.filepath).stem)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class Preview(bpy.types.Operator):
+    """Let the target follow the source live, by constraints; feet are pinned only by Retarget"""
+
+    bl_idname = "tricap.retarget_preview"
+    bl_label = "Preview"
+    bl_options = {"UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Add the constraints."""
+        props = context.scene.tricap_retarget
+        try:
+            source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
+            apply.check_distinct(source, target)
+            source_rig, goal = read_rig(source), apply.read_target(target)
+            edited = properties.edited_map(props)
+            goal = goal if edited is None else with_map(goal, edited)
+            count = preview.add_preview(source, source_rig, apply.map_of(source_rig), target, goal.rig, goal.rig_map)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{count} bones of {target.name} follow {source.name}.")
+        return {"FINISHED"}
+
+
+class EndPreview(bpy.types.Operator):
+    """Take the constraints of the preview away"""
+
+    bl_idname = "tricap.retarget_end_preview"
+    bl_label = "End Preview"
+    bl_options = {"UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove them."""
+        target = context.scene.tricap_retarget.target
+        if target is None or not preview.remove_preview(target):
+            self.report({"WARNING"}, "There is no preview on the target.")
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+CLASSES = (Retarget, FindMap, SaveMap, Preview, EndPreview)

@@ -1,0 +1,96 @@
+"""A live preview: the target follows the source by constraints, before anything is baked.
+
+Each part of the target follows an empty that hangs on the source's bone, turned by what lies between the two rest poses:
+
+    R_t = R_s · K,   K = R_s,restᵀ · A · R_t,rest                      (2) of core.motion.retarget.transfer
+
+The hips follow an empty driven by the source's hips, scaled. Feet are not pinned in the preview; taking it away leaves the rig as it was.
+"""
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...core.errors import InputError
+from ...core.motion.retarget.mapping import RigMap
+from ...core.motion.retarget.retarget import leg_ratio
+from ...core.motion.retarget.rig import Rig
+from ...core.motion.retarget.roles import part_of
+from ...core.motion.retarget.transfer import alignments
+
+NAME = "Tricap preview"
+
+
+def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, target: bpy.types.Object, rig: Rig, rig_map: RigMap
+                ) -> int:
+    """Constrain the target to the source; the number of bones that follow.
+
+    Raises:
+        InputError: source and target have no part in common.
+    """
+    remove_preview(target)
+    aligned = alignments(source_rig, source_map, rig, rig_map)
+    if not aligned:
+        raise InputError("Source and target have no part of the body in common; check the two mappings.")
+    collection = bpy.data.collections.new(NAME)
+    bpy.context.scene.collection.children.link(collection)
+    count = 0
+    for role, A in aligned.items():
+        follows = source_map.bones[role][-1]
+        R_s = source_rig.R_rest[source_rig.index[follows]]
+        chain = rig_map.bones[role]
+        for bone in chain if part_of(role) not in ("hand", "neck", "spine") else chain[-1:]:
+            K = R_s.T @ A @ rig.R_rest[rig.index[bone]]
+            _follow(target.pose.bones[bone], _empty(collection, source, follows, K, f"{NAME} {bone}"))
+            count += 1
+    if "hips" in aligned:
+        _carry(collection, source, source_map.bones["hips"][0], target, rig_map.bones["hips"][0],
+               leg_ratio(source_rig, source_map, rig, rig_map))
+    collection.hide_viewport = collection.hide_render = True
+    return count
+
+
+def remove_preview(target: bpy.types.Object) -> int:
+    """Take the preview's constraints and empties away; how many constraints there were."""
+    count = 0
+    for bone in target.pose.bones:
+        for constraint in [c for c in bone.constraints if c.name.startswith(NAME)]:
+            bone.constraints.remove(constraint)
+            count += 1
+    if not any(c.name.startswith(NAME) for o in bpy.data.objects if o.type == "ARMATURE" for b in o.pose.bones for c in b.constraints):
+        for collection in [c for c in bpy.data.collections if c.name.startswith(NAME)]:
+            bpy.data.batch_remove(list(collection.objects))
+            bpy.data.collections.remove(collection)
+    return count
+
+
+def _empty(collection: bpy.types.Collection, source: bpy.types.Object, bone: str, K: np.ndarray, name: str) -> bpy.types.Object:
+    """An empty on a bone of the source. What is parented to a bone sits at its tail."""
+    empty = bpy.data.objects.new(name, None)
+    collection.objects.link(empty)
+    empty.parent, empty.parent_type, empty.parent_bone = source, "BONE", bone
+    empty.matrix_basis = Matrix(K).to_4x4()
+    return empty
+
+
+def _follow(bone: bpy.types.PoseBone, empty: bpy.types.Object) -> None:
+    constraint = bone.constraints.new("COPY_ROTATION")
+    constraint.name, constraint.target = NAME, empty
+    constraint.target_space = constraint.owner_space = "WORLD"
+
+
+def _carry(collection: bpy.types.Collection, source: bpy.types.Object, source_hips: str, target: bpy.types.Object, hips: str,
+           scale: float) -> None:
+    """The hips' place: the source's, times the ratio of the legs, by drivers."""
+    empty = bpy.data.objects.new(f"{NAME} place", None)
+    collection.objects.link(empty)
+    for i, axis in enumerate("XYZ"):
+        driver = empty.driver_add("location", i).driver
+        driver.type = "SCRIPTED"
+        variable = driver.variables.new()
+        variable.name, variable.type = "p", "TRANSFORMS"
+        variable.targets[0].id, variable.targets[0].bone_target = source, source_hips
+        variable.targets[0].transform_type, variable.targets[0].transform_space = f"LOC_{axis}", "WORLD_SPACE"
+        driver.expression = f"p * {scale!r}"
+    constraint = target.pose.bones[hips].constraints.new("COPY_LOCATION")
+    constraint.name, constraint.target = NAME, empty

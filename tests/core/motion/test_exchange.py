@@ -1,0 +1,199 @@
+"""BVH, TRC, C3D and CSV: round trips, readers that are not ours, and damaged files."""
+
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.errors import InputError
+from tricap.core.motion.bvh import read_bvh, write_bvh
+from tricap.core.motion.c3d import read_c3d, write_c3d
+from tricap.core.motion.markers import Markers
+from tricap.core.motion.points_csv import read_points_csv, write_points_csv
+from tricap.core.motion.retarget.mapping import find_map
+from tricap.core.motion.retarget.points import joint_of, motion_from_points
+from tricap.core.motion.retarget.transfer import directions
+from tricap.core.motion.retarget.turns import angle_of, transposed
+from tricap.core.motion.sources import read_motion_source
+from tricap.core.motion.trc import read_trc, write_trc
+
+from .persons import flail, person
+
+PLACE_M = 2e-6  # text has 1e-6 of the unit, C3D float32 of millimetres
+MOCAP = Path(__file__).resolve().parents[4] / "shared" / "mocap"
+
+
+def cloud(sigma: bool = True) -> Markers:
+    random = np.random.default_rng(0)
+    xyz = random.uniform(-2, 2, (40, 3, 3))
+    xyz[5:9, 1] = np.nan
+    sigma_m = np.where(np.isnan(xyz[..., 0]), np.nan, 1e-4 * random.integers(1, 200, (40, 3))) if sigma else np.full((40, 3), np.nan)
+    return Markers(names=("shoulder.R", "elbow.R", "wrist, right"), fps=59.94, frames=np.arange(40) + 12, xyz_m=xyz, sigma_m=sigma_m)
+
+
+@pytest.mark.parametrize("kind", ["trc", "c3d", "csv"])
+@pytest.mark.parametrize("axes", ["Z up", "Y up", "OpenSim"])
+def test_points_come_back(tmp_path: Path, kind: str, axes: str) -> None:
+    points, file = cloud(), tmp_path / f"points.{kind}"
+    if kind == "csv":
+        write_points_csv(file, points)
+        found = read_points_csv(file)
+    elif kind == "trc":
+        write_trc(file, points, axes=axes, unit="mm")
+        found = read_trc(file, axes=axes)
+    else:
+        write_c3d(file, points, axes=axes)
+        found = read_c3d(file, axes=axes)
+    assert found.names == points.names and abs(found.fps - points.fps) < 0.01
+    np.testing.assert_array_equal(found.frames, points.frames)
+    np.testing.assert_allclose(found.xyz_m, points.xyz_m, atol=PLACE_M)
+    if kind != "trc":
+        np.testing.assert_allclose(found.sigma_m, points.sigma_m, atol=1e-6)
+
+
+def test_wide_tables_are_read(tmp_path: Path) -> None:
+    (tmp_path / "wide.csv").write_text("frame,time_s,elbow.R x,elbow.R y,elbow.R z\n3,0.1,1,2,3\n4,0.2,,,\n5,0.3,4,5,6\n")
+    found = read_points_csv(tmp_path / "wide.csv")
+    assert found.names == ("elbow.R",) and abs(found.fps - 10.0) < 1e-9 and np.isnan(found.xyz_m[1]).all()
+
+
+def test_another_reader_of_c3d_agrees(tmp_path: Path) -> None:
+    c3d = pytest.importorskip("c3d")
+    if not hasattr(c3d, "Reader"):
+        pytest.skip("the library c3d is not installed")
+    points = cloud()
+    write_c3d(tmp_path / "points.c3d", points)
+    with (tmp_path / "points.c3d").open("rb") as file:
+        reader = c3d.Reader(file)
+        frames = [(i, data) for i, data, _ in reader.read_frames()]
+        assert [label.strip() for label in reader.point_labels] == list(points.names) and abs(reader.point_rate - 59.94) < 1e-3
+    data = np.array([rows for _, rows in frames])
+    known = np.isfinite(points.xyz_m[..., 0])
+    np.testing.assert_allclose(data[known][:, :3] / 1000.0, points.xyz_m[known], atol=PLACE_M)
+    np.testing.assert_allclose(data[known][:, 3] / 1000.0, points.sigma_m[known], atol=1e-6)
+    assert (data[~known][:, 3] < 0).all() and [i for i, _ in frames] == points.frames.tolist()
+
+
+@pytest.mark.parametrize("order", ["ZXY", "XYZ", "YZX"])
+@pytest.mark.parametrize("unit_m", [1.0, 0.01])
+def test_a_motion_comes_back_from_bvh(tmp_path: Path, order: str, unit_m: float) -> None:
+    motion = flail(person(roll_seed=3))
+    write_bvh(tmp_path / "a.bvh", motion, order=order, unit_m=unit_m)
+    found = read_bvh(tmp_path / "a.bvh")
+    index = [found.rig.index[name] for name in motion.rig.names]
+    np.testing.assert_allclose(found.head_m[:, index], motion.head_m, atol=1e-5)  # 1e-6 per joint of a chain
+    np.testing.assert_allclose(found.rig.head_m[index], motion.rig.head_m, atol=1e-5)
+    since = [m.R[:, i] @ transposed(m.rig.R_rest[i]) for m, i in ((found, index), (motion, slice(None)))]
+    assert np.degrees(angle_of(transposed(since[0]) @ since[1])).max() < 1e-4
+    assert abs(found.fps - motion.fps) < 1e-6
+
+
+def test_points_make_a_motion_whose_limbs_point_alike() -> None:
+    source = flail(person(), reach=0.4)
+    joints = {"hip": "thigh", "knee": "shin", "ankle": "foot", "shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand", "toe": "toe"}
+    places = {f"{side}{joint}": source.head_m[:, source.rig.index[f"{part}.{side}"]] for side in "LR" for joint, part in joints.items()}
+    points = Markers(names=tuple(places), fps=30.0, frames=source.frames, xyz_m=np.stack(list(places.values()), axis=1),
+                     sigma_m=np.full((len(source.frames), len(places)), np.nan))
+    motion = motion_from_points(points)
+    ours, theirs = directions(motion, find_map(motion.rig)), directions(source, find_map(source.rig))
+    assert len(ours) == 8
+    for role, along in ours.items():
+        np.testing.assert_allclose(along, theirs[role], atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "joint"), [("RKnee", "shin.R"), ("elbow.L", "forearm.L"), ("left_ankle", "foot.L"), ("MidHip", "hips"),
+                                             ("LBigToe", "toe.L"), ("C7", "")])
+def test_joints_by_name(name: str, joint: str) -> None:
+    assert joint_of(name) == joint
+
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+ OFFSET 0 0 0
+ CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+ JOINT Chest
+ {
+  OFFSET 0 10 0
+  CHANNELS 3 Zrotation Xrotation Yrotation
+  End Site
+  {
+   OFFSET 0 5 0
+  }
+ }
+}
+MOTION
+Frames: 2
+Frame Time: 0.04
+0 0 0 0 0 0 0 0 0
+0 1 0 0 0 0 90 0 0
+"""
+
+
+def test_a_small_bvh(tmp_path: Path) -> None:
+    (tmp_path / "a.bvh").write_text(BVH)
+    motion = read_bvh(tmp_path / "a.bvh", unit_m=0.1)
+    assert motion.rig.names == ("Hips", "Chest") and motion.fps == 25.0
+    np.testing.assert_allclose(motion.head_m[1], [[0, 0, 0.1], [0, 0, 1.1]], atol=1e-12)
+    np.testing.assert_allclose(motion.R[1, 1, :, 1], [-1, 0, 0], atol=1e-12)
+    assert read_motion_source(tmp_path / "a.bvh").frames.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(("old", "new", "word"), [
+    ("HIERARCHY", "SOMETHING", "not a BVH"), ("Frames: 2", "Frames: 3000000000", "promises"), ("Frames: 2", "Frames: 0", "motion needs"),
+    ("Frames: 2", "Frames: many", "number is needed"), ("Xposition", "Sideways", "channels"), ("CHANNELS 3", "CHANNELS 300", "channels"),
+    ("OFFSET 0 10 0", "OFFSET 0 ten 0", "number is needed"), ("OFFSET 0 10 0", "OFFSET 0 nan 0", "finite"),
+    ("0 1 0 0 0 0 90 0 0", "0 1 0 0", "promises"), ("0 1 0 0 0 0 90 0 0", "0 1 0 0 0 inf 90 0 0", "good values"),
+    ("}\nMOTION", "MOTION", "ends within"), ("Frame Time: 0.04", "Frame Time: 0", "motion needs"),
+    ("JOINT Chest\n {", "JOINT Chest\n", "Hips|no sense|damaged|number")])
+def test_damaged_bvh_is_said(tmp_path: Path, old: str, new: str, word: str) -> None:
+    assert old in BVH
+    (tmp_path / "a.bvh").write_text(BVH.replace(old, new))
+    with pytest.raises(InputError, match=word):
+        read_bvh(tmp_path / "a.bvh")
+
+
+def test_damaged_points_are_said(tmp_path: Path) -> None:
+    write_c3d(tmp_path / "a.c3d", cloud())
+    data = (tmp_path / "a.c3d").read_bytes()
+    write_trc(tmp_path / "a.trc", cloud())
+    text = (tmp_path / "a.trc").read_text()
+    cases = [("b.c3d", data[:900], "not a C3D"), ("b.c3d", data[:1600], "too short|damaged"), ("b.c3d", b"P" * 4000, "not a C3D|damaged"),
+             ("b.c3d", data[:2] + struct.pack("<H", 65000) + data[4:], "too short|cannot hold"),
+             ("b.c3d", data[:16] + b"\xff\xff" + data[18:], "too short"),
+             ("b.trc", text.replace("PathFileType", "Path").encode(), "not a TRC"),
+             ("b.trc", text.replace("\t40\t3\tm", "\t3000000000\t3\tm").encode(), "promises"),
+             ("b.trc", text.replace("\t3\tm", "\t3\tfathom").encode(), "fathom"), ("b.trc", text[:-600].encode(), "promises"),
+             ("b.csv", b"", "no columns"), ("b.csv", b"a,b\n1,2\n", "no columns"), ("b.csv", b"frame,p x,p y,p z\n1,2\n", "rows"),
+             ("b.xyz", b"", "no motion that can be read")]
+    for name, content, word in cases:
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=word):
+            read_motion_source(tmp_path / name)
+    with pytest.raises(InputError, match="no motion"):
+        read_motion_source(tmp_path / "nothing.bvh")
+
+
+@pytest.mark.slow
+def test_whatever_is_changed_in_a_c3d_file_it_is_read_or_said(tmp_path: Path) -> None:
+    write_c3d(tmp_path / "a.c3d", cloud())
+    data, random = bytearray((tmp_path / "a.c3d").read_bytes()), np.random.default_rng(1)
+    for _ in range(400):
+        changed = bytearray(data)
+        for at in random.integers(0, 1400, 3):
+            changed[at] = random.integers(0, 256)
+        (tmp_path / "b.c3d").write_bytes(changed)
+        try:
+            read_c3d(tmp_path / "b.c3d")
+        except InputError:
+            continue
+
+
+def test_all_motions_at_hand_are_read_and_mapped() -> None:
+    if not MOCAP.is_dir() or sys.platform == "win32":
+        pytest.skip("the motions are not on this machine (no folder shared/mocap beside the repository)")
+    for path in sorted(MOCAP.glob("*/*.bvh")):
+        motion = read_bvh(path)
+        assert not find_map(motion.rig).missing, path
