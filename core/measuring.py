@@ -12,6 +12,7 @@ import numpy as np
 from . import store
 from .errors import InputError
 from .geometry.intersection import forward_intersection
+from .images.enhance import EnhanceSettings, enhanced
 from .images.sampling import SplineImage
 from .matching import foreground as fg
 from .matching.constraints import constrain
@@ -49,18 +50,25 @@ class MeasuredFrame:
     key: str
 
 
-def load_images(footage: Footage, frame: int) -> FrameImages:
-    """Read a frame and prepare it.
+def load_images(footage: Footage, frame: int, enhance: EnhanceSettings | None = None) -> FrameImages:
+    """Read a frame and prepare it; what is matched may be enhanced, the grey values stay as they were taken.
 
     Raises:
         InputError: see `Footage.read`.
     """
     grey = [footage.take.rows.rows(image) for image in footage.read(frame)]
-    return FrameImages(grey=grey, spline=[SplineImage(g) for g in grey])
+    matched = enhanced(grey, enhance, row_step=footage.take.rows.step) if enhance is not None else grey
+    return FrameImages(grey=grey, spline=[SplineImage(g) for g in matched])
 
 
 def measure_frames(
-    footage: Footage, matching: MatchingSettings, growing: GrowingSettings, surface: SurfaceSettings, results: Results, monitor: Monitor
+    footage: Footage,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    surface: SurfaceSettings,
+    results: Results,
+    monitor: Monitor,
+    enhance: EnhanceSettings | None = None,
 ) -> Iterator[MeasuredFrame]:
     """Measure all frames: from the frame of the clicks to the end, then from it to the beginning.
 
@@ -72,7 +80,7 @@ def measure_frames(
     order = [*range(first, footage.frames.stop), *range(first - 1, footage.frames.start - 1, -1)]
     base = store.digest(
         ALGORITHM,
-        repr((matching, growing, surface)),
+        repr((matching, growing, surface, enhance)),
         take.rig_path,
         repr((take.interlaced, take.reference_view, _seed_table(footage))),
         repr([(v.name, v.offset_frames) for v in take.views]),
@@ -86,7 +94,7 @@ def measure_frames(
         key = store.digest(base, before.key if before else "", str(frame), *_image_digests(footage, frame))
         measured = _from_checkpoint(footage, results, frame, key)
         if measured is None:
-            measured = _measure(footage, matching, growing, surface, frame, before, key, part)
+            measured = _measure(footage, matching, growing, surface, frame, before, key, part, enhance)
             _checkpoint(results, measured)
         start = start or measured
         before = measured
@@ -124,9 +132,10 @@ def _measure(
     before: MeasuredFrame | None,
     key: str,
     monitor: Monitor,
+    enhance: EnhanceSettings | None,
 ) -> MeasuredFrame:
     take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
-    images = load_images(footage, frame)
+    images = load_images(footage, frame, enhance)
     grid = template_grid(images.spline[ref].shape, take.rows, growing.spacing_px)
     if before is None:
         where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, monitor)

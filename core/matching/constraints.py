@@ -33,6 +33,7 @@ SAMPLE = 1000  # points that tell the rig's quality
 NEIGHBOUR_NOISE_PX = 0.05
 MEDIAN_OF_CHI2 = 0.4549
 SCATTER_SHARE = 0.3  # of the neighbours' scatter about their quadric: what the model does not follow
+LOOSER, LESS_ALIKE = 2.0, 0.15  # limits of a piece of surface: held by all views and its neighbours, it may look less alike in each
 MAX_STEEPNESS = 5.0  # change of depth per distance across
 OUTLINE_SIGMA_PX = 1.3  # across the ray, where no neighbour supports a point: at an outline the patch hangs over the body's edge
 
@@ -92,7 +93,13 @@ def _object_space(
     around = _surface_of(field, cameras[reference], reference, speed)
     xy, start = field.grid.xy(field.cell), around.coefficients[:, : 6 if neighbours else 3]
     prior = _prior(start, speed)
-    wide = replace(settings, patch_px=settings.patch_px + WINDOW_EXTRA_PX)
+    wide = replace(
+        settings,
+        patch_px=settings.patch_px + WINDOW_EXTRA_PX,
+        max_sigma_px=LOOSER * settings.max_sigma_px,
+        max_sigma0=LOOSER * settings.max_sigma0,
+        min_correlation=max(0.0, settings.min_correlation - LESS_ALIKE),
+    )
     weight = _window(wide.patch_px, rows.step)
 
     def match(which: np.ndarray, prior: SurfacePrior, sigma_c: float) -> SurfacePatch:
