@@ -2,8 +2,8 @@
 
 OpenCV's calibration sample writes camera_matrix, distortion_coefficients, image_width, image_height of one camera; its stereo sample M1
 D1 M2 D2 and R T (of the second camera). For a rig we write `names` and, for each name n, camera_matrix_n, distortion_coefficients_n,
-image_width_n, image_height_n, R_n (3×3), T_n. EasyMocap: intri.yml with names, K_n, dist_n, and H_n, W_n in newer files; extri.yml with R_n (Rodrigues),
-Rot_n, T_n in metres.
+image_width_n, image_height_n, R_n (3×3), T_n. EasyMocap: intri.yml with names, K_n, dist_n, and H_n, W_n in newer files; extri.yml with
+R_n (Rodrigues), Rot_n, T_n in metres.
 """
 
 from collections.abc import Callable

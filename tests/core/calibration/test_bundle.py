@@ -19,7 +19,7 @@ from tricap.core.calibration.bundle import (
 from tricap.core.geometry.camera_derivatives import EXTERIOR, INTERIOR, camera_of, image_with_derivatives, interior_of
 from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, random_cameras, waved_bar
 
-from .conftest import true_network
+from .truth import true_network
 
 ALL = np.ones(10, dtype=bool)
 

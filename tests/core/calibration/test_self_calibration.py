@@ -10,9 +10,10 @@ from tricap.core.geometry.camera_derivatives import INTERIOR
 from tricap.core.progress import Cancelled, Monitor
 from tricap.core.synthetic.bar import RIG_KINDS, BarNoise, WavedBar, bar_ends, benchmark_cameras, random_cameras, waved_bar
 
-from .conftest import bound, error_m, observed
+from .truth import bound, error_m, observed
 
-# Ratio of the error to the bound: its median over seeds must be near 1; a single one has measured up to 1.9 (one eigen-direction dominates).
+# Ratio of the error to the bound: its median over seeds must be near 1; a single one has measured up to 1.9 (one eigen-direction
+# dominates).
 WORST_RATIO = 2.5
 
 

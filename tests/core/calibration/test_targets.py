@@ -16,7 +16,7 @@ from tricap.core.progress import Monitor
 from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, waved_bar
 from tricap.core.synthetic.bar_images import BarPictures, draw_disc, picture, write_bar_folder
 
-from .conftest import error_m
+from .truth import error_m
 
 
 def discs(rng: np.random.Generator, grey: float, squeeze: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

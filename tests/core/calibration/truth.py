@@ -1,9 +1,8 @@
 """A waved bar with its truth, and how far estimated cameras are from true ones."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-import pytest
 
 from tricap.core.calibration.bundle import Network, Unknowns, normal_equations, residuals
 from tricap.core.calibration.observations import BarObservations
@@ -13,6 +12,7 @@ from tricap.core.geometry.intersection import forward_intersection
 from tricap.core.synthetic.bar import WavedBar, bar_ends
 
 TEST_BARS = bar_ends(800, np.random.default_rng(9), 0.5)
+TEST_POINTS = TEST_BARS.reshape(-1, 3)
 
 
 def observed(waved: WavedBar, labelled: bool = True) -> BarObservations:
@@ -61,7 +61,7 @@ def rigid(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return R, b.mean(axis=0) - R @ a.mean(axis=0)
 
 
-def error_m(true: Sequence[Camera], estimated: Sequence[Camera], points: np.ndarray = TEST_BARS.reshape(-1, 3)) -> float:
+def error_m(true: Sequence[Camera], estimated: Sequence[Camera], points: np.ndarray = TEST_POINTS) -> float:
     """RMS distance of points, seen by the true cameras without noise and intersected by the estimated ones, after rigid alignment."""
     xy = np.stack([c.project(points) for c in true], axis=1)
     inside = np.stack([c.sees(xy[:, n]) for n, c in enumerate(true)], axis=1)
@@ -70,10 +70,3 @@ def error_m(true: Sequence[Camera], estimated: Sequence[Camera], points: np.ndar
     ok = np.isfinite(X).all(axis=1)
     R, t = rigid(X[ok], points[ok])
     return float(np.sqrt(np.mean(np.sum((X[ok] @ R.T + t - points[ok]) ** 2, axis=1))))
-
-
-@pytest.fixture(scope="session")
-def quiet() -> Callable[[], object]:
-    from tricap.core.progress import Monitor
-
-    return Monitor
