@@ -1,10 +1,11 @@
 """Body models are data files (models/*.toml): bones, DOFs with limits, default lengths and radii. A user can write another one.
 
-A file with `mirror_of` is the mirror image (x → −x) of another: names change side, limits about y and z change sign.
+A file with `mirror_of` is the mirror image (x → −x) of another: names change side, limits about y and z change sign. In a `symmetric`
+file the bones of the right side stand for both. A file with `part_of` is another model `without` some bones and what hangs on them.
 """
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, radians
 from pathlib import Path
@@ -57,7 +58,27 @@ def read_model(name: str | Path) -> BodyModel:
         raise InputError(f"The body model {path} cannot be read: {error}.") from error
     if "mirror_of" in table:
         return mirrored(read_model(str(table["mirror_of"])), str(table.get("name", name)))
+    if "part_of" in table:
+        return without(read_model(str(table["part_of"])), table.get("without", ()), str(table.get("name", name)))
     return _model(table, path)
+
+
+def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
+    """A model without some bones and all that hangs on them.
+
+    Raises:
+        InputError: the model has no such bone, or nothing is left.
+    """
+    names = [bone.name for bone in model.skeleton.bones]
+    for missing in set(bones) - set(names):
+        raise InputError(f"The model “{name}” leaves out “{missing}”, which “{model.name}” does not have.{nearest_name(missing, names)}")
+    gone = set(bones)
+    for bone in model.skeleton.bones:
+        if bone.parent in gone:
+            gone.add(bone.name)
+    rows = [i for i, left in enumerate(names) if left not in gone]
+    skeleton = Skeleton(name=name, bones=tuple(model.skeleton.bones[i] for i in rows), base_dofs=model.skeleton.base_dofs)
+    return BodyModel(name=name, skeleton=skeleton, visible_radii_m=model.visible_radii_m[rows], surface=model.surface[rows])
 
 
 def mirrored(model: BodyModel, name: str) -> BodyModel:
@@ -115,13 +136,21 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
         raise InputError(f"{path} is no body model of this version of Tricap; begin it with format = \"tricap-model\" and version = 1.")
     try:
         stature = float(table["stature_m"])
-        bones = tuple(Bone(name=str(t["name"]), parent=t.get("parent"), head_joint=str(t["head"]), tail_joint=str(t["tail"]),
-                           nominal_length_m=stature * float(t["length_per_stature"]), R_rest=rest_frame(t["y"], t["z"]),
-                           rotation_mode=str(t.get("rotation_mode", "YZX")), dofs=tuple(map(dof_from_table, t.get("dofs", ()))))
-                      for t in table["bones"])
-        radii = [np.broadcast_to(np.array(t.get("radii_m", [np.nan] * 3), dtype=float).reshape(3, -1), (3, 2)) for t in table["bones"]]
-        surface = [t.get("surface", (0.0, 1.0)) for t in table["bones"]]
-        skeleton = Skeleton(name=str(table["name"]), bones=bones, base_dofs=base_dofs(str(table["base"])))
+        rows = list(table["bones"])
+        bones = [_bone(t, stature) for t in rows]
+        radii = [np.broadcast_to(np.array(t.get("radii_m", [np.nan] * 3), dtype=float).reshape(3, -1), (3, 2)) for t in rows]
+        surface = [t.get("surface", (0.0, 1.0)) for t in rows]
+        if table.get("symmetric", False):
+            right = [i for i, bone in enumerate(bones) if bone.name.endswith(".R")]
+            bones += [_mirrored_bone(bones[i]) for i in right]
+            radii, surface = radii + [radii[i] for i in right], surface + [surface[i] for i in right]
+        skeleton = Skeleton(name=str(table["name"]), bones=tuple(bones), base_dofs=base_dofs(str(table["base"])))
         return BodyModel(name=skeleton.name, skeleton=skeleton, visible_radii_m=np.array(radii), surface=np.array(surface))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The body model {path} lacks something or holds a wrong value: {error}.") from error
+
+
+def _bone(t: Mapping[str, Any], stature: float) -> Bone:
+    return Bone(name=str(t["name"]), parent=t.get("parent"), head_joint=str(t["head"]), tail_joint=str(t["tail"]),
+                nominal_length_m=stature * float(t["length_per_stature"]), R_rest=rest_frame(t["y"], t["z"]),
+                rotation_mode=str(t.get("rotation_mode", "YZX")), dofs=tuple(map(dof_from_table, t.get("dofs", ()))))

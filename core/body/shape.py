@@ -1,7 +1,7 @@
 """The shape of one person: bone lengths and metaball radii with their sigmas, and its file body.toml."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees, isfinite
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,13 @@ def default_shape(model: BodyModel) -> BodyShape:
     balls = three_balls(has_balls, lengths, model.visible_radii_m[has_balls])
     return BodyShape(model=model.name, skeleton=model.skeleton, lengths_m=lengths, metaballs=balls,
                      length_sigma_m=np.full(len(lengths), np.nan), radius_sigma_m=np.full((len(balls.weight), 3), np.nan))
+
+
+def scaled_shape(shape: BodyShape, factor: float) -> BodyShape:
+    """The same body, taller (`factor` > 1) or smaller in all its lengths and radii."""
+    balls = shape.metaballs
+    scaled = Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=factor * balls.radii_m, weight=balls.weight)
+    return replace(shape, lengths_m=factor * shape.lengths_m, metaballs=scaled)
 
 
 def write_body(path: Path, shape: BodyShape) -> None:

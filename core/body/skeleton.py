@@ -19,7 +19,6 @@ from math import inf
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.rotation import axis_rotation
 from ..settings import nearest_name
 from ..values import frozen
 
@@ -163,12 +162,41 @@ class Skeleton:
         return table
 
     @cached_property
+    def rest_to_parent(self) -> np.ndarray:
+        """(B, 3, 3) Rest_rel of (1): each bone's rest frame in its parent's; of the first bone its own."""
+        return np.stack([bone.R_rest if p < 0 else self.bones[p].R_rest.T @ bone.R_rest for bone, p in zip(self.bones, self.parents)])
+
+    @cached_property
+    def turn_order(self) -> tuple[tuple[tuple[int, int], ...], ...]:
+        """For each bone its DOFs and their axes (0, 1, 2), outermost first."""
+        order, n = [], len(self.base_dofs)
+        for bone in self.bones:
+            index = {dof.axis: n + i for i, dof in enumerate(bone.dofs)}
+            n += len(bone.dofs)
+            order.append(tuple((index[a], "xyz".index(a)) for a in reversed(bone.rotation_mode.lower()) if a in index))
+        return tuple(order)
+
+    @cached_property
+    def dofs_about(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The DOFs that turn about local x, y and z."""
+        n = len(self.base_dofs)
+        x, y, z = (np.array([i for i, dof in enumerate(self.dofs) if i >= n and dof.axis == a], dtype=np.intp) for a in "xyz")
+        return x, y, z
+
+    @cached_property
     def neighbours(self) -> np.ndarray:
-        """(B, B) symmetric: a bone itself, its parent and its children; their fields add where they meet (consistent mode)."""
+        """(B, B) symmetric: a bone itself, its parent and its children; their fields add where they meet (consistent mode).
+
+        A bone without DOFs is a rigid part of its parent: what hangs on it is the parent's child.
+        """
+        rigid = list(range(len(self.bones)))
+        for b, p in enumerate(self.parents):
+            if p >= 0 and not self.bones[b].dofs:
+                rigid[b] = rigid[p]
         table = np.eye(len(self.bones), dtype=bool)
         for b, p in enumerate(self.parents):
-            if p >= 0:
-                table[b, p] = table[p, b] = True
+            for c in (p, rigid[p]) if p >= 0 else ():
+                table[b, c] = table[c, b] = True
         return table
 
     @cached_property
@@ -224,18 +252,29 @@ def _forward(skeleton: Skeleton, lengths_m: np.ndarray, motion: np.ndarray) -> t
     axes = np.zeros((*shape, motion.shape[-1], 3))
     n = len(skeleton.base_dofs)
     axes[..., np.arange(n), np.arange(n)] = 1.0
+    turns = _turns(skeleton, motion)
     for b, (bone, p) in enumerate(zip(skeleton.bones, skeleton.parents)):
         if p < 0:
             frame, head[..., b, :] = np.broadcast_to(bone.R_rest, (*shape, 3, 3)), motion[..., :n]
         else:
-            frame = R[..., p, :, :] @ (skeleton.bones[p].R_rest.T @ bone.R_rest)
+            frame = R[..., p, :, :] @ skeleton.rest_to_parent[b]
             offset = lengths_m[p] * R[..., p, :, 1] if skeleton.starts_at_tail[b] else 0.0
             head[..., b, :] = head[..., p, :] + offset
-        index = {dof.axis: n + i for i, dof in enumerate(bone.dofs)}
-        n += len(bone.dofs)
-        for letter in reversed(bone.rotation_mode.lower()):  # (2)
-            if letter in index:
-                axes[..., index[letter], :] = frame[..., :, "xyz".index(letter)]
-                frame = frame @ axis_rotation(letter, motion[..., index[letter]])
+        for dof, axis in skeleton.turn_order[b]:  # (2)
+            axes[..., dof, :] = frame[..., :, axis]
+            frame = frame @ turns[..., dof, :, :]
         R[..., b, :, :] = frame
     return R, head, axes
+
+
+def _turns(skeleton: Skeleton, motion: np.ndarray) -> np.ndarray:
+    """The rotation matrix (…, D, 3, 3) of every DOF about its axis; of base DOFs without meaning."""
+    cos, sin = np.cos(motion), np.sin(motion)
+    turns = np.zeros((*motion.shape, 3, 3))
+    for k in range(3):
+        dofs = skeleton.dofs_about[k]
+        i, j = (k + 1) % 3, (k + 2) % 3
+        turns[..., dofs, k, k] = 1.0
+        turns[..., dofs, i, i] = turns[..., dofs, j, j] = cos[..., dofs]
+        turns[..., dofs, j, i], turns[..., dofs, i, j] = sin[..., dofs], -sin[..., dofs]
+    return turns

@@ -20,6 +20,7 @@ WIDE = 1.5  # the gate, as long as the radii are the model's
 POSE_STEPS, STEPS = 15, 25
 SUSPICIOUS = 3.0  # sigma0 of a posture behind the limb or beside it
 ALTERNATIONS, ALTERNATION_STEPS = 6, 5
+MOST_OTHERS = 12  # of the starts for limbs that nobody clicked, those that explain most points
 DEPTH_SHIFT_M = 0.04  # clicks from a short base are least certain along the view
 
 
@@ -31,7 +32,7 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     """
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.settings.length_sigma)
     best, best_support = None, -1.0
-    starts = _starts(fit, clicked.motion[0])
+    starts = _starts(fit, points, clicked.motion[0], clicked.vector)
     for i, motion in enumerate(starts):
         monitor.step("fit the click frame", i, len(starts))
         solution = fit_posture_and_shape(fit, points, motion, clicked.vector)
@@ -80,8 +81,12 @@ def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) ->
     return solution.vector[lengths], np.sqrt(np.diag(covariance)[lengths])
 
 
-def _starts(fit: Conditions, motion: np.ndarray) -> list[np.ndarray]:
-    starts = [motion, *other_postures(fit.parameters, fit.clicks, motion)]
+def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> list[np.ndarray]:
+    others = other_postures(fit.parameters, fit.clicks, motion)
+    if len(others) > MOST_OTHERS:
+        support = [fit.support(points, other, vector) for other in others]
+        others = [others[i] for i in np.argsort(support)[::-1][:MOST_OTHERS]]
+    starts = [motion, *others]
     view = np.mean([camera.R_cam_world[2] for camera in fit.clicks.observation.cameras], axis=0)
     for shift in (-DEPTH_SHIFT_M, DEPTH_SHIFT_M):
         moved = motion.copy()

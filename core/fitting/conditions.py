@@ -9,7 +9,7 @@ from ..body.model_file import BodyModel
 from .acceleration import Acceleration
 from .clicks import Clicks
 from .cloud_points import CloudPoints
-from .observations import EqualRadii, Observation, ShapePrior, SurfacePoints
+from .observations import EqualRadii, Observation, ShapePrior, SurfacePoints, Symmetry
 from .problem import Problem
 from .robust import robust_weights
 from .segmentation import segment
@@ -50,7 +50,11 @@ class Conditions:
         sigma = np.full(len(mean), s.radius_sigma)
         of_lengths = self.parameters.layout.set("lengths")
         mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], s.length_sigma)
-        return [ShapePrior(mean=mean, sigma=sigma), EqualRadii(sigma=s.roundness_sigma)]
+        radii = self.parameters.template.metaballs.radii_m
+        found: list[Observation] = [ShapePrior(mean=mean, sigma=sigma),
+                                    EqualRadii(sigma=s.roundness_sigma, log_ratio=np.log(radii[:, 0] / radii[:, 2]))]
+        left, right = self.parameters.pairs()
+        return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma)] if len(left) else found
 
     def problem(self, observe: Callable[[int, BodyState], list[Observation]], free: str | None = None,
                 smoothness: Acceleration | None = None) -> Problem:

@@ -1,8 +1,11 @@
-"""From clicked joints to a posture and bone lengths: a coarse search outwards along the skeleton, then least squares in the images."""
+"""From clicked joints to a posture and bone lengths: the trunk as a rigid body, a coarse search outwards along the limbs, then least
+squares in the images.
+"""
 
 from itertools import product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..body.skeleton import Skeleton, joint_positions
 from .clicks import Clicks
@@ -13,6 +16,11 @@ from .state import ShapeParameters
 GRID_STEP = np.radians(25.0)
 FREE_SPAN = np.pi  # search range of a DOF without limits
 STEPS = 40
+LITTLE = np.radians(65.0)  # what bends less belongs to the trunk
+ENOUGH_BONES = 4
+OWN_SIGMA, STATURE_SIGMA = 0.10, 0.07  # of a bone about its person's proportions, of a person about the model
+CLICK_SIGMA_M = 0.03
+FIRM = np.radians(20.5)  # a prior of this sigma is start enough
 
 
 def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], length_sigma: float) -> Solution:
@@ -28,19 +36,50 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
     return solve(problem, start[None], vector, steps=STEPS)
 
 
+def clicked_stature(skeleton: Skeleton, lengths_m: np.ndarray, clicks: Clicks) -> float:
+    """The person's stature over the model's, from the bones (B,) that have both ends clicked and the distances between trunk joints.
+
+    Few bones say less about a stature than their own clicks say about them: then 1.
+    """
+    rest = joint_positions(skeleton, lengths_m, np.zeros(len(skeleton.dofs)))
+    place = dict(zip(skeleton.joint_names, clicks.xyz_m))
+    trunk = [j for j in trunk_joints(skeleton) if np.isfinite(place[j]).all()]
+    pairs = [(bone.head_joint, bone.tail_joint) for bone in skeleton.bones if bone.head_joint not in trunk or bone.tail_joint not in trunk]
+    pairs += [(a, b) for i, a in enumerate(trunk) for b in trunk[i + 1 :]]
+    clicked = [(a, b) for a, b in pairs if np.isfinite(place[a]).all() and np.isfinite(place[b]).all()]
+    wanted = np.array([np.linalg.norm(rest[a] - rest[b]) for a, b in clicked])
+    found = np.array([np.linalg.norm(place[a] - place[b]) for a, b in clicked])
+    if len(clicked) < ENOUGH_BONES or wanted.min() <= 0 or found.min() <= 0:
+        return 1.0
+    weight = 1 / (OWN_SIGMA**2 + (CLICK_SIGMA_M / wanted) ** 2)
+    return float(np.exp(weight @ np.log(found / wanted) / (weight.sum() + 1 / STATURE_SIGMA**2)))
+
+
+def trunk_joints(skeleton: Skeleton) -> list[str]:
+    """The joints that keep their places in the trunk: those of the first bone and of the bones on it that turn by little."""
+    stiff = [not b or max((abs(limit) for dof in bone.dofs for limit in dof.limits), default=0.0) <= LITTLE
+             for b, bone in enumerate(skeleton.bones)]
+    for b, p in enumerate(skeleton.parents):
+        stiff[b] = stiff[b] and (p < 0 or stiff[p])
+    return list(dict.fromkeys(j for bone, s in zip(skeleton.bones, stiff) if s for j in (bone.head_joint, bone.tail_joint)))
+
+
 def coarse_posture(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
-    """A motion vector (D,) near the located joints: for bone after bone the best on a grid of the DOFs that move its tail."""
+    """A motion vector (D,) near the located joints: the trunk turned as a whole, then for limb after limb the best on a grid of the DOFs
+    that move its tail."""
     skeleton, lengths = parameters.skeleton, parameters.template.lengths_m
     motion = np.array([np.clip(0.0, *dof.limits) for dof in skeleton.dofs])
-    names = list(skeleton.joint_names)
-    known = np.flatnonzero(clicks.located)
-    first = names[known[0]]
-    base = skeleton.layout.set("base")
+    names, trunk = list(skeleton.joint_names), trunk_joints(skeleton)
+    placed = [names.index(j) for j in trunk if clicks.located[names.index(j)]]
+    turned = len(placed) >= 3
+    if turned:
+        _turn_trunk(skeleton, lengths, clicks.xyz_m, placed, motion)
+    known = placed if turned else np.flatnonzero(clicks.located)[:1].tolist()
+    _shift(skeleton, lengths, clicks.xyz_m, known, motion)
     for b, bone in enumerate(skeleton.bones):
-        motion[base] += clicks.xyz_m[known[0]] - joint_positions(skeleton, lengths, motion)[first]
         target = clicks.xyz_m[names.index(bone.tail_joint)]
         dofs = _movers(skeleton, b)
-        if not np.isfinite(target).all() or not len(dofs):
+        if not np.isfinite(target).all() or not len(dofs) or (turned and bone.tail_joint in trunk):
             continue
         grid = np.array(list(product(*(_values(skeleton, d) for d in dofs))))
         trial = np.repeat(motion[None], len(grid), axis=0)
@@ -50,16 +89,39 @@ def coarse_posture(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
         wanted = target - (clicks.xyz_m[names.index(bone.head_joint)] if clicks.located[names.index(bone.head_joint)] else head)
         angle = _angle(places[bone.tail_joint] - head, wanted)
         motion = trial[np.argmin(angle + 1e-3 * np.abs(grid).sum(axis=1))]
-    motion[base] += clicks.xyz_m[known[0]] - joint_positions(skeleton, lengths, motion)[first]
+        _shift(skeleton, lengths, clicks.xyz_m, known, motion)
     return motion
 
 
+def _shift(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, known: list[int], motion: np.ndarray) -> None:
+    """Bring the middle of the joints `known` to its place, by the base."""
+    places = np.stack(list(joint_positions(skeleton, lengths, motion).values()))
+    motion[skeleton.layout.set("base")] += (xyz_m[known] - places[known]).mean(axis=0)
+
+
+def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, placed: list[int], motion: np.ndarray) -> None:
+    """Turn the first bone so that the trunk's joints fit best (Kabsch 1976)."""
+    rest = np.stack(list(joint_positions(skeleton, lengths, np.zeros(len(motion))).values()))[placed]
+    found = xyz_m[placed]
+    U, _, Vt = np.linalg.svd((found - found.mean(axis=0)).T @ (rest - rest.mean(axis=0)))
+    turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    bone, R = skeleton.bones[0], skeleton.bones[0].R_rest
+    order = bone.rotation_mode[::-1]
+    angles = dict(zip(order.lower(), Rotation.from_matrix(R.T @ turn @ R).as_euler(order)))
+    for dof in bone.dofs:
+        motion[skeleton.layout[dof.name]] = angles[dof.axis]
+
+
 def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarray) -> list[np.ndarray]:
-    """Further starts for bones whose tail nobody clicked: a coarse grid of the DOFs that move it, the others as in `motion` (D,)."""
+    """Further starts for bones whose tail nobody clicked: a coarse grid of the DOFs that move it, the others as in `motion` (D,).
+
+    Bones whose posture the model believes firmly have none.
+    """
     skeleton, starts = parameters.skeleton, []
     for b, bone in enumerate(skeleton.bones):
         dofs = _movers(skeleton, b)
-        if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or not len(dofs):
+        believed = all(skeleton.dofs[d].prior_sigma <= FIRM for d in dofs)
+        if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or believed:
             continue
         for values in product(*(_values(skeleton, d)[1::2] for d in dofs)):
             start = motion.copy()

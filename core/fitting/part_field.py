@@ -5,89 +5,143 @@ A bone j whose balls give the gradient g_j at X moves under DOF k with the veloc
     ∂F/∂ln L_a = −L_a y_a · Σ_j g_j           over the bones j that L_a shifts, and, in bone a's own axes,
                + Σ_{i ∈ a} (∂F_i/∂ln l_y − ∇_local F_i · c_i)                                            (2)
     ∂F/∂ln l = 4 q² w exp(−2d)                                                                           (3)
+
+A part knows few of the parameters: derivatives are given for its own columns only.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..body.metaballs import Metaballs, ball_terms
-from .state import CROSS, BodyState
+from ..body.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from .state import BodyState
+
+CROSS = [0, 2]  # the two axes across a bone
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Part:
-    """The balls that make the surface of one bone's part: its own, its parent's and its children's."""
+    """The balls that make the surface of one bone's part (its own, its parent's, its children's), and the parameters that move them."""
 
-    balls: Metaballs
-    columns: np.ndarray  # (m,) their places among all balls
+    skeleton: Skeleton
+    bone: int
+    bone_index: np.ndarray  # (M,) of all balls
 
-    @staticmethod
-    def of(state: BodyState, bone: int) -> "Part":
-        """The part of a bone (index)."""
-        b = state.balls
-        columns = np.flatnonzero(state.skeleton.neighbours[bone, b.bone_index])
-        return Part(columns=columns, balls=Metaballs(bone_index=b.bone_index[columns], centre=b.centre[columns],
-                                                     radii_m=b.radii_m[columns], weight=b.weight[columns]))
+    @cached_property
+    def balls(self) -> np.ndarray:
+        """(m,) the part's balls among all, bone after bone."""
+        mine = np.flatnonzero(self.skeleton.neighbours[self.bone, self.bone_index])
+        return mine[np.argsort(self.bone_index[mine], kind="stable")]
 
-    def field(self, state: BodyState, xyz_m: np.ndarray) -> np.ndarray:
-        """F (N,) at world points (N, 3)."""
-        return self._terms(state, xyz_m)[1].sum(axis=1)
+    @cached_property
+    def bones(self) -> list[tuple[int, slice]]:
+        """The bones that carry the part's balls, and which of its balls each carries."""
+        bones, first = np.unique(self.bone_index[self.balls], return_index=True)
+        ends = [*first[1:].tolist(), len(self.balls)]
+        return [(int(b), slice(int(i), int(j))) for b, i, j in zip(bones, first, ends)]
 
-    def gradient(self, state: BodyState, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """F (N,) and its gradient in space (N, 3)."""
-        q, terms = self._terms(state, xyz_m)
-        return terms.sum(axis=1), sum(self._bone_gradients(state, q, terms)[1])  # type: ignore[return-value]
+    @cached_property
+    def dofs(self) -> np.ndarray:
+        """(d,) the DOFs that move any of its balls, base first."""
+        n = len(self.skeleton.base_dofs)
+        moved = np.any([self.skeleton.moved_by[b] for b, _ in self.bones], axis=0)
+        moved[:n] = True
+        return np.flatnonzero(moved)
 
-    def shares(self, state: BodyState, xyz_m: np.ndarray) -> np.ndarray:
-        """Which part (N, m) of F at each point comes from which of the balls."""
-        terms = self._terms(state, xyz_m)[1]
-        return terms / np.maximum(terms.sum(axis=1, keepdims=True), 1e-300)
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """(k,) the bones whose lengths move any of its balls."""
+        on = np.any([self.skeleton.offset_by[b] for b, _ in self.bones], axis=0)
+        on[[b for b, _ in self.bones]] = True
+        return np.flatnonzero(on)
 
-    def jacobian(self, state: BodyState, xyz_m: np.ndarray, shape: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """F (N,) and its derivative (N, D + S) to motion and shape, or (N, D) to motion."""
-        q, terms = self._terms(state, xyz_m)
-        bones, gradients = self._bone_gradients(state, q, terms)
-        motion = self._to_motion(state, xyz_m, bones, gradients)
-        F = terms.sum(axis=1)
-        if not shape:
-            return F, motion
-        out = np.zeros((len(xyz_m), state.n_motion + state.n_shape))
-        out[:, : state.n_motion] = motion
-        self._to_shape(state, bones, gradients, q, terms, out[:, state.n_motion :])
-        return F, out
+    @cached_property
+    def chain(self) -> tuple[np.ndarray, np.ndarray]:
+        """The DOFs (d,), base first, and the lengths (l,) that move the bone itself."""
+        moved = self.skeleton.moved_by[self.bone].copy()
+        moved[: len(self.skeleton.base_dofs)] = True
+        return np.flatnonzero(moved), np.flatnonzero(self.skeleton.offset_by[self.bone])
 
-    def _terms(self, state: BodyState, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        bones, which = np.unique(self.balls.bone_index, return_inverse=True)
-        local = np.stack([(xyz_m - state.head_m[b]) @ state.R[b] for b in bones], axis=1)
-        near = Metaballs(bone_index=which.ravel(), centre=self.balls.centre, radii_m=self.balls.radii_m, weight=self.balls.weight)
-        return ball_terms(near, state.lengths_m[bones], local)
+    def columns(self, shape: bool) -> np.ndarray:
+        """Its columns (c,) in a Jacobian of the whole state (D + S)."""
+        return self._all_columns if shape else self.dofs
 
-    def _bone_gradients(self, state: BodyState, q: np.ndarray, terms: np.ndarray) -> tuple[list[int], list[np.ndarray]]:
-        bones = np.unique(self.balls.bone_index).tolist()
-        local = (-4 * terms)[..., None] * q / self.balls.radii_m
-        return bones, [local[:, self.balls.bone_index == b].sum(axis=1) @ state.R[b].T for b in bones]
+    @cached_property
+    def _all_columns(self) -> np.ndarray:
+        D, B = len(self.skeleton.dofs), len(self.skeleton.bones)
+        radii = D + B + 2 * self.balls[:, None] + np.arange(2)
+        return np.concatenate([self.dofs, D + self.lengths, radii.ravel()])
 
-    def _to_motion(self, state: BodyState, xyz_m: np.ndarray, bones: list[int], gradients: list[np.ndarray]) -> np.ndarray:
-        sk, n = state.skeleton, len(state.skeleton.base_dofs)
-        wrench = np.concatenate([part for g in gradients for part in (g, np.cross(xyz_m, g))], axis=1)  # force and moment of each bone
-        lever = np.cross(state.axes, state.head_m[sk.dof_bone])  # a_k × o_k
-        table = np.zeros((2 * len(bones), 3, state.n_motion))
-        for i, b in enumerate(bones):
-            moved = sk.moved_by[b]
-            table[2 * i] = np.where(moved, lever.T, 0.0)
-            table[2 * i + 1] = np.where(moved, -state.axes.T, 0.0)
-            table[2 * i, :, :n], table[2 * i + 1, :, :n] = -state.axes[:n].T, 0.0
-        return wrench @ table.reshape(-1, state.n_motion)  # (1): −a·((X − o) × g) = −a·(X × g) + (a × o)·g
+    @cached_property
+    def tables(self) -> tuple[np.ndarray, np.ndarray]:
+        """For each of its bones whether each of its rotations turns it (k, d), and whether each of its lengths shifts it (k, l)."""
+        bones, n = np.array([b for b, _ in self.bones]), len(self.skeleton.base_dofs)
+        moved = self.skeleton.moved_by[np.ix_(bones, self.dofs)].astype(float)
+        moved[:, :n] = 0.0
+        return moved, self.skeleton.offset_by[np.ix_(bones, self.lengths)].astype(float)
 
-    def _to_shape(self, state: BodyState, bones: list[int], gradients: list[np.ndarray], q: np.ndarray, terms: np.ndarray,
-                  out: np.ndarray) -> None:
-        sk, L, n = state.skeleton, state.lengths_m, len(state.lengths_m)
-        stretch = L[:, None] * state.R[:, :, 1]
-        for b, g in zip(bones, gradients):
-            out[:, :n] -= g @ np.where(sk.offset_by[b][:, None], stretch, 0.0).T
-        own = 4 * terms * (q[..., 1] ** 2 + np.einsum("nmi,mi->nm", q, self.balls.centres_m(L) / self.balls.radii_m))
-        for b in bones:
-            out[:, b] += own[:, self.balls.bone_index == b].sum(axis=1)  # (2)
-        cross = 4 * terms[..., None] * q[..., CROSS] ** 2  # (3)
-        out[:, n + 2 * self.columns[:, None] + np.arange(2)] = cross
+
+class PartField:
+    """The field of a part of one body at world points (N, 3). What is asked for is computed once."""
+
+    def __init__(self, part: Part, state: "BodyState", xyz_m: np.ndarray) -> None:
+        self.part, self.state, self.xyz_m = part, state, xyz_m
+        self._radii = state.balls.radii_m[part.balls]
+        self._centres = state.balls.centre[part.balls] * state.lengths_m[state.balls.bone_index[part.balls], None]
+        self._q = np.empty((len(xyz_m), len(part.balls), 3))
+        for b, own in part.bones:
+            local = (xyz_m - state.head_m[b]) @ state.R[b]
+            self._q[:, own] = (local[:, None, :] - self._centres[own]) / self._radii[own]
+        self.terms = state.balls.weight[part.balls] * np.exp(-2 * np.einsum("nmi,nmi->nm", self._q, self._q))
+
+    @cached_property
+    def F(self) -> np.ndarray:
+        """(N,)"""
+        return self.terms.sum(axis=1)
+
+    @cached_property
+    def gradient(self) -> np.ndarray:
+        """(N, 3) in the world's axes."""
+        return np.asarray(self._bone_gradients.sum(axis=1))
+
+    @cached_property
+    def shares(self) -> np.ndarray:
+        """(N, m) which part of F comes from which of the balls."""
+        return self.terms / np.maximum(self.F, 1e-300)[:, None]
+
+    def jacobian(self, shape: bool) -> np.ndarray:
+        """Derivative (N, c) of F to the part's columns."""
+        motion = self._to_motion()
+        return np.concatenate([motion, self._to_shape()], axis=1) if shape else motion
+
+    @cached_property
+    def _bone_gradients(self) -> np.ndarray:
+        local = (-4 * self.terms)[..., None] * (self._q / self._radii)
+        return np.stack([local[:, own].sum(axis=1) @ self.state.R[b].T for b, own in self.part.bones], axis=1)
+
+    def _to_motion(self) -> np.ndarray:
+        state, part, n = self.state, self.part, len(self.part.skeleton.base_dofs)
+        moved, _ = part.tables
+        axes = state.axes[part.dofs]
+        lever = np.cross(axes, state.head_m[part.skeleton.dof_bone[part.dofs]])  # a_k × o_k
+        g = self._bone_gradients
+        moments = np.cross(self.xyz_m[:, None], g)
+        table = np.concatenate([np.einsum("kd,di->kid", moved, lever), np.einsum("kd,di->kid", moved, -axes)], axis=1)
+        table[:, :3, :n] = -axes[:n].T
+        wrench = np.concatenate([g, moments], axis=2).reshape(len(g), -1)  # force and moment of each bone
+        return wrench @ table.reshape(-1, len(part.dofs))  # (1): −a·((X − o) × g) = −a·(X × g) + (a × o)·g
+
+    def _to_shape(self) -> np.ndarray:
+        state, part, q = self.state, self.part, self._q
+        stretch = state.lengths_m[part.lengths, None] * state.R[part.lengths, :, 1]
+        table = np.einsum("kl,li->kil", part.tables[1], stretch).reshape(-1, len(part.lengths))
+        lengths = -self._bone_gradients.reshape(len(q), -1) @ table
+        own = 4 * self.terms * (q[..., 1] ** 2 + np.einsum("nmi,mi->nm", q, self._centres / self._radii))
+        for b, balls in part.bones:
+            lengths[:, np.searchsorted(part.lengths, b)] += own[:, balls].sum(axis=1)  # (2)
+        cross = 4 * self.terms[..., None] * q[..., CROSS] ** 2  # (3)
+        return np.concatenate([lengths, cross.reshape(len(q), -1)], axis=1)

@@ -7,14 +7,15 @@ r are residuals of unit weight (D'Apuzzo et al. 1999, Eqs. 9–12). Measured poi
 pose is solved is choosing an empty set of free shape parameters.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from .acceleration import Acceleration
 from .block_band import NormalEquations
-from .observations import MaterialSteps, Observation
+from .observations import Block, FromBlocks, MaterialSteps, Observation
 from .robust import robust_scale, robust_weights, variance_factor
 from .state import BodyState, ShapeParameters
 
@@ -40,6 +41,13 @@ class Problem:
     smoothness: Acceleration | None = None
     robust: str = "geman-mcclure"
     robust_width: float = 3.0
+
+    @cached_property
+    def place_of_shape(self) -> np.ndarray:
+        """(S,) where each shape parameter stands among the free ones; −1: it is held."""
+        place = np.full(len(self.parameters.layout), -1)
+        place[self.free_shape] = np.arange(len(self.free_shape))
+        return place
 
     def weights(self, residuals: np.ndarray, scale: float, crowding: np.ndarray | float) -> np.ndarray:
         """Weights of robust observations in (1)."""
@@ -70,7 +78,7 @@ def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: 
     factor = understated or Scales()
     T, D = motion.shape
     lin = Linearised(observations=[], steps=[], equations=NormalEquations.empty(T, D, len(problem.free_shape)))
-    states = [problem.parameters.state(m, vector) for m in motion]
+    states = problem.parameters.states(motion, vector)
     for t, state in enumerate(states):
         _add_frame(problem, lin, t, state, scales.points, factor.points)
     for t in range(T - 1):
@@ -88,7 +96,7 @@ def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: 
 
 def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarray) -> float:
     """(1) at another motion and shape, with the observations and weights of `lin`."""
-    states = [problem.parameters.state(m, vector) for m in motion]
+    states = problem.parameters.states(motion, vector)
     total = sum(float(np.sum(w * o.residual(state) ** 2)) for state, frame in zip(states, lin.observations) for o, w in frame)
     total += sum(float(np.sum(step[1] * step[0].residual(a, b) ** 2)) for a, b, step in zip(states, states[1:], lin.steps) if step)
     if len(problem.free_shape):
@@ -105,7 +113,7 @@ def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scale
 
 def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, before: Scales) -> Scales:
     """The scales of the residuals before the first step."""
-    states = [problem.parameters.state(m, vector) for m in motion]
+    states = problem.parameters.states(motion, vector)
     points = [o.residual(state) for t, state in enumerate(states) for o in problem.observe(t, state) if o.robust]
     steps = []
     if problem.observe_step is not None:
@@ -118,24 +126,35 @@ def _scale(residuals: list[np.ndarray], before: float) -> float:
     return robust_scale(np.concatenate(residuals), before) if residuals else before
 
 
+def blocks_of(observation: Observation, state: BodyState, shape: bool) -> Iterable[Block]:
+    """The Jacobian in blocks; one that is not sparse is one block."""
+    if isinstance(observation, FromBlocks):
+        return observation.blocks(state, shape)
+    J = observation.jacobian(state, shape)
+    return [(np.arange(len(J)), np.arange(J.shape[1]), J)]
+
+
 def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scale: float, factor: float) -> None:
     e, free, D, frame = lin.equations, problem.free_shape, state.n_motion, []
     for o in problem.observe(t, state):
-        r, J = o.residual(state), o.jacobian(state, shape=len(free) > 0)
+        r = o.residual(state)
         w: np.ndarray | float = 1.0
         if o.robust:
             lin.point_residuals.append(r)
             w = problem.weights(r, scale, o.crowding) / factor
         frame.append((o, w))
         lin.cost += float(np.sum(w * r * r))
-        weighted = (J.T * w)[: D], J[:, :D]
-        e.diagonal[t] += weighted[0] @ weighted[1]
-        e.g[t] -= weighted[0] @ r
-        if len(free):
-            S = J[:, D + free]
-            e.border[t] += weighted[0] @ S
-            e.corner += (S.T * w) @ S
-            e.h -= (S.T * w) @ r
+        for rows, columns, J in blocks_of(o, state, len(free) > 0):
+            weighted, columns, J = _free_columns(problem, D, w, rows, columns, J)
+            H, g = weighted @ J, weighted @ r[rows]
+            motion = columns < D
+            d, s = columns[motion], columns[~motion] - D
+            e.diagonal[t][np.ix_(d, d)] += H[np.ix_(motion, motion)]
+            e.g[t][d] -= g[motion]
+            if len(s):
+                e.border[t][np.ix_(d, s)] += H[np.ix_(motion, ~motion)]
+                e.corner[np.ix_(s, s)] += H[np.ix_(~motion, ~motion)]
+                e.h[s] -= g[~motion]
     lin.observations.append(frame)
 
 
@@ -144,20 +163,35 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
     if step is None:
         lin.steps.append(None)
         return
-    e, free, D = lin.equations, problem.free_shape, a.n_motion
-    r, J = step.residual(a, b), step.jacobian(a, b)
+    e, D = lin.equations, a.n_motion
+    r = step.residual(a, b)
     w = problem.weights(r, scale, step.crowding) / factor
     lin.steps.append((step, w))
     lin.step_residuals.append(r)
     lin.cost += float(np.sum(w * r * r))
-    A, B, S = J[:, :D], J[:, D : 2 * D], J[:, 2 * D + free]
-    Aw, Bw, Sw = A.T * w, B.T * w, S.T * w
-    e.diagonal[t] += Aw @ A
-    e.diagonal[t + 1] += Bw @ B
-    e.next1[t] += Bw @ A
-    e.g[t] -= Aw @ r
-    e.g[t + 1] -= Bw @ r
-    e.border[t] += Aw @ S
-    e.border[t + 1] += Bw @ S
-    e.corner += Sw @ S
-    e.h -= Sw @ r
+    for rows, columns, J in step.blocks(a, b, len(problem.free_shape) > 0):
+        weighted, columns, J = _free_columns(problem, 2 * D, w, rows, columns, J)
+        H, g = weighted @ J, weighted @ r[rows]
+        n = int(np.searchsorted(columns, D))  # its DOFs
+        d, s = columns[:n], columns[2 * n :] - 2 * D
+        A, B, S = slice(0, n), slice(n, 2 * n), slice(2 * n, None)
+        dd, ds = np.ix_(d, d), np.ix_(d, s)
+        e.diagonal[t][dd] += H[A, A]
+        e.diagonal[t + 1][dd] += H[B, B]
+        e.next1[t][dd] += H[B, A]
+        e.g[t][d] -= g[A]
+        e.g[t + 1][d] -= g[B]
+        e.border[t][ds] += H[A, S]
+        e.border[t + 1][ds] += H[B, S]
+        e.corner[np.ix_(s, s)] += H[S, S]
+        e.h[s] -= g[S]
+
+
+def _free_columns(problem: Problem, motion: int, w: np.ndarray | float, rows: np.ndarray, columns: np.ndarray,
+                  J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weighted transpose (c, n), columns (c,) and J (n, c) of a block without the shape parameters that are held."""
+    if columns[-1] >= motion and len(problem.free_shape) < len(problem.place_of_shape):
+        place = np.where(columns < motion, columns, motion + problem.place_of_shape[np.maximum(columns - motion, 0)])
+        keep = place >= np.where(columns < motion, 0, motion)
+        columns, J = place[keep], J[:, keep]
+    return J.T * (w if np.ndim(w) == 0 else np.asarray(w)[rows]), columns, J

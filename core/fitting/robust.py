@@ -21,9 +21,11 @@ def variance_factor(x: np.ndarray, kind: str, width: float) -> float:
     if len(x) < 20:
         return 1.0
     w = robust_weights(x, kind, width)
+    slope: np.ndarray
     if kind == "geman-mcclure":
         u = (x / width) ** 2
         slope = (1 - 3 * u) / (1 + u) ** 3
     else:
         slope = (np.abs(x) < width).astype(float)
-    return float(np.clip(np.mean((w * x) ** 2) * np.mean(w) / max(np.mean(slope), 0.05) ** 2, 0.5, 10.0))
+    least = max(float(np.mean(slope)), 0.05)
+    return float(np.clip(np.mean((w * x) ** 2) * np.mean(w) / least**2, 0.5, 10.0))

@@ -13,7 +13,7 @@ from .cloud_points import CloudPoints
 from .state import CROSS, BodyState
 
 RADIUS_OF_SUM = 1 / 1.534  # limb radius / l of three balls a segment
-FACING = 0.6  # least cosine between a point's normal and its direction from the bone
+FACING = 0.6  # least cosine between a point's normal and the limb's
 
 
 def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -21,38 +21,58 @@ def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: 
 
     `surface` (B, 2): fractions of each bone between which a surface is its own; `gate_m`: farthest distance from the limb's surface.
     """
-    bones = np.unique(state.balls.bone_index)
-    if not len(points.xyz_m):
-        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    gap, along, facing = (np.stack(a, axis=1) for a in zip(*(_from_bone(points, state, int(b)) for b in bones)))
-    nearest = np.argmin(gap, axis=1)
-    rows = np.arange(len(nearest))
-    bone, t = bones[nearest], along[rows, nearest]
-    own = (t >= surface[bone, 0]) & (t <= surface[bone, 1])
-    keep = own & (np.abs(gap[rows, nearest]) < gate_m) & facing[rows, nearest]
-    return np.flatnonzero(keep), bone[keep]
+    n = len(points.xyz_m)
+    nearest, owner = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
+    own = np.zeros(n, dtype=bool)
+    for b, rows in _candidates(points.xyz_m, state, gate_m):
+        gap, along, facing = _from_bone(points.xyz_m[rows], points.normals[rows], state, b)
+        closer = gap < nearest[rows]
+        rows = rows[closer]
+        nearest[rows], owner[rows] = gap[closer], b
+        own[rows] = ((along >= surface[b, 0]) & (along <= surface[b, 1]) & facing)[closer]
+    found = np.flatnonzero(own & (np.abs(nearest) < gate_m))
+    return found, owner[found]
 
 
 def crop(points: CloudPoints, state: BodyState, reach_m: float) -> CloudPoints:
     """The points within `reach_m` of the bones: what a fit near this posture can ever need."""
     near = np.zeros(len(points.xyz_m), dtype=bool)
-    for b in np.unique(state.balls.bone_index):
-        near |= _from_bone(points, state, int(b))[0] < reach_m
+    for b, rows in _candidates(points.xyz_m, state, reach_m):
+        near[rows] |= _from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] < reach_m
     return points.take(np.flatnonzero(near))
 
 
-def _from_bone(points: CloudPoints, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: float) -> list[tuple[int, np.ndarray]]:
+    """For each bone with balls the points (K,) in a sphere that holds all within `reach_m` of its surface."""
+    bones = np.unique(state.balls.bone_index)
+    widest = np.array([RADIUS_OF_SUM * state.balls.radii_m[state.balls.bone_index == b][:, CROSS].max() for b in bones])
+    half = state.lengths_m[bones] / 2
+    middle = state.head_m[bones] + half[:, None] * state.R[bones, :, 1]
+    origin = middle.mean(axis=0)
+    X, C = xyz_m - origin, middle - origin
+    squares = np.einsum("ni,ni->n", X, X)[:, None] - 2 * X @ C.T + np.einsum("bi,bi->b", C, C)
+    near = squares <= (half + widest + reach_m) ** 2
+    return [(int(b), np.flatnonzero(column)) for b, column in zip(bones, near.T)]
+
+
+def _from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance from the limb's surface (N,) [m], fraction along the bone (N,), and whether the normal points outwards (N,)."""
-    local = (points.xyz_m - state.head_m[bone]) @ state.R[bone]
-    along = local[:, 1] / state.lengths_m[bone]
-    across = local.copy()
-    across[:, 1] -= np.clip(along, 0.0, 1.0) * state.lengths_m[bone]
-    distance = np.linalg.norm(across, axis=1)
-    mine = state.balls.bone_index == bone
-    radii = RADIUS_OF_SUM * state.balls.radii_m[mine][:, CROSS].mean(axis=1)
-    order = np.argsort(state.balls.centre[mine, 1]) if mine.sum() != len(STATIONS) else slice(None)
-    radius = np.interp(along, state.balls.centre[mine, 1][order], radii[order])
-    normal = points.normals @ state.R[bone]
-    outward = normal[:, 0] * across[:, 0] + normal[:, 2] * across[:, 2]
-    size = np.linalg.norm(normal, axis=1) * np.hypot(across[:, 0], across[:, 2])
-    return distance - radius, along, (outward >= FACING * size)
+    local = (xyz_m - state.head_m[bone]) @ state.R[bone]
+    length = state.lengths_m[bone]
+    along, across = local[:, 1] / length, local[:, CROSS]
+    beyond = local[:, 1] - np.clip(local[:, 1], 0.0, length)
+    distance = np.hypot(np.hypot(across[:, 0], across[:, 1]), beyond)
+    mine = np.flatnonzero(state.balls.bone_index == bone)
+    radii = RADIUS_OF_SUM * state.balls.radii_m[mine][:, CROSS]
+    if len(mine) != len(STATIONS):
+        order = np.argsort(state.balls.centre[mine, 1])
+        mine, radii = mine[order], radii[order]
+    stations = state.balls.centre[mine, 1]
+    a, b = np.interp(along, stations, radii[:, 0]), np.interp(along, stations, radii[:, 1])
+    outward = across / np.stack([a, b], axis=1)
+    stretch = np.linalg.norm(outward, axis=1)
+    radius = np.linalg.norm(across, axis=1) / np.maximum(stretch, 1e-9)  # of the ellipse in the point's direction
+    outward /= np.stack([a, b], axis=1)
+    normal = (normals @ state.R[bone])[:, CROSS]
+    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(outward, axis=1)
+    return distance - radius, along, np.einsum("ni,ni->n", normal, outward) >= FACING * size

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..body.model_file import read_model
-from ..body.shape import default_shape
+from ..body.shape import default_shape, scaled_shape
 from ..errors import InputError
 from ..geometry.rig import Rig
 from ..progress import Monitor
@@ -27,7 +27,7 @@ from .clicks import read_clicks
 from .cloud_points import Cloud, CloudPoints, thinned
 from .conditions import Conditions
 from .frame_to_frame import follow
-from .inverse_kinematics import dof_priors
+from .inverse_kinematics import FIRM, clicked_stature, dof_priors
 from .material_tracks import MaterialTracks, Trajectories
 from .observations import Observation
 from .problem import Problem, linearise, variance_factors
@@ -85,7 +85,9 @@ def _conditions(rig: Rig, model_name: str, frames: list[int], joints: Mapping[st
     model = read_model(model_name)
     clicks = read_clicks(rig, model.skeleton.joint_names, joints, settings.click_sigma_px)
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
-    return Conditions(model=model, parameters=ShapeParameters(default_shape(model)), settings=settings, clicks=clicks,
+    shape = default_shape(model)
+    shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
+    return Conditions(model=model, parameters=ShapeParameters(shape), settings=settings, clicks=clicks,
                       click=frames.index(click_frame), priors=priors)
 
 
@@ -140,8 +142,9 @@ def _covariance(problem: Problem, solution: Solution) -> tuple[np.ndarray, np.nd
 
 
 def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
-    with_balls = np.unique(fit.parameters.template.metaballs.bone_index)
-    enough = counts[:, with_balls] >= fit.settings.min_points
+    bones = fit.model.skeleton.bones
+    free = [b for b in np.unique(fit.parameters.template.metaballs.bone_index) if any(dof.prior_sigma > FIRM for dof in bones[b].dofs)]
+    enough = counts[:, free] >= fit.settings.min_points
     usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
     total = counts.sum(axis=1)
     few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))

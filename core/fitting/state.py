@@ -13,37 +13,24 @@ import numpy as np
 from ..body.metaballs import Metaballs
 from ..body.shape import BodyShape
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
+from .part_field import CROSS, Part
 
-CROSS = [0, 2]  # the two axes across a bone
+__all__ = ["CROSS", "BodyState", "ShapeParameters", "shape_vector"]
+
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyState:
-    """A body in one posture. Cheap to make; everything derived is computed once."""
+    """A body in one posture."""
 
     skeleton: Skeleton
     lengths_m: np.ndarray  # (B,)
     balls: Metaballs
     motion: np.ndarray  # (D,)
-
-    @cached_property
-    def _forward(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return frames_and_axes(self.skeleton, self.lengths_m, self.motion)
-
-    @property
-    def R(self) -> np.ndarray:
-        """Bone frames (B, 3, 3)."""
-        return self._forward[0]
-
-    @property
-    def head_m(self) -> np.ndarray:
-        """Bone heads (B, 3) in the world."""
-        return self._forward[1]
-
-    @property
-    def axes(self) -> np.ndarray:
-        """Axes of the DOFs in the world (D, 3)."""
-        return self._forward[2]
+    parts: tuple[Part, ...]  # B
+    R: np.ndarray  # (B, 3, 3) bone frames
+    head_m: np.ndarray  # (B, 3) bone heads in the world
+    axes: np.ndarray  # (D, 3) axes of the DOFs in the world
 
     @property
     def n_motion(self) -> int:
@@ -74,6 +61,11 @@ class BodyState:
         return X, jacobian
 
 
+def shape_vector(state: BodyState) -> np.ndarray:
+    """(S,) of a body: ln of lengths and cross radii."""
+    return np.log(np.concatenate([state.lengths_m, state.balls.radii_m[:, CROSS].ravel()]))
+
+
 class ShapeParameters:
     """The owner of the shape vector (S,): names, sets ("lengths", "radii", "shape"), and the way from vectors to bodies and back."""
 
@@ -81,6 +73,7 @@ class ShapeParameters:
         self.template = template
         self.skeleton = template.skeleton
         self.n_lengths = len(template.lengths_m)
+        self.parts = tuple(Part(self.skeleton, b, template.metaballs.bone_index) for b in range(self.n_lengths))
         self.layout = Layout(_names(template), _sets(self.n_lengths, len(template.metaballs.weight)))
 
     def vector(self, shape: BodyShape | None = None) -> np.ndarray:
@@ -96,10 +89,23 @@ class ShapeParameters:
         radii[:, CROSS] = np.exp(vector[self.n_lengths :]).reshape(-1, 2)
         return lengths, Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=radii, weight=balls.weight)
 
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices (K,), (K,) of the parameters that a left and a right limb share by name."""
+        names = self.layout.names
+        right = [i for i, name in enumerate(names) if ".R" in name and name.replace(".R", ".L") in names]
+        left = [self.layout[names[i].replace(".R", ".L")] for i in right]
+        return np.array(left, dtype=np.intp), np.array(right, dtype=np.intp)
+
     def state(self, motion: np.ndarray, vector: np.ndarray) -> BodyState:
         """The body of a shape vector (S,) in the posture of a motion vector (D,)."""
+        return self.states(np.asarray(motion)[None], vector)[0]
+
+    def states(self, motion: np.ndarray, vector: np.ndarray) -> list[BodyState]:
+        """The body of a shape vector (S,) in T postures (T, D)."""
         lengths, balls = self.body(vector)
-        return BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=motion)
+        forward = frames_and_axes(self.skeleton, lengths, motion)
+        return [BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=m, parts=self.parts, R=R, head_m=head, axes=axes)
+                for m, R, head, axes in zip(motion, *forward)]
 
     def shape(self, vector: np.ndarray, sigma: np.ndarray) -> BodyShape:
         """The body's shape with sigmas, from the vector (S,) and the sigma of its logarithms (S,)."""

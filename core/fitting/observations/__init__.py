@@ -8,15 +8,17 @@ from typing import Protocol
 import numpy as np
 
 from ..state import BodyState
+from .blocks import Block, FromBlocks
 from .clicked_joint import ClickedJoints
 from .equal_radii import EqualRadii
 from .gaussian_prior import MotionPrior, ShapePrior
 from .joint_limit import JointLimits
 from .material_step import MaterialSteps, StepsFromFixed
 from .surface_point import SurfacePoints
+from .symmetry import Symmetry
 
-__all__ = ["ClickedJoints", "EqualRadii", "JointLimits", "MaterialSteps", "MotionPrior", "Observation", "ShapePrior",
-           "StepsFromFixed", "SurfacePoints"]
+__all__ = ["Block", "ClickedJoints", "EqualRadii", "FromBlocks", "JointLimits", "MaterialSteps", "MotionPrior", "Observation",
+           "ShapePrior", "StepsFromFixed", "SurfacePoints", "Symmetry"]
 
 
 class Observation(Protocol):

@@ -1,4 +1,7 @@
-"""Limbs are nearly round: ln l_x − ln l_z = ε for every ball, σ about 10 %. Points seen from one side cannot tell depth from thickness."""
+"""Limbs are nearly round, trunks as flat as the model's: ln l_x − ln l_z = ln of the model's ratio + ε for every ball, σ about 10 %.
+
+Points seen from one side cannot tell depth from thickness.
+"""
 
 from dataclasses import dataclass
 
@@ -12,12 +15,13 @@ class EqualRadii:
     """One observation for each of the M balls."""
 
     sigma: float
+    log_ratio: np.ndarray | float = 0.0  # (M,) the model's ln l_x − ln l_z
     robust: bool = False
     crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(M,)"""
-        return np.log(state.balls.radii_m[:, 0] / state.balls.radii_m[:, 2]) / self.sigma
+        return (np.log(state.balls.radii_m[:, 0] / state.balls.radii_m[:, 2]) - self.log_ratio) / self.sigma
 
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(M, D + S); zeros (M, D) without shape"""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..state import CROSS, BodyState
+from ..state import BodyState, shape_vector
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,8 +39,7 @@ class ShapePrior:
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(S,)"""
-        value = np.log(np.concatenate([state.lengths_m, state.balls.radii_m[:, CROSS].ravel()]))
-        return (value - self.mean) / self.sigma
+        return (shape_vector(state) - self.mean) / self.sigma
 
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(S, D + S); zeros (S, D) without shape"""

@@ -6,11 +6,13 @@ their band; as long as the same points are seen the errors telescope, so little 
 is 1–10 mm (skin slides).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..state import BodyState
+from .blocks import Block, FromBlocks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,16 +30,29 @@ class MaterialSteps:
         difference = _local(b, self.bone, self.to_m) - _local(a, self.bone, self.from_m)
         return (difference / self.sigma_m[:, None]).ravel()
 
+    def blocks(self, a: BodyState, b: BodyState, shape: bool = True) -> Iterator[Block]:
+        """Derivatives, limb by limb, to the motion of frame a, of frame b, and (columns from 2 D on) to the shape that both share."""
+        D = a.n_motion
+        for limb in np.unique(self.bone).tolist():
+            own = np.flatnonzero(self.bone == limb)
+            dofs, lengths = a.parts[limb].chain
+            at_a, at_b = -_derivative(a, limb, self.from_m[own]), _derivative(b, limb, self.to_m[own])
+            d = len(dofs)
+            parts = [at_a[..., :d], at_b[..., :d], *([at_a[..., d:] + at_b[..., d:]] if shape else [])]
+            J = np.concatenate(parts, axis=2) / self.sigma_m[own, None, None]
+            columns = np.concatenate([dofs, D + dofs, *([2 * D + lengths] if shape else [])])
+            yield (3 * own[:, None] + np.arange(3)).ravel(), columns, J.reshape(3 * len(own), -1)
+
     def jacobian(self, a: BodyState, b: BodyState) -> np.ndarray:
         """(3N, D + D + S): derivatives to the motion of frame a, of frame b, and to the shape that both share."""
-        D = a.n_motion
-        at_a, at_b = -_derivative(a, self.bone, self.from_m), _derivative(b, self.bone, self.to_m)
-        J = np.concatenate([at_a[..., :D], at_b[..., :D], at_a[..., D:] + at_b[..., D:]], axis=2)
-        return (J / self.sigma_m[:, None, None]).reshape(3 * len(self.bone), -1)
+        J = np.zeros((3 * len(self.bone), 2 * a.n_motion + a.n_shape))
+        for rows, columns, block in self.blocks(a, b):
+            J[rows[:, None], columns] = block
+        return J
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StepsFromFixed:
+class StepsFromFixed(FromBlocks):
     """The same observations for one body `b`, while the other frame's body is held."""
 
     steps: MaterialSteps
@@ -50,28 +65,34 @@ class StepsFromFixed:
         """As in the steps."""
         return self.steps.crowding
 
+    @property
+    def size(self) -> int:
+        """3N."""
+        return 3 * len(self.steps.bone)
+
     def residual(self, state: BodyState) -> np.ndarray:
         """(3N,)"""
         return self.steps.residual(state, self.other) if self.backwards else self.steps.residual(self.other, state)
 
-    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
-        """(3N, D); with shape (3N, D + S), where both bodies have it."""
-        a, b = (state, self.other) if self.backwards else (self.other, state)
-        D, J = state.n_motion, self.steps.jacobian(a, b)
-        motion = J[:, :D] if self.backwards else J[:, D : 2 * D]
-        return np.concatenate([motion, J[:, 2 * D :]], axis=1) if shape else motion
+    def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
+        """Derivatives, limb by limb; to the shape, which both bodies have."""
+        D, first = state.n_motion, 0 if self.backwards else state.n_motion
+        for rows, columns, J in self.steps.blocks(*((state, self.other) if self.backwards else (self.other, state)), shape):
+            mine = ((columns >= first) & (columns < first + D)) | (columns >= 2 * D)
+            own = columns[mine]
+            yield rows, np.where(own < 2 * D, own - first, own - D), J[:, mine]
 
 
 def _local(state: BodyState, bone: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
     return np.einsum("nij,ni->nj", state.R[bone], xyz_m - state.head_m[bone])
 
 
-def _derivative(state: BodyState, bone: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
-    """Of the local points, to motion and shape (N, 3, D + S)."""
-    sk, n = state.skeleton, len(state.lengths_m)
-    moves = np.zeros((len(bone), state.n_motion + state.n_shape, 3))
-    turns = np.cross(state.axes, xyz_m[:, None] - state.head_m[sk.dof_bone])
+def _derivative(state: BodyState, bone: int, xyz_m: np.ndarray) -> np.ndarray:
+    """Of the local points of one bone, to the DOFs and lengths of its chain (N, 3, d + l)."""
+    sk = state.skeleton
+    dofs, lengths = state.parts[bone].chain
+    turns = np.cross(state.axes[dofs], xyz_m[:, None] - state.head_m[sk.dof_bone[dofs]])
     turns[:, : len(sk.base_dofs)] = np.eye(3)
-    moves[:, : state.n_motion] = np.where(sk.moved_by[bone][..., None], turns, 0.0)
-    moves[:, state.n_motion : state.n_motion + n] = sk.offset_by[bone][..., None] * (state.lengths_m[:, None] * state.R[:, :, 1])
-    return -np.einsum("nij,nki->njk", state.R[bone], moves)
+    stretch = state.lengths_m[lengths, None] * state.R[lengths, :, 1]
+    moves = np.concatenate([turns, np.broadcast_to(stretch, (len(xyz_m), *stretch.shape))], axis=1)
+    return -(moves @ state.R[bone]).transpose(0, 2, 1)

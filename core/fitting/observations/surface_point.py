@@ -10,13 +10,15 @@ The mean radius l of the balls at the point, over its value l₀ at the held sta
 radii run away). Inside, where −½ ln F falls below `LINEAR`, the root is continued by its tangent.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...body.metaballs import THRESHOLD, VISIBLE
-from ..part_field import Part
+from ..part_field import PartField
 from ..state import CROSS, BodyState
+from .blocks import Block, FromBlocks
 
 SMALLEST = 1e-250
 LINEAR = 0.03
@@ -24,7 +26,18 @@ SCALE_RANGE = (0.4, 2.5)  # bounds of |∇D| in units of 1 / (mean l of the part
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SurfacePoints:
+class _Scaled:
+    """What is held of one part's points since `scaled`."""
+
+    rows: np.ndarray  # (n,) of the points
+    bone: int
+    field: PartField  # at the state of `scaled`
+    scale: np.ndarray  # (n,) |∇D| or |∇F|, 1/m
+    log_radius: np.ndarray  # (n,) ln l₀
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SurfacePoints(FromBlocks):
     """N points, each the surface of one bone's part."""
 
     xyz_m: np.ndarray  # (N, 3) world
@@ -32,60 +45,67 @@ class SurfacePoints:
     sigma_m: np.ndarray  # (N,) of one residual, along the normal
     crowding: np.ndarray | float = 1.0  # (N,) how many times less a point tells than if its error were its own
     form: str = "metric"  # or "paper"
-    scale: np.ndarray | None = None  # (N,) |∇D| or |∇F| at the state of `scaled`, 1/m
-    shares: np.ndarray | None = None  # (N, M) parts of F that come from each ball, at the same state
-    log_radius: np.ndarray | None = None  # (N,) ln l₀
+    parts: tuple[_Scaled, ...] | None = None
     robust: bool = True
 
     def scaled(self, state: BodyState) -> "SurfacePoints":
         """The same points with weights for this state.  (12)"""
-        scale, shares = np.ones(len(self.bone)), np.zeros((len(self.bone), len(state.balls.weight)))
-        for b, rows in self._parts():
-            part = Part.of(state, b)
-            shares[rows[:, None], part.columns] = part.shares(state, self.xyz_m[rows])
-            typical = 1 / part.balls.radii_m[:, CROSS].mean()
+        parts = []
+        for b in np.unique(self.bone):
+            rows = np.flatnonzero(self.bone == b)
+            field = PartField(state.parts[b], state, self.xyz_m[rows])
+            typical = 1 / state.balls.radii_m[field.part.balls][:, CROSS].mean()
             if self.form == "paper":
-                scale[rows] = 4 * THRESHOLD * VISIBLE * typical
-                continue
-            F, gradient = part.gradient(state, self.xyz_m[rows])
-            slope = np.linalg.norm(gradient, axis=1) * np.abs(_distance(F)[1])
-            scale[rows] = np.clip(slope, SCALE_RANGE[0] * typical, SCALE_RANGE[1] * typical)
-        return replace(self, scale=scale, shares=shares, log_radius=shares @ _log_radii(state))
+                scale = np.full(len(rows), 4 * THRESHOLD * VISIBLE * typical)
+            else:
+                slope = np.linalg.norm(field.gradient, axis=1) * np.abs(_distance(field.F)[1])
+                scale = np.clip(slope, SCALE_RANGE[0] * typical, SCALE_RANGE[1] * typical)
+            parts.append(_Scaled(rows=rows, bone=int(b), field=field, scale=scale, log_radius=field.shares @ _log_radii(field)))
+        return replace(self, parts=tuple(parts))
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(N,)"""
         value = np.empty(len(self.bone))
-        for b, rows in self._parts():
-            value[rows] = self._value(Part.of(state, b).field(state, self.xyz_m[rows]))[0]
-        return value / self._unit(state)
+        for held in self._held():
+            field = self._field(held, state)
+            value[held.rows] = self._value(field.F)[0] / self._unit(held, field)
+        return value
 
-    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
-        """(N, D + S) or (N, D)"""
-        J = np.zeros((len(self.bone), state.n_motion + (state.n_shape if shape else 0)))
-        for b, rows in self._parts():
-            F, dF = Part.of(state, b).jacobian(state, self.xyz_m[rows], shape)
-            value, slope = self._value(F)
-            J[rows] = slope[:, None] * dF
-            if shape and self.shares is not None:
-                grows = value[:, None] * np.repeat(self.shares[rows] / 2, 2, axis=1)
-                J[rows, state.n_motion + len(state.lengths_m) :] += grows
-        return J / self._unit(state)[:, None]
+    def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
+        """Derivatives, part by part."""
+        for held in self._held():
+            field = self._field(held, state)
+            value, slope = self._value(field.F)
+            J = field.jacobian(shape)
+            J *= slope[:, None]
+            if shape:
+                J[:, -2 * len(field.part.balls) :] += value[:, None] * np.repeat(held.field.shares / 2, 2, axis=1)
+            J /= self._unit(held, field)[:, None]
+            yield held.rows, field.part.columns(shape), J
 
-    def _parts(self) -> list[tuple[int, np.ndarray]]:
-        return [(int(b), np.flatnonzero(self.bone == b)) for b in np.unique(self.bone)]
+    @property
+    def size(self) -> int:
+        """N."""
+        return len(self.bone)
 
-    def _unit(self, state: BodyState) -> np.ndarray:
-        if self.scale is None or self.shares is None:
+    def _held(self) -> tuple[_Scaled, ...]:
+        if self.parts is None:
             raise ValueError("surface points need `scaled(state)` first")
-        return self.sigma_m * self.scale * np.exp(self.log_radius - self.shares @ _log_radii(state))
+        return self.parts
+
+    def _field(self, held: _Scaled, state: BodyState) -> PartField:
+        return held.field if state is held.field.state else PartField(state.parts[held.bone], state, held.field.xyz_m)
+
+    def _unit(self, held: _Scaled, field: PartField) -> np.ndarray:
+        return self.sigma_m[held.rows] * held.scale * np.exp(held.log_radius - held.field.shares @ _log_radii(field))
 
     def _value(self, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return (THRESHOLD - F, np.full_like(F, -1.0)) if self.form == "paper" else _distance(F)
 
 
-def _log_radii(state: BodyState) -> np.ndarray:
-    """ln of the mean cross radius (M,)."""
-    return np.log(state.balls.radii_m[:, CROSS]).mean(axis=1)
+def _log_radii(field: PartField) -> np.ndarray:
+    """ln of the mean cross radius (m,) of a part's balls."""
+    return np.log(field.state.balls.radii_m[field.part.balls][:, CROSS]).mean(axis=1)
 
 
 def _distance(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tricap.core.body.model_file import mirrored, model_names, read_model
+from tricap.core.body.model_file import mirrored, model_names, other_side, read_model, without
 from tricap.core.body.skeleton import Bone, Dof, Skeleton, bone_frames, frames_and_axes, joint_positions
 from tricap.core.errors import InputError
 from tricap.core.geometry.rotation import axis_rotation
@@ -70,16 +70,18 @@ def test_the_papers_chain_is_the_same_motion() -> None:
 @pytest.mark.parametrize("model", model_names())
 def test_axes_are_the_derivatives_of_joints(model: str) -> None:
     skeleton = read_model(model).skeleton
-    lengths, motion, h = _lengths(skeleton), RNG.normal(0, 0.4, 8), 1e-6
+    n = len(skeleton.dofs)
+    lengths, motion, h = _lengths(skeleton), RNG.normal(0, 0.4, n), 1e-6
     _, head, axes = frames_and_axes(skeleton, lengths, motion)
-    tip = skeleton.bones[-1].tail_joint
-    X = joint_positions(skeleton, lengths, motion)[tip]
+    bone = skeleton.bones[-1]
+    X = joint_positions(skeleton, lengths, motion)[bone.tail_joint]
     for k, name in enumerate(skeleton.dof_names):
-        step = np.eye(8)[k] * h
-        there, back = (joint_positions(skeleton, lengths, motion + s)[tip] for s in (step, -step))
+        step = np.eye(n)[k] * h
+        there, back = (joint_positions(skeleton, lengths, motion + s)[bone.tail_joint] for s in (step, -step))
         difference = (there - back) / (2 * h)
         wanted = axes[k] if k < 3 else np.cross(axes[k], X - head[skeleton.dof_bone[k]])
-        assert np.allclose(difference, wanted, atol=1e-8), name
+        moves = k < 3 or skeleton.moved_by[-1, k]
+        assert np.allclose(difference, wanted if moves else 0.0, atol=1e-8), name
 
 
 def test_many_postures_at_once_are_the_postures_one_by_one() -> None:
@@ -88,6 +90,49 @@ def test_many_postures_at_once_are_the_postures_one_by_one() -> None:
     R, head = bone_frames(skeleton, _lengths(skeleton), motions)
     one = bone_frames(skeleton, _lengths(skeleton), motions[1, 2])
     assert np.allclose(R[1, 2], one[0]) and np.allclose(head[1, 2], one[1])
+
+
+def test_a_whole_body_is_its_own_mirror_image() -> None:
+    model = read_model("full")
+    other = mirrored(model, "full")
+    names, lengths = model.skeleton.joint_names, _lengths(model.skeleton)
+    motion = RNG.normal(0, 0.3, len(model.skeleton.dofs))
+    signs = np.array([-1 if dof.axis == "x" else 1 for dof in model.skeleton.base_dofs]
+                     + [1 if dof.axis == "x" else -1 for dof in model.skeleton.dofs[3:]])
+    a = joint_positions(model.skeleton, lengths, motion)
+    b = joint_positions(other.skeleton, lengths, motion * signs)
+    for name in names:
+        assert np.allclose(b[other_side(name)], a[name] * [-1, 1, 1]), name
+    assert set(other.skeleton.joint_names) == set(names) and set(other.skeleton.dof_names) == set(model.skeleton.dof_names)
+
+
+def test_rest_pose_of_a_person() -> None:
+    """A person of 1.75 m: facing -Y, the right side -X, arms 45° down, legs straight; 44 to 48 DOF."""
+    skeleton = read_model("full").skeleton
+    assert len(skeleton.dofs) == 48
+    rest = joint_positions(skeleton, _lengths(skeleton), np.zeros(48))
+    for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe"):
+        assert rest[f"{joint}.R"][0] < 0 < rest[f"{joint}.L"][0]
+    assert np.allclose(rest["elbow.R"] - rest["shoulder.R"], [-0.2005, 0, -0.2005], atol=1e-3)
+    assert rest["toe.R"][1] < -0.1, "the person faces -Y"
+    height = rest["crown"][2] - rest["toe.R"][2]
+    assert 1.70 < height < 1.80
+    above = {j for j in skeleton.joint_names if j[:-2] not in ("hip", "knee", "ankle", "toe")}
+    assert set(read_model("upper_body").skeleton.joint_names) == above
+
+
+def test_what_hangs_on_a_rigid_part_meets_what_the_part_belongs_to() -> None:
+    skeleton = read_model("full").skeleton
+    index = {bone.name: b for b, bone in enumerate(skeleton.bones)}
+    meet = skeleton.neighbours
+    assert meet[index["thigh.R"], index["pelvis"]] and meet[index["pelvis"], index["thigh.L"]]
+    assert not meet[index["thigh.R"], index["thigh.L"]] and not meet[index["upper_arm.R"], index["chest"]]
+    assert (meet == meet.T).all()
+
+
+def test_a_model_without_bones_that_it_does_not_have_is_refused() -> None:
+    with pytest.raises(InputError, match="hip.r.*nearest|hip.R"):
+        without(read_model("full"), ["hip.r"], "half")
 
 
 @pytest.mark.parametrize("side", ["arm", "leg"])

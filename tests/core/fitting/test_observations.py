@@ -13,6 +13,7 @@ from tricap.core.fitting.observations import (
     MotionPrior,
     ShapePrior,
     SurfacePoints,
+    Symmetry,
 )
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.camera import Camera
@@ -30,8 +31,8 @@ def _motion(parameters: ShapeParameters, rng: np.random.Generator) -> np.ndarray
 
 
 def _cases(parameters: ShapeParameters, state, rng):
-    n, bones, dofs, joints = 30, len(state.lengths_m), state.n_motion, len(state.skeleton.joint_names)
-    bone = np.arange(n) % bones
+    n, dofs, joints = 60, state.n_motion, len(state.skeleton.joint_names)
+    bone = state.balls.bone_index[rng.integers(0, len(state.balls.weight), n)]
     along = rng.uniform(0.1, 0.9, n)
     local = np.stack([rng.normal(0, 0.05, n), along * state.lengths_m[bone], rng.normal(0, 0.05, n)], axis=1)
     near = state.head_m[bone] + np.einsum("nij,nj->ni", state.R[bone], local)
@@ -44,10 +45,11 @@ def _cases(parameters: ShapeParameters, state, rng):
             ClickedJoints(cameras=(camera,) * joints, joint=np.arange(joints), xy_px=rng.normal(400, 50, (joints, 2)), sigma_px=5.0),
             JointLimits(low=np.full(dofs, -0.2), high=np.full(dofs, 0.2), sigma=0.03),
             MotionPrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
-            ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)), EqualRadii(sigma=0.1)]
+            ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)), EqualRadii(sigma=0.1, log_ratio=0.3),
+            Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=0.03)]
 
 
-@pytest.mark.parametrize("model", ["arm.R", "leg.L"])
+@pytest.mark.parametrize("model", ["arm.R", "leg.L", "full"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_jacobians_equal_differences(model: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -72,14 +74,15 @@ def test_jacobians_equal_differences(model: str, seed: int) -> None:
         assert np.array_equal(observation.jacobian(state(x), shape=False), J[:, : len(motion)])
 
 
-@pytest.mark.parametrize("model", ["arm.R", "leg.L"])
+@pytest.mark.parametrize("model", ["arm.R", "leg.L", "full"])
 def test_jacobian_of_a_step_between_frames_equals_differences(model: str) -> None:
     rng = np.random.default_rng(3)
     parameters = _parameters(model)
     vector, D = parameters.vector(), len(parameters.skeleton.dofs)
     x = np.concatenate([_motion(parameters, rng), _motion(parameters, rng), vector])
     names = [f"{name} of frame {k}" for k in "ab" for name in parameters.skeleton.dof_names] + list(parameters.layout.names)
-    steps = MaterialSteps(from_m=rng.normal(0, 0.3, (20, 3)), to_m=rng.normal(0, 0.3, (20, 3)), bone=np.arange(20) % 2,
+    bone = np.arange(20) % len(parameters.skeleton.bones)
+    steps = MaterialSteps(from_m=rng.normal(0, 0.3, (20, 3)), to_m=rng.normal(0, 0.3, (20, 3)), bone=bone,
                           sigma_m=rng.uniform(0.001, 0.005, 20))
 
     def states(x):
