@@ -26,7 +26,10 @@ sys.path.insert(0, str(HERE.parent / "core" / "calibration"))
 
 from truth import TEST_BARS, bound, error_m, observed, rigid  # noqa: E402
 
+from tricap.core.calibration.bars import enough_rays, with_bars  # noqa: E402
+from tricap.core.calibration.bundle import Network, adjust  # noqa: E402
 from tricap.core.calibration.precision import predicted_error  # noqa: E402
+from tricap.core.calibration.pseudo import lens_knowledge  # noqa: E402
 from tricap.core.calibration.reference_bar import initial_network  # noqa: E402
 from tricap.core.calibration.self_calibration import calibrate  # noqa: E402
 from tricap.core.calibration.targets import find_blobs, find_targets  # noqa: E402
@@ -129,10 +132,27 @@ def peers(positions: int, sigma: float) -> dict[str, Any]:
     waved = _benchmark(positions, sigma, 0)
     out: dict[str, Any] = {"tricap, from nothing": one(waved, sigma)}
     start = initial_network(observed(waved)).network
+    out["tricap, from the same start as the peers, without k3"] = same_steps(waved, start, sigma)
     python = os.environ.get("TRICAP_PEERS")
     for name, script in PEERS.items():
         out[name] = "missing: set TRICAP_PEERS to a Python that has it" if not python else _peer(python, script, waved, start, sigma)
     return out
+
+
+def same_steps(waved: WavedBar, start: Network, sigma: float) -> dict[str, float]:
+    """What the GTSAM script does, with our adjustment: robust, trimmed, trimmed again, all unknowns but k3."""
+    seconds = time.process_time()
+    observations = observed(waved)
+    unknowns = lens_knowledge(observations.size_px, start.interior[:, 0])
+    unknowns = unknowns.only(*(name for name in INTERIOR if name != "k3"))
+    network, keep = with_bars(start, observations, 30.0)
+    for cauchy in (3 * sigma, None, None):
+        done = adjust(network, waved.xy_px, keep, unknowns, cauchy_px=cauchy, unit_px=sigma, max_iterations=30, tolerance=1e-3)
+        network = done.network
+        keep = enough_rays(keep & (np.abs(np.nan_to_num(done.residual_px, nan=np.inf)).max(axis=-1) < 6 * sigma))
+    seconds = time.process_time() - seconds
+    actual = error_m(waved.cameras, network.cameras(observations.names, observations.size_px))
+    return dict(mm=1e3 * actual, ratio=actual / bound(waved, sigma).rms_m, seconds=seconds)
 
 
 def _peer(python: str, script: str, waved: WavedBar, start: Any, sigma: float) -> Any:
