@@ -19,6 +19,7 @@ from .matching.constraints import constrain
 from .matching.grid import TemplateGrid, template_grid
 from .matching.growing import GrowingSettings, TripletField, grow
 from .matching.least_squares import MatchingSettings
+from .matching.scanning import scan
 from .matching.seeds import Approximations, approximations_at_depth, sweep_seeds
 from .progress import Monitor
 from .results import Results
@@ -151,7 +152,8 @@ def _measure(
             depth_range_m=where.depth_range_m,
             monitor=monitor,
         )
-    field = grow(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
+    cover = scan if growing.method == "published" else grow
+    field = cover(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
     field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor)
     field = clean_field(_single(field), cameras[ref], ref, surface)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)

@@ -34,6 +34,16 @@ SEED_MEDIANS, MAX_LIMIT_PX = 3.0, 2.5
 class GrowingSettings:
     """How the surface is covered with points."""
 
+    method: str = knob(
+        "fronts",
+        "How the surface is covered: whole fronts of points at a time, or the published scan over the seeds' regions.",
+        choices=("fronts", "published"),
+    )
+    texture: str = knob(
+        "clothing",
+        "Quality limits of the published scan: those of a level of texture, or the ones set for matching (own).",
+        choices=("strong", "clothing", "skin", "own"),
+    )
     spacing_px: int = knob(4, "Distance between measured points in the reference image.", unit="px", low=1, high=32)
     seed_spacing_px: int = knob(24, "Distance between the points at which seeds are looked for.", unit="px", low=4, high=128)
     attempts: int = knob(3, "How often a point is tried from different neighbours.", low=1, high=8)
