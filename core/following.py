@@ -1,7 +1,7 @@
 """Tracking of a whole take: the points of each frame followed into the next, in the order of time, with a checkpoint per frame."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -11,10 +11,32 @@ from .measuring import FrameImages, MeasuredFrame, load_images
 from .progress import Monitor
 from .results import Results
 from .take import Footage
-from .tracking.step import TrackedFrame, TrackingSettings, TrackingView, track_step
-from .tracking.surface import regenerate, start_tracks
+from .tracking.settings import TrackingSettings
+from .tracking.step import FramePair, TrackingView, track_step
+from .tracking.surface import on_surface, regenerate, start_tracks
+from .tracking.templates import Templates, cut_templates, no_templates
+from .tracking.tracked import TrackedFrame
 
-ALGORITHM = "tracking 1"
+ALGORITHM = "tracking 2"  # part of every key: raise it when the same input gives other numbers
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _State:
+    """What the next step needs."""
+
+    before: TrackedFrame | None
+    current: TrackedFrame | None
+    templates: Templates
+    born: int  # the next identity
+
+    def after(self, tracked: TrackedFrame, cut: Templates) -> "_State":
+        """The state after a frame, with the templates that were cut in it."""
+        return _State(
+            before=self.current,
+            current=tracked,
+            templates=self.templates.only(tracked.identity).with_tiles(cut),
+            born=max([self.born, *(tracked.identity[-1:] + 1)]),
+        )
 
 
 def track_frames(
@@ -26,62 +48,72 @@ def track_frames(
     monitor: Monitor,
 ) -> Iterator[TrackedFrame]:
     """Follow the surface through the frames (in the order of time)."""
-    base = store.digest(ALGORITHM, repr((matching, tracking)))
-    limit_px = max(tracking.max_residual_px, float(np.median([m.field.limit_px for m in measured])))
-    view = TrackingView(
+    view = tracking_view(footage, matching, tracking, float(np.median([m.field.limit_px for m in measured])))
+    state = _State(before=None, current=None, templates=no_templates(view.half_patch), born=0)
+    key = store.digest(ALGORITHM, repr((matching, tracking)))
+    images: FrameImages | None = None
+    for i, m in enumerate(measured):
+        monitor.step("tracks", i, len(measured))
+        key = store.digest(key, m.key)
+        done = _from_checkpoint(results, m.frame, key)
+        if done is None:
+            if state.current is not None and images is None:
+                images = load_images(footage, state.current.frame)
+            following = load_images(footage, m.frame)
+            tracked = _advance(view, state, images, following, m, i, monitor)
+            done = tracked, _cut(view, tracked, following)
+            _checkpoint(results, *done, key)
+            images = following
+        else:
+            images = None
+        state = state.after(*done)
+        yield done[0]
+
+
+def tracking_view(footage: Footage, matching: MatchingSettings, tracking: TrackingSettings, limit_px: float) -> TrackingView:
+    """What tracking needs to know of a recording whose rays were allowed to miss by `limit_px`."""
+    return TrackingView(
         cameras=footage.rig.cameras,
         reference=footage.take.reference,
         rows=footage.take.rows,
         matching=matching,
         tracking=tracking,
-        limit_px=limit_px,
+        limit_px=max(tracking.max_residual_px, limit_px),
     )
-    before: TrackedFrame | None = None
-    current: TrackedFrame | None = None
-    images: FrameImages | None = None
-    key, born = base, 0
-    for i, m in enumerate(measured):
-        monitor.step("tracks", i, len(measured))
-        key = store.digest(key, m.key)
-        tracked = _from_checkpoint(results, m.frame, key)
-        if tracked is None:
-            if current is not None and images is None:
-                images = load_images(footage, current.frame)
-            tracked, images = _advance(footage, view, before, current, images, m, born, i, monitor)
-            _checkpoint(results, tracked, key)
-        else:
-            images = None
-        born = max([born, *(tracked.identity[-1:] + 1)])
-        before, current = current, tracked
-        yield tracked
 
 
 def _advance(
-    footage: Footage,
     view: TrackingView,
-    before: TrackedFrame | None,
-    current: TrackedFrame | None,
+    state: _State,
     images: FrameImages | None,
+    following: FrameImages,
     m: MeasuredFrame,
-    born: int,
     index: int,
     monitor: Monitor,
-) -> tuple[TrackedFrame, FrameImages]:
-    following = load_images(footage, m.frame)
-    if current is None or images is None:
-        return start_tracks(m.field, m.frame, view.tracking), following
-    tracked = track_step(view, before, current, images.spline, following.spline, following.grey, images.grey, m.frame, monitor)
+) -> TrackedFrame:
+    if state.current is None or images is None:
+        return start_tracks(m.field, m.cloud, view)
+    pair = FramePair(grey=images.grey, spline=images.spline, next_grey=following.grey, next_spline=following.spline)
+    tracked = track_step(view, state.before, state.current, state.templates, pair, m.frame, monitor)
+    tracked = on_surface(tracked, m.field, m.cloud, view)
     every = view.tracking.regenerate_every
-    if every and index % every == 0:
-        tracked = regenerate(tracked, m.field, view.reference, born, view.tracking)
-    return tracked, following
+    return regenerate(tracked, m.field, m.cloud, view, state.born) if every and index % every == 0 else tracked
 
 
-def _checkpoint(results: Results, tracked: TrackedFrame, key: str) -> None:
-    arrays = {f.name: getattr(tracked, f.name) for f in fields(TrackedFrame) if f.name != "frame"}
+def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Templates:
+    """The key templates that begin in this frame: of new points, and of those that outgrew theirs."""
+    fresh = (tracked.key_shape == np.eye(2)).all(axis=(1, 2))
+    return cut_templates(images.spline[view.reference], tracked.identity[fresh], tracked.xy[fresh, view.reference], view.half_patch)
+
+
+def _checkpoint(results: Results, tracked: TrackedFrame, cut: Templates, key: str) -> None:
+    arrays = tracked.arrays() | {f"cut_{f.name}": getattr(cut, f.name) for f in fields(Templates)}
     results.save_checkpoint("tracks", f"{tracked.frame:04d}", key, arrays)
 
 
-def _from_checkpoint(results: Results, frame: int, key: str) -> TrackedFrame | None:
+def _from_checkpoint(results: Results, frame: int, key: str) -> tuple[TrackedFrame, Templates] | None:
     arrays = results.load_checkpoint("tracks", f"{frame:04d}", key)
-    return None if arrays is None else TrackedFrame(frame=frame, **arrays)
+    if arrays is None:
+        return None
+    cut = Templates(**{f.name: arrays.pop(f"cut_{f.name}") for f in fields(Templates)})
+    return TrackedFrame(frame=frame, **arrays), cut

@@ -1,93 +1,44 @@
 """One tracking step: from frame i to i + 1, all points as arrays (D'Apuzzo et al. 1999, §2.4; 2000, §3).
 
-    predict   X̂ = 2 X_i − X_{i−1} (a new point stays where it is), projected into every view                 (1)
-    search    the box about the prediction for the largest correlation with the patch of frame i              (2)
-    temporal  least squares matching of the patch of frame i in frame i + 1, in every view                    (3)
-    spatial   least squares matching of the reference view's patch in the other views of frame i + 1          (4)
-    verify    |x_s − x_t| ≤ max(0.5 px, 3 √(σ_s² + σ_t²)), else once more in a box twice as large, else stop  (5)
+    predict   X̂ = 2 X_i − X_{i−1}, projected into every view; a new point moves as its neighbours do              (1)
+    search    the box about the prediction for the largest correlation with the patch of frame i                   (2)
+    temporal  least squares matching of the patch of frame i in frame i + 1, in every view                         (3)
+    control   the reference view's result is adjusted with a match of the point's key template (templates.py)      (4)
+    spatial   least squares matching of the reference view's patch in the other views of frame i + 1               (5)
+    verify    Δ = x_s − x_t,  Δᵀ (K_s + K_t + Q)⁻¹ Δ ≤ s² χ²(0.999; 2), else once more in a bigger box, else stop   (6)
 
-Kept: the reference view's temporal result, elsewhere the mean of temporal and spatial weighted by their covariances; then the point
-where the rays meet.
+s² in (6) is the variance component that the step's own points show: matching's covariances are too small where the noise is
+correlated, by a factor that differs from recording to recording. Kept: the reference view's controlled result, elsewhere the mean of
+temporal and spatial weighted by their covariances; then the point where the rays meet. Its covariance contains the drift over the body.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import IntEnum
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.intersection import Intersection, forward_intersection
+from ..geometry.intersection import forward_intersection
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches, patch_offsets
 from ..progress import Monitor
-from ..settings import knob
+from .neighbours import common_motion, nearest_neighbours
+from .search import search_box
+from .settings import TrackingSettings, TrackStatus
+from .templates import Atlas, Templates, atlas
+from .tracked import TrackedFrame, rows_of
 
-VERIFY_PX, VERIFY_SIGMAS = 0.5, 3.0
+CHI2, CHI2_MEDIAN = 13.82, 1.386  # two degrees of freedom: 0.999 and 0.5
+MODEL_SIGMA_PX = 0.12  # Q of (6): what an affine patch cannot follow
+LARGEST_SCALE, PRIOR_POINTS = 5.0, 20  # of s; as many points as would have s = 1
 PREDICTED_BOX = 0.4  # of the box, for points whose velocity is known
+KEY_SIGMAS, KEY_JUMP_PX = 5.0, 1.0  # a key template's match further off than both is another place
+HARMLESS_M = 2e-3  # scatter of neighbours about their common motion
+TEMPLATE_SIGMA_PX = 0.02  # of the reference view's point in the intersection; its drift is added afterwards
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TrackingSettings:
-    """How points are followed from frame to frame, and which trajectories are kept."""
-
-    spacing_px: int = knob(8, "Distance between tracked points in the reference image.", unit="px", low=1, high=64)
-    box_px: int = knob(
-        12,
-        "Half size of the box that is searched about the predicted position; the second try has twice as much.",
-        unit="px",
-        low=2,
-        high=64,
-    )
-    min_correlation: float = knob(0.6, "Smallest correlation in the box.", low=0.0, high=0.99)
-    max_residual_px: float = knob(
-        0.7, "Largest distance by which rays may miss, or what the calibration of the take needs.", unit="px", low=0.05, high=10.0
-    )
-    regenerate_every: int = knob(
-        2, "Every so many frames, new points start where the surface has none (0: never).", unit="frames", low=0, high=1000
-    )
-    max_speed: float = knob(10.0, "Trajectories faster than this are cut.", unit="m/s", low=0.1, high=100.0)
-    max_acceleration: float = knob(150.0, "Trajectories that accelerate more than this are cut.", unit="m/s²", low=1.0, high=10_000.0)
-    min_length: int = knob(5, "Trajectories of fewer frames are removed.", unit="frames", low=2, high=1000)
-
-
-class TrackStatus(IntEnum):
-    """What became of a trajectory in a frame."""
-
-    ABSENT = 0  # not born yet, or ended before
-    MEASURED = 1
-    LEFT_IMAGE = 2
-    NOT_FOUND = 3  # no correlation in the box
-    NOT_MATCHED = 4  # temporal matching failed its limits
-    NOT_VERIFIED = 5  # spatial matching contradicts the temporal one
-    RAYS_MISS = 6
-    TOO_FAST = 7
-    ACCELERATES = 8
-    TOO_SHORT = 9
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class TrackedFrame:
-    """The points that are followed at one frame. Rows' pixels, metres."""
-
-    frame: int
-    identity: np.ndarray  # (N,) int, ascending
-    xy: np.ndarray  # (N, K, 2)
-    shape: np.ndarray  # (N, K, 2, 2) from the reference view to each view
-    xyz_m: np.ndarray  # (N, 3)
-    covariance_m2: np.ndarray  # (N, 3, 3)
-    ended: np.ndarray  # (M,) identities that were lost on the way to this frame
-    reason: np.ndarray  # (M,) TrackStatus
-
-    def select(self, rows: np.ndarray) -> "TrackedFrame":
-        """Only these rows (a mask or indices); the ended ones stay."""
-        names = ("identity", "xy", "shape", "xyz_m", "covariance_m2")
-        return TrackedFrame(frame=self.frame, ended=self.ended, reason=self.reason, **{n: getattr(self, n)[rows] for n in names})
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TrackingView:
     """What a step needs to know of the recording."""
 
@@ -98,55 +49,89 @@ class TrackingView:
     tracking: TrackingSettings
     limit_px: float  # by which rays may miss
 
+    @property
+    def half_patch(self) -> tuple[int, int]:
+        """Half size of the patch, columns and rows."""
+        return patch_offsets(self.matching.patch_px, self.rows.step)[2]
+
+    @property
+    def others(self) -> list[int]:
+        """The views beside the reference."""
+        return [k for k in range(len(self.cameras)) if k != self.reference]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FramePair:
+    """The rows of two frames, prepared for matching: grey (h', w) float32 and splines, per view."""
+
+    grey: Sequence[np.ndarray]
+    spline: Sequence[SplineImage]
+    next_grey: Sequence[np.ndarray]
+    next_spline: Sequence[SplineImage]
+
 
 def track_step(
     view: TrackingView,
     before: TrackedFrame | None,
     current: TrackedFrame,
-    images: Sequence[SplineImage],
-    next_images: Sequence[SplineImage],
-    next_grey: Sequence[np.ndarray],
-    grey: Sequence[np.ndarray],
+    templates: Templates,
+    images: FramePair,
     frame: int,
     monitor: Monitor,
 ) -> TrackedFrame:
-    """Follow all points of `current` to `frame`, whose images are `next_images` and `next_grey` (rows, float32)."""
+    """Follow all points of `current` to `frame`, the second of the two frames of `images`."""
     n = len(current.identity)
-    predicted, known = _predict(current, before)
+    predicted, known = predict(current, before, view.tracking.neighbourhood_m)
+    tiles = atlas(templates, current.identity)
     reason = np.full(n, TrackStatus.LEFT_IMAGE, dtype=np.int8)
-    result, rest = current, np.arange(n)
+    result, rest, scale = current, np.arange(n), None
     for attempt in (1, 2):
-        box = np.where(known[rest] & (attempt == 1), PREDICTED_BOX * view.tracking.box_px, attempt * view.tracking.box_px)
+        box = view.tracking.box_px * np.where(known[rest], (PREDICTED_BOX, 1.0)[attempt - 1], attempt)
         if monitor.cancelled:
             monitor.step("tracks", attempt, 2)
-        found, status = _attempt(view, current.select(rest), predicted[rest], box, images, next_images, next_grey, grey)
+        found, status, scale = _attempt(view, current.select(rest), predicted[rest], box, tiles, rest, images, scale)
         reason[rest] = status
         good = status == TrackStatus.MEASURED
-        result = _replace_rows(result, rest[good], found, good)
-        rest = rest[~good]
-        rest = rest[reason[rest] != TrackStatus.LEFT_IMAGE]
+        result = result.changed(rest[good], found.select(good))
+        rest = rest[~good & (status != TrackStatus.LEFT_IMAGE)]
         if not len(rest):
             break
-    kept = reason == TrackStatus.MEASURED
-    return TrackedFrame(
-        frame=frame,
-        identity=current.identity[kept],
-        xy=result.xy[kept],
-        shape=result.shape[kept],
-        xyz_m=result.xyz_m[kept],
-        covariance_m2=result.covariance_m2[kept],
-        ended=current.identity[~kept],
-        reason=reason[~kept],
+        predicted, known = _with_the_others(current, result, reason == TrackStatus.MEASURED, predicted, view.tracking.neighbourhood_m)
+    return replace(result, frame=frame, ended=np.zeros(0, np.int64), reason=np.zeros(0, np.int8)).without(
+        reason != TrackStatus.MEASURED, reason
     )
 
 
-def _predict(current: TrackedFrame, before: TrackedFrame | None) -> tuple[np.ndarray, np.ndarray]:
-    """Predicted positions (N, 3) and for which points a velocity is known.  (1)"""
+def predict(current: TrackedFrame, before: TrackedFrame | None, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Predicted positions (N, 3), and for which points a motion is known: their own, or that of neighbours.  (1)"""
     if before is None or not len(before.identity):
         return current.xyz_m, np.zeros(len(current.identity), dtype=bool)
-    at = np.searchsorted(before.identity, current.identity).clip(0, len(before.identity) - 1)
-    known = before.identity[at] == current.identity
-    return np.where(known[:, None], 2 * current.xyz_m - before.xyz_m[at], current.xyz_m), known
+    at = rows_of(before.identity, current.identity)
+    known = at >= 0
+    goal = np.where(known[:, None], 2 * current.xyz_m - before.xyz_m[at], current.xyz_m)
+    new = np.flatnonzero(~known)
+    if len(new) and known.any():
+        rows, there = nearest_neighbours(current.xyz_m[new], current.xyz_m[known], radius_m)
+        moved = common_motion(current.xyz_m[new], current.xyz_m[known][rows], goal[known][rows], there.astype(float), HARMLESS_M).xyz_m
+        usable = np.isfinite(moved).all(axis=1)
+        goal[new[usable]], known[new[usable]] = moved[usable], True
+    return goal, known
+
+
+def _with_the_others(
+    current: TrackedFrame, result: TrackedFrame, found: np.ndarray, predicted: np.ndarray, radius_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Better predictions for the points that were not found: the motion of their neighbours that were."""
+    goal, known = predicted.copy(), np.zeros(len(predicted), dtype=bool)
+    lost = np.flatnonzero(~found)
+    rows, there = nearest_neighbours(current.xyz_m[lost], current.xyz_m[found], radius_m)
+    if there.any():
+        moved = common_motion(
+            current.xyz_m[lost], current.xyz_m[found][rows], result.xyz_m[found][rows], there.astype(float), HARMLESS_M
+        )
+        usable = np.isfinite(moved.xyz_m).all(axis=1)
+        goal[lost[usable]], known[lost[usable]] = moved.xyz_m[usable], True
+    return goal, known
 
 
 def _attempt(
@@ -154,103 +139,140 @@ def _attempt(
     points: TrackedFrame,
     predicted: np.ndarray,
     box: np.ndarray,
-    images: Sequence[SplineImage],
-    next_images: Sequence[SplineImage],
-    next_grey: Sequence[np.ndarray],
-    grey: Sequence[np.ndarray],
-) -> tuple[TrackedFrame, np.ndarray]:
+    tiles: Atlas,
+    tile_rows: np.ndarray,
+    images: FramePair,
+    scale: float | None,
+) -> tuple[TrackedFrame, np.ndarray, float]:
+    """Steps (2) to (6); gives the points, a status each, and s of (6), which is estimated when it is not given."""
     n, K = len(points.identity), len(view.cameras)
-    status = np.full(n, TrackStatus.MEASURED, dtype=np.int8)
+    status = np.where(np.isfinite(points.xy).all(axis=2), TrackStatus.MEASURED, TrackStatus.ABSENT).astype(np.int8)
     start = np.empty((n, K, 2))
     for k, camera in enumerate(view.cameras):
         centre = view.rows.from_frame(camera.project(predicted))
-        start[:, k], correlation = _search_box(grey[k], next_grey[k], points.xy[:, k], centre, box, view)
-        _mark(status, ~next_images[k].inside(centre, 1.0), TrackStatus.LEFT_IMAGE)
-        _mark(status, correlation < view.tracking.min_correlation, TrackStatus.NOT_FOUND)
-    temporal = _temporal(view, points, start, images, next_images, status)
-    xy, covariance, shape = _verify(view, points, temporal, next_images, status)
-    good = status == TrackStatus.MEASURED
-    point = forward_intersection(
-        view.cameras, np.where(good[:, None, None], view.rows.to_frame(xy), np.nan), view.rows.covariance_to_frame(covariance)
-    )
-    with np.errstate(invalid="ignore"):
-        _mark(status, ~(point.rms_residual_px <= view.limit_px), TrackStatus.RAYS_MISS)
-    return _tracked(points, xy, shape, point), status
+        start[:, k], correlation = search_box(
+            images.grey[k], images.next_grey[k], points.xy[:, k], centre, box, view.matching.patch_px, view.rows.step
+        )
+        mark(status[:, k], ~images.next_spline[k].inside(centre, 1.0), TrackStatus.LEFT_IMAGE)
+        mark(status[:, k], correlation < view.tracking.min_correlation, TrackStatus.NOT_FOUND)
+    temporal = _temporal(view, points, start, images, status)
+    points, temporal = control(view, points, temporal, tiles, tile_rows, images.next_spline[view.reference], status[:, view.reference])
+    spatial = match_spatially(view, points, [m.xy for m in temporal], images.next_spline, status)
+    scale = scale or disagreement(view, temporal, spatial, status)
+    xy, K_xy, shape = _verify(view, points, temporal, spatial, status, scale)
+    return *intersect(view, points, xy, K_xy, shape, status), scale
 
 
-def _mark(status: np.ndarray, bad: np.ndarray, why: TrackStatus) -> None:
+def mark(status: np.ndarray, bad: np.ndarray, why: TrackStatus) -> None:
+    """Note why points failed, those that have not failed before."""
     status[bad & (status == TrackStatus.MEASURED)] = why
 
 
-def _search_box(
-    grey: np.ndarray, next_grey: np.ndarray, xy: np.ndarray, centre: np.ndarray, box: np.ndarray, view: TrackingView
-) -> tuple[np.ndarray, np.ndarray]:
-    """Start positions (n, 2) where the patch correlates best within the box, and that correlation (n,).  (2)"""
-    _, _, (w, h) = patch_offsets(view.matching.patch_px, view.rows.step)
-    H, W = grey.shape
-    best, start = np.full(len(xy), -1.0), np.array(centre)
-    with np.errstate(invalid="ignore"):
-        p = np.rint(np.nan_to_num(xy, nan=-1e6)).astype(np.int64)
-        q = np.rint(np.nan_to_num(centre, nan=-1e6)).astype(np.int64)
-    rx, ry = np.ceil(box).astype(np.int64), np.maximum(1, np.ceil(box / view.rows.step)).astype(np.int64)
-    usable = (p[:, 0] >= w) & (p[:, 1] >= h) & (p[:, 0] < W - w) & (p[:, 1] < H - h)
-    usable &= (q[:, 0] >= w) & (q[:, 1] >= h) & (q[:, 0] < W - w) & (q[:, 1] < H - h)
-    for i in np.flatnonzero(usable):
-        (px, py), (qx, qy) = p[i], q[i]
-        x0, x1 = max(0, qx - w - rx[i]), min(W, qx + w + rx[i] + 1)
-        y0, y1 = max(0, qy - h - ry[i]), min(H, qy + h + ry[i] + 1)
-        score = cv2.matchTemplate(next_grey[y0:y1, x0:x1], grey[py - h : py + h + 1, px - w : px + w + 1], cv2.TM_CCOEFF_NORMED)
-        _, best[i], _, (bx, by) = cv2.minMaxLoc(score)
-        start[i] = xy[i] + (x0 + bx + w - px, y0 + by + h - py)
-    return start, best
-
-
-def _temporal(
-    view: TrackingView,
-    points: TrackedFrame,
-    start: np.ndarray,
-    images: Sequence[SplineImage],
-    next_images: Sequence[SplineImage],
-    status: np.ndarray,
-) -> list[Matches]:
+def _temporal(view: TrackingView, points: TrackedFrame, start: np.ndarray, images: FramePair, status: np.ndarray) -> list[Matches]:
     """The patch of frame i found in frame i + 1, per view.  (3)"""
     eye = np.tile(np.eye(2), (len(start), 1, 1))
     matches = []
     for k in range(len(view.cameras)):
-        begin = np.where((status == TrackStatus.MEASURED)[:, None], start[:, k], np.nan)
-        m = match_patches(images[k], points.xy[:, k], [next_images[k]], [begin], [eye], view.matching, row_step=view.rows.step)[0]
-        _mark(status, ~m.ok, TrackStatus.NOT_MATCHED)
+        begin = np.where((status[:, k] == TrackStatus.MEASURED)[:, None], start[:, k], np.nan)
+        m = match_patches(
+            images.spline[k], points.xy[:, k], [images.next_spline[k]], [begin], [eye], view.matching, row_step=view.rows.step
+        )[0]
+        mark(status[:, k], ~m.ok, TrackStatus.NOT_MATCHED)
         matches.append(m)
     return matches
 
 
-def _verify(
-    view: TrackingView, points: TrackedFrame, temporal: list[Matches], next_images: Sequence[SplineImage], status: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, covariances and shapes of frame i + 1 in every view, where spatial and temporal matching agree.  (4), (5)"""
-    ref = view.reference
-    others = [k for k in range(len(view.cameras)) if k != ref]
+def control(
+    view: TrackingView,
+    points: TrackedFrame,
+    temporal: list[Matches],
+    tiles: Atlas,
+    tile_rows: np.ndarray,
+    image: SplineImage,
+    status: np.ndarray,
+) -> tuple[TrackedFrame, list[Matches]]:
+    """The points with their drift, and the temporal matches shifted to where the key templates say.  (4)"""
+    ref = temporal[view.reference]
     good = status == TrackStatus.MEASURED
-    centre = temporal[ref].xy
-    starts = [np.where(good[:, None], temporal[k].xy, np.nan) for k in others]
+    grown = np.where(good[:, None, None], points.drift + ref.covariance, points.drift)
+    shape = np.where(good[:, None, None], ref.shape @ points.key_shape, points.key_shape)
+    start = np.where(good[:, None], ref.xy, np.nan)
+    key = match_patches(tiles.spline, tiles.xy[tile_rows], [image], [start], [shape], view.matching, row_step=view.rows.step)[0]
+    away = np.linalg.norm(key.xy - ref.xy, axis=1)
+    sigma = np.sqrt(np.maximum(np.trace(grown + key.covariance, axis1=1, axis2=2), 0.0))
+    held = good & key.ok & (key.correlation >= view.tracking.drift_correlation) & (away <= np.maximum(KEY_JUMP_PX, KEY_SIGMAS * sigma))
+    shift, drift = np.zeros((len(good), 2)), grown.copy()
+    small = np.eye(2) * 1e-8
+    gain = grown[held] @ np.linalg.inv(grown[held] + key.covariance[held] + small)  # (1) of templates.py
+    shift[held] = np.einsum("nij,nj->ni", gain, key.xy[held] - ref.xy[held])
+    drift[held] = (np.eye(2) - gain) @ grown[held]
+    shape[held] = key.shape[held]
+    moved = [
+        replace(m, xy=m.xy + (shift if k == view.reference else np.einsum("nij,nj->ni", points.shape[:, k], shift)))
+        for k, m in enumerate(temporal)
+    ]
+    renewed = good & ~held  # its present patch becomes the template
+    return (
+        replace(
+            points,
+            key_shape=np.where(renewed[:, None, None], np.eye(2), shape),
+            key_drift=points.key_drift + np.where(renewed[:, None, None], drift, 0.0),
+            drift=np.where(renewed[:, None, None], 0.0, drift),
+        ),
+        moved,
+    )
+
+
+def match_spatially(
+    view: TrackingView, points: TrackedFrame, at: Sequence[np.ndarray], images: Sequence[SplineImage], status: np.ndarray
+) -> list[Matches]:
+    """The reference view's patch matched in the other views of the same frame, from positions (N, 2) in every view.  (5)
+
+    `status` (N, K) is per view, here and below: a point goes on without the views in which it failed as long as three are left, or both
+    of two.
+    """
+    good = status == TrackStatus.MEASURED
+    good &= good[:, [view.reference]]
     spatial = match_patches(
-        next_images[ref],
-        centre,
-        [next_images[k] for k in others],
-        starts,
-        [points.shape[:, k] for k in others],
+        images[view.reference],
+        at[view.reference],
+        [images[k] for k in view.others],
+        [np.where(good[:, [k]], at[k], np.nan) for k in view.others],
+        [points.shape[:, k] for k in view.others],
         view.matching,
         row_step=view.rows.step,
     )
+    for k, s in zip(view.others, spatial):
+        mark(status[:, k], ~s.ok, TrackStatus.NOT_VERIFIED)
+    return spatial
+
+
+def disagreement(view: TrackingView, temporal: Sequence[Matches], spatial: Sequence[Matches], status: np.ndarray) -> float:
+    """s of (6): by how much temporal and spatial results differ more than their covariances say."""
+    d2 = np.concatenate([_distance2(temporal[k], s)[status[:, k] == TrackStatus.MEASURED] for k, s in zip(view.others, spatial)])
+    middle = float(np.median(d2)) / CHI2_MEDIAN if len(d2) else 1.0
+    return float(np.sqrt(np.clip((len(d2) * middle + PRIOR_POINTS) / (len(d2) + PRIOR_POINTS), 1.0, LARGEST_SCALE**2)))
+
+
+def _distance2(t: Matches, s: Matches) -> np.ndarray:
+    """Δᵀ (K_s + K_t + Q)⁻¹ Δ of (6)."""
+    K = s.covariance + t.covariance + np.eye(2) * MODEL_SIGMA_PX**2
+    K = np.where(np.isfinite(K), K, np.eye(2))
+    step = s.xy - t.xy
+    return np.einsum("ni,nij,nj->n", step, np.linalg.inv(K), step)
+
+
+def _verify(
+    view: TrackingView, points: TrackedFrame, temporal: Sequence[Matches], spatial: Sequence[Matches], status: np.ndarray, scale: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, covariances and shapes in every view, where spatial and temporal matching agree.  (6)"""
     xy = np.stack([m.xy for m in temporal], axis=1)
     covariance = np.stack([m.covariance for m in temporal], axis=1)
+    covariance[:, view.reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
     shape = points.shape.copy()
-    for k, s in zip(others, spatial):
-        _mark(status, ~s.ok, TrackStatus.NOT_VERIFIED)
-        total = s.covariance + temporal[k].covariance
-        allowed = np.maximum(VERIFY_PX, VERIFY_SIGMAS * np.sqrt(np.maximum(np.trace(total, axis1=1, axis2=2), 0.0)))
-        _mark(status, np.linalg.norm(s.xy - temporal[k].xy, axis=1) > allowed, TrackStatus.NOT_VERIFIED)
-        xy[:, k], covariance[:, k] = _weighted_mean(temporal[k], s, status == TrackStatus.MEASURED)
+    for k, s in zip(view.others, spatial):
+        mark(status[:, k], ~(_distance2(temporal[k], s) <= scale**2 * CHI2), TrackStatus.NOT_VERIFIED)
+        xy[:, k], covariance[:, k] = _weighted_mean(temporal[k], s, status[:, k] == TrackStatus.MEASURED)
         shape[:, k] = s.shape
     return xy, covariance, shape
 
@@ -264,22 +286,33 @@ def _weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray
     return xy, K
 
 
-def _tracked(points: TrackedFrame, xy: np.ndarray, shape: np.ndarray, point: Intersection) -> TrackedFrame:
-    return TrackedFrame(
-        frame=points.frame,
-        identity=points.identity,
-        xy=xy,
-        shape=shape,
-        xyz_m=point.xyz_m,
-        covariance_m2=point.covariance_m2,
-        ended=points.ended,
-        reason=points.reason,
-    )
+def intersect(
+    view: TrackingView, points: TrackedFrame, xy: np.ndarray, covariance: np.ndarray, shape: np.ndarray, status: np.ndarray
+) -> tuple[TrackedFrame, np.ndarray]:
+    """The points where the rays of the good views meet, and one status (N,) each, RAYS_MISS where they do not."""
+    good = status == TrackStatus.MEASURED
+    verdict = _verdict(view, status)
+    usable = good & (verdict == TrackStatus.MEASURED)[:, None]
+    xy = np.where(usable[:, :, None], xy, np.nan)
+    point = forward_intersection(view.cameras, view.rows.to_frame(xy), view.rows.covariance_to_frame(covariance))
+    with np.errstate(invalid="ignore"):
+        mark(verdict, ~(point.rms_residual_px <= view.limit_px), TrackStatus.RAYS_MISS)
+    K = point.covariance_m2 + over_the_body(view, point.xyz_m, points.key_drift + points.drift)
+    return replace(points, xy=xy, shape=shape, xyz_m=point.xyz_m, covariance_m2=K), verdict
 
 
-def _replace_rows(all_rows: TrackedFrame, rows: np.ndarray, found: TrackedFrame, good: np.ndarray) -> TrackedFrame:
-    values = {}
-    for name in ("xy", "shape", "xyz_m", "covariance_m2"):
-        values[name] = getattr(all_rows, name).copy()
-        values[name][rows] = getattr(found, name)[good]
-    return TrackedFrame(frame=all_rows.frame, identity=all_rows.identity, ended=all_rows.ended, reason=all_rows.reason, **values)
+def _verdict(view: TrackingView, status: np.ndarray) -> np.ndarray:
+    """One status (N,) of those in the views (N, K): why the reference, or the first other view, failed, where too few are left."""
+    good = status == TrackStatus.MEASURED
+    enough = good[:, view.reference] & (good.sum(axis=1) >= min(3, len(view.cameras)))
+    failed = np.where(good | (status == TrackStatus.ABSENT), 127, status)
+    first = np.where(failed[:, view.reference] < 127, failed[:, view.reference], failed.min(axis=1))
+    return np.where(enough, TrackStatus.MEASURED, np.where(first < 127, first, TrackStatus.NOT_FOUND)).astype(np.int8)
+
+
+def over_the_body(view: TrackingView, xyz_m: np.ndarray, drift_px2: np.ndarray) -> np.ndarray:
+    """Covariance (N, 3, 3) of drift (N, 2, 2) in the reference image, across the rays."""
+    camera = view.cameras[view.reference]
+    pixel_m = camera.to_camera(xyz_m)[:, 2] / camera.focal_px
+    across = camera.R_cam_world[:2]  # of a camera that looks at the person, near enough
+    return np.einsum("ia,nij,jb->nab", across, view.rows.covariance_to_frame(drift_px2), across) * (pixel_m**2)[:, None, None]

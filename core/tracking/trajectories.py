@@ -10,8 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..progress import Monitor
 from ..values import frozen
-from .step import TrackedFrame, TrackingSettings, TrackStatus
+from .filters import against_neighbours, against_voxels, cut, over_thresholds
+from .settings import TrackingSettings, TrackStatus
+from .tracked import TrackedFrame
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -53,37 +56,23 @@ def assemble(steps: Sequence[TrackedFrame], fps: float) -> Trajectories:
     return _with_kinematics(frames, frames / fps, xyz, sigma, status)
 
 
-def filter_by_thresholds(trajectories: Trajectories, settings: TrackingSettings) -> Trajectories:
-    """Filter 1 of the papers: cut a trajectory where it is too fast or accelerates too much, and remove what is short.
-
-    A cut trajectory keeps its longest piece; the frames that went carry the reason. Trajectories without any frame left are dropped.
-    """
-    xyz, status = trajectories.xyz_m.copy(), trajectories.status.copy()
-    sigma, seen = trajectories.sigma_m.copy(), trajectories.seen
-    dt = float(np.median(np.diff(trajectories.time_s))) if len(trajectories.time_s) > 1 else 1.0
-    with np.errstate(invalid="ignore"):
-        noise = np.nan_to_num(sigma)
-        fast = np.linalg.norm(trajectories.velocity_m_s, axis=2) > settings.max_speed + 3 * noise / (np.sqrt(2) * dt)
-        jerky = np.linalg.norm(trajectories.acceleration_m_s2, axis=2) > settings.max_acceleration + 3 * np.sqrt(6) * noise / dt**2
-    status[seen & jerky], status[seen & fast] = TrackStatus.ACCELERATES, TrackStatus.TOO_FAST
-    kept = _longest_run(status == TrackStatus.MEASURED)
-    short = kept & (kept.sum(axis=0) < settings.min_length)
-    status[short] = TrackStatus.TOO_SHORT
-    kept &= ~short
+def filter_trajectories(raw: Trajectories, settings: TrackingSettings, monitor: Monitor | None = None) -> Trajectories:
+    """What is left of the trajectories after the filters (filters.py), in pieces; the frames that went carry the reason."""
+    monitor = monitor or Monitor()
+    dt = float(np.median(np.diff(raw.time_s))) if len(raw.time_s) > 1 else 1.0
+    verdict = over_thresholds(raw.velocity_m_s, raw.acceleration_m_s2, raw.sigma_m, dt, settings)
+    if settings.uniformity == "voxels":
+        more = against_voxels(raw.xyz_m, raw.velocity_m_s, settings)
+    elif settings.uniformity == "rigid":
+        more = against_neighbours(raw.xyz_m, raw.sigma_m, settings, lambda done, total: monitor.step("filters", done, total))
+    else:
+        more = verdict
+    verdict = np.where(verdict == TrackStatus.MEASURED, more, verdict)
+    status = np.where(raw.seen, verdict, raw.status)
+    source, kept, status = cut(raw.seen, status, settings)
+    xyz, sigma = raw.xyz_m[:, source].copy(), raw.sigma_m[:, source].copy()
     xyz[~kept], sigma[~kept] = np.nan, np.nan
-    alive = kept.any(axis=0)
-    return _with_kinematics(trajectories.frames, trajectories.time_s, xyz[:, alive], sigma[:, alive], status[:, alive])
-
-
-def _longest_run(mask: np.ndarray) -> np.ndarray:
-    """Of each column of mask (T, N), only its longest run of True (the first, where several are as long)."""
-    T, N = mask.shape
-    length = np.zeros((T + 1, N), dtype=np.int32)
-    for step in range(T):
-        length[step + 1] = (length[step] + 1) * mask[step]
-    end, longest = length.argmax(axis=0), length.max(axis=0)
-    t = np.arange(1, T + 1)[:, None]
-    return (t <= end) & (t > end - longest)
+    return _with_kinematics(raw.frames, raw.time_s, xyz, sigma, status)
 
 
 def _with_kinematics(frames: np.ndarray, time_s: np.ndarray, xyz: np.ndarray, sigma: np.ndarray, status: np.ndarray) -> Trajectories:

@@ -1,0 +1,169 @@
+"""False trajectories: found by their speed, by what their neighbours do, and cut or removed with the reason kept.
+
+Three filters, each a table (T, N) of statuses:
+
+thresholds   |v| ≤ v_max + 3 σ_v ,  |a| ≤ a_max + 3 σ_a: the limits stand above the noise of a difference (D'Apuzzo et al. 2000, §3.3)
+voxels       as published: in each time step the velocity must agree with the median of the other trajectories in the same voxel,
+             |v − v̄| ≤ max(3 · 1.4826 MAD, 0.15 |v̄| + 60 mm/s)                                                              (1)
+rigid        a limb that rotates has no common velocity, so here the point must go where the rigid motion of its neighbours takes it,
+             over one step and over longer spans, in which what slides slowly gets far enough to be seen:
+             |X_{i+s} − X̂_{i+s}| ≤ max(√s d, 3.5 √(σ_i² + σ_{i+s}² + spread²))                                                  (2)
+             X̂ from all neighbours or from those whose distance to the point stayed (neighbours.py), whichever is nearer.
+
+             Neighbours that scatter by more than √s d have no common motion and say nothing; a trajectory of which they say nothing
+             in most of its steps, though others have neighbours that do, is removed: alone, at an outline, it proves nothing.
+
+A trajectory is cut where it is false; its other pieces go on as trajectories of their own unless they are short, and one that is false
+in more than half of its steps goes altogether.
+"""
+
+from collections.abc import Callable
+from enum import IntEnum
+
+import numpy as np
+
+from .neighbours import common_motion, nearest_neighbours, same_distance
+from .settings import TrackingSettings, TrackStatus
+
+SPANS = ((1, 1), (4, 2), (10, 5))  # frames, and every how many frames a span begins
+SIGMAS = 3.5
+MIN_MEMBERS = 5
+MOST_SPREAD = 1.0  # of √s d: neighbours that scatter more have no common motion
+MIN_SUPPORT = 0.5  # of a trajectory's steps must be confirmed
+VOXEL_MEMBERS, VOXEL_SLACK, VOXEL_PART = 4, 0.06, 0.15  # of (1): members, m/s, part of the mean velocity
+MOSTLY_FALSE = 0.5
+
+Progress = Callable[[float, float], None]
+
+
+def over_thresholds(
+    velocity_m_s: np.ndarray, acceleration_m_s2: np.ndarray, sigma_m: np.ndarray, dt: float, settings: TrackingSettings
+) -> np.ndarray:
+    """TOO_FAST or ACCELERATES (T, N) where a trajectory is or does so beyond its noise, else MEASURED."""
+    verdict = np.full(sigma_m.shape, TrackStatus.MEASURED, dtype=np.int8)
+    noise = np.nan_to_num(sigma_m)
+    with np.errstate(invalid="ignore"):
+        jerky = np.linalg.norm(acceleration_m_s2, axis=2) > settings.max_acceleration + 3 * np.sqrt(6) * noise / dt**2
+        fast = np.linalg.norm(velocity_m_s, axis=2) > settings.max_speed + 3 * noise / (np.sqrt(2) * dt)
+    verdict[jerky], verdict[fast] = TrackStatus.ACCELERATES, TrackStatus.TOO_FAST
+    return verdict
+
+
+def against_voxels(xyz_m: np.ndarray, velocity_m_s: np.ndarray, settings: TrackingSettings) -> np.ndarray:
+    """NOT_UNIFORM (T, N) where a velocity differs from that of the others in its voxel in the same and the neighbouring steps.  (1)"""
+    verdict = np.full(xyz_m.shape[:2], TrackStatus.MEASURED, dtype=np.int8)
+    known = np.isfinite(velocity_m_s).all(axis=2) & np.isfinite(xyz_m).all(axis=2)
+    cell = np.floor(np.nan_to_num(xyz_m) / settings.neighbourhood_m).astype(np.int64)
+    for t in range(len(xyz_m)):
+        rows = np.flatnonzero(known[t])
+        near = [(u, j) for u in (t - 1, t, t + 1) if 0 <= u < len(xyz_m) for j in np.flatnonzero(known[u])]
+        if not len(rows) or not near:
+            continue
+        u, j = np.array(near).T
+        v, owner = velocity_m_s[u, j], j
+        _, place = np.unique(np.concatenate([cell[t, rows], cell[u, j]]), axis=0, return_inverse=True)
+        place = place.reshape(-1)
+        for voxel in np.unique(place[: len(rows)]):
+            inside, others = rows[place[: len(rows)] == voxel], place[len(rows) :] == voxel
+            verdict[t, inside[_differs(inside, velocity_m_s[t, inside], owner[others], v[others])]] = TrackStatus.NOT_UNIFORM
+    return verdict
+
+
+def _differs(inside: np.ndarray, velocity: np.ndarray, owner: np.ndarray, all_velocities: np.ndarray) -> np.ndarray:
+    """Which of the trajectories in a voxel violate (1), each against the others (leave one out)."""
+    other = inside[:, None] != owner
+    every = np.where(other[..., None], all_velocities, np.nan)
+    enough = other.sum(axis=1) >= VOXEL_MEMBERS
+    bad = np.zeros(len(inside), dtype=bool)
+    if enough.any():
+        mean = np.nanmedian(every[enough], axis=1)
+        mad = np.nanmedian(np.linalg.norm(every[enough] - mean[:, None], axis=2), axis=1)
+        limit = np.maximum(3 * 1.4826 * mad, VOXEL_PART * np.linalg.norm(mean, axis=1) + VOXEL_SLACK)
+        bad[enough] = np.linalg.norm(velocity[enough] - mean, axis=1) > limit
+    return bad
+
+
+def against_neighbours(xyz_m: np.ndarray, sigma_m: np.ndarray, settings: TrackingSettings, progress: Progress) -> np.ndarray:
+    """NOT_RIGID (T, N) where a trajectory leaves the rigid motion of its neighbours (2), UNSUPPORTED where they cannot say.
+
+    Unsupported are whole trajectories of which few steps could be tested, and the ends of others before the first and after the last step
+    that was confirmed. Where half of all trajectories have no neighbours, that is not held against any.
+    """
+    verdict = np.full(sigma_m.shape, TrackStatus.MEASURED, dtype=np.int8)
+    T, N = sigma_m.shape
+    answers = np.full((len(SPANS), T, N), -1, dtype=np.int8)
+    for done, (span, every) in enumerate(SPANS):
+        for t in range(0, T - span, every):
+            progress(done + t / T, len(SPANS))
+            rows = np.flatnonzero(np.isfinite(xyz_m[[t, t + span], :, 0]).all(axis=0))
+            sigma = np.hypot(sigma_m[t, rows], sigma_m[t + span, rows])
+            answers[done, t, rows] = answer = ask_neighbours(xyz_m[t, rows], xyz_m[t + span, rows], sigma, span, settings)
+            verdict[t + 1 : t + span + 1, rows[answer == Answer.DEVIATES]] = TrackStatus.NOT_RIGID
+    tested = (answers >= 0).sum(axis=(0, 1))
+    support = (answers == Answer.CONFIRMED).sum(axis=(0, 1)) / np.maximum(tested, 1)
+    if tested.any() and np.median(support[tested > 0]) >= MIN_SUPPORT:
+        alone = ~_between_confirmed(answers[0] == Answer.CONFIRMED) | (support < MIN_SUPPORT)
+        verdict[(verdict == TrackStatus.MEASURED) & alone & (tested > 0)] = TrackStatus.UNSUPPORTED
+    return verdict
+
+
+def _between_confirmed(confirmed: np.ndarray) -> np.ndarray:
+    """Frames (T, N) from the first to the last of the steps t → t + 1 that are confirmed (T, N)."""
+    ends = confirmed | np.concatenate([np.zeros_like(confirmed[:1]), confirmed[:-1]])
+    return np.logical_or.accumulate(ends, axis=0) & np.logical_or.accumulate(ends[::-1], axis=0)[::-1]
+
+
+class Answer(IntEnum):
+    """What neighbours say about a point's motion."""
+
+    UNKNOWN = 0  # too few, or they do not move alike
+    CONFIRMED = 1
+    DEVIATES = 2
+
+
+def ask_neighbours(before_m: np.ndarray, after_m: np.ndarray, sigma_m: np.ndarray, span: int, settings: TrackingSettings) -> np.ndarray:
+    """An Answer for each of N points that moved in `span` frames: do they go where their neighbours' rigid motion takes them?  (2)"""
+    rows, there = nearest_neighbours(before_m, before_m, settings.neighbourhood_m, same=True)
+    slack = np.sqrt(span) * 1e-3 * settings.max_deviation_mm
+    sigma = np.nan_to_num(sigma_m)
+
+    def ask(i: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        goal = common_motion(before_m[i], before_m[rows[i]], after_m[rows[i]], weight, slack / 2)
+        limit = np.maximum(slack, SIGMAS * np.hypot(sigma[i], goal.spread_m))
+        with np.errstate(invalid="ignore"):
+            near = np.linalg.norm(after_m[i] - goal.xyz_m, axis=1) <= limit
+        alike = (goal.members >= MIN_MEMBERS) & (goal.spread_m <= MOST_SPREAD * slack)
+        return np.where(alike, np.where(near, Answer.CONFIRMED, Answer.DEVIATES), Answer.UNKNOWN)
+
+    answer = np.full(len(before_m), Answer.UNKNOWN)
+    rest = np.flatnonzero(there.sum(axis=1) >= MIN_MEMBERS)
+    if len(rest):
+        answer[rest] = ask(rest, there[rest].astype(np.float64))
+    rest = rest[answer[rest] != Answer.CONFIRMED]
+    if len(rest):
+        weight = there[rest] * same_distance(before_m[rest], after_m[rest], before_m[rows[rest]], after_m[rows[rest]], slack / 2)
+        again = ask(rest, weight)
+        answer[rest] = np.where(again == Answer.UNKNOWN, answer[rest], again)
+    return answer
+
+
+def cut(seen: np.ndarray, status: np.ndarray, settings: TrackingSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pieces of the trajectories: source column (M,), which frames each piece keeps (T, M), and its statuses (T, M).
+
+    `seen` (T, N): frames with a position; `status`: MEASURED or the reason against it. A gap (not seen, no reason against) cuts nothing.
+    """
+    good = seen & (status == TrackStatus.MEASURED)
+    false = seen & ~good
+    mostly = false.sum(axis=0) > MOSTLY_FALSE * np.maximum(seen.sum(axis=0), 1)
+    piece = np.cumsum(false, axis=0)
+    columns, kept, statuses = [], [], []
+    for n in np.flatnonzero(seen.any(axis=0)):
+        for number in np.unique(piece[good[:, n], n]) if not mostly[n] else ():
+            frames = good[:, n] & (piece[:, n] == number)
+            if frames.sum() >= settings.min_length:
+                columns.append(n)
+                kept.append(frames)
+                statuses.append(np.where(seen[:, n] & ~frames & good[:, n], TrackStatus.OTHER_PIECE, status[:, n]))
+    T = len(seen)
+    stack = [np.array(a, dtype=d).reshape(-1, T).T for a, d in ((kept, bool), (statuses, np.int8))]
+    return np.array(columns, dtype=np.int64), stack[0], stack[1]

@@ -1,0 +1,96 @@
+"""What the neighbours of a point say about its motion: the rigid motion that they share, fitted robustly and without the point itself.
+
+Of two instants with the neighbours' places p_j → q_j and weights w_j (p̄, q̄ their weighted means), the rotation R is found by
+
+    (Σ w (|P|² I − P Pᵀ) + λ I) ω = Σ w P × (q − q̄ − P) ,   P = R (p − p̄) ,   R ← exp(ω) R                (1)
+
+and the point should move to R (x − p̄) + q̄. One step of (1) is the velocity field v = v0 + ω × (X − X̄) of a rigid body, which a
+rotating limb obeys and a common velocity does not; repeated, it holds for rotations of any size. λ keeps R = I about axes that the
+neighbours do not determine. A point on one limb whose neighbours lie mostly on another has a second fit, which starts from the
+neighbours whose distance from the point is the same at both instants: in a rigid body all distances are invariant.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..geometry.rotation import rotation_from_vector
+
+NEIGHBOURS = 14
+STEPS = 6
+PLAIN_STEPS = 2  # without reweighting, while R is still far off
+NOISE_M = 2e-3  # of a neighbour: λ of (1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Expectation:
+    """Where N points should be by their neighbours. Metres."""
+
+    xyz_m: np.ndarray  # (N, 3); NaN with fewer than three neighbours
+    spread_m: np.ndarray  # (N,) robust scatter of the neighbours about their common motion
+    members: np.ndarray  # (N,) neighbours that share the motion
+
+
+def nearest_neighbours(xyz_m: np.ndarray, among_m: np.ndarray, radius_m: float, *, same: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (N, m) of `among_m` nearest to the points (N, 3) within the radius, and which of them are any.
+
+    `same`: the points are those of `among_m`, and none is its own neighbour.
+    """
+    if not len(among_m):
+        return np.zeros((len(xyz_m), 1), dtype=np.int64), np.zeros((len(xyz_m), 1), dtype=bool)
+    count = min(NEIGHBOURS + same, len(among_m))
+    distance, rows = cKDTree(among_m).query(
+        xyz_m, k=list(range(1 + same, count + 1)) if count > same else [1], distance_upper_bound=radius_m
+    )
+    there = np.isfinite(distance) & (np.full(len(xyz_m), count > same)[:, None])
+    return np.where(there, rows, 0), there
+
+
+def common_motion(
+    xyz_m: np.ndarray, before_m: np.ndarray, after_m: np.ndarray, weight: np.ndarray, scale_m: float | np.ndarray
+) -> Expectation:
+    """Where points (N, 3) move with their neighbours, who went from `before_m` to `after_m` (N, m, 3). `weight` (N, m) of the start.
+
+    `scale_m` is the scatter of neighbours that is certainly harmless.
+    """
+    R = np.tile(np.eye(3), (len(xyz_m), 1, 1))
+    there, w = weight > 0, weight.astype(np.float64)
+    scale = np.broadcast_to(np.asarray(scale_m, dtype=np.float64), (len(xyz_m),))
+    for step in range(STEPS):
+        total = np.maximum(w.sum(axis=1), 1e-12)[:, None]
+        p0, q0 = np.einsum("nm,nmi->ni", w, before_m) / total, np.einsum("nm,nmi->ni", w, after_m) / total
+        P = (before_m - p0[:, None]) @ R.transpose(0, 2, 1)
+        R = rotation_from_vector(_turn(P, after_m - q0[:, None], w)) @ R  # (1)
+        miss = np.linalg.norm((before_m - p0[:, None]) @ R.transpose(0, 2, 1) + q0[:, None] - after_m, axis=2)
+        if step >= PLAIN_STEPS - 1:
+            spread = 1.4826 * masked_median(miss, w > 0.25 * w.max(axis=1, keepdims=True))
+            w = weight / (1 + (miss / (2 * np.maximum(spread, scale))[:, None]) ** 2) ** 2  # Geman & McClure
+    members = (there & (miss < 3 * np.maximum(spread, scale)[:, None])).sum(axis=1)
+    goal = np.einsum("nij,nj->ni", R, xyz_m - p0) + q0
+    return Expectation(xyz_m=np.where((there.sum(axis=1) >= 3)[:, None], goal, np.nan), spread_m=spread, members=members)
+
+
+def _turn(P: np.ndarray, Q: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Rotation vectors ω (N, 3) of (1), at most a radian."""
+    torque = np.einsum("nm,nmi->ni", w, np.cross(P, Q - P))
+    J = -np.einsum("nm,nmi,nmj->nij", w, P, P, optimize=True)
+    J += np.eye(3) * (np.einsum("nm,nmi,nmi->n", w, P, P, optimize=True) + w.sum(axis=1) * NOISE_M**2 + 1e-15)[:, None, None]
+    omega = np.linalg.solve(J, torque[..., None])[..., 0]
+    return omega / np.maximum(1.0, np.linalg.norm(omega, axis=1))[:, None]
+
+
+def same_distance(
+    before_m: np.ndarray, after_m: np.ndarray, neighbours_before: np.ndarray, neighbours_after: np.ndarray, scale_m: float | np.ndarray
+) -> np.ndarray:
+    """Weights (N, m) by how little the distance from a point (N, 3) to each neighbour (N, m, 3) has changed."""
+    d0 = np.linalg.norm(neighbours_before - before_m[:, None], axis=2)
+    d1 = np.linalg.norm(neighbours_after - after_m[:, None], axis=2)
+    return 1 / (1 + ((d1 - d0) / (2 * np.reshape(np.asarray(scale_m), (-1, 1)))) ** 2) ** 2
+
+
+def masked_median(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Median of each row (N, m) over its mask; zero for empty rows."""
+    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
+    middle = np.maximum(mask.sum(axis=1) - 1, 0) // 2
+    return np.where(mask.any(axis=1), ordered[np.arange(len(values)), middle], 0.0)

@@ -1,0 +1,74 @@
+"""Settings of tracking, and what can become of a trajectory."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from ..settings import knob
+
+UNIFORMITY = ("rigid", "voxels", "off")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrackingSettings:
+    """How points are followed from frame to frame, and which trajectories are kept."""
+
+    spacing_px: int = knob(8, "Distance between tracked points in the reference image.", unit="px", low=1, high=64)
+    box_px: int = knob(
+        12,
+        "Half size of the box that is searched about the predicted position; the second try has twice as much.",
+        unit="px",
+        low=2,
+        high=64,
+    )
+    min_correlation: float = knob(0.6, "Smallest correlation in the box.", low=0.0, high=0.99)
+    max_residual_px: float = knob(
+        0.7, "Largest distance by which rays may miss, or what the calibration of the take needs.", unit="px", low=0.05, high=10.0
+    )
+    drift_correlation: float = knob(
+        0.8, "A point is held to the patch of its birth as long as they correlate by this much (1: never).", low=0.3, high=1.0
+    )
+    min_coverage: float = knob(
+        0.6, "Smallest part of a tracked patch that lies on the measured surface; less is the outline of the body.", low=0.0, high=1.0
+    )
+    regenerate_every: int = knob(
+        2, "Every so many frames, new points start where the surface has none (0: never).", unit="frames", low=0, high=1000
+    )
+    bridge_frames: int = knob(
+        3, "A point that is lost may be found again by its template within so many frames (0: never).", unit="frames", low=0, high=100
+    )
+    max_speed: float = knob(10.0, "Trajectories faster than this are cut.", unit="m/s", low=0.1, high=100.0)
+    max_acceleration: float = knob(150.0, "Trajectories that accelerate more than this are cut.", unit="m/s²", low=1.0, high=10_000.0)
+    uniformity: str = knob(
+        "rigid",
+        "What a trajectory's neighbours are asked: their rigid motion, their mean velocity in voxels as published, or nothing.",
+        choices=UNIFORMITY,
+    )
+    neighbourhood_m: float = knob(0.1, "Radius of a point's neighbourhood, and side of a voxel.", unit="m", low=0.01, high=1.0)
+    max_deviation_mm: float = knob(
+        2.5, "Deviation from the neighbours' motion that is always allowed in one frame.", unit="mm", low=0.1, high=100.0
+    )
+    min_length: int = knob(5, "Trajectories of fewer frames are removed.", unit="frames", low=2, high=1000)
+    smooth_frames: int = knob(
+        7, "Frames over which smoothed velocities and accelerations are taken (odd; 0: none).", unit="frames", low=0, high=99
+    )
+
+
+class TrackStatus(IntEnum):
+    """What became of a trajectory in a frame."""
+
+    ABSENT = 0  # not born yet, or ended before
+    MEASURED = 1
+    LEFT_IMAGE = 2
+    NOT_FOUND = 3  # no correlation in the box
+    NOT_MATCHED = 4  # temporal matching failed its limits
+    NOT_VERIFIED = 5  # spatial matching contradicts the temporal one
+    RAYS_MISS = 6
+    TOO_FAST = 7
+    ACCELERATES = 8
+    TOO_SHORT = 9
+    AT_OUTLINE = 10  # the patch lies partly beyond the outline of the body
+    OFF_SURFACE = 11  # the frame's own surface is elsewhere
+    NOT_UNIFORM = 12  # its velocity is not that of its voxel
+    NOT_RIGID = 13  # it leaves the rigid motion of its neighbours
+    OTHER_PIECE = 14  # a frame of a trajectory that was cut; the other pieces stand in columns of their own
+    UNSUPPORTED = 15  # it has no neighbours that could confirm it
