@@ -13,7 +13,7 @@ import numpy as np
 
 from . import store
 from .body.shape import write_body
-from .body.skin import SkinSettings, limb_skin
+from .body.skin import SkinSettings, body_skin
 from .errors import InputError
 from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
@@ -299,7 +299,12 @@ def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
     skins = []
     for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
         monitor.step("skin", i, len(body.motion.frames))
-        skins.append((int(frame), limb_skin(body.shape, values, run.settings["skin"])))
+        try:
+            skins.append((int(frame), body_skin(body.shape, values, run.settings["skin"])))
+        except InputError as no_skin:
+            run.warn(f"No skin was made: {no_skin}")
+            skins.clear()
+            break
     for frame, skin in skins:
         write_mesh(run.results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)
     write_joints(run.results.path("joints.csv"), body.motion)
