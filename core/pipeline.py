@@ -30,8 +30,9 @@ from .results import Results
 from .settings import from_table, nearest_name, to_table
 from .surface.cloud import PointCloud, SurfaceSettings
 from .take import Footage, open_take, read_take
-from .tracking.step import TrackedFrame, TrackingSettings
-from .tracking.trajectories import Trajectories, assemble, filter_by_thresholds
+from .tracking.settings import TrackingSettings
+from .tracking.tracked import TrackedFrame
+from .tracking.trajectories import Trajectories, assemble, filter_trajectories
 
 SETTINGS: dict[str, type] = {
     "matching": MatchingSettings,
@@ -195,7 +196,7 @@ def track(run: Run, monitor: Monitor) -> None:
             "Stopped: the surface of all frames is kept, and the tracks as far as they are; the same command goes on from there."
         ) from stop
     raw = assemble(steps, run.footage.take.fps)
-    run.trajectories = filter_by_thresholds(raw, s["tracking"])
+    run.trajectories = filter_trajectories(raw, s["tracking"], monitor)
     run.results.write_trajectories(run.trajectories, {"format": "tricap-trajectories", "version": 1, "fps": run.footage.take.fps})
     seen = run.trajectories.seen
     run.finish_stage(
