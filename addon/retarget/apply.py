@@ -101,11 +101,16 @@ def check_played(armature_object: bpy.types.Object, result: Retargeted, toleranc
     if not whole:
         return []
     played = read_motion(armature_object, wanted.rig, [int(wanted.frames[i]) for i in whole])
-    off = np.degrees(angle_of(transposed(played.R) @ wanted.R[whole]))[:, result.driven].max(axis=0)
-    if off.max() <= tolerance_deg:
-        return []
-    worst = wanted.rig.names[int(np.flatnonzero(result.driven)[off.argmax()])]
-    return [f"something else steers the rig, too: “{worst}” plays up to {off.max():.0f}° off what was keyed"]
+    turned = np.degrees(angle_of(transposed(played.R) @ wanted.R[whole]))[:, result.driven].max(axis=0)
+    moved = np.linalg.norm(played.head_m - wanted.head_m[whole], axis=2)[:, result.driven].max(axis=0)
+    names = [wanted.rig.names[b] for b in np.flatnonzero(result.driven)]
+    if turned.max() > tolerance_deg:
+        worst = names[int(turned.argmax())]
+        return [f"something else steers the rig, too: “{worst}” plays up to {turned.max():.0f}° off what was keyed"]
+    if moved.max() > np.radians(tolerance_deg) * wanted.rig.height_m:
+        worst = names[int(moved.argmax())]
+        return [f"something else steers the rig, too: “{worst}” plays up to {1e3 * moved.max():.0f} mm off what was keyed"]
+    return []
 
 
 def set_range(scene: bpy.types.Scene, motion: Motion) -> None:

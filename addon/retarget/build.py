@@ -42,8 +42,8 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
     basis, driven = channels(rig, motion.R), np.ones(len(rig.names), dtype=bool)
     first = int(roots[0])
     shift_m = motion.head_m[:, first] - rig.head_m[first]
-    write_action(armature_object, Retargeted(motion=motion, basis=basis, shift_m=shift_m, carrier=first, driven=driven, scale=1.0, roles=(),
-                                             contacts=None, notes=()), name)
+    write_action(armature_object, Retargeted(motion=motion, basis=basis, shift_m=shift_m, carrier=first, loose_m={}, driven=driven,
+                                             scale=1.0, roles=(), contacts=None, notes=()), name)
     return armature_object
 
 

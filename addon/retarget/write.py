@@ -41,9 +41,10 @@ def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tol
         channel, values = rotation_values(bone, result.basis[:, b])
         keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2)
         keys += _key(action, target, f"{bone.path_from_id()}.{channel}", frames[keep], values[keep], bone.name)
-    if result.carrier >= 0:
-        bone = target.pose.bones[rig.names[result.carrier]]
-        values = location_values(target, bone, result)
+    carried = dict(result.loose_m) | ({result.carrier: result.shift_m} if result.carrier >= 0 else {})
+    for b, shift_m in carried.items():
+        bone = target.pose.bones[rig.names[b]]
+        values = location_values(target, bone, result, b, shift_m)
         keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2 * float(np.ptp(rig.head_m, axis=0).max()) / scale_of(target))
         keys += _key(action, target, f"{bone.path_from_id()}.location", frames[keep], values[keep], bone.name)
     keys += _rest_of_the_rest(action, target, result)
@@ -62,9 +63,9 @@ def rotation_values(bone: bpy.types.PoseBone, basis: np.ndarray) -> tuple[str, n
     return "rotation_axis_angle", np.concatenate([2 * np.arctan2(sine, q[:, :1]), axis], axis=1)
 
 
-def location_values(target: bpy.types.Object, bone: bpy.types.PoseBone, result: Retargeted) -> np.ndarray:
-    """The location channels (T, 3) of the carrier."""
-    b, shift = result.carrier, result.shift_m / scale_of(target)
+def location_values(target: bpy.types.Object, bone: bpy.types.PoseBone, result: Retargeted, b: int, shift_m: np.ndarray) -> np.ndarray:
+    """The location channels (T, 3) of bone b, which shifts by `shift_m` (T, 3) in the world."""
+    shift = shift_m / scale_of(target)
     if bone.bone.use_local_location:
         carried = result.motion.R[:, b] @ transposed(result.basis[:, b])
         return np.einsum("tji,tj->ti", carried, shift)
@@ -91,7 +92,7 @@ def _rest_of_the_rest(action: bpy.types.Action, target: bpy.types.Object, result
         bone = target.pose.bones[name]
         rotation = CHANNEL.get(bone.rotation_mode, ("rotation_euler", 3))[0]
         for channel in (rotation, "location", "scale"):
-            if (channel == rotation and result.driven[b]) or (channel == "location" and b == result.carrier):
+            if (channel == rotation and result.driven[b]) or (channel == "location" and (b == result.carrier or b in result.loose_m)):
                 continue
             now, rest = np.array(getattr(bone, channel)), np.array(REST[channel], dtype=float)
             moved = abs(now[0]) > 1e-6 if channel == "rotation_axis_angle" else np.abs(now - rest).max() > 1e-6

@@ -140,8 +140,8 @@ def test_bad_rigs_are_said_and_the_scene_is_unchanged(empty: ModuleType, tmp_pat
     (tmp_path / "broken.fbx").write_bytes(b"Kaydara FBX Binary  \0\x1a\0" + b"\x01" * 90)
     (tmp_path / "broken.blend").write_bytes(b"BLENDER-v405" + b"\0" * 50)
     for name, word in (("none.blend", "no armature"), ("two.blend", "2 armatures"), ("names.blend", "recognised"),
-                       ("broken.glb", "export it"), ("huge.glb", "export it"), ("broken.fbx", "export it"), ("broken.blend", "export it"), ("nothing.glb", "no file"),
-                       ("move.txt", "no file")):
+                       ("broken.glb", "export it"), ("huge.glb", "export it"), ("broken.fbx", "export it"),
+                       ("broken.blend", "export it"), ("nothing.glb", "no file"), ("move.txt", "no file")):
         capsys.readouterr()
         out = tmp_path / "out.blend"
         assert main(["retarget", str(tmp_path / "move.bvh"), "--rig", str(tmp_path / name), "--out", str(out), "--quiet"]) == 2, name

@@ -37,7 +37,7 @@ GIVE = 0.4  # how much counts what a lifted foot can yield to by turning
 TILT = 0.2  # a turn of the hips counts as much less than one of a leg
 BENT = np.radians(8.0)  # a knee is taken to be bent at least as much in (4)
 NEAR = 0.8  # an ankle nearer to the ball than this part of the foot does not tell the foot's direction
-ROLL_M = 0.004  # the ball of a foot that rolls over its toes goes forward by at most this
+ROLL_M = 0.002  # the ball of a foot that rolls over its toes goes forward by at most this
 REACH = 0.9995  # a leg is not stretched beyond this part of its length
 STRAIGHT = 0.005  # a knee that is out of the line by less of the thigh's length bends forwards
 

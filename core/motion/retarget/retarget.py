@@ -16,7 +16,7 @@ from .contacts import Contacts, FeetSettings, find_contacts
 from .mapping import RigMap
 from .rest import with_person_like_rest
 from .rig import Motion, Rig, channels, head_of
-from .roles import SEGMENTS, SIDES, sided
+from .roles import SEGMENTS, SIDES, parent_role, sided
 from .transfer import alignments, body_axes, follow, share_twist, turn
 from .turns import matrix_from_vector
 
@@ -41,6 +41,7 @@ class Retargeted:
     basis: np.ndarray  # (T, B, 3, 3) pose channels
     shift_m: np.ndarray  # (T, 3) of the carrier's head against where its parent leaves it, in the world
     carrier: int  # the bone whose location channels carry the body; −1 for none
+    loose_m: Mapping[int, np.ndarray]  # by bone, the like (T, 3) of parts that do not hang on the body
     driven: np.ndarray  # (B,) bones that get keys
     scale: float
     roles: tuple[str, ...]
@@ -80,11 +81,12 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     monitor.step("retargeting", 3, 4)
     if settings.root == "in place" and carrier >= 0:
         shift = shift - (shift - shift[0]) * (1.0, 1.0, 0.0)
-    head = _heads(target, R, carrier, shift)
+    head = _heads(target, R, carrier, shift, target_map)
     moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
     notes = (*filter(None, [rest_note]), *_notes(source_map, target_map, carrier))
     monitor.step("retargeting", 4, 4)
-    return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, driven=driven, scale=scale,
+    loose = {b: head[:, b] - head_of(target, R, head, b) for b in loose_parts(target, target_map) if driven[b] and b != carrier}
+    return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, loose_m=loose, driven=driven, scale=scale,
                       roles=tuple(aligned), contacts=contacts, notes=notes)
 
 
@@ -145,10 +147,40 @@ def _carrier(target: Rig, target_map: RigMap) -> int:
     return bone
 
 
-def _heads(target: Rig, R: np.ndarray, carrier: int, shift: np.ndarray) -> np.ndarray:
-    head = np.empty(R.shape[:3])
+def loose_parts(target: Rig, target_map: RigMap) -> dict[int, int]:
+    """Bones that do not hang on what they belong to in a body (as in control rigs), by index, and what that is: they must be carried."""
+    loose = {}
+    for role, chain in target_map.bones.items():
+        above = parent_role(role)
+        while above and above not in target_map.bones:
+            above = parent_role(above)
+        line = [*(target_map.bones[above][-1:] if above else ()), *chain]
+        for a, b in zip((target.index[name] for name in line), (target.index[name] for name in line[1:])):
+            if a not in target.ancestors(b) and not target.connected[b]:
+                loose[b] = a
+    return loose
+
+
+def _heads(target: Rig, R: np.ndarray, carrier: int, shift: np.ndarray, target_map: RigMap) -> np.ndarray:
+    """Heads (T, B, 3) of all bones, loose parts where the body has them."""
+    head, loose = np.empty(R.shape[:3]), loose_parts(target, target_map)
+    done: set[int] = set()
+
+    def place(b: int) -> None:
+        if b in done:
+            return
+        done.add(b)
+        a = loose.get(b, int(target.parents[b]))
+        if a >= 0:
+            place(a)
+            head[:, b] = head[:, a] + R[:, a] @ (target.R_rest[a].T @ (target.head_m[b] - target.head_m[a]))
+        else:
+            head[:, b] = target.head_m[b]
+        if b == carrier:
+            head[:, b] += shift
+
     for b in range(len(target.names)):
-        head[:, b] = head_of(target, R, head, b) + (shift if b == carrier else 0.0)
+        place(b)
     return head
 
 
@@ -178,18 +210,19 @@ def _grounded(source: Motion, source_map: RigMap, target: Rig, target_map: RigMa
     pinning = contacts is not None and settings.mode != "off" and bool(legs)
     if pinning and contacts is not None:
         R = follow(target, feet.lock_flat(R, legs, contacts, target, settings, source.fps), driven)
-    middle = hip_centre(Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=_heads(target, R, carrier, shift)), target_map)
+    heads = _heads(target, R, carrier, shift, target_map)
+    middle = hip_centre(Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=heads), target_map)
     path = _travel(source, source_map, target, target_map, contacts, scale, legs, floor_m)
     shift = path - middle
     if not pinning or contacts is None:
         return R, shift
-    heads = _heads(target, R, carrier, shift)
+    heads = _heads(target, R, carrier, shift, target_map)
     stands = feet.find_stands(legs, contacts, target, R, floor_m)
     moved, tilt, places = feet.carry_root(
         stands, {side: heads[:, leg.foot[0]] for side, leg in legs.items()}, {s: heads[:, leg.thigh[0]] - path for s, leg in legs.items()},
         {side: feet.stiffness(leg, target, R) for side, leg in legs.items()}, source.fps, _leg_m(target, target_map))
     R, shift = _tilted(target, target_map, R, driven, carrier, shift, tilt, path + moved)
-    return _pinned(target, target_map, R, driven, _heads(target, R, carrier, shift), legs, stands, places, floor_m,
+    return _pinned(target, target_map, R, driven, _heads(target, R, carrier, shift, target_map), legs, stands, places, floor_m,
                    settings.blend_s * source.fps), shift
 
 
@@ -200,7 +233,7 @@ def _tilted(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, 
     for name in target_map.bones["hips"]:
         R[:, target.index[name]] = matrix_from_vector(tilt) @ R[:, target.index[name]]
     R = follow(target, R, driven)
-    now = Motion(rig=target, fps=1.0, frames=np.arange(len(R)), R=R, head_m=_heads(target, R, carrier, shift))
+    now = Motion(rig=target, fps=1.0, frames=np.arange(len(R)), R=R, head_m=_heads(target, R, carrier, shift, target_map))
     return R, shift + middle - hip_centre(now, target_map)
 
 

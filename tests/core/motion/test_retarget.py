@@ -105,6 +105,19 @@ def test_a_measured_arm_alone_moves_an_arm_alone() -> None:
     assert result.carrier == -1 and any("travel" in note for note in result.notes)
 
 
+def test_parts_that_hang_elsewhere_are_carried() -> None:
+    """A rig whose arms and legs are not children of the trunk, as in control rigs."""
+    source, whole = flail(person()), person(arms_down_deg=30.0)
+    cut = np.array([-1 if name.startswith(("clavicle", "thigh", "shin")) else p for name, p in zip(whole.names, whole.parents)])
+    target = Rig(**{f: getattr(whole, f) for f in whole.__dataclass_fields__ if f != "parents"}, parents=cut)
+    names = find_map(whole)
+    one, other = (retarget(source, find_map(source.rig), rig, names, feet_settings=OFF) for rig in (whole, target))
+    np.testing.assert_allclose(other.motion.head_m, one.motion.head_m, atol=1e-9)
+    shifts = dict(other.loose_m) | {other.carrier: other.shift_m}
+    assert {target.names[b][:-2] for b in other.loose_m} == {"clavicle", "thigh", "shin"}
+    np.testing.assert_allclose(posed(target, other.basis, shifts)[1], one.motion.head_m, atol=1e-9)
+
+
 def test_zero_pose_that_is_no_pose() -> None:
     """A source whose bones all lie along X in the rest pose, as some files have it."""
     true = flail(person(), reach=0.5)
