@@ -7,6 +7,8 @@ import numpy as np
 from ..settings import knob
 from ..values import frozen
 
+INTERPOLATING, APPROXIMATING = "interpolating", "approximating"
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SkinSettings:
@@ -15,6 +17,9 @@ class SkinSettings:
     contours: int = knob(14, "Contours along each bone.", low=4, high=200)
     rays: int = knob(32, "Points on each contour (an even number).", low=8, high=400)
     cap_contours: int = knob(5, "Contours that close each end of the limb.", low=2, high=100)
+    detail: int = knob(1, "Pieces of each mesh between contours and points, by B-spline patches; 1: the points alone.", low=1, high=16)
+    patches: str = knob(INTERPOLATING, "B-spline patches go through the points, or approximate them and shrink a little.",
+                        choices=(INTERPOLATING, APPROXIMATING))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -25,12 +30,15 @@ class Skin:
     faces: np.ndarray  # (F, 4)
     weights: np.ndarray  # (V, B) share of each bone of the skeleton in a vertex; rows sum to 1
     bone_names: tuple[str, ...]
-    part_sizes: tuple[int, ...] = ()  # vertices of each part, in order; every part is closed by itself; empty: one part
+    normals: np.ndarray  # (V, 3) outward, of the implicit surface
+    part_sizes: tuple[int, ...]  # vertices of each part, in order; every part is closed by itself
+    rays: int  # points on each contour
 
     def __post_init__(self) -> None:
         v = len(self.vertices_m)
         object.__setattr__(self, "vertices_m", frozen(self.vertices_m, (v, 3), name="vertices_m"))
         object.__setattr__(self, "faces", frozen(self.faces, (None, 4), np.int64, "faces"))
+        object.__setattr__(self, "normals", frozen(self.normals, (v, 3), name="normals"))
         object.__setattr__(self, "weights", frozen(self.weights, (v, len(self.bone_names)), name="weights"))
 
     @property

@@ -121,16 +121,20 @@ def cast(segments: list[Segment], settings: SkinSettings, n_bones: int) -> Rays:
         fraction = np.linspace(start, stop, settings.contours + 1)[0 if segment.first else 1:]
         around = (before.bone if before else None, after.bone if after else None)
         if segment.first:
-            parts.append(_contours(segment, np.full(settings.cap_contours, start), -_cap_angles(settings)[::-1], around, settings, n_bones))
+            rise = _cap_angles(segment, settings)
+            parts.append(_contours(segment, np.full(len(rise), start), -rise[::-1], around, settings, n_bones))
         parts.append(_contours(segment, fraction, np.zeros(len(fraction)), around, settings, n_bones))
         if segment.last:
-            parts.append(_contours(segment, np.full(settings.cap_contours, stop), _cap_angles(settings), around, settings, n_bones))
+            rise = _cap_angles(segment, settings)
+            parts.append(_contours(segment, np.full(len(rise), stop), rise, around, settings, n_bones))
     parts = [_pole(segments[0], parts[0], 0), *parts, _pole(segments[-1], parts[-1], -1)]
     return Rays(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in Rays.__slots__})
 
 
-def _cap_angles(settings: SkinSettings) -> np.ndarray:
-    return np.arange(1, settings.cap_contours + 1) * (np.pi / 2 / (settings.cap_contours + 1))
+def _cap_angles(segment: Segment, settings: SkinSettings) -> np.ndarray:
+    """How far the rays of a cap's contours rise from the contour's plane; a stout bone's cap is wide and gets more of them."""
+    count = settings.cap_contours * max(1, round(2 * segment.radius / segment.length))
+    return np.arange(1, count + 1) * (np.pi / 2 / (count + 1))
 
 
 def _contours(segment: Segment, fraction: np.ndarray, rise: np.ndarray, around: tuple[int | None, int | None], settings: SkinSettings,

@@ -4,10 +4,10 @@ A limb of one chain has the field of its bones, F_b = own + parent's + children'
 of a body meet, the sum would bulge and the larger of the two would leave a crease; their fields are joined by the blend of
 constructive solid geometry (Ricci 1973, Comput. J. 16),
 
-    G = (Σ_p F_p^n)^(1/n) ,   n = 8                                                                        (1)
+    G = (Σ_p F_p^n)^(1/n) ,   n = 4                                                                        (1)
 
-which differs from the larger field by ln 2 / n where both are equal and by nothing elsewhere: a fillet of less than 4 mm on a radius of
-60 mm. Both parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A part ends inside its neighbour:
+which is 2^(1/n) of the larger field where both are equal, and the larger field elsewhere: a fillet of 4 mm on a radius of 60 mm. Both
+parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A part ends inside its neighbour:
 
     outermost root of  min( G/T , F_own/(τ T) ) = 1 ,   τ = 0.7                                            (2)
 
@@ -19,12 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .metaballs import THRESHOLD, Metaballs, active_balls, field
+from .metaballs import THRESHOLD, active_balls, field, field_and_derivatives
 from .shape import BodyShape
 from .skin_parts import Part
 from .skin_rays import Rays, smooth
 
-BLEND_POWER = 8.0  # n of (1)
+BLEND_POWER = 4.0  # n of (1)
 OWN_SHARE = 0.7  # τ of (2)
 STEP = 0.05  # march, in units of the reach
 SECANT_STEPS = 7
@@ -45,14 +45,23 @@ def limb_root(shape: BodyShape, R: np.ndarray, head: np.ndarray, rays: Rays) -> 
     return outermost_root(log_ratio, rays.reach)
 
 
-def part_root(shape: BodyShape, parts: tuple[Part, ...], index: int, R: np.ndarray, head: np.ndarray, rays: Rays) -> np.ndarray:
-    """ρ (V,) of (2) on the rays of part `index`, bone after bone."""
-    rho = np.empty(len(rays.bone))
+def limb_normals(shape: BodyShape, R: np.ndarray, head: np.ndarray, rays: Rays, vertices_m: np.ndarray) -> np.ndarray:
+    """Outward unit normals (V, 3) of the field that `limb_root` looked at, −∇F/|∇F|."""
+    active = np.stack([active_balls(shape.metaballs, shape.skeleton.neighbours, b) for b in range(len(shape.skeleton.bones))])[rays.bone]
+    return _unit(-field_and_derivatives(shape.metaballs, shape.lengths_m, R, head, vertices_m, active)[1])
+
+
+def part_root(shape: BodyShape, parts: tuple[Part, ...], index: int, R: np.ndarray, head: np.ndarray,
+              rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+    """ρ (V,) of (2) on the rays of part `index`, and the outward normals of (1) there (V, 3); bone after bone."""
+    rho, normals = np.empty(len(rays.bone)), np.empty((len(rays.bone), 3))
     for bone in parts[index].bones:
         own = np.flatnonzero(rays.bone == bone)
         if len(own):
-            rho[own] = outermost_root(_bone_field(shape, parts, index, bone, R, head, rays, own), rays.reach[own])
-    return rho
+            near = _joined_field(shape, parts, index, bone, R, head, rays, own)
+            rho[own] = outermost_root(near.log_ratio, rays.reach[own])
+            normals[own] = near.normals(rays.origin[own] + rho[own, None] * rays.direction[own])
+    return rho, normals
 
 
 def outermost_root(log_ratio: LogField, reach: np.ndarray) -> np.ndarray:
@@ -82,44 +91,55 @@ def _secant(f: LogField, a: np.ndarray, b: np.ndarray, fa: np.ndarray, fb: np.nd
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Sums:
-    """Which balls make which field near one bone: rows of `chosen` (K, m) over the m balls in use."""
+class _JoinedField:
+    """The fields near one bone, on the rays of N of its vertices."""
 
-    balls: Metaballs  # the m balls in use, numbered by the bones in use
-    bones: np.ndarray  # bones in use
+    origin: np.ndarray  # (N, 3)
+    direction: np.ndarray  # (N, 3)
+    fade: np.ndarray  # (N,) how much other parts count
+    weight: np.ndarray  # (m,) of the balls in use
+    frame: np.ndarray  # (m, 3, 3) columns: a ball's axes in the world over its l
+    shift: np.ndarray  # (m, 3) its centre in them
     chosen: np.ndarray  # (K, m) 0 or 1: row 0 the field of the bone, row 1 of its own part alone, then those of other parts
     part: np.ndarray  # (K − 2,) which other part a row belongs to
 
+    def log_ratio(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """ln of (2) at ρ (N',) on the rays `which` (N',)."""
+        ln = self._logs(self._terms(self.origin[which] + rho[:, None] * self.direction[which])[1])
+        joined = self._joined(ln, self.fade[which])
+        return np.minimum(joined, ln[:, 1] - np.log(OWN_SHARE)) if len(self.part) else joined  # (2)
 
-def _bone_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays,
-                own: np.ndarray) -> LogField:
-    sums = _sums(shape, parts, index, bone)
-    lengths, frames, heads = shape.lengths_m[sums.bones], R[sums.bones], head[sums.bones]
-    fade = np.maximum(_fade(parts[index], bone, rays, own, shape.lengths_m, head), NOTHING)
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """−∇G/|∇G| (N, 3) at a point of each ray."""
+        q, terms = self._terms(points)
+        ln = self._logs(terms)
+        share = np.exp(BLEND_POWER * (ln + np.log(np.column_stack([np.ones((len(ln), 2)), *[self.fade] * len(self.part)]))))
+        share[:, 1] = 0.0
+        for part in np.unique(self.part):
+            rows = 2 + np.flatnonzero(self.part == part)
+            share[:, rows] *= share[:, rows] == share[:, rows].max(axis=1, keepdims=True)
+        of_ball = terms * ((share / np.exp(ln)) @ self.chosen)
+        return _unit(np.einsum("nm,mij,nmj->ni", of_ball, self.frame, q, optimize=True))
 
-    def log_ratio(rho: np.ndarray, which: np.ndarray) -> np.ndarray:
-        points = rays.origin[own[which]] + rho[:, None] * rays.direction[own[which]]
-        ln = np.log(np.maximum(_terms(sums.balls, lengths, frames, heads, points) @ sums.chosen.T, NOTHING) / THRESHOLD)
-        if not len(sums.part):
-            return np.asarray(ln[:, 0])
+    def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        flat = points @ self.frame.transpose(1, 0, 2).reshape(3, -1) - self.shift.ravel()
+        q = flat.reshape(len(points), len(self.weight), 3)
+        return q, self.weight * np.exp(-2 * np.einsum("nmi,nmi->nm", q, q))
+
+    def _logs(self, terms: np.ndarray) -> np.ndarray:
+        return np.asarray(np.log(np.maximum(terms @ self.chosen.T, NOTHING) / THRESHOLD))
+
+    def _joined(self, ln: np.ndarray, fade: np.ndarray) -> np.ndarray:
+        """ln of (1) over T."""
         joined = BLEND_POWER * ln[:, 0]
-        for part in np.unique(sums.part):
-            other = ln[:, 2:][:, sums.part == part].max(axis=1) + np.log(fade[which])
-            joined = np.logaddexp(joined, BLEND_POWER * other)  # (1)
-        return np.minimum(joined / BLEND_POWER, ln[:, 1] - np.log(OWN_SHARE))  # (2)
-
-    return log_ratio
+        for part in np.unique(self.part):
+            other = ln[:, 2:][:, self.part == part].max(axis=1) + np.log(fade)
+            joined = np.logaddexp(joined, BLEND_POWER * other)
+        return joined / BLEND_POWER
 
 
-def _terms(balls: Metaballs, lengths_m: np.ndarray, R: np.ndarray, head: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """w exp(−2 d) (N, m); each ball's frame as one affine map."""
-    frame = R[balls.bone_index] / balls.radii_m[:, None, :]  # columns: axes over l
-    shift = np.einsum("mi,mij->mj", head[balls.bone_index], frame) + balls.centres_m(lengths_m) / balls.radii_m
-    q = points @ frame.transpose(1, 0, 2).reshape(3, -1) - shift.ravel()
-    return np.asarray(balls.weight * np.exp(-2 * np.einsum("nmi,nmi->nm", *[q.reshape(len(points), len(balls.weight), 3)] * 2)))
-
-
-def _sums(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int) -> _Sums:
+def _joined_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays,
+                  own: np.ndarray) -> _JoinedField:
     neighbours, balls, part = shape.skeleton.neighbours, shape.metaballs, parts[index]
     active = active_balls(balls, neighbours, bone)
     masks, owners = [active, active & np.isin(balls.bone_index, part.bones)], []
@@ -127,9 +147,17 @@ def _sums(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int) -> _
         masks += [active_balls(balls, neighbours, b) for b in bones]
         owners += [other] * len(bones)
     used = np.flatnonzero(np.any(masks, axis=0))
-    bones_used, number = np.unique(balls.bone_index[used], return_inverse=True)
-    kept = Metaballs(bone_index=number, centre=balls.centre[used], radii_m=balls.radii_m[used], weight=balls.weight[used])
-    return _Sums(balls=kept, bones=bones_used, chosen=np.stack(masks)[:, used].astype(np.float64), part=np.array(owners, dtype=np.int64))
+    of, radii = balls.bone_index[used], balls.radii_m[used]
+    frame = R[of] / radii[:, None, :]
+    fade = np.maximum(_fade(part, bone, rays, own, shape.lengths_m, head), NOTHING)
+    return _JoinedField(
+        origin=rays.origin[own], direction=rays.direction[own], fade=fade,
+        weight=balls.weight[used], frame=frame, chosen=np.stack(masks)[:, used].astype(np.float64), part=np.array(owners, dtype=np.int64),
+        shift=np.einsum("mi,mij->mj", head[of], frame) + balls.centres_m(shape.lengths_m)[used] / radii)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), NOTHING))
 
 
 def _adjacent(parts: tuple[Part, ...], index: int, bone: int) -> list[tuple[int, tuple[int, ...]]]:

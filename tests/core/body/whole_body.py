@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tricap.core.body.metaballs import three_balls
+from tricap.core.body.metaballs import Metaballs, three_balls
 from tricap.core.body.model_file import rest_frame
 from tricap.core.body.shape import BodyShape
 from tricap.core.body.skeleton import Bone, Dof, Skeleton
@@ -39,9 +39,20 @@ def whole_body() -> BodyShape:
     lengths = np.array([row[4] for row in table])
     fleshy = [i for i, row in enumerate(table) if row[8] is not None]
     seen = [[np.broadcast_to(r, 2) for r in table[i][8]] for i in fleshy]
-    balls = three_balls(np.array(fleshy), lengths, np.array(seen, dtype=float))
+    balls = _trunk_of_round_balls(three_balls(np.array(fleshy), lengths, np.array(seen, dtype=float)))
     return BodyShape(model="whole", skeleton=skeleton, lengths_m=lengths, metaballs=balls, length_sigma_m=np.full(len(lengths), np.nan),
                      radius_sigma_m=np.full((len(balls.weight), 3), np.nan))
+
+
+def _trunk_of_round_balls(balls: Metaballs) -> Metaballs:
+    """The trunk's bones are shorter than it is wide: balls longer and weaker along it, the pelvis' lower ball below its bone."""
+    trunk = balls.bone_index < 3
+    radii, centre, weight = balls.radii_m.copy(), balls.centre.copy(), balls.weight.copy()
+    radii[trunk, 1] *= 2.0
+    weight[trunk] *= 0.55
+    pelvis = balls.bone_index == 0
+    weight[pelvis], centre[pelvis, 1] = 0.9, (-0.25, 0.3, 0.8)
+    return Metaballs(bone_index=balls.bone_index, centre=centre, radii_m=radii, weight=weight)
 
 
 def posture(shape: BodyShape, **angles_deg: float) -> np.ndarray:
