@@ -5,9 +5,10 @@ from types import ModuleType
 
 def _modules() -> tuple[ModuleType, ...]:
     from . import command, jobs, operators, panels, properties
+    from .calibrate import registration as calibrate
     from .retarget import registration
 
-    return jobs, properties, operators, panels, registration, command
+    return jobs, properties, operators, panels, calibrate, registration, command
 
 
 def register() -> None:

@@ -4,6 +4,7 @@ BARDIR holds a folder of images or a movie per camera; their names are the camer
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from .calibration.pictures import pictures
 from .calibration.quality import Quality, assess
 from .calibration.self_calibration import Calibration, calibrate
 from .calibration.target_tracks import BarTrack, track_bar
-from .calibration.targets import Targets, find_targets
+from .calibration.targets import Targets, TargetStatus, find_targets
 from .calibration.world_frame import WorldFrame, frame_of_cameras, frame_on_floor
 from .errors import InputError
 from .geometry.rig import Rig
@@ -26,6 +27,7 @@ from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence, read_image
 from .progress import Monitor
 
 MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
+Note = Callable[[str, int, int], None]  # view, images looked at, images with both targets
 MIN_POSITIONS = 12
 MIN_WAY = 0.02  # of the image width: a bar that moves less stands still
 LONGEST_BAR_M = 20.0
@@ -90,8 +92,8 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None) -
     return BarFootage(folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, mask=shown)
 
 
-def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor) -> MeasuredBar:
-    """Find, measure and follow the bar's targets in all images.
+def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor, note: Note | None = None) -> MeasuredBar:
+    """Find, measure and follow the bar's targets in all images; `note` hears how many images of a view showed two targets so far.
 
     Raises:
         InputError: the length cannot be, images cannot be read, or the bar is not seen well enough to calibrate with.
@@ -104,7 +106,7 @@ def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor) -> Measu
     tracks, sizes = [], []
     for view, (name, sequence) in enumerate(zip(footage.names, footage.sequences)):
         found: list[Targets] = []
-        size = (0, 0)
+        size, whole = (0, 0), 0
         for n in range(footage.count):
             monitor.step(f"targets {name}", n, footage.count)
             image = sequence.read(n)
@@ -115,6 +117,9 @@ def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor) -> Measu
                 raise InputError(f"The mask has {footage.mask.shape[1]}×{footage.mask.shape[0]} pixels, view {name} {size[0]}×{size[1]}.")
             targets = find_targets(rows.rows(image), None if footage.mask is None else rows.rows(footage.mask))
             found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
+            whole += int((targets.status == TargetStatus.OK).sum() >= 2)
+            if note is not None:
+                note(name, len(found), whole)
         monitor.step(f"targets {name}", footage.count, footage.count)
         tracks.append(track_bar(found, float(size[0])))
         sizes.append(size)

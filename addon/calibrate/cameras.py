@@ -1,0 +1,136 @@
+"""Calibrated cameras in the open scene, and the scene's cameras as a calibrated rig.
+
+Blender keeps lens, shift and pose in single precision. What was calibrated is therefore kept beside it in double precision and counts as long
+as nobody has changed the camera; a camera that was made or changed in Blender is read from Blender's own values.
+"""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...core.calibration.target_tracks import BarTrack
+from ...core.errors import InputError
+from ...core.geometry.camera import Camera
+from ...core.geometry.rig import Rig
+from ..scene import axes, clips
+from ..scene.cameras import add_camera, frame_render
+
+COLLECTION = "Tricap Rig"
+EXACT = "tricap_exact"
+SAME = 2e-6  # relative: what single precision leaves of a number
+
+
+def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]], tracks: dict[str, BarTrack]) -> list[bpy.types.Object]:
+    """Cameras in a collection of their own, with their footage behind them and the measured targets as tracks over it.
+
+    A rig that was built before is replaced.
+    """
+    old = bpy.data.collections.get(COLLECTION)
+    if old is not None:
+        for camera_object in list(old.objects):
+            bpy.data.objects.remove(camera_object)
+        bpy.data.collections.remove(old)
+    collection = bpy.data.collections.new(COLLECTION)
+    scene.collection.children.link(collection)
+    made = []
+    for camera in rig.cameras:
+        camera_object = add_camera(collection, camera)
+        camera_object[EXACT] = _exact_values(camera)
+        if files.get(camera.name):
+            clip = clips.load_clip(f"Bar {camera.name}", files[camera.name][0], camera)
+            clips.show_behind(camera_object.data, clip)
+            if camera.name in tracks:
+                add_tracks(clip, tracks[camera.name], camera.size_px)
+        made.append(camera_object)
+    middle = made[len(made) // 2]
+    scene.camera = middle
+    frame_render(scene, rig[middle["tricap_view"]])
+    return made
+
+
+def add_tracks(clip: bpy.types.MovieClip, track: BarTrack, size_px: tuple[int, int]) -> None:
+    """The measured targets as two tracks of the clip; the clip's own frames count from 1."""
+    uv = axes.uv_from_pixel(track.xy_px, size_px)
+    for end in range(2):
+        seen = np.flatnonzero(np.isfinite(uv[:, end]).all(axis=1))
+        made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(seen[0]) + 1 if len(seen) else 1)
+        for n in seen:
+            made.markers.insert_frame(int(n) + 1, co=tuple(uv[n, end]))
+
+
+def rig_of_scene(scene: bpy.types.Scene) -> Rig:
+    """The scene's cameras as a rig, with the distortion of the movie clip behind each.
+
+    Raises:
+        InputError: there is no camera, or one cannot be said as a central projection.
+    """
+    found = [o for o in scene.objects if o.type == "CAMERA"]
+    if not found:
+        raise InputError("The scene has no camera; add cameras, or calibrate first.")
+    return Rig(cameras=tuple(camera_of(scene, camera_object) for camera_object in found))
+
+
+def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera:
+    """One camera of the scene.
+
+    Raises:
+        InputError: it is no perspective camera, or its sensor is fitted to the height.
+    """
+    data = camera_object.data
+    if data.type != "PERSP" or data.sensor_fit == "VERTICAL":
+        raise InputError(f"{camera_object.name} is no perspective camera with the sensor fitted to its width; set both in its properties.")
+    clip = next((b.clip for b in data.background_images if b.source == "MOVIE_CLIP" and b.clip), None)
+    own = camera_object.get("tricap_size_px")
+    size = tuple(int(v) for v in (own or (clip.size if clip else (scene.render.resolution_x, scene.render.resolution_y))))
+    aspect = clip.tracking.camera.pixel_aspect if clip else scene.render.pixel_aspect_y / scene.render.pixel_aspect_x
+    w, h = size
+    fx = data.lens * w / data.sensor_width
+    cx, cy = axes.pixel_from_uv(np.array([0.5 - data.shift_x, 0.5 - data.shift_y * w / h / aspect]), (w, h))
+    R, t = axes.camera_from_world(np.array(camera_object.matrix_world))
+    name = str(camera_object.get("tricap_view", camera_object.name))
+    matrix = np.array([[fx, 0, cx], [0, fx / aspect, cy], [0, 0, 1]])
+    read = Camera(name=name, size_px=(w, h), matrix=matrix, distortions=_distortions(clip), R_cam_world=R, t_cam_world_m=t)
+    exact = camera_object.get(EXACT)
+    return _exact_camera(read, np.array(exact)) if exact is not None and _unchanged(read, np.array(exact)) else read
+
+
+def _distortions(clip: bpy.types.MovieClip | None) -> np.ndarray:
+    """k1 k2 p1 p2 k3 of the clip's tracking camera."""
+    if clip is None:
+        return np.zeros(5)
+    lens = clip.tracking.camera
+    if lens.distortion_model == "BROWN":
+        return np.array([lens.brown_k1, lens.brown_k2, -lens.brown_p2, lens.brown_p1, lens.brown_k3])
+    if lens.distortion_model == "POLYNOMIAL":
+        return np.array([lens.k1, lens.k2, 0.0, 0.0, lens.k3])
+    raise InputError(f"The lens model “{lens.distortion_model}” of the clip {clip.name} cannot be read; choose Brown or Polynomial.")
+
+
+def _exact_values(camera: Camera) -> list[float]:
+    parts = (camera.matrix, camera.distortions, camera.affinity, camera.R_cam_world, camera.t_cam_world_m)
+    return [float(v) for part in parts for v in part.ravel()]
+
+
+def _exact_camera(read: Camera, values: np.ndarray) -> Camera:
+    return Camera(
+        name=read.name,
+        size_px=read.size_px,
+        matrix=values[:9].reshape(3, 3),
+        distortions=values[9:14],
+        affinity=values[14:16],
+        R_cam_world=values[16:25].reshape(3, 3),
+        t_cam_world_m=values[25:28],
+    )
+
+
+def _unchanged(read: Camera, values: np.ndarray) -> bool:
+    """Whether Blender's values are still those of the calibrated camera, as far as single precision can say."""
+    exact = _exact_camera(read, values)
+    fx = exact.matrix[0, 0] * (1 + exact.affinity[0])
+    expected = np.array([fx, exact.matrix[1, 1], *exact.matrix[:2, 2], *exact.R_cam_world.ravel(), *exact.t_cam_world_m])
+    got = np.array([read.matrix[0, 0], read.matrix[1, 1], *read.matrix[:2, 2], *read.R_cam_world.ravel(), *read.t_cam_world_m])
+    pixels = SAME * max(read.size_px) * 4
+    scale = np.array([fx * SAME * 4, fx * SAME * 4, pixels, pixels, *[SAME] * 9, *[SAME * (1 + np.abs(exact.t_cam_world_m).max()) * 4] * 3])
+    distorted = np.any(read.distortions) and np.abs(read.distortions - exact.distortions).max() > 1e-6
+    return bool((np.abs(expected - got) <= scale).all() and not distorted)

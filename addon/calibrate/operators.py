@@ -1,0 +1,128 @@
+"""bpy.ops.tricap.calibrate(bar="…", length_m=0.6), bpy.ops.tricap.import_rig(…), bpy.ops.tricap.export_rig(…)"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+from bpy_extras.io_utils import ExportHelper, ImportHelper
+
+from ...core.calibrating import BarFootage, CalibratedRig, MeasuredBar, calibrate_rig, measure_bar, open_bar, write_report
+from ...core.calibration.rig_files import FORMATS, read_any, write_as
+from ...core.errors import InputError
+from ...core.geometry.rig import write_rig
+from ...core.progress import Monitor
+from .. import folders
+from ..jobs import JobOperator
+from . import live
+from .cameras import build_cameras, rig_of_scene
+
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Done:
+    """What the computation made."""
+
+    footage: BarFootage
+    measured: MeasuredBar
+    result: CalibratedRig
+    written: Path
+
+
+class Calibrate(JobOperator, bpy.types.Operator):
+    """Find the bar's targets in the footage, calibrate the cameras and put them into the scene"""
+
+    bl_idname = "tricap.calibrate"
+    bl_label = "Calibrate"
+    bl_options = {"UNDO"}
+    last_words = "No camera was changed."
+
+    bar: bpy.props.StringProperty(name="Bar Footage", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="Folder with a folder of images, or a movie, per camera; empty: the panel's")
+    length_m: bpy.props.FloatProperty(name="Bar Length", min=0.0, unit="LENGTH", precision=4,  # type: ignore[valid-type]
+                                      description="Distance between the middles of the bar's targets; 0: the panel's")
+    out: bpy.props.StringProperty(name="Rig", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="File for the rig; empty: rig.toml beside the bar's footage")
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Done]:
+        """Folder, length and switches as they are now."""
+        props = context.scene.tricap_calibrate
+        if not (self.bar or props.bar):
+            raise InputError("Choose the bar's footage first: the folder with a folder of images, or a movie, per camera.")
+        folder = folders._absolute(self.bar or props.bar)
+        out = folders._absolute(self.out) if self.out else folder.parent / "rig.toml"
+        folders.check_writable(out.parent)
+        # Blender keeps single precision; what was typed is the shortest decimal that is stored alike.
+        length, interlaced = float(f"{self.length_m or props.length_m:.7g}"), props.interlaced
+        focal = props.focal_px if props.focal_px > 0 else None
+        live.begin()
+        return lambda monitor: compute(folder, length, interlaced, focal, out, monitor)
+
+    def finish(self, context: bpy.types.Context, result: Done) -> set[str]:
+        """Build the cameras and tell the verdict."""
+        files = {name: list(s.files()) for name, s in zip(result.footage.names, result.footage.sequences)}
+        tracks = dict(zip(result.footage.names, result.measured.tracks))
+        build_cameras(context.scene, result.result.rig, files, tracks)
+        verdict, props = result.result.verdict, context.scene.tricap_calibrate
+        props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
+        self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)
+        return {"FINISHED"}
+
+
+def compute(folder: Path, length_m: float, interlaced: str, focal_px: float | None, out: Path, monitor: Monitor) -> Done:
+    """The computation, free of bpy: from footage to rig.toml and its report beside it."""
+    footage = open_bar(folder, interlaced)
+    measured = measure_bar(footage, length_m, monitor, live.note)
+    result = calibrate_rig(measured.observations, monitor, focal_px=focal_px)
+    write_report(out.parent / f"{out.stem}_report", result)
+    write_rig(out, result.rig)
+    return Done(footage=footage, measured=measured, result=result, written=out)
+
+
+class ImportRig(ImportHelper, bpy.types.Operator):
+    """Put the cameras of a calibration into the scene: ours, Anipose, Pose2Sim, caliscope, OpenCV, EasyMocap, COLMAP, OpenPTV or Agisoft"""
+
+    bl_idname = "tricap.import_rig"
+    bl_label = "Import Cameras"
+    bl_options = {"UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Read the file and build its cameras."""
+        try:
+            rig = read_any(folders._absolute(self.filepath))
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        build_cameras(context.scene, rig, {}, {})
+        self.report({"INFO"}, f"{len(rig.cameras)} cameras from {self.filepath}.")
+        return {"FINISHED"}
+
+
+class ExportRig(ExportHelper, bpy.types.Operator):
+    """Write the scene's cameras, with the lens distortion of the movie clips behind them, as a calibration"""
+
+    bl_idname = "tricap.export_rig"
+    bl_label = "Export Cameras"
+
+    filename_ext = ".toml"
+    check_extension = None
+    layout_name: bpy.props.EnumProperty(name="Format", default="tricap",  # type: ignore[valid-type]
+                                        items=[(name, name, "") for name in ("tricap", *sorted(FORMATS))])
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Read the scene and write the file."""
+        try:
+            rig, path = rig_of_scene(context.scene), folders._absolute(self.filepath)
+            if self.layout_name == "tricap":
+                write_rig(path, rig)
+            else:
+                write_as(path, rig, self.layout_name)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(rig.cameras)} cameras in {path}.")
+        return {"FINISHED"}
+
+
+CLASSES = (Calibrate, ImportRig, ExportRig)

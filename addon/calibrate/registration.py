@@ -1,0 +1,45 @@
+"""What Blender is told of calibration: properties, operators, and a section of the panel."""
+
+import bpy
+
+from .. import jobs
+from . import operators, panel
+
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+
+class TricapCalibrate(bpy.types.PropertyGroup):
+    """What the panel “Calibrate” holds."""
+
+    bar: bpy.props.StringProperty(name="Bar Footage", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="Folder with a folder of images, or a movie, of the waved bar per camera")
+    length_m: bpy.props.FloatProperty(name="Bar Length", default=0.5, min=0.0, soft_max=5.0, unit="LENGTH",  # type: ignore[valid-type]
+                                      precision=4, description="Distance between the middles of the bar's two targets")
+    interlaced: bpy.props.EnumProperty(name="Interlaced", default="none",  # type: ignore[valid-type]
+                                       items=[("none", "None", "Progressive"), ("odd", "Odd", "Keep the 1st, 3rd, … line"),
+                                              ("even", "Even", "Keep the 2nd, 4th, … line")])
+    focal_px: bpy.props.FloatProperty(name="Rough Focal Length [px]", default=0.0, min=0.0,  # type: ignore[valid-type]
+                                      description="In pixels, if it is known; 0: it is found")
+    light: bpy.props.StringProperty(name="Light")  # type: ignore[valid-type]
+    verdict: bpy.props.StringProperty(name="Verdict")  # type: ignore[valid-type]
+    advice: bpy.props.StringProperty(name="Advice")  # type: ignore[valid-type]
+    rig: bpy.props.StringProperty(name="Rig", subtype="FILE_PATH")  # type: ignore[valid-type]
+
+
+CLASSES = (TricapCalibrate, *operators.CLASSES, *panel.CLASSES)
+
+
+def register() -> None:
+    """Register everything, in order."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Scene.tricap_calibrate = bpy.props.PointerProperty(type=TricapCalibrate)
+
+
+def unregister() -> None:
+    """Stop a running job and take everything away again, in reverse order."""
+    jobs.stop_current()
+    jobs.stop_watching()
+    del bpy.types.Scene.tricap_calibrate
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
