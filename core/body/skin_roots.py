@@ -4,12 +4,12 @@ A limb of one chain has the field of its bones, F_b = own + parent's + children'
 of a body meet, the sum would bulge and the larger of the two would leave a crease; their fields are joined by the blend of
 constructive solid geometry (Ricci 1973, Comput. J. 16),
 
-    G = (Σ_p F_p^n)^(1/n) ,   n = 4                                                                        (1)
+    G = (F_b^n + max_q F_q^n)^(1/n) ,   n = 4 ,   q: the bones of the other part next to b                 (1)
 
 which is 2^(1/n) of the larger field where both are equal, and the larger field elsewhere: a fillet of 4 mm on a radius of 60 mm. Both
 parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A part ends inside its neighbour:
 
-    outermost root of  min( G/T , F_own/(τ T) ) = 1 ,   τ = 0.7                                            (2)
+    outermost root of  min( G/T , F_own/(τ T) ) = 1 ,   τ = 0.4                                            (2)
 
 with F_own the field of its own balls, so its mesh leaves the common surface only where the neighbour's is the body's surface.
 """
@@ -25,7 +25,7 @@ from .skin_parts import Part
 from .skin_rays import Rays, smooth
 
 BLEND_POWER = 4.0  # n of (1)
-OWN_SHARE = 0.7  # τ of (2)
+OWN_SHARE = 0.4  # τ of (2): below ½, or two that reach T together would both stay below it
 STEP = 0.05  # march, in units of the reach
 SECANT_STEPS = 7
 LEAST_RHO_M = 1e-3  # where the field is too weak to surround the axis
@@ -101,23 +101,26 @@ class _JoinedField:
     frame: np.ndarray  # (m, 3, 3) columns: a ball's axes in the world over its l
     shift: np.ndarray  # (m, 3) its centre in them
     chosen: np.ndarray  # (K, m) 0 or 1: row 0 the field of the bone, row 1 of its own part alone, then those of other parts
-    part: np.ndarray  # (K − 2,) which other part a row belongs to
+
+    @property
+    def others(self) -> int:
+        """How many fields of other parts there are."""
+        return len(self.chosen) - 2
 
     def log_ratio(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
         """ln of (2) at ρ (N',) on the rays `which` (N',)."""
         ln = self._logs(self._terms(self.origin[which] + rho[:, None] * self.direction[which])[1])
         joined = self._joined(ln, self.fade[which])
-        return np.minimum(joined, ln[:, 1] - np.log(OWN_SHARE)) if len(self.part) else joined  # (2)
+        return np.minimum(joined, ln[:, 1] - np.log(OWN_SHARE)) if self.others else joined  # (2)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """−∇G/|∇G| (N, 3) at a point of each ray."""
         q, terms = self._terms(points)
         ln = self._logs(terms)
-        share = np.exp(BLEND_POWER * (ln + np.log(np.column_stack([np.ones((len(ln), 2)), *[self.fade] * len(self.part)]))))
+        share = np.exp(BLEND_POWER * (ln + np.log(np.column_stack([np.ones((len(ln), 2)), *[self.fade] * self.others]))))
         share[:, 1] = 0.0
-        for part in np.unique(self.part):
-            rows = 2 + np.flatnonzero(self.part == part)
-            share[:, rows] *= share[:, rows] == share[:, rows].max(axis=1, keepdims=True)
+        if self.others:
+            share[:, 2:] *= share[:, 2:] == share[:, 2:].max(axis=1, keepdims=True)
         of_ball = terms * ((share / np.exp(ln)) @ self.chosen)
         return _unit(np.einsum("nm,mij,nmj->ni", of_ball, self.frame, q, optimize=True))
 
@@ -131,28 +134,24 @@ class _JoinedField:
 
     def _joined(self, ln: np.ndarray, fade: np.ndarray) -> np.ndarray:
         """ln of (1) over T."""
-        joined = BLEND_POWER * ln[:, 0]
-        for part in np.unique(self.part):
-            other = ln[:, 2:][:, self.part == part].max(axis=1) + np.log(fade)
-            joined = np.logaddexp(joined, BLEND_POWER * other)
-        return joined / BLEND_POWER
+        if not self.others:
+            return np.asarray(ln[:, 0])
+        return np.asarray(np.logaddexp(BLEND_POWER * ln[:, 0], BLEND_POWER * (ln[:, 2:].max(axis=1) + np.log(fade))) / BLEND_POWER)
 
 
 def _joined_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays,
                   own: np.ndarray) -> _JoinedField:
     neighbours, balls, part = shape.skeleton.neighbours, shape.metaballs, parts[index]
     active = active_balls(balls, neighbours, bone)
-    masks, owners = [active, active & np.isin(balls.bone_index, part.bones)], []
-    for other, bones in _adjacent(parts, index, bone):
-        masks += [active_balls(balls, neighbours, b) for b in bones]
-        owners += [other] * len(bones)
+    masks = [active, active & np.isin(balls.bone_index, part.bones)]
+    masks += [active_balls(balls, neighbours, b) for b in _adjacent(parts, index, bone)]
     used = np.flatnonzero(np.any(masks, axis=0))
     of, radii = balls.bone_index[used], balls.radii_m[used]
     frame = R[of] / radii[:, None, :]
     fade = np.maximum(_fade(part, bone, rays, own, shape.lengths_m, head), NOTHING)
     return _JoinedField(
         origin=rays.origin[own], direction=rays.direction[own], fade=fade,
-        weight=balls.weight[used], frame=frame, chosen=np.stack(masks)[:, used].astype(np.float64), part=np.array(owners, dtype=np.int64),
+        weight=balls.weight[used], frame=frame, chosen=np.stack(masks)[:, used].astype(np.float64),
         shift=np.einsum("mi,mij->mj", head[of], frame) + balls.centres_m(shape.lengths_m)[used] / radii)
 
 
@@ -160,12 +159,12 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), NOTHING))
 
 
-def _adjacent(parts: tuple[Part, ...], index: int, bone: int) -> list[tuple[int, tuple[int, ...]]]:
-    """Other parts whose surface joins that of `bone`, each with the bones whose field it may have there."""
+def _adjacent(parts: tuple[Part, ...], index: int, bone: int) -> list[int]:
+    """The bones of other parts whose field may join that of `bone`."""
     part = parts[index]
-    found = [(i, other.junction) for i, other in enumerate(parts) if other.parent == index and _near(part, other.attachment, bone)]
+    found = [b for other in parts if other.parent == index and _near(part, other.attachment, bone) for b in other.junction]
     if part.parent is not None and bone in part.junction:
-        found.append((part.parent, tuple(b for b in parts[part.parent].bones if _near(parts[part.parent], part.attachment, b))))
+        found += [b for b in parts[part.parent].bones if _near(parts[part.parent], part.attachment, b)]
     return found
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
-from ..body.skin import SkinSettings, limb_skin
+from ..body.skin import SkinSettings, body_skin
 from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..surface.cloud import PointCloud
@@ -22,7 +22,7 @@ TAIL_FRAMES = 10
 
 def body_over_footage(grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> np.ndarray:
     """The skin of one posture, shaded, with its bones, over one view (h, w, 3) uint8. `values` (D,) are the posture's DOFs."""
-    skin = limb_skin(shape, values, settings)
+    skin = body_skin(shape, values, settings)
     picture = colour(grey).astype(np.float32)
     light, covered = shade(camera, skin.vertices_m, skin.triangles)
     alpha = (OPACITY * covered)[..., None]
