@@ -14,6 +14,7 @@ from .errors import InputError
 from .geometry.intersection import forward_intersection
 from .images.enhance import EnhanceSettings, enhanced
 from .images.sampling import SplineImage
+from .images.sequence import IMAGE_ENDINGS
 from .matching import foreground as fg
 from .matching.constraints import constrain
 from .matching.grid import TemplateGrid, template_grid
@@ -92,7 +93,8 @@ def measure_frames(
         part.step("surface", 0, 1)
         if frame == first - 1:
             before = start
-        key = store.digest(base, before.key if before else "", str(frame), *_image_digests(footage, frame))
+        known = [before.key] if before else _image_digests(footage, _furthest_frame(footage, frame))  # the room is found with that frame
+        key = store.digest(base, *known, str(frame), *_image_digests(footage, frame))
         measured = _from_checkpoint(footage, results, frame, key)
         if measured is None:
             measured = _measure(footage, matching, growing, surface, frame, before, key, part, enhance)
@@ -108,11 +110,7 @@ def _image_digests(footage: Footage, frame: int) -> list[str]:
     for path in footage.files(frame):
         try:
             state = path.stat()
-            parts.append(
-                store.digest(path)
-                if path.suffix.lower() not in (".mp4", ".avi", ".mov", ".mkv", ".mpg", ".webm")
-                else f"{state.st_size} {state.st_mtime_ns}"
-            )
+            parts.append(store.digest(path) if path.suffix.lower() in IMAGE_ENDINGS else f"{state.st_size} {state.st_mtime_ns}")
         except OSError as error:
             raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
     return parts
@@ -242,10 +240,15 @@ def _with_clicked(footage: Footage, seeds: Approximations, depth_m: np.ndarray) 
     return Approximations(**{f.name: np.concatenate([getattr(seeds, f.name), getattr(clicked, f.name)]) for f in fields(Approximations)})
 
 
+def _furthest_frame(footage: Footage, frame: int) -> int:
+    """The frame that differs most in time."""
+    return max(footage.frames, key=lambda f: abs(f - frame))
+
+
 def _room(footage: Footage, images: FrameImages, seeds: Approximations, frame: int) -> np.ndarray:
     """Planes of floor and walls, from the seeds whose patch is the same in the frame furthest in time."""
     ref, camera = footage.take.reference, footage.rig.cameras[footage.take.reference]
-    other = max(footage.frames, key=lambda f: abs(f - frame))
+    other = _furthest_frame(footage, frame)
     if other == frame or not len(seeds.depth_m):
         return np.zeros((0, 4))
     later = load_images(footage, other).grey[ref]

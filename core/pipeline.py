@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from . import store
+from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
 from .errors import InputError
@@ -19,6 +20,7 @@ from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
 from .fitting.settings import FitSettings
 from .following import track_frames
+from .images.enhance import EnhanceSettings
 from .matching.growing import GrowingSettings
 from .matching.least_squares import MatchingSettings
 from .measuring import MeasuredFrame, clicked_depth, measure_frames
@@ -35,6 +37,7 @@ from .tracking.tracked import TrackedFrame
 from .tracking.trajectories import Trajectories, assemble, filter_trajectories
 
 SETTINGS: dict[str, type] = {
+    "enhance": EnhanceSettings,
     "matching": MatchingSettings,
     "growing": GrowingSettings,
     "surface": SurfaceSettings,
@@ -44,6 +47,7 @@ SETTINGS: dict[str, type] = {
 }
 Overrides = Mapping[str, Mapping[str, Any]]
 DOUBTFUL_RESIDUAL_PX = 1.0
+DERIVED = ("trajectories.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend")  # what is made of the clouds
 
 
 @dataclass(kw_only=True)
@@ -101,8 +105,12 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
     return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
 
 
-def open_run(take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None) -> Run:
+def open_run(
+    take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None, *, restart: bool = False
+) -> Run:
     """Open a take and the folder for its results. Everything that can be checked before computing is checked here.
+
+    What an earlier run with other footage, settings or frames left in OUT is removed once it is replaced; `restart` removes it now.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending.
@@ -119,8 +127,12 @@ def open_run(take_folder: Path, out: Path, overrides: Overrides | None = None, f
         footage = Footage(take=take, rig=footage.rig, sequences=footage.sequences, frames=range(*frames))
     for name, at in take.seeds.joints.items():
         clicked_depth(footage, name, at)
+    if take.body_model is not None:
+        read_model(take.body_model)
     results = Results(out)
-    before = results.read_run()
+    if restart:
+        results.remove("cache", *DERIVED)
+    before = {} if restart else results.read_run()
     account = {
         "take": str(take.folder),
         "frames": [footage.frames.start, footage.frames.stop],
@@ -132,9 +144,13 @@ def open_run(take_folder: Path, out: Path, overrides: Overrides | None = None, f
         "settings": {name: to_table(value) for name, value in settings.items()},
         "inputs": {"take.toml": store.digest(take.folder / "take.toml"), take.rig_path.name: store.digest(take.rig_path)},
         "rig": {k: v for k, v in footage.rig.metadata.items() if isinstance(v, (str, int, float))},
-        "stages": before.get("stages", {}),
+        "stages": {},
         "warnings": [],
     }
+    if all(before.get(name) == account[name] for name in ("take", "frames", "settings", "inputs")):
+        account["stages"] = before.get("stages", {})
+    elif before:
+        results.remove(*DERIVED)  # made with other settings or of another take: it must not stand beside the new
     return Run(footage=footage, settings=settings, results=results, account=account)
 
 
@@ -149,7 +165,7 @@ def measure(run: Run, monitor: Monitor) -> None:
     _forget_other_clouds(run)
     done = []
     try:
-        for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor):
+        for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
             run.results.write_cloud(m.cloud)
             done.append(m)
     except Cancelled as stop:
@@ -287,10 +303,7 @@ def run(
         Cancelled: what is done is kept.
     """
     monitor = monitor or Monitor()
-    job = open_run(take_folder, out, overrides, frames)
-    if restart:
-        job.results.remove("cache")
-        job.account["stages"] = {}
+    job = open_run(take_folder, out, overrides, frames, restart=restart)
     for stage in (measure, track, fit, report):
         stage(job, monitor)
     return job
@@ -314,7 +327,7 @@ def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
 
 
 def _forget_other_clouds(run: Run) -> None:
-    """Remove clouds of frames that this run does not have, and what an earlier run made of other clouds."""
+    """Remove clouds of frames that this run does not have."""
     for path in run.results.path("clouds").glob("*.ply"):
         if not path.stem.isdigit() or int(path.stem) not in run.footage.frames:
             path.unlink()

@@ -218,7 +218,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         interlaced=interlaced,
         reference_view=reference,
         frames=_range(table.get("frames"), where),
-        body_model=body.get("model"),
+        body_model=_model(folder, body.get("model"), where),
         seeds=_seeds(_table(table, "seeds", where), names, where),
         settings=_settings(_table(table, "settings", where), where),
     )
@@ -282,9 +282,14 @@ def _range(value: Any, where: str) -> tuple[int, int] | None:
     return value[0], value[1]
 
 
-def _inside(folder: Path, name: Any, where: str) -> Path:
+def _model(folder: Path, name: Any, where: str) -> str | None:
+    """The name of one of our models, or the path of the take's own, a .toml file in its folder."""
+    return str(_inside(folder, name, where, "model")) if isinstance(name, str) and name.endswith(".toml") else name
+
+
+def _inside(folder: Path, name: Any, where: str, key: str = "rig") -> Path:
     if not isinstance(name, str) or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InputError(f"`rig` of {where} is {name!r}; it must be a file inside the take's folder. Copy it there.")
+        raise InputError(f"`{key}` of {where} is {name!r}; it must be a file inside the take's folder. Copy it there.")
     return folder / name
 
 

@@ -70,7 +70,6 @@ def test_restart_measures_anew(plane_take: Path, out: Path, monkeypatch: pytest.
     assert len(computed) == 2
 
 
-@pytest.mark.xfail(strict=True, reason="open_run reads the old run.json before restart is looked at; the message advises --restart in vain")
 def test_restart_helps_over_a_run_of_another_version(plane_take: Path, out: Path) -> None:
     store.write_json(out / "run.json", {"format": "tricap-run", "version": 99})
     with pytest.raises(InputError, match="--restart"):
@@ -78,7 +77,6 @@ def test_restart_helps_over_a_run_of_another_version(plane_take: Path, out: Path
     pipeline.run(plane_take, out, frames=(0, 1), restart=True)
 
 
-@pytest.mark.xfail(strict=True, reason="an unknown [body] model is noticed only in the fit, after everything was measured and tracked")
 def test_an_unknown_body_is_noticed_before_anything_is_computed(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
     take = Path(shutil.copytree(plane_take, tmp_path / "take"))
     c, r = (scenes.three_cameras()[v].project([0.0, 0.0, 2.16]).round(1).tolist() for v in "CR")
@@ -89,7 +87,6 @@ def test_an_unknown_body_is_noticed_before_anything_is_computed(plane_take: Path
     assert not (tmp_path / "out" / "clouds").exists()
 
 
-@pytest.mark.xfail(strict=True, reason="measure() removes other clouds only: old trajectories stay beside new clouds")
 def test_results_of_other_settings_do_not_stay(plane_take: Path, out: Path) -> None:
     """`tricap measure` with another patch into the folder of a finished run: its trajectories belong to clouds that are gone."""
     assert commands.main(["measure", str(plane_take), "--out", str(out), "--set", "matching.patch_px=11", "--quiet"]) == 0
