@@ -27,7 +27,8 @@ from .object_space import Epipolar, SurfacePatch, SurfacePrior, match_surface, n
 from .template_patches import monomials
 
 WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
-SLOPE_SIGMA, CURVATURE_SIGMA, STIFF = 0.1, 0.01, 0.1  # px/px and px/px² in the search view that moves fastest; the second try
+SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SHARE = 0.1, 0.001, 1.0  # px/px and px/px² in the search view that moves fastest; of itself
+STIFF = 0.1  # of these sigmas in the second try
 FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
 SAMPLE = 1000  # points that tell the rig's quality
 NEIGHBOUR_NOISE_PX = 0.05
@@ -129,10 +130,12 @@ def _object_space(
 
 
 def _prior(start: np.ndarray, speed: float) -> SurfacePrior:
-    """What the neighbours say of slopes and curvatures; of planes (N, 3) they say nothing."""
-    said = np.array([SLOPE_SIGMA, SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SIGMA, CURVATURE_SIGMA]) / speed
-    sigma = np.array([np.inf, *said]) if start.shape[1] == 6 else np.full(3, np.inf)
-    return SurfacePrior(value=start, sigma=np.tile(sigma, (len(start), 1)))
+    """What the neighbours say of slopes and curvatures, the less surely the rounder it is there; of planes (N, 3) they say nothing."""
+    sigma = np.full(start.shape, np.inf)
+    if start.shape[1] == 6:
+        sigma[:, 1:3] = SLOPE_SIGMA / speed
+        sigma[:, 3:] = CURVATURE_SIGMA / speed + CURVATURE_SHARE * np.linalg.norm(start[:, 3:], axis=1, keepdims=True)
+    return SurfacePrior(value=start, sigma=sigma)
 
 
 def _window(patch_px: int, row_step: int) -> np.ndarray:

@@ -1,0 +1,203 @@
+"""Matching under constraints: derivatives, exactness of the warp, covariance against scatter, and what the constraints are for."""
+
+from dataclasses import replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.images.fields import RowGrid
+from tricap.core.images.sampling import SplineImage
+from tricap.core.matching.constraints import constrain
+from tricap.core.matching.foreground import Foreground
+from tricap.core.matching.grid import template_grid
+from tricap.core.matching.growing import GrowingSettings, TripletField, grow
+from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
+from tricap.core.matching.multi_image import match_multi_image
+from tricap.core.matching.object_space import Epipolar, SurfacePrior, match_surface
+from tricap.core.matching.seeds import sweep_seeds
+from tricap.core.matching.template_patches import TemplatePatches, monomials
+from tricap.core.progress import Monitor
+
+EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
+SETTINGS = MatchingSettings()
+
+
+class Scene:
+    """A rendered surface, and points on it with their true inverse depth and its derivatives."""
+
+    def __init__(self, surfaces: ModuleType, surface: Any, kind: str, seed: int = 0, noise: float = 2.0, spacing: int = 9) -> None:
+        self.rig, self.grey = surfaces.render(surface, kind, seed=seed, noise=noise)
+        self.images, self.surface = [SplineImage(g) for g in self.grey], surface
+        y, x = np.mgrid[40:200:spacing, 60:260:spacing].astype(float)
+        xy = np.stack([x.ravel(), y.ravel()], axis=1)
+        tips = xy[:, None] + [[0, 0], [9, 0], [-9, 0], [0, 9], [0, -9]]
+        seen = np.isfinite(self.depth(tips)).all(axis=1)
+        self.xy = xy[seen]
+        w = 1 / self.depth(tips[seen])
+        zero = np.zeros(len(w))
+        self.theta = np.stack(
+            [w[:, 0], (w[:, 1] - w[:, 2]) / 18, (w[:, 3] - w[:, 4]) / 18, (w[:, 1] + w[:, 2] - 2 * w[:, 0]) / 81, zero, zero], axis=1
+        )
+
+    def depth(self, xy: np.ndarray) -> np.ndarray:
+        """True depth in the centre camera."""
+        return self.surface.hit(self.rig[1].centre_m, self.rig[1].rays(xy))[0]
+
+    def xyz(self, xy: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Points of the centre view's pixels at inverse depth w."""
+        return self.rig[1].points_at_depth(xy, 1 / w)
+
+    def grown(self) -> TripletField:
+        """The unconstrained field."""
+        grid = template_grid(self.images[1].shape, RowGrid(), 4)
+        seeds = sweep_seeds(self.images, self.rig, 1, grid, SETTINGS, spacing_px=24, depth_range_m=(1.1, 1.8), monitor=Monitor())
+        return grow(self.images, self.rig, 1, grid, seeds, SETTINGS, GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
+
+
+@pytest.fixture(scope="module")
+def plane(surfaces: ModuleType) -> Scene:
+    return Scene(surfaces, surfaces.plane(), "strong")
+
+
+@pytest.mark.parametrize("row_step", [1, 2])
+def test_warp_is_the_projection_of_the_surface(surfaces: ModuleType, row_step: int) -> None:
+    """Every pixel of a patch lands where the camera sees its point of the surface; what is left is distortion's own curvature."""
+    rig, rows = surfaces.cameras(), RowGrid(row_step, row_step - 1)
+    xy = np.array([[100.0, 60.0 / row_step], [200.0, 150.0 / row_step]])
+    theta = np.array([[0.7, 2e-3, -1e-3, 2e-5, -1e-5, 3e-5], [0.72, -1e-3, 2e-3, 1e-5, 2e-5, 1e-5]])
+    v, u = (a.ravel().astype(np.float32) for a in np.mgrid[-6:7, -8:9])
+    m = monomials(u, v, 2)
+    X = rig[1].points_at_depth(rows.to_frame(xy[:, None] + np.stack([u, v], axis=1)), 1 / (theta @ m.T))
+    for k in (0, 2):
+        line = Epipolar(rig[1], rig[k], rows, xy)
+        c, _, _, L = line.centre(theta)
+        x, y = line.warp(theta, m, np.arange(2), c, L)
+        assert np.abs(np.stack([x, y], axis=-1) - rows.from_frame(rig[k].project(X))).max() < 0.006
+
+
+def test_derivatives_of_the_epipolar_geometry(surfaces: ModuleType) -> None:
+    """∂x/∂w and A of the patch's middle against differences."""
+    rig, rows, step = surfaces.cameras(), RowGrid(2, 1), 1e-5
+    xy, theta = np.array([[120.0, 50.0]]), np.array([[0.71, 3e-3, -2e-3]])
+
+    def image(xy: np.ndarray, w: float) -> np.ndarray:
+        return rows.from_frame(rig[2].project(rig[1].points_at_depth(rows.to_frame(xy), 1 / w)))
+
+    _, along, A, _ = Epipolar(rig[1], rig[2], rows, xy).centre(theta)
+    assert along[0] == pytest.approx((image(xy[0], 0.71 + step) - image(xy[0], 0.71 - step)) / (2 * step), rel=1e-6)
+    for i, name in enumerate("uv"):
+        tip = np.eye(2)[i] * 0.01
+        numeric = (image(xy[0] + tip, 0.71 + theta[0, 1 + i] * 0.01) - image(xy[0] - tip, 0.71 - theta[0, 1 + i] * 0.01)) / 0.02
+        assert A[0, :, i] == pytest.approx(numeric, abs=1e-5), f"derivative to {name}"
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_design_matrix_is_the_derivative_of_the_patch(degree: int) -> None:
+    """Products with the design matrix against differences of a smooth template, for every parameter; and N against JᵀMJ."""
+    y, x = np.mgrid[:60, :60].astype(float)
+
+    def look(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 100 + 30 * np.sin(0.35 * x + 0.1 * y) + 20 * np.cos(0.12 * x - 0.3 * y)
+
+    patches = TemplatePatches(SplineImage(look(x, y)), np.array([[30.0, 28.0]]), 13, 1, degree=degree)
+    m, s = patches.monomials.astype(float), np.array([[0.8, -0.3]])
+    J = np.empty((len(m), m.shape[1]))
+    for i in range(m.shape[1]):
+        ahead, behind = (
+            look(30 + patches.u + sign * s[0, 0] * m[:, i], 28 + patches.v + sign * s[0, 1] * m[:, i]) for sign in (1e-4, -1e-4)
+        )
+        J[:, i] = (ahead - behind) / 2e-4
+    test = np.random.default_rng(0).standard_normal((1, len(m))).astype(np.float32)
+    px, py = patches.project(test)
+    assert (s[0, 0] * px + s[0, 1] * py)[0] == pytest.approx(test[0] @ J, rel=2e-3, abs=0.5)
+    f = look(30 + patches.u, 28 + patches.v)
+    f = (f - f.mean()) / np.linalg.norm(f - f.mean())
+    M = np.eye(len(f)) - 1 / len(f) - np.outer(f, f)
+    scale = np.sqrt(np.diag(J.T @ M @ J))
+    assert np.abs((patches.normal(s, s)[0] - J.T @ M @ J) / np.outer(scale, scale)).max() < 2e-3
+    assert patches.normal_to_shift(s, s)[0] == pytest.approx(patches.normal(s, s)[0, :, 0])
+    assert patches.normal_of_shift(s, s)[0] == pytest.approx(patches.normal(s, s)[0, 0, 0])
+
+
+def test_object_space_finds_the_plane_and_knows_its_error(surfaces: ModuleType) -> None:
+    z, bias = [], []
+    for seed in range(3):
+        scene = Scene(surfaces, surfaces.plane(), "strong", seed)
+        start = scene.theta[:, :3] * (1 + 0.002 * np.random.default_rng(seed).standard_normal((len(scene.xy), 1)))  # about 0.3 px
+        found = match_surface(scene.images, scene.rig, 1, RowGrid(), scene.xy, start, SETTINGS, sigma_across_px=0.03)
+        assert found.ok.mean() > 0.98
+        o, ok = found.offset, found.ok
+        m = monomials(o[:, 0], o[:, 1], 1).astype(float)
+        w = np.einsum("ni,ni->n", m, found.theta)
+        error = (w - 1 / scene.depth(scene.xy + o))[ok]
+        z.append(error / np.sqrt(np.einsum("ni,nij,nj->n", m, found.covariance, m))[ok])
+        bias.append(error * 210)  # px in a search view: f · base
+        assert np.median(found.across_px[ok] ** 2) < 0.03**2
+    assert 0.8 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.25
+    assert abs(np.mean(np.concatenate(bias))) < 0.01
+
+
+def test_collinearity_holds_the_rays_together(plane: Scene) -> None:
+    """With σ_c = 10 px the images are free, with 0.001 px their rays meet; well-textured depths agree within their sigma."""
+    scene, rows = plane, RowGrid()
+    lines = [Epipolar(scene.rig[1], scene.rig[k], rows, scene.xy).centre(scene.theta[:, :3]) for k in (0, 2)]
+    middle, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
+    X = scene.xyz(scene.xy, scene.theta[:, 0])
+    free, held = (
+        match_multi_image(scene.images, scene.rig, 1, rows, scene.xy, middle + 0.3, shape, X, SETTINGS, sigma_c_px=s) for s in (10.0, 0.001)
+    )
+    both = free.ok & held.ok
+    assert both.mean() > 0.9
+    assert np.abs(held.residual_px[both]).max() < 1e-3 < 0.02 < np.abs(free.residual_px[both]).mean() * 5
+    sigma = np.sqrt(np.trace(held.covariance_m2, axis1=1, axis2=2))[both]
+    error = scene.surface.distance_m(held.xyz_m[both])
+    assert np.median(np.abs(error)) < 1.2 * np.median(np.abs(scene.surface.distance_m(free.xyz_m[both])))
+    assert 0.3 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.5
+
+
+def test_curvature_removes_the_flattening(surfaces: ModuleType) -> None:
+    """On a cylinder a plane is measured too deep; with curvatures known to be there it is not."""
+    scene = Scene(surfaces, surfaces.cylinder(0.06), "strong")
+    settings, sigma = replace(SETTINGS, patch_px=17), np.array([np.inf, 4e-4, 4e-4, 4e-5, 4e-5, 4e-5])
+    biases = []
+    for columns in (3, 6):
+        start = scene.theta[:, :columns]
+        prior = SurfacePrior(value=start, sigma=np.tile(sigma[:columns], (len(start), 1)))
+        found = match_surface(scene.images, scene.rig, 1, RowGrid(), scene.xy, start, settings, sigma_across_px=0.03, prior=prior)
+        m = monomials(found.offset[:, 0], found.offset[:, 1], 1 if columns == 3 else 2).astype(float)
+        w = np.einsum("ni,ni->n", m, found.theta)
+        biases.append(np.median(scene.surface.distance_m(scene.xyz(scene.xy + found.offset, w)[found.ok])))
+    assert biases[0] < -0.4e-3
+    assert abs(biases[1]) < 0.2e-3
+
+
+@pytest.mark.parametrize("kind", ["strong", "weak"])
+def test_constraints_earn_their_place(surfaces: ModuleType, kind: str) -> None:
+    scene = Scene(surfaces, surfaces.cylinder(0.06), kind)
+    field = scene.grown()
+    rms = {}
+    for constraint in ("none", "epipolar", "object"):
+        found = constrain(
+            field, scene.images, scene.rig, 1, replace(SETTINGS, constraint=constraint), foreground=EVERYWHERE, monitor=Monitor()
+        )
+        error = scene.surface.distance_m(found.xyz_m)
+        rms[constraint] = np.sqrt(np.mean(error[np.abs(error) < 0.005] ** 2))
+        assert len(found.cell) > (0.75 if constraint == "epipolar" else 0.9) * len(field.cell)
+        assert np.isfinite(found.covariance_m2).all()
+    assert rms["object"] < 0.9 * rms["none"]
+    assert rms["epipolar"] < rms["none"]
+
+
+def test_failures_are_statuses(plane: Scene) -> None:
+    xy = np.array([[100.0, 100.0], [3.0, 100.0], [100.0, 100.0], [4.0, 4.0]])
+    theta = np.array([[np.nan] * 3, [0.7, 0, 0], [5.0, 0, 0], [0.7, 0, 0]])
+    found = match_surface(plane.images, plane.rig, 1, RowGrid(), xy, theta, SETTINGS, sigma_across_px=0.03)
+    assert found.status.tolist()[0] == found.status.tolist()[1] == MatchStatus.OUT_OF_IMAGE
+    assert not found.ok.any()
+    flat = [SplineImage(np.full((240, 320), 90.0)) for _ in range(3)]
+    found = match_surface(flat, plane.rig, 1, RowGrid(), plane.xy, plane.theta[:, :3], SETTINGS, sigma_across_px=0.03)
+    assert (found.status == MatchStatus.NO_TEXTURE).all()
+    nothing = match_surface(plane.images, plane.rig, 1, RowGrid(), np.zeros((0, 2)), np.zeros((0, 3)), SETTINGS, sigma_across_px=0.03)
+    assert len(nothing.theta) == 0
