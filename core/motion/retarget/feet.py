@@ -244,21 +244,26 @@ def plant(leg: Leg, rig: Rig, R: np.ndarray, stand: Stand, place: np.ndarray, an
         free = free + fade(np.abs(time - nearest), blend)[:, None] * (pinned - free)[nearest]
     arm = _arm(leg, rig, own)
     ball, length = pinned + arm, float(np.linalg.norm(arm[0]))
+    level = np.where(stand.lifted, (rig.head_m[foot][2] - leg.ball_m[2]) / length, -1.0)
     for _ in range(3):
-        goal = ball + length * _away(ball, free, arm)  # (2)
+        goal = ball + length * _away(ball, free, arm, level)  # (2)
         own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
         ball[stand.lifted, 2] += (floor_m - goal[:, 2] - lowest(leg, rig, own))[stand.lifted]
     if leg.toe:
         ball = _over_the_tip(leg, rig, own, ball, free, length)
-    goal = ball + length * _away(ball, free, arm)
+    goal = ball + length * _away(ball, free, arm, level)
     own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
     return goal, own
 
 
-def _away(ball: np.ndarray, free: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """From the ball towards the ankle (n, 3), unit vectors; if that is too near the ball to tell, as the foot was."""
+def _away(ball: np.ndarray, free: np.ndarray, arm: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """From the ball towards the ankle (n, 3), unit vectors; if that is too near the ball to tell, as the foot was. Their height is at
+    least `level`, that of a foot that stands flat: a lifted heel is not pressed into the floor."""
     lack = np.maximum(NEAR * np.linalg.norm(arm, axis=1) - np.linalg.norm(free - ball, axis=1), 0.0)
-    return unit(free - ball - lack[:, None] * unit(arm))
+    up = unit(free - ball - lack[:, None] * unit(arm))
+    least = np.maximum(up[:, 2], level)
+    flat = np.sqrt(1.0 - least**2) / np.maximum(np.linalg.norm(up[:, :2], axis=1), 1e-9)
+    return np.column_stack([up[:, :2] * flat[:, None], least])
 
 
 def _over_the_tip(leg: Leg, rig: Rig, own: np.ndarray, ball: np.ndarray, free: np.ndarray, length: float) -> np.ndarray:
@@ -281,20 +286,32 @@ def _over_the_tip(leg: Leg, rig: Rig, own: np.ndarray, ball: np.ndarray, free: n
 
 
 def step_over(leg: Leg, rig: Rig, R: np.ndarray, ankle: np.ndarray, floor_m: float, swinging: np.ndarray) -> np.ndarray:
-    """R with a swinging foot held more level where it would go through the floor, by no more than it takes."""
-    R, foot = R.copy(), leg.foot[0]
-    some = np.flatnonzero(swinging & (ankle[:, 2] + lowest(leg, rig, R) < floor_m))
+    """R with a swinging foot's toes held straighter, then the foot more level, where they would go through the floor, by no more than
+    it takes."""
+    foot = leg.foot[0]
+    if leg.toe:
+        toe = leg.toe[0]
+        straight = R[:, foot] @ (rig.R_rest[foot].T @ rig.R_rest[toe]) @ np.swapaxes(R[:, toe], 1, 2)
+        R = _eased(leg, rig, R, leg.toe, vector_from_matrix(straight), ankle, floor_m, swinging)
+    level = shortest((R[:, foot] @ rig.R_rest[foot].T)[:, :, 2], np.array([0.0, 0.0, 1.0]))
+    return _eased(leg, rig, R, (*leg.foot, *leg.toe), vector_from_matrix(level), ankle, floor_m, swinging)
+
+
+def _eased(leg: Leg, rig: Rig, R: np.ndarray, bones: tuple[int, ...], turn: np.ndarray, ankle: np.ndarray, floor_m: float,
+           swinging: np.ndarray) -> np.ndarray:
+    """R with `bones` turned by the least part of the Rodrigues vectors `turn` (T, 3) that clears the floor; not if that is no help."""
+    before = ankle[:, 2] + lowest(leg, rig, R) - floor_m
+    some = np.flatnonzero(swinging & (before < 0.0))
+    some = some[(ankle[:, 2] + lowest(leg, rig, _turned(R, bones, turn)) - floor_m)[some] > before[some]]
     if not len(some):
         return R
-    base, up = R[some], (R[some, foot] @ rig.R_rest[foot].T)[:, :, 2]
-    turn = vector_from_matrix(shortest(up, np.array([0.0, 0.0, 1.0])))
     little, much = np.zeros(len(some)), np.ones(len(some))
     for _ in range(12):
         part = (little + much) / 2
-        tried = _turned(base, (*leg.foot, *leg.toe), turn * part[:, None])
-        clear = ankle[some, 2] + lowest(leg, rig, tried) >= floor_m
+        clear = ankle[some, 2] + lowest(leg, rig, _turned(R[some], bones, turn[some] * part[:, None])) >= floor_m
         little, much = np.where(clear, little, part), np.where(clear, part, much)
-    R[some] = _turned(base, (*leg.foot, *leg.toe), turn * much[:, None])
+    R = R.copy()
+    R[some] = _turned(R[some], bones, turn[some] * much[:, None])
     return R
 
 
