@@ -82,12 +82,8 @@ class Results:
 
     def write_trajectories(self, trajectories: Trajectories, header: Mapping[str, Any]) -> None:
         """trajectories.npz"""
-        names = ("frames", "time_s", "xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status")
-        arrays = {name: getattr(trajectories, name) for name in names}
-        small = {
-            n: a.astype(np.float32) if n in ("xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m") else a for n, a in arrays.items()
-        }
-        store.save(self.path("trajectories.npz"), small, header)
+        arrays = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in trajectories.arrays().items()}
+        store.save(self.path("trajectories.npz"), arrays, header)
 
     def read_run(self) -> dict[str, Any]:
         """run.json, or an empty table where there is none yet.

@@ -93,12 +93,17 @@ def against_neighbours(xyz_m: np.ndarray, sigma_m: np.ndarray, settings: Trackin
     T, N = sigma_m.shape
     answers = np.full((len(SPANS), T, N), -1, dtype=np.int8)
     for done, (span, every) in enumerate(SPANS):
+        fresh: list[tuple[slice, np.ndarray]] = []
         for t in range(0, T - span, every):
             progress(done + t / T, len(SPANS))
             rows = np.flatnonzero(np.isfinite(xyz_m[[t, t + span], :, 0]).all(axis=0))
             sigma = np.hypot(sigma_m[t, rows], sigma_m[t + span, rows])
             answers[done, t, rows] = answer = ask_neighbours(xyz_m[t, rows], xyz_m[t + span, rows], sigma, span, settings)
-            verdict[t + 1 : t + span + 1, rows[answer == Answer.DEVIATES]] = TrackStatus.NOT_RIGID
+            false = rows[answer == Answer.DEVIATES]
+            false = false[(verdict[t + 1 : t + span + 1, false] == TrackStatus.MEASURED).all(axis=0)]  # not yet explained by a shorter span
+            fresh.append((slice(t + 1, t + span + 1), false))
+        for frames, false in fresh:
+            verdict[frames, false] = TrackStatus.NOT_RIGID
     tested = (answers >= 0).sum(axis=(0, 1))
     support = (answers == Answer.CONFIRMED).sum(axis=(0, 1)) / np.maximum(tested, 1)
     if tested.any() and np.median(support[tested > 0]) >= MIN_SUPPORT:

@@ -49,7 +49,7 @@ class TrackingSettings:
     )
     min_length: int = knob(5, "Trajectories of fewer frames are removed.", unit="frames", low=2, high=1000)
     smooth_frames: int = knob(
-        7, "Frames over which smoothed velocities and accelerations are taken (odd; 0: none).", unit="frames", low=0, high=99
+        7, "Frames over which smoothed velocities and accelerations are taken (odd; 0: as they are).", unit="frames", low=0, high=99
     )
 
 

@@ -1,20 +1,18 @@
-"""Trajectories: position, velocity and acceleration of every tracked point, and why it ended.
-
-    v_i = (X_{i+1} − X_{i−1}) / 2 dt ,   a_i = (X_{i+1} − 2 X_i + X_{i−1}) / dt²                      (1)
-
-At the ends of a trajectory v is the one-sided difference and a is NaN. Gaps stay gaps.
-"""
+"""Trajectories: position, velocity and acceleration of every tracked point, raw and smoothed (kinematics.py), and why it ended."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from ..progress import Monitor
 from ..values import frozen
 from .filters import against_neighbours, against_voxels, cut, over_thresholds
+from .kinematics import Kinematics, differences, smoothed
 from .settings import TrackingSettings, TrackStatus
 from .tracked import TrackedFrame
+
+SMOOTH_FRAMES = 7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -28,6 +26,8 @@ class Trajectories:
     acceleration_m_s2: np.ndarray  # (T, N, 3)
     sigma_m: np.ndarray  # (T, N)
     status: np.ndarray  # (T, N)
+    raw: Kinematics | None = None  # the same velocities and accelerations with their sigmas
+    smooth: Kinematics | None = None  # smoothed ones with theirs
 
     def __post_init__(self) -> None:
         t, n = self.sigma_m.shape
@@ -36,14 +36,22 @@ class Trajectories:
         for name, shape in dict(time_s=(t,), xyz_m=(t, n, 3), velocity_m_s=(t, n, 3), acceleration_m_s2=(t, n, 3), sigma_m=(t, n)).items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays by the names that they have in trajectories.npz."""
+        arrays = {n: getattr(self, n) for n in ("frames", "time_s", "xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status")}
+        for prefix, kinematics in (("", self.raw), ("smooth_", self.smooth)):
+            if kinematics is not None:
+                arrays |= {f"{prefix}{f.name}": getattr(kinematics, f.name) for f in fields(Kinematics)}
+        return arrays
+
     @property
     def seen(self) -> np.ndarray:
         """(T, N) where a position was measured."""
         return np.isfinite(self.xyz_m[..., 0])
 
 
-def assemble(steps: Sequence[TrackedFrame], fps: float) -> Trajectories:
-    """The trajectories of consecutive tracked frames, in the order of their identities."""
+def assemble(steps: Sequence[TrackedFrame], fps: float, smooth_frames: int = SMOOTH_FRAMES) -> Trajectories:
+    """The trajectories of consecutive tracked frames, in the order of their identities; derivatives smoothed over so many frames (or 0)."""
     T, N = len(steps), 1 + max((int(s.identity.max()) for s in steps if len(s.identity)), default=-1)
     xyz, sigma = np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
     status = np.zeros((T, N), dtype=np.int8)
@@ -53,7 +61,7 @@ def assemble(steps: Sequence[TrackedFrame], fps: float) -> Trajectories:
         status[t, s.identity] = TrackStatus.MEASURED
         status[t, s.ended] = s.reason
     frames = np.array([s.frame for s in steps], dtype=np.int32)
-    return _with_kinematics(frames, frames / fps, xyz, sigma, status)
+    return with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames)
 
 
 def filter_trajectories(raw: Trajectories, settings: TrackingSettings, monitor: Monitor | None = None) -> Trajectories:
@@ -72,17 +80,23 @@ def filter_trajectories(raw: Trajectories, settings: TrackingSettings, monitor: 
     source, kept, status = cut(raw.seen, status, settings)
     xyz, sigma = raw.xyz_m[:, source].copy(), raw.sigma_m[:, source].copy()
     xyz[~kept], sigma[~kept] = np.nan, np.nan
-    return _with_kinematics(raw.frames, raw.time_s, xyz, sigma, status)
+    return with_kinematics(raw.frames, raw.time_s, xyz, sigma, status, settings.smooth_frames)
 
 
-def _with_kinematics(frames: np.ndarray, time_s: np.ndarray, xyz: np.ndarray, sigma: np.ndarray, status: np.ndarray) -> Trajectories:
+def with_kinematics(
+    frames: np.ndarray, time_s: np.ndarray, xyz_m: np.ndarray, sigma_m: np.ndarray, status: np.ndarray, smooth_frames: int
+) -> Trajectories:
+    """Trajectories of these positions (T, N, 3), with their velocities and accelerations."""
     dt = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
-    velocity, acceleration = np.full(xyz.shape, np.nan), np.full(xyz.shape, np.nan)
-    if len(xyz) > 1:
-        step = np.diff(xyz, axis=0) / dt
-        forward, backward = np.concatenate([step, step[:1] * np.nan]), np.concatenate([step[:1] * np.nan, step])
-        velocity = np.where(np.isnan(forward), backward, np.where(np.isnan(backward), forward, 0.5 * (forward + backward)))  # (1)
-        acceleration = (forward - backward) / dt
+    raw = differences(xyz_m, sigma_m, dt)
     return Trajectories(
-        frames=frames, time_s=time_s, xyz_m=xyz, velocity_m_s=velocity, acceleration_m_s2=acceleration, sigma_m=sigma, status=status
+        frames=frames,
+        time_s=time_s,
+        xyz_m=xyz_m,
+        velocity_m_s=raw.velocity_m_s,
+        acceleration_m_s2=raw.acceleration_m_s2,
+        sigma_m=sigma_m,
+        status=status,
+        raw=raw,
+        smooth=smoothed(xyz_m, sigma_m, dt, smooth_frames) if smooth_frames else raw,
     )
