@@ -24,6 +24,16 @@ def add_commands(subparsers: Any) -> None:
     parser: argparse.ArgumentParser = subparsers.add_parser("scene", help=about, description=about)
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run")
     parser.add_argument("--blend", metavar="FILE.blend", type=Path, required=True, help="the file to write")
+    parser.add_argument("--preview", metavar="FILE.png", type=Path, help="also a picture: the body shaded, and over the footage")
+    parser.add_argument("--turntable", metavar="FILE.mp4", type=Path, help="also a movie of a turn around the body")
+    parser.add_argument("--frame", metavar="N", type=int, help="the frame of preview and turntable (default: the middle one)")
+    parser.add_argument("--detail", metavar="N", type=int, default=1, choices=range(1, 9), help="level of detail of the skin, 1 to 8")
+    parser.add_argument("--exact-skin", action="store_true", help="also the exact skin of every frame, as FILE.pc2 beside the .blend")
+    parser.add_argument("--rest-pose", choices=("A", "T"), default="A", help="of the armature (default A)")
+    parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0,
+                        help="play a second action with few keys, within this many degrees; the measured one is kept")
+    parser.add_argument("--colour", choices=("intensity", "sigma", "speed"), default="intensity", help="what colours the cloud")
+    parser.add_argument("--arrows", action="store_true", help="velocities as arrows")
     parser.set_defaults(run=scene)
 
 
@@ -39,13 +49,22 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     with _standard_output_kept_clean():
         import bpy
 
-        from .scene.build import build_scene
+        from .scene.build import SceneOptions, write_scene
         from .scene.cameras import look_through
+        from .scene.contents import read_contents
+        from .scene.preview import preview, turntable
 
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
         look_through()
-        report = build_scene(args.out, args.blend, monitor)
-    return [*report.warnings, f"{args.blend}: {report}"]
+        contents = read_contents(args.out, monitor)
+        options = SceneOptions(detail=args.detail, exact_skin=args.exact_skin, rest_pose=args.rest_pose, simplify_deg=args.simplify,
+                               colour=args.colour, arrows=args.arrows)
+        report = write_scene(contents, args.blend, options, monitor)
+        if args.preview is not None:
+            preview(contents, args.preview, args.frame)
+        if args.turntable is not None:
+            turntable(args.turntable, args.frame, monitor)
+    return [*report.warnings, f"{args.blend}: {report}", *(str(path) for path in (args.preview, args.turntable) if path is not None)]
 
 
 @contextmanager

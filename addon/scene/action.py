@@ -13,8 +13,11 @@ import numpy as np
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone
 from . import armature
+from .simplify import kept_keys
 
-NAME = "Measured motion"
+NAME, SIMPLE_NAME = "Measured motion", "Simplified motion"
+MEASURED_KEY = "tricap_measured_motion"  # custom property of the armature: the measured action while another one plays
+METRES_PER_RADIAN = 0.2  # of the tolerance: 1° of an angle counts like 3.5 mm of the base
 LIMITS_TOLERANCE_RAD = 1e-6
 
 
@@ -34,6 +37,26 @@ def add_action(armature_object: bpy.types.Object, shape: BodyShape, frames: np.n
     motion = {name: values[:, column] for column, name in enumerate(dof_names)}
     for bone in shape.skeleton.bones:
         _mute_limits_that_bind(armature_object.pose.bones[bone.name], bone, motion)
+    return action
+
+
+def add_simplified(armature_object: bpy.types.Object, shape: BodyShape, frames: np.ndarray, dof_names: Sequence[str], values: np.ndarray,
+                   tolerance_deg: float) -> bpy.types.Action:
+    """A second action with few keys, every angle of `values` (T, D) within `tolerance_deg`; it becomes the armature's.
+
+    The measured motion stays in the file, in its own action. Places count `METRES_PER_RADIAN`.
+    """
+    armature_object[MEASURED_KEY] = armature_object.animation_data.action  # which gives it a user
+    action = bpy.data.actions.new(SIMPLE_NAME)
+    armature_object.animation_data.action = action
+    channels = armature.channel_of(shape)
+    for column, name in enumerate(dof_names):
+        bone_name, channel, index = channels[name]
+        known = np.flatnonzero(np.isfinite(values[:, column]))
+        tolerance = np.radians(tolerance_deg) * (1.0 if channel == "rotation_euler" else METRES_PER_RADIAN)
+        kept = known[kept_keys(frames[known], values[known, column], tolerance)]
+        path = f"{armature_object.pose.bones[bone_name].path_from_id()}.{channel}"
+        _key(action, armature_object, path, index, frames[kept], values[kept, column])
     return action
 
 

@@ -66,9 +66,18 @@ def _edit_bones(armature_object: bpy.types.Object, shape: BodyShape) -> None:
 
 
 def _bone_collections(armature: bpy.types.Armature) -> None:
-    base, body = armature.collections.new("Base"), armature.collections.new("Body")
+    """Base, trunk, and the limbs of each side, by the bones' names and what they hang on."""
     for bone in armature.bones:
-        (base if bone.name == ROOT else body).assign(bone)
+        name = "Base" if bone.name == ROOT else _region(bone)
+        (armature.collections.get(name) or armature.collections.new(name)).assign(bone)
+
+
+def _region(bone: bpy.types.Bone) -> str:
+    side = {".R": " right", ".L": " left"}.get(bone.name[-2:])
+    if side is None:
+        return "Trunk"
+    line = {each.name[:-2] for each in (bone, *bone.parent_recursive, *bone.children_recursive) if each.name[-2:] == bone.name[-2:]}
+    return ("Arm" if line & {"upper_arm", "forearm"} else "Leg" if line & {"thigh", "shin"} else "Limb") + side
 
 
 def _free_base(root: bpy.types.PoseBone, dofs: tuple[Dof, ...]) -> None:

@@ -5,11 +5,13 @@
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ...core.errors import InputError
 from ...core.motion.ply import Ply
@@ -17,10 +19,27 @@ from ...core.progress import Monitor
 from . import action, armature, cameras, clips, metaballs, skin
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
-from .trajectories import add_trajectories
+from .rest_pose import at_rest
+from .trajectories import add_arrows, add_trajectories
 
 COLLECTION = "Tricap"
+NEAR_M = 0.03  # a cloud's point has the speed of a tracked point within this distance
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder it was built from
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """What a user may want otherwise."""
+
+    detail: int = 1  # the skin's level of detail: pieces of each edge
+    exact_skin: bool = False  # also the skin of every frame, as a mesh cache beside the .blend
+    rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
+    simplify_deg: float = 0.0  # above 0: the armature plays a second action with few keys, within this tolerance
+    colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
+    arrows: bool = False  # velocities as arrows
+
+
+DEFAULTS = SceneOptions()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,18 +55,22 @@ class SceneReport:
         return ", ".join(f"{count} {what}" for what, count in self.counts.items() if count) or "nothing to show"
 
 
-def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = None) -> SceneReport:
+def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = None, options: SceneOptions = DEFAULTS) -> SceneReport:
     """Put the results in OUT into the open scene, replacing what an earlier build left, and save a copy as `blend`.
 
     Raises:
         InputError: OUT is no folder of results or damaged, or the file cannot be written.
         Cancelled: the monitor was cancelled; the scene is unchanged.
     """
-    return write_scene(read_contents(Path(out), monitor or Monitor()), blend)
+    monitor = monitor or Monitor()
+    return write_scene(read_contents(Path(out), monitor), blend, options, monitor)
 
 
-def write_scene(contents: Contents, blend: Path | None = None) -> SceneReport:
+def write_scene(contents: Contents, blend: Path | None = None, options: SceneOptions = DEFAULTS,
+                monitor: Monitor | None = None) -> SceneReport:
     """The second half of `build_scene`: main thread only."""
+    if options.exact_skin and blend is None:
+        raise InputError("The exact skin is kept in a file beside the Blender file; give the Blender file a name.")
     scene = bpy.context.scene
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
@@ -58,11 +81,13 @@ def write_scene(contents: Contents, blend: Path | None = None) -> SceneReport:
     set_time(scene, contents)
     warnings, counts = list(contents.warnings), {}
     counts["cameras"] = _add_cameras(scene, collection, contents, warnings)
-    counts["cloud points"] = _add_cloud(collection, contents)
+    counts["cloud points"] = _add_cloud(collection, contents, options.colour)
     if contents.trajectories is not None:
         add_trajectories(collection, contents.trajectories)
+        if options.arrows:
+            add_arrows(collection, contents.trajectories)
         counts["trajectories"] = contents.trajectories["xyz_m"].shape[1]
-    counts |= _add_body(collection, contents, warnings)
+    counts |= _add_body(collection, contents, warnings, options, blend, monitor)
     scene.frame_set(scene.frame_start)
     if blend is not None:
         save_blend(Path(blend))
@@ -75,6 +100,7 @@ def remove_earlier() -> None:
     for collection in [child for child in scene.collection.children_recursive if OUT_KEY in child]:
         objects = [o for o in collection.all_objects if len(o.users_collection) == 1]
         used = {id_ for o in objects for id_ in (o.data, o.animation_data.action if o.animation_data else None) if id_ is not None}
+        used |= {o[action.MEASURED_KEY] for o in objects if o.get(action.MEASURED_KEY) is not None}
         used |= {background.clip for o in objects if o.type == "CAMERA" for background in o.data.background_images if background.clip}
         used |= {modifier.node_group for o in objects for modifier in o.modifiers if modifier.type == "NODES" and modifier.node_group}
         used |= {m for o in objects if hasattr(o.data, "materials") for m in o.data.materials if m}
@@ -137,36 +163,65 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
     return len(take.views)
 
 
-def _add_cloud(collection: bpy.types.Collection, contents: Contents) -> int:
-    clouds = [_cloud_points(frame, ply) for frame, ply in contents.clouds.items()]
+def _add_cloud(collection: bpy.types.Collection, contents: Contents, colour: str) -> int:
+    clouds = [_cloud_points(frame, ply, contents.trajectories) for frame, ply in contents.clouds.items()]
     if clouds:
-        add_cloud(collection, clouds)
+        add_cloud(collection, clouds, colour)
     return sum(len(cloud.xyz_m) for cloud in clouds)
 
 
-def _cloud_points(frame: int, ply: Ply) -> CloudPoints:
+def _cloud_points(frame: int, ply: Ply, trajectories: Mapping[str, np.ndarray] | None) -> CloudPoints:
     xyz = ply.xyz_m
     column = {name: ply.vertex.get(name, np.zeros(len(xyz))) for name in ("sigma", "nx", "ny", "nz", "intensity")}
     normals = np.stack([column[name] for name in ("nx", "ny", "nz")], axis=-1)
-    return CloudPoints(frame=frame, xyz_m=xyz, sigma_m=column["sigma"], normals=normals, intensity=column["intensity"])
+    return CloudPoints(frame=frame, xyz_m=xyz, sigma_m=column["sigma"], normals=normals, intensity=column["intensity"],
+                       speed_m_s=_speed_nearby(frame, xyz, trajectories))
 
 
-def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: list[str]) -> dict[str, int]:
-    if contents.shape is None:
+def _speed_nearby(frame: int, xyz: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
+    """Speed (N,) of the nearest tracked point of the frame; 0 where none is near."""
+    at = np.flatnonzero(trajectories["frames"] == frame) if trajectories is not None else np.zeros(0, dtype=int)
+    if trajectories is None or not len(at) or not len(xyz):
+        return np.zeros(len(xyz))
+    place, velocity = trajectories["xyz_m"][at[0]], trajectories["velocity_m_s"][at[0]]
+    known = np.isfinite(place).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    if not known.any():
+        return np.zeros(len(xyz))
+    distance, nearest = cKDTree(place[known]).query(xyz, distance_upper_bound=NEAR_M)
+    speed = np.linalg.norm(velocity[known], axis=1)
+    return np.where(np.isfinite(distance), speed[np.minimum(nearest, len(speed) - 1)], 0.0)
+
+
+def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: list[str], options: SceneOptions, blend: Path | None,
+              monitor: Monitor | None) -> dict[str, int]:
+    shape, motion = contents.shape, contents.motion
+    if shape is None:
         return {}
-    armature_object = armature.add_armature(collection, contents.shape)
-    flesh = metaballs.add_metaballs(collection, armature_object, contents.shape)
-    counts = {"bones": len(contents.shape.skeleton.bones), "metaball parts": len(flesh)}
+    n = len(shape.skeleton.dof_names)
+    values, sigma = (motion.values, motion.sigma) if motion is not None else (np.zeros((0, n)), np.zeros((0, n)))
+    shape, values, sigma = at_rest(shape, values, sigma, options.rest_pose)
+    armature_object = armature.add_armature(collection, shape)
+    flesh = metaballs.add_metaballs(collection, armature_object, shape)
+    counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
+    exact = motion is not None and options.exact_skin
     try:
-        skin_object = skin.add_skin(collection, armature_object, contents.shape)
+        skin_object = skin.add_skin(collection, armature_object, shape, options.detail)
+        if exact and blend is not None:
+            cache = Path(blend).resolve().with_suffix(".pc2")
+            other = skin.add_exact_skin(collection, shape, motion.frames, values, cache, monitor, options.detail)
+            for part in flesh:
+                part.hide_set(True)
+                part.hide_render = True
+            counts["exact skin faces"] = len(other.data.polygons)
     except InputError as error:
         warnings.append(f"No polygonal skin in the scene: {error}")
     else:
-        skin_object.hide_set(True)  # it lies in the metaballs' surface
+        skin_object.hide_set(True)  # it lies in the metaballs' or the exact skin's surface
         skin_object.hide_render = True
         counts["skin faces"] = len(skin_object.data.polygons)
-    if contents.motion is not None:
-        motion = contents.motion
-        action.add_action(armature_object, contents.shape, motion.frames, motion.dof_names, motion.values, motion.sigma)
+    if motion is not None:
+        action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
         counts["frames of motion"] = len(motion.frames)
+        if options.simplify_deg > 0:
+            action.add_simplified(armature_object, shape, motion.frames, motion.dof_names, values, options.simplify_deg)
     return counts

@@ -1,6 +1,6 @@
 """The point clouds of all frames as ONE mesh object of points; geometry nodes show the current frame's.
 
-Named attributes on the points: frame (int), sigma [m] and intensity (float), normal (vector).
+Named attributes on the points: frame (int), sigma [m], intensity and speed [m/s] (float), normal (vector).
 """
 
 from collections.abc import Sequence
@@ -13,29 +13,33 @@ from . import nodes, paint
 
 NAME = "Cloud"
 POINT_RADIUS_M = 0.0015
+COLOURS = ("intensity", "sigma", "speed")
+REDDEST_PERCENTILE = 98.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class CloudPoints:
-    """The points of one frame: xyz_m (N, 3), sigma_m (N,), normals (N, 3), intensity (N,)."""
+    """The points of one frame: xyz_m (N, 3), sigma_m (N,), normals (N, 3), intensity (N,), speed_m_s (N,) 0 = unknown."""
 
     frame: int
     xyz_m: np.ndarray
     sigma_m: np.ndarray
     normals: np.ndarray
     intensity: np.ndarray
+    speed_m_s: np.ndarray
 
 
-def add_cloud(collection: bpy.types.Collection, clouds: Sequence[CloudPoints]) -> bpy.types.Object:
-    """One object with the points of all `clouds`, of which the scene shows those of its current frame."""
+def add_cloud(collection: bpy.types.Collection, clouds: Sequence[CloudPoints], colour: str = "intensity") -> bpy.types.Object:
+    """One object with the points of all `clouds`, of which the scene shows those of its current frame; `colour` is one of COLOURS."""
     mesh = bpy.data.meshes.new(NAME)
     mesh.vertices.add(sum(len(cloud.xyz_m) for cloud in clouds))
     write(mesh, "position", "FLOAT_VECTOR", np.concatenate([cloud.xyz_m for cloud in clouds]))
     write(mesh, "normal", "FLOAT_VECTOR", np.concatenate([cloud.normals for cloud in clouds]))
     write(mesh, "sigma", "FLOAT", np.concatenate([cloud.sigma_m for cloud in clouds]))
     write(mesh, "intensity", "FLOAT", np.concatenate([cloud.intensity for cloud in clouds]))
+    write(mesh, "speed", "FLOAT", np.concatenate([cloud.speed_m_s for cloud in clouds]))
     write(mesh, "frame", "INT", np.concatenate([np.full(len(cloud.xyz_m), cloud.frame) for cloud in clouds]))
-    material = paint.attribute_material(NAME, "intensity", 1.0 / _white(clouds))
+    material = _material(clouds, colour)
     mesh.materials.append(material)
     cloud_object = bpy.data.objects.new(NAME, mesh)
     collection.objects.link(cloud_object)
@@ -66,6 +70,13 @@ def current_frame_group(material: bpy.types.Material) -> bpy.types.NodeTree:
     group.links.new(paint_node.outputs["Geometry"], group_output.inputs[0])
     nodes.arrange(group)
     return group
+
+
+def _material(clouds: Sequence[CloudPoints], colour: str) -> bpy.types.Material:
+    if colour == "intensity":
+        return paint.attribute_material(NAME, colour, 1.0 / _white(clouds))
+    values = np.concatenate([cloud.sigma_m if colour == "sigma" else cloud.speed_m_s for cloud in clouds])
+    return paint.heat_material(NAME, colour, float(np.percentile(values, REDDEST_PERCENTILE)) or 1.0)
 
 
 def _white(clouds: Sequence[CloudPoints]) -> float:

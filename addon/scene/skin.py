@@ -1,35 +1,84 @@
-"""The polygonal skin: core's skin of the rest pose as a mesh with the bones' vertex groups and an armature modifier.
+"""The polygonal skin: core's skin as quads with texture coordinates, bound to the armature, and on request exact in every frame.
 
-The armature deforms it by blending bones; the exact skin of a posture is core.body.skin.limb_skin of that posture.
+The armature deforms the skin of the rest pose by blending bones. The exact skin, the implicit surface of every frame's posture found
+anew, is a mesh cache beside the .blend (PC2, Blender's Mesh Cache modifier): shape keys would put 120 MB into a file of 1,000 frames.
 """
+
+import struct
+from pathlib import Path
 
 import bpy
 import numpy as np
 
+from ...core import store
 from ...core.body.shape import BodyShape
-from ...core.body.skin import Skin, limb_skin
+from ...core.body.skin import Skin, SkinSettings, body_skin
+from ...core.body.skin_patches import corner_uv, refined
+from ...core.progress import Monitor
 from . import paint
 
-NAME = "Skin"
+NAME, EXACT_NAME = "Skin", "Exact skin"
 SKIN_COLOUR = (0.80, 0.52, 0.41)
+PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
 
-def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape) -> bpy.types.Object:
-    """The skin of the rest pose, bound to the armature.
+def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape, detail: int = 1) -> bpy.types.Object:
+    """The skin of the rest pose, bound to the armature; `detail` cuts its B-spline patches finer.
 
     Raises:
-        InputError: the body is of a kind that core makes no skin for.
+        InputError: the body has no metaballs.
     """
-    skin = limb_skin(shape, np.zeros(len(shape.skeleton.dof_names)))
-    mesh = bpy.data.meshes.new(NAME)
-    mesh.from_pydata(skin.vertices_m.tolist(), [], skin.faces.tolist())
-    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
-    mesh.materials.append(paint.plain_material(NAME, SKIN_COLOUR))
-    mesh.update()
-    skin_object = bpy.data.objects.new(NAME, mesh)
+    skin = _skin(shape, np.zeros(len(shape.skeleton.dof_names)), detail)
+    skin_object = _mesh_object(collection, NAME, skin)
     skin_object.parent = armature_object
     _bind(skin_object, skin)
     skin_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    return skin_object
+
+
+def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, frames: np.ndarray, values: np.ndarray, cache: Path,
+                   monitor: Monitor | None = None, detail: int = 1) -> bpy.types.Object:
+    """The skin as it is in every frame: frames (T,) in order, values (T, D) rad and metres. Writes `cache` (.pc2).
+
+    Frames without a fit, or missing, hold the posture before them. About 0.1 s a frame for a whole body.
+
+    Raises:
+        InputError: the body has no metaballs, or the cache cannot be written.
+        Cancelled: the monitor was cancelled; no cache is written.
+    """
+    monitor = monitor or Monitor()
+    row_of = {int(frame): row for frame, row in zip(frames, values) if np.isfinite(row).all()}
+    known = sorted(row_of)
+    samples: list[np.ndarray] = []
+    skin = _skin(shape, row_of[known[0]], detail)
+    for frame in range(known[0], known[-1] + 1):
+        monitor.step("exact skin", frame - known[0], known[-1] + 1 - known[0])
+        samples.append(_skin(shape, row_of[frame], detail).vertices_m.astype("<f4") if frame in row_of else samples[-1])
+    head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(skin.vertices_m), float(known[0]), 1.0, len(samples))
+    store.write_bytes(cache, head + b"".join(sample.tobytes() for sample in samples))
+    skin_object = _mesh_object(collection, EXACT_NAME, skin)
+    modifier = skin_object.modifiers.new("Every frame", "MESH_CACHE")
+    modifier.cache_format, modifier.filepath = "PC2", str(cache)
+    modifier.frame_start = float(known[0])
+    return skin_object
+
+
+def _skin(shape: BodyShape, motion: np.ndarray, detail: int) -> Skin:
+    skin = body_skin(shape, motion, SkinSettings())
+    return refined(skin, detail) if detail > 1 else skin
+
+
+def _mesh_object(collection: bpy.types.Collection, name: str, skin: Skin) -> bpy.types.Object:
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(skin.vertices_m.tolist(), [], skin.faces.tolist())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
+    layer = mesh.uv_layers.new(name="UVMap")
+    layer.data.foreach_set("uv", corner_uv(skin).astype(np.float32).ravel())
+    mesh.materials.append(paint.plain_material(name, SKIN_COLOUR))
+    mesh.update()
+    if len(skin.part_sizes) > 1:  # where parts overlap, shade by the surface they share
+        mesh.normals_split_custom_set_from_vertices(skin.normals.tolist())
+    skin_object = bpy.data.objects.new(name, mesh)
     collection.objects.link(skin_object)
     return skin_object
 

@@ -12,10 +12,12 @@ import numpy as np
 from . import nodes, paint
 from .cloud import write
 
-NAME = "Trajectories"
+NAME, ARROWS_NAME = "Trajectories", "Velocities"
+ARROW_S = 0.1  # an arrow shows the way of this time
+BARB = 0.25  # length of an arrow's barbs, as a fraction of it
 TRAIL_FRAMES = 10
 TRAIL_RADIUS_M = 0.0006
-RESTING_COLOUR_SPEED_M_S = 2.0  # the speed that is painted brightest
+REDDEST_SPEED_M_S = 2.0  # the speed that is painted reddest
 
 
 def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
@@ -37,7 +39,7 @@ def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.n
     write(mesh, "sigma", "FLOAT", np.nan_to_num(arrays["sigma_m"][seen]))
     write(mesh, "speed", "FLOAT", np.nan_to_num(np.linalg.norm(arrays["velocity_m_s"][seen], axis=-1)))
     mesh.update()
-    material = paint.attribute_material(NAME, "speed", 1.0 / RESTING_COLOUR_SPEED_M_S)
+    material = paint.heat_material(NAME, "speed", REDDEST_SPEED_M_S)
     mesh.materials.append(material)
     trail_object = bpy.data.objects.new(NAME, mesh)
     collection.objects.link(trail_object)
@@ -45,11 +47,37 @@ def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.n
     return trail_object
 
 
-def trail_group(material: bpy.types.Material) -> bpy.types.NodeTree:
+def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
+    """One object with an arrow for the velocity of every point in every frame; the scene shows those of its current frame."""
+    known = np.isfinite(arrays["xyz_m"]).all(axis=-1) & np.isfinite(arrays["velocity_m_s"]).all(axis=-1)
+    row, _ = np.nonzero(known)
+    at, velocity = arrays["xyz_m"][known], arrays["velocity_m_s"][known]
+    way = ARROW_S * velocity
+    aside = np.cross(way, [0.0, 1.0, 0.0])
+    aside *= 0.5 * BARB * np.linalg.norm(way, axis=1, keepdims=True) / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-12)
+    corners = np.stack([at, at + way, at + (1 - BARB) * way + aside, at + (1 - BARB) * way - aside], axis=1)
+    edges = 4 * np.arange(len(at))[:, None, None] + np.array([[0, 1], [1, 2], [1, 3]])
+    mesh = bpy.data.meshes.new(ARROWS_NAME)
+    mesh.vertices.add(4 * len(at))
+    mesh.edges.add(3 * len(at))
+    mesh.edges.foreach_set("vertices", np.ascontiguousarray(edges, dtype=np.int32).ravel())
+    write(mesh, "position", "FLOAT_VECTOR", corners.reshape(-1, 3))
+    write(mesh, "frame", "INT", np.repeat(arrays["frames"][row], 4))
+    write(mesh, "speed", "FLOAT", np.repeat(np.linalg.norm(velocity, axis=1), 4))
+    mesh.update()
+    material = paint.heat_material(ARROWS_NAME, "speed", REDDEST_SPEED_M_S)
+    mesh.materials.append(material)
+    arrows_object = bpy.data.objects.new(ARROWS_NAME, mesh)
+    collection.objects.link(arrows_object)
+    arrows_object.modifiers.new("Current frame", "NODES").node_group = trail_group(material, 0)
+    return arrows_object
+
+
+def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy.types.NodeTree:
     """Geometry nodes: keep what lies up to `Trail` frames behind the scene's frame, as thin threads."""
     group, group_input, group_output = nodes.new_group("Tricap trail")
     trail = group.interface.new_socket("Trail", in_out="INPUT", socket_type="NodeSocketInt")
-    trail.default_value, trail.min_value = TRAIL_FRAMES, 1
+    trail.default_value, trail.min_value = frames, 0
     now = nodes.add(group, "GeometryNodeInputSceneTime").outputs["Frame"]
     frame = nodes.attribute(group, "frame", "INT")
     begin = nodes.math(group, "SUBTRACT", now, group_input.outputs["Trail"])

@@ -78,8 +78,8 @@ def segments_of(shape: BodyShape, chain: Sequence[int], R: np.ndarray, head: np.
         y, delta = R[b, :, 1], 0.0
         if i:
             p = chain[i - 1]
-            across = rest[b].T @ _swing(rest[p, :, 1], rest[b, :, 1]) @ rest[p] @ across
-            carried = R[b].T @ _swing(R[p, :, 1], y) @ segments[-1].e1
+            across = rest[b].T @ swing(rest[p, :, 1], rest[b, :, 1]) @ rest[p] @ across
+            carried = R[b].T @ swing(R[p, :, 1], y) @ segments[-1].e1
             delta = float(np.arctan2(np.cross(across, carried)[1], across @ carried))
         widest = balls.radii_m[balls.bone_index == b][:, [0, 2]].max()
         ahead = chain[i + 1] if i + 1 < len(chain) else None
@@ -98,7 +98,7 @@ def _reach(shape: BodyShape, chain: Sequence[int]) -> float:
     return float((aside + REACH * balls.radii_m[own][:, [0, 2]].max(axis=1)).max())
 
 
-def _swing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def swing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The smallest rotation that turns unit vector a into b."""
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis)

@@ -13,15 +13,15 @@ from tricap.core.body.skin import limb_skin
 
 from .conftest import FRAMES, arm
 
-ROTATION = 2e-6  # measured 4e-7 over 60 random postures: single precision of the pose matrices
-PLACE_M = 1e-6  # measured 2.2e-7
-SURFACE_RMS_M, SURFACE_MAX_M = 0.15e-3, 0.45e-3  # measured 0.10 and 0.33 mm, arm, rest and bent; three-kernel conversion
+ROTATION = 1e-5  # measured 4e-7 for a limb, 4.2e-6 for the seven joints from pelvis to hand: single precision of the pose matrices
+PLACE_M = 5e-6  # measured 2.2e-7, limb; a whole body is seven bones deep
+SURFACE_RMS_M, SURFACE_MAX_M = 0.1e-3, 0.3e-3  # measured 0.05 and 0.12 mm, arm; 0.07 and 0.21 mm, leg; rest and bent to 110°
 
 
 def motion_within_limits(shape: BodyShape, count: int, seed: int) -> np.ndarray:
     """Random postures (count, D) over the whole range of every DOF."""
-    low = np.array([max(dof.limits[0], -1.0) if i < 3 else dof.limits[0] for i, dof in enumerate(shape.skeleton.dofs)])
-    high = np.array([min(dof.limits[1], 1.0) if i < 3 else dof.limits[1] for i, dof in enumerate(shape.skeleton.dofs)])
+    low = np.array([max(dof.limits[0], -1.0 if i < 3 else -3.5) for i, dof in enumerate(shape.skeleton.dofs)])
+    high = np.array([min(dof.limits[1], 1.0 if i < 3 else 3.5) for i, dof in enumerate(shape.skeleton.dofs)])
     return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
 
 
