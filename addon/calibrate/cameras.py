@@ -1,7 +1,7 @@
 """Calibrated cameras in the open scene, and the scene's cameras as a calibrated rig.
 
-Blender keeps lens, shift and pose in single precision. What was calibrated is therefore kept beside it in double precision and counts as long
-as nobody has changed the camera; a camera that was made or changed in Blender is read from Blender's own values.
+Blender keeps lens, shift and pose in single precision. What was calibrated is therefore kept beside it in double precision and counts as
+long as nobody has changed the camera; a camera that was made or changed in Blender is read from Blender's own values.
 """
 
 from pathlib import Path

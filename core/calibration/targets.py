@@ -25,7 +25,9 @@ MIN_AREA, MAX_AREA_PART = 4, 0.02  # pixels; part of the image
 MIN_FILL, MAX_ELONGATION = 0.72, 3.5
 MOST_BLOBS = 64
 WINDOW_SIDES = (9, 13, 19, 27, 39, 57, 83, 121)
-ITERATIONS, CONVERGED_PX = 12, 1e-3
+ITERATIONS, CONVERGED_PX = 16, 1e-3
+SETTLED = 5  # iterations after which the target's outline is known
+SECTORS, RING_PX, BESIDE, MOST_BESIDE = 24, 3.0, 0.015, 0.4
 ROBUST = 3.0  # sigmas of the grey values
 MAX_MISFIT = 0.08  # RMS of the grey values as a part of g1
 
@@ -146,7 +148,10 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
     near = reach < 1.12 + 1.5 / np.sqrt(p[:, 5, None])  # what lies further out, such as the other target, takes no part
     active, converged = np.arange(m), np.zeros(m, dtype=bool)
     covariance, sigma0, misfit = np.full((m, 2), np.inf), np.full(m, np.inf), np.full(m, np.inf)
-    for _ in range(ITERATIONS):
+    for iteration in range(ITERATIONS):
+        if iteration == SETTLED:
+            near &= ~_beside_something(p, grid, grey)
+            active, converged[:] = np.flatnonzero(np.isfinite(p).all(axis=1)), False
         v, J = _disc(p[active], grid, grey[active])
         misfit[active] = np.sqrt(np.sum(v * v * near[active], axis=1) / np.maximum(near[active].sum(axis=1) - 8, 1))
         weight = near[active] / (1 + (v / (ROBUST * 1.4826 * _median_of_near(np.abs(v), near[active]))) ** 2)  # the bar takes no part
@@ -164,11 +169,34 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
         still = np.abs(step[:, :2]).max(axis=1) >= CONVERGED_PX
         converged[active[~still]] = True
         active = active[still & np.isfinite(p[active]).all(axis=1)]
-        if not len(active):
+        if not len(active) and iteration >= SETTLED:
             break
     bad = ~converged | (np.abs(p[:, :2] - start[:, :2]) > 0.25 * start[:, 2:4] + 1.0).any(axis=1)
     status = np.where(bad, TargetStatus.NOT_CONVERGED, np.where(misfit > MAX_MISFIT * p[:, 7], TargetStatus.NO_DISC, TargetStatus.OK))
     return np.where(bad[:, None], start[:, :2], p[:, :2]), sigma0 * np.sqrt(covariance.mean(axis=1)), status.astype(np.int8)
+
+
+def _beside_something(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> np.ndarray:
+    """Pixels (m, k) in the directions in which something bright touches the target, such as the bar, which would draw its centre there.
+
+    The directions are those in which a ring outside the target is brighter than the background.
+    """
+    ux, uy = grid[:, 0] - p[:, 0, None], grid[:, 1] - p[:, 1, None]
+    q = np.hypot(p[:, 2, None] * ux + p[:, 3, None] * uy, p[:, 3, None] * ux + p[:, 4, None] * uy)
+    step = 0.5 * (p[:, 2] + p[:, 4])[:, None]  # q per pixel
+    inner = 1 + 2.2 / np.maximum(p[:, 5, None], 1.0)
+    ring = (q > inner) & (q < inner + RING_PX * step)
+    sector = ((np.arctan2(uy, ux) / (2 * np.pi)) % 1.0 * SECTORS).astype(int) % SECTORS
+    flat = (np.arange(len(p))[:, None] * SECTORS + sector)[ring]
+    count = np.bincount(flat, minlength=len(p) * SECTORS).reshape(-1, SECTORS)
+    total = np.bincount(flat, weights=(grey - p[:, 6, None])[ring], minlength=len(p) * SECTORS).reshape(-1, SECTORS)
+    mean = np.nan_to_num(total / np.maximum(count, 1))  # a match that ran away has none
+    level = np.median(mean, axis=1, keepdims=True)
+    spread = 1.4826 * np.median(np.abs(mean - level), axis=1, keepdims=True)
+    bright = (count > 0) & (mean - level > np.maximum(BESIDE * p[:, 7, None], 4 * spread))
+    bright[bright.mean(axis=1) > MOST_BESIDE] = False
+    bright |= np.roll(bright, 1, axis=1) | np.roll(bright, -1, axis=1)
+    return np.take_along_axis(bright, sector, axis=1) & (q > 0.5)
 
 
 def _median_of_near(values: np.ndarray, near: np.ndarray) -> np.ndarray:

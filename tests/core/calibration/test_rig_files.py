@@ -227,3 +227,15 @@ def test_an_entity_bomb_is_refused(tmp_path: Path) -> None:
     (tmp_path / "rig.xml").write_text('<!DOCTYPE a [<!ENTITY b "c">]><document>&b;</document>')
     with pytest.raises(InputError, match="entities"):
         read_any(tmp_path / "rig.xml")
+
+
+def test_the_command_converts(tmp_path: Path) -> None:
+    from tricap.core.commands import main
+
+    write_as(tmp_path / "cameras.xml", Rig(cameras=benchmark_cameras()), "agisoft")
+    assert main(["calibrate", "--import", str(tmp_path / "cameras.xml"), "--out", str(tmp_path / "rig.toml"), "--quiet"]) == 0
+    assert distance(Rig(cameras=benchmark_cameras()), read_rig(tmp_path / "rig.toml")) < 1e-9
+    out = tmp_path / "colmap"
+    assert main(["calibrate", "--import", str(tmp_path / "rig.toml"), "--export", "colmap", "--out", str(out), "--quiet"]) == 0
+    assert (out / "images.txt").exists()
+    assert main(["calibrate", "--import", str(tmp_path / "none.toml"), "--out", str(out), "--quiet"]) == 2
