@@ -1,0 +1,137 @@
+"""What a user may want otherwise: exact skin, T-pose, fewer keys, colours, arrows, pictures."""
+
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import bone_frames
+from tricap.core.body.skin import body_skin
+from tricap.core.errors import InputError
+
+from .conftest import FRAMES, SmallRun
+from .test_scene_body import animated, curves, world_vertices
+
+
+def test_the_exact_skin_is_the_skin_of_every_frame(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.scene.build import SceneOptions, build_scene
+
+    build_scene(small_run.out, tmp_path / "body.blend", options=SceneOptions(exact_skin=True))
+    assert (tmp_path / "body.pc2").is_file()
+    empty.ops.wm.open_mainfile(filepath=str(tmp_path / "body.blend"))
+    for frame, motion in zip(FRAMES, small_run.motion):
+        empty.context.scene.frame_set(frame)
+        exact = body_skin(small_run.shape, motion).vertices_m  # the table keeps nine digits
+        assert np.abs(world_vertices(empty, empty.data.objects["Exact skin"]) - exact).max() < 1e-5
+    with pytest.raises(InputError, match="give the Blender file a name"):
+        build_scene(small_run.out, options=SceneOptions(exact_skin=True))
+
+
+@pytest.mark.parametrize("model", ["arm.R", "full"])
+def test_in_t_pose_the_person_moves_the_same(empty: ModuleType, model: str) -> None:
+    from tricap.addon.scene.rest_pose import at_rest
+
+    shape = default_shape(read_model(model))
+    random = np.random.default_rng(3)
+    values = random.uniform(-0.6, 0.6, (12, len(shape.skeleton.dof_names)))
+    other, new, sigma = at_rest(shape, values, np.full(values.shape, 0.01), "T")
+    upper = next(bone for bone in other.skeleton.bones if bone.name == "upper_arm.R")
+    np.testing.assert_allclose(upper.R_rest[:, 1], [-1, 0, 0], atol=1e-12)
+    for a, b in zip(bone_frames(shape.skeleton, shape.lengths_m, values), bone_frames(other.skeleton, other.lengths_m, new)):
+        np.testing.assert_allclose(a, b, atol=2e-6)  # mathutils' Euler angles are single precision
+    changed = np.flatnonzero(np.abs(new - values).max(axis=0) > 1e-6)
+    assert {shape.skeleton.dof_names[i].partition(" ")[0] for i in changed} <= {"shoulder.R", "shoulder.L"}
+    assert np.isfinite(sigma).all() and (sigma > 0).all()
+    same = at_rest(shape, values, sigma, "A")
+    assert same[0] is shape and same[1] is values
+
+
+def test_fewer_keys_stay_within_the_tolerance_and_the_measured_motion_is_kept(empty: ModuleType) -> None:
+    from tricap.addon.scene import action
+
+    shape = default_shape(read_model("arm.R"))
+    frames = np.arange(200)
+    phase = frames[:, None] / 40 + np.arange(len(shape.skeleton.dof_names))
+    values = 0.4 * np.sin(phase) + np.random.default_rng(0).normal(0, 5e-4, phase.shape)
+    values[50] = np.nan
+    body = animated(empty, shape, values, frames)
+    measured = body.animation_data.action
+    simple = action.add_simplified(body, shape, frames, shape.skeleton.dof_names, values, 0.5)
+    assert body.animation_data.action == simple and measured.users > 0 and body[action.MEASURED_KEY] == measured
+    counted = sum(len(points) for _, _, points in curves(body))
+    assert counted < 0.35 * 199 * len(shape.skeleton.dof_names)
+    worst = 0.0
+    for frame in frames[np.isfinite(values).all(axis=1)]:
+        empty.context.scene.frame_set(int(frame))
+        upper, fore = (body.pose.bones[name].rotation_euler for name in ("upper_arm.R", "forearm.R"))
+        angles = [upper[0], upper[2], upper[1], fore[0]]
+        worst = max(worst, float(np.abs(np.degrees(angles) - np.degrees(values[frame, 3:7])).max()))
+    assert 0.1 < worst < 0.501
+
+
+def test_keys_of_a_straight_line_are_its_ends() -> None:
+    from tricap.addon.scene.simplify import kept_keys
+
+    frames = np.array([0, 1, 2, 5, 9])
+    assert kept_keys(frames, 2.0 * frames, 1e-9).tolist() == [0, 4]
+    assert kept_keys(frames, np.array([0, 0, 5, 0, 0]), 1.0).tolist() == [0, 1, 2, 3, 4]
+    assert kept_keys(frames[:1], frames[:1], 1.0).tolist() == [0]
+
+
+def test_colours_arrows_and_nothing_piles_up(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.scene.build import SceneOptions, build_scene
+
+    def census() -> dict[str, list[str]]:
+        kinds = "objects meshes armatures actions metaballs materials node_groups movieclips cameras collections".split()
+        return {kind: sorted(each.name for each in getattr(empty.data, kind)) for kind in kinds}
+
+    options = SceneOptions(colour="speed", arrows=True, simplify_deg=1.0, exact_skin=True, rest_pose="T", detail=2)
+    build_scene(small_run.out, tmp_path / "a.blend", options=options)
+    first = census()
+    assert {"Velocities", "Exact skin"} <= set(first["objects"]) and len(first["actions"]) == 2
+    empty.context.scene.frame_set(FRAMES[2])
+    shown = empty.data.objects["Velocities"].evaluated_get(empty.context.evaluated_depsgraph_get()).data
+    assert len(shown.polygons) > 0
+    speed = [value.value for value in empty.data.objects["Cloud"].data.attributes["speed"].data]
+    assert max(speed) > 0
+    build_scene(small_run.out, tmp_path / "a.blend", options=options)
+    assert census() == first
+
+
+def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> None:
+    from tricap.addon.scene import metaballs, skin
+
+    shape = default_shape(read_model("full"))
+    body = animated(empty, shape, np.zeros((1, len(shape.skeleton.dof_names))), np.arange(1))
+    names = {c.name for c in body.data.collections}
+    assert names == {"Base", "Trunk", "Arm right", "Leg right", "Arm left", "Leg left"}
+    flesh = metaballs.add_metaballs(empty.context.scene.collection, body, shape)
+    families = [part for part in flesh if len(world_vertices(empty, part))]
+    assert len(families) == 5
+    skin_object = skin.add_skin(empty.context.scene.collection, body, shape)
+    assert skin_object.data.uv_layers and skin_object.data.has_custom_normals
+    rest = body_skin(shape, np.zeros(len(shape.skeleton.dof_names))).vertices_m
+    np.testing.assert_allclose(world_vertices(empty, skin_object), rest, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_preview_and_turntable(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.scene import build, contents, preview
+    from tricap.core.progress import Monitor
+
+    results = contents.read_contents(small_run.out, Monitor())
+    build.write_scene(results)
+    before = empty.context.scene.camera, empty.context.scene.render.engine, len(empty.data.cameras)
+    preview.preview(results, tmp_path / "p.png")
+    preview.turntable(tmp_path / "t.mp4")
+    assert before == (empty.context.scene.camera, empty.context.scene.render.engine, len(empty.data.cameras))
+    picture = cv2.imread(str(tmp_path / "p.png"))
+    alone, over = np.split(picture.astype(float), 2, axis=1)
+    covered = np.abs(alone - 40).max(axis=2) > 20
+    assert 0.01 < covered.mean() < 0.6 and over[~covered].std() > 1
+    movie = cv2.VideoCapture(str(tmp_path / "t.mp4"))
+    assert int(movie.get(cv2.CAP_PROP_FRAME_COUNT)) == 48
