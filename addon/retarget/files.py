@@ -1,14 +1,19 @@
-"""Rigs and motions from files: .blend, glTF, VRM, FBX and BVH through Blender's importers, the rest through core's readers."""
+"""Rigs and motions from files: .blend, glTF, VRM and FBX through Blender's importers, the rest through core's readers."""
 
 import shutil
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
 from ...core.errors import InputError
+from ...core.motion.bvh import read_bvh
+from ...core.motion.retarget.mapping import find_map
+from ...core.motion.retarget.rest import with_person_like_rest
 from ...core.motion.retarget.vrm import read_humanoid
+from .build import build_armature
 
 RIG_FILES = (".blend", ".glb", ".gltf", ".vrm", ".fbx", ".bvh")
 ROLES_KEY = "tricap_roles"  # custom property of an armature: what its file says its bones are
@@ -54,13 +59,25 @@ def import_rig(path: Path) -> list[bpy.types.Object]:
         _try(lambda: bpy.ops.import_scene.fbx(filepath=str(path)), path)
     else:
         humanoid = {}
-        _try(lambda: bpy.ops.import_anim.bvh(filepath=str(path), update_scene_fps=False, update_scene_duration=False), path)
+        _rig_of_bvh(path)
     armatures = [o for o in bpy.data.objects if o not in before and o.type == "ARMATURE"]
     for armature_object in armatures:
         known = {role: name for role, name in humanoid.items() if name in armature_object.data.bones}
         if known:
             armature_object.data[ROLES_KEY] = known
     return armatures
+
+
+def _rig_of_bvh(path: Path) -> None:
+    """A BVH file's skeleton as an armature at rest, by our own reader: in metres, and in a person's pose if its zero pose is none."""
+    motion = read_bvh(path)
+    motion, _ = with_person_like_rest(motion, find_map(motion.rig))
+    armature_object = build_armature(replace(motion, frames=motion.frames[:1], R=motion.R[:1], head_m=motion.head_m[:1]), path.stem)
+    action = armature_object.animation_data.action
+    armature_object.animation_data_clear()
+    bpy.data.actions.remove(action)
+    for bone in armature_object.pose.bones:
+        bone.matrix_basis.identity()
 
 
 def _try(load: Callable[[], object], path: Path) -> None:

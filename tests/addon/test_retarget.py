@@ -150,6 +150,15 @@ def test_bad_rigs_are_said_and_the_scene_is_unchanged(empty: ModuleType, tmp_pat
         assert not out.exists()
 
 
+def test_a_bvh_file_is_a_rig_too(empty: ModuleType, tmp_path: Path) -> None:
+    write_bvh(tmp_path / "rig.bvh", flail(person(arms_down_deg=45.0), frames=5), unit_m=0.01)
+    files.open_rig(tmp_path / "rig.bvh")
+    target = files.the_armature("", "rig.bvh")
+    assert abs(target.data.bones["thigh.L"].length - 0.43) < 1e-5
+    assert target.animation_data is None or target.animation_data.action is None
+    assert onto(target, squat(person())).figures.direction_rms_deg < 0.01
+
+
 def test_uneven_scale_is_said(empty: ModuleType) -> None:
     target = armature(person(), "Target")
     target.scale = (1, 1, 2)

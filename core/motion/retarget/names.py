@@ -61,7 +61,7 @@ class Reading:
 def read_name(name: str) -> Reading:
     """What the name of a bone says; an empty Reading if nothing."""
     words = [word.lower() for word in WORD.findall(_without_prefix(name))]
-    side, words = _side(words)
+    side, words = side_of_words(words)
     twist = bool(TWIST & set(words)) and not ({"control", "ctrl", "ik"} & set(words))
     words = [word for word in words if word not in TWIST or not twist]
     if STEERING & set(words):
@@ -87,7 +87,8 @@ def _without_prefix(name: str) -> str:
     return re.sub(r"(?i)^(j_(bip|sec|adj)|cc_base|neo|character\d*|m_avg|f_avg)_", "", name)
 
 
-def _side(words: list[str]) -> tuple[str, list[str]]:
+def side_of_words(words: list[str]) -> tuple[str, list[str]]:
+    """Side (“L”, “R” or none) of a name that was cut into lower-case words, and the other words."""
     sides = [("L" if word in LEFT else "R") for word in words if word in LEFT | RIGHT]
     rest = [word for word in words if word not in LEFT | RIGHT]
     if sides:

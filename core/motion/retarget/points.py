@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import InputError
 from ..markers import Markers, filled
-from .names import WORD, _side
+from .names import WORD, read_name, side_of_words
 from .rig import Motion, Rig
 from .roles import SIDES, sided
 from .turns import shortest, transposed, unit
@@ -28,13 +28,19 @@ LIMBS = (("upper_arm", "upper_arm", "forearm", "spine", (1.0, 0.0, 0.0)), ("fore
 def joint_of(name: str) -> str:
     """"RKnee", "knee.R", "right_knee" -> "shin.R"; "" for points that are no joint of ours."""
     words = [word.lower() for word in WORD.findall(name)]
-    side, words = _side(words)
+    side, words = side_of_words(words)
     core = "".join(word for word in words if not word.isdigit() and word not in ("joint", "center", "centre", "jc"))
     if side:
         return sided(WORDS[core], side) if core in WORDS else ""
     if core[:1] in ("r", "l") and core[1:] in WORDS:
         return sided(WORDS[core[1:]], core[0].upper())
     return CENTRAL.get(core, "")
+
+
+def joint_of_bone(name: str) -> str:
+    """The joint at the head of a bone, for points that are named like bones: "lfemur" -> "thigh.L"."""
+    reading = read_name(name)
+    return sided(reading.part, reading.side) if reading.part and reading.side else reading.part if reading.part in ("hips", "head") else ""
 
 
 def motion_from_points(markers: Markers) -> Motion:
@@ -46,7 +52,7 @@ def motion_from_points(markers: Markers) -> Motion:
     points = filled(markers)
     places: dict[str, np.ndarray] = {}
     for i, name in enumerate(points.names):
-        places.setdefault(joint_of(name), points.xyz_m[:, i])
+        places.setdefault(joint_of(name) or joint_of_bone(name), points.xyz_m[:, i])
     places.pop("", None)
     rows = _torso(places)
     for side in SIDES:
@@ -58,7 +64,7 @@ def motion_from_points(markers: Markers) -> Motion:
                 continue
             rows[sided(part, side)] = (a, b, parent if parent in rows else "", np.array(rest) * mirror)
     limbs = [role for role in rows if role not in ("hips", "spine", "head")]
-    if not limbs:
+    if not any(rows[role][1] is not None for role in limbs):
         raise InputError("No two of the points are joints of one limb (such as shoulder.R and elbow.R); rename the points.")
     return _motion(rows, points)
 

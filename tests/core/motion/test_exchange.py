@@ -13,7 +13,7 @@ from tricap.core.motion.c3d import read_c3d, write_c3d
 from tricap.core.motion.markers import Markers
 from tricap.core.motion.points_csv import read_points_csv, write_points_csv
 from tricap.core.motion.retarget.mapping import find_map
-from tricap.core.motion.retarget.points import joint_of, motion_from_points
+from tricap.core.motion.retarget.points import joint_of, joint_of_bone, motion_from_points
 from tricap.core.motion.retarget.transfer import directions
 from tricap.core.motion.retarget.turns import angle_of, transposed
 from tricap.core.motion.sources import read_motion_source
@@ -104,9 +104,10 @@ def test_points_make_a_motion_whose_limbs_point_alike() -> None:
 
 
 @pytest.mark.parametrize(("name", "joint"), [("RKnee", "shin.R"), ("elbow.L", "forearm.L"), ("left_ankle", "foot.L"), ("MidHip", "hips"),
-                                             ("LBigToe", "toe.L"), ("C7", "")])
+                                             ("LBigToe", "toe.L"), ("C7", ""), ("lfemur", "thigh.L"),
+                                             ("mixamorig:RightForeArm", "forearm.R")])
 def test_joints_by_name(name: str, joint: str) -> None:
-    assert joint_of(name) == joint
+    assert (joint_of(name) or joint_of_bone(name)) == joint
 
 
 BVH = """HIERARCHY
