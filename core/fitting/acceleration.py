@@ -9,6 +9,9 @@ import numpy as np
 
 from .block_band import NormalEquations
 
+SPAN_S = 0.1  # accelerations of a start are taken over this time, so that its noise does not count
+LEAST = 0.1  # of the loosest sigma: however steady a motion was where it was seen
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Acceleration:
@@ -42,3 +45,19 @@ class Acceleration:
             equations.next1[t] += np.diag(c[1] * c[0] * weight)
             equations.next1[t + 1] += np.diag(c[2] * c[1] * weight)
             equations.next2[t] += np.diag(c[2] * c[0] * weight)
+
+
+def typical_acceleration(motion: np.ndarray, known: np.ndarray, time_s: np.ndarray, loosest: np.ndarray) -> np.ndarray:
+    """Sigma (D,) of the accelerations of a motion (T, D), from where it is `known` (T, D); between `LEAST` times and once the `loosest`.
+
+    A hidden limb goes on as that limb moves where it is seen. The root mean square of second differences over `SPAN_S`.
+    """
+    step = max(1, round(SPAN_S / float(np.median(np.diff(time_s))))) if len(time_s) > 1 else 1
+    if len(motion) < 2 * step + 3:
+        return loosest
+    h = (time_s[2 * step :] - time_s[: -2 * step]) / 2
+    a = (motion[2 * step :] - 2 * motion[step:-step] + motion[: -2 * step]) / h[:, None] ** 2
+    good = known[2 * step :] & known[step:-step] & known[: -2 * step]
+    count = good.sum(axis=0)
+    rms = np.sqrt((np.where(good, a, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1))
+    return np.where(count >= 3, np.clip(rms, LEAST * loosest, loosest), loosest)

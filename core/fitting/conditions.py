@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from .cloud_points import CloudPoints
 from .observations import EqualRadii, Observation, ShapePrior, SurfacePoints, Symmetry
 from .problem import Problem
 from .robust import robust_weights
-from .segmentation import segment
+from .segmentation import HeldSegments, segment
 from .settings import FitSettings
 from .state import BodyState, ShapeParameters
 
@@ -31,13 +32,15 @@ class Conditions:
     click: int  # index of the click frame
     priors: list[Observation]  # of every frame's motion
 
-    def surface(self, points: CloudPoints, state: BodyState, wide: float = 1.0) -> SurfacePoints:
-        """The points near a body's surface, as observations of it; `wide` multiplies the gate.
+    def surface(self, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0, held: HeldSegments | None = None,
+                ) -> SurfacePoints:
+        """The points near a body's surface, as observations of it; `wide` (B,) or for all multiplies the gate.
 
         Points within one patch share the model's error: the weight of their common part is divided among them (`crowding`).
         """
         s = self.settings
-        rows, bone = segment(points, state, self.model.surface, s.gate_m * wide)
+        find = partial(segment, points, state, self.model.surface, s.gate_m * wide)
+        rows, bone = find() if held is None else held.get(points.frame, state, find)
         own, model = points.sigma_m[rows] ** 2 + 1e-12, s.model_sigma_m**2
         share = max(1.0, (s.model_patch_m / s.voxel_m) ** 2)
         found = SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=np.sqrt(own + model),

@@ -2,7 +2,8 @@
 
 Each frame starts from the prediction 2θ_i − θ_{i−1}, which is also a weak observation; tracked points tie it to its neighbour. A frame
 that explains far fewer points than its neighbour is tried again from the neighbour's posture; one without points keeps the prediction, and
-the next is tried from both.
+the next is tried from both. A limb without points (hidden behind another) comes to rest in its prediction, and is looked for in a wider
+and wider gate, so that it is found where it comes out.
 """
 
 import numpy as np
@@ -14,39 +15,68 @@ from .material_tracks import MaterialTracks
 from .observations import MotionPrior, Observation, StepsFromFixed
 from .segmentation import crop
 from .solver import Solution, solve
-from .state import BodyState
+from .state import BodyState, free_bones
 
 LOST_SUPPORT = 0.6  # a frame with a smaller share of its neighbour's support is tried again
 COASTING = 5  # after so many frames without points the prediction stands still
 REACH_M = 0.20  # of the points looked at in one frame; half of it is kept for the adjustment of the sequence
+MOST_POINTS = 1200  # of a frame: enough for a start of the adjustment over the sequence
+SLOWING = 0.7  # per frame, of what is not seen
+WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per frame, and at most
 
 
 def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first: Solution, tracks: MaterialTracks | None,
-           monitor: Monitor) -> tuple[np.ndarray, list[CloudPoints]]:
-    """Motion (T, D) of all frames, and the points near the body in each."""
+           monitor: Monitor) -> tuple[np.ndarray, list[CloudPoints], np.ndarray]:
+    """Motion (T, D) of all frames, the points near the body in each, and where each DOF (T, D) was seen."""
     T, done = len(points), 1
     motion = np.empty((T, first.motion.shape[1]))
     motion[fit.click] = first.motion[0]
+    known = np.ones(motion.shape, dtype=bool)
     for direction in (1, -1):
         support, seen = None, [fit.click]
+        unseen = _unseen(fit, points[fit.click], first.motion[0], first.vector, np.zeros(len(fit.model.skeleton.bones)))
         for t in range(fit.click + direction, T if direction > 0 else -1, direction):
             monitor.step("fit frame after frame", done, T)
             before = fit.parameters.state(motion[t - direction], first.vector)
             moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else None
-            near = crop(points[t], before, REACH_M)
-            motion[t], found = _next_posture(fit, near, moved, _predictions(motion, time_s, seen, t), first, support)
+            near = _some(crop(points[t], before, REACH_M))
+            predictions = _predictions(motion, time_s, seen, t, _slowing(fit, unseen))
+            motion[t], found = _next_posture(fit, near, moved, predictions, first, support, 1 + np.minimum(WIDENING * unseen, WIDEST - 1))
+            known[t] = False
             if found is not None:
                 support = found
                 seen.append(t)
+                unseen = _unseen(fit, near, motion[t], first.vector, unseen)
+                known[t] = _slowing(fit, unseen) == 1
             done += 1
-    return motion, [crop(p, fit.parameters.state(m, first.vector), REACH_M / 2) for p, m in zip(points, motion)]
+    states = fit.parameters.states(motion, first.vector)
+    return motion, [crop(p, state, REACH_M / 2) for p, state in zip(points, states)], known
 
 
-def _predictions(motion: np.ndarray, time_s: np.ndarray, seen: list[int], t: int) -> list[np.ndarray]:
+def _some(points: CloudPoints) -> CloudPoints:
+    """Not more than `MOST_POINTS`, evenly from the order of the voxels."""
+    return points.take(np.arange(0, len(points.xyz_m), 1 + (len(points.xyz_m) - 1) // MOST_POINTS)) if len(points.xyz_m) else points
+
+
+def _unseen(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """For how many frames each bone (B,) had too few points; 0 for those whose posture the model believes firmly."""
+    bones = fit.surface(points, fit.parameters.state(motion, vector)).bone
+    few = np.bincount(bones, minlength=len(before)) < fit.settings.min_points / 2
+    return np.where(few & free_bones(fit.parameters), before + 1, 0)
+
+
+def _slowing(fit: Conditions, unseen: np.ndarray) -> np.ndarray:
+    """Factor (D,) of the predicted change of every DOF: less than 1 where none of the bones that it moves is seen."""
+    moved, free = fit.model.skeleton.moved_by, free_bones(fit.parameters)
+    seen = ((unseen == 0) & free)[:, None] & moved
+    return np.where(seen.any(axis=0) | ~(free[:, None] & moved).any(axis=0), 1.0, SLOWING)
+
+
+def _predictions(motion: np.ndarray, time_s: np.ndarray, seen: list[int], t: int, slowing: np.ndarray) -> list[np.ndarray]:
     last = motion[seen[-1]]
     if len(seen) < 2 or abs(t - seen[-1]) > COASTING:
         return [last]
-    rate = (last - motion[seen[-2]]) / (time_s[seen[-1]] - time_s[seen[-2]])
+    rate = slowing * (last - motion[seen[-2]]) / (time_s[seen[-1]] - time_s[seen[-2]])
     return [last + rate * (time_s[t] - time_s[seen[-1]]), last]
 
 
@@ -59,7 +89,7 @@ def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, di
 
 
 def _next_posture(fit: Conditions, points: CloudPoints, moved: StepsFromFixed | None, predictions: list[np.ndarray], first: Solution,
-                  last_support: float | None) -> tuple[np.ndarray, float | None]:
+                  last_support: float | None, wide: np.ndarray) -> tuple[np.ndarray, float | None]:
     """The posture (D,) and its support; None if the frame has too few points, and the posture is the prediction."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
@@ -69,7 +99,7 @@ def _next_posture(fit: Conditions, points: CloudPoints, moved: StepsFromFixed | 
         prior = MotionPrior(mean=start, sigma=sigma)
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior) -> list[Observation]:
-            return [fit.surface(points, state), *([moved] if moved is not None else []), prior, *fit.priors]
+            return [fit.surface(points, state, wide), *([moved] if moved is not None else []), prior, *fit.priors]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
         support = fit.support(points, solution.motion[0], first.vector)

@@ -2,6 +2,7 @@
 squares in the images.
 """
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -11,16 +12,16 @@ from ..body.skeleton import Skeleton, joint_positions
 from .clicks import Clicks
 from .observations import JointLimits, MotionPrior, Observation, ShapePrior
 from .solver import Problem, Solution, solve
-from .state import ShapeParameters
+from .state import FIRM, ShapeParameters
 
 GRID_STEP = np.radians(25.0)
 FREE_SPAN = np.pi  # search range of a DOF without limits
 STEPS = 40
 LITTLE = np.radians(65.0)  # what bends less belongs to the trunk
+LASTS_S = 0.5
 ENOUGH_BONES = 4
 OWN_SIGMA, STATURE_SIGMA = 0.10, 0.07  # of a bone about its person's proportions, of a person about the model
 CLICK_SIGMA_M = 0.03
-FIRM = np.radians(20.5)  # a prior of this sigma is start enough
 
 
 def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], length_sigma: float) -> Solution:
@@ -118,10 +119,12 @@ def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarr
     Bones whose posture the model believes firmly have none.
     """
     skeleton, starts = parameters.skeleton, []
+    trunk = trunk_joints(skeleton)
+    turned = sum(clicks.located[skeleton.joint_names.index(j)] for j in trunk) >= 3
     for b, bone in enumerate(skeleton.bones):
         dofs = _movers(skeleton, b)
-        believed = all(skeleton.dofs[d].prior_sigma <= FIRM for d in dofs)
-        if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or believed:
+        believed = all(dof.prior_sigma <= FIRM for dof in bone.dofs)
+        if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or believed or (turned and bone.tail_joint in trunk):
             continue
         for values in product(*(_values(skeleton, d)[1::2] for d in dofs)):
             start = motion.copy()
@@ -140,6 +143,17 @@ def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> l
     sigma[free] = np.pi
     mean[base], sigma[base] = about_m, 10.0
     return [JointLimits(low=low, high=high, sigma=limit_sigma), MotionPrior(mean=mean, sigma=sigma)]
+
+
+def lasting(priors: list[Observation], time_s: np.ndarray) -> list[Observation]:
+    """The beliefs of one frame for every frame of a sequence: a posture lasts, so frames closer than `LASTS_S` share one belief.
+
+    Not so firm beliefs: they stand for what is hardly measured, and are up against the model's error, which is the same in all frames.
+    """
+    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else LASTS_S
+    frames = min(max(1.0, LASTS_S / step), float(len(time_s)))
+    return [replace(p, sigma=np.where(p.sigma <= FIRM, p.sigma, p.sigma * np.sqrt(frames))) if isinstance(p, MotionPrior) else p
+            for p in priors]
 
 
 def _movers(skeleton: Skeleton, bone: int) -> np.ndarray:

@@ -1,13 +1,14 @@
 """Trajectories as the fit sees them: for each pair of successive frames the points that were seen in both, thinned, on their limbs."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from .cloud_points import CloudPoints
 from .observations import MaterialSteps
-from .segmentation import segment
+from .segmentation import HeldSegments, segment
 from .settings import FitSettings
 from .state import BodyState
 
@@ -39,12 +40,14 @@ class MaterialTracks:
         self._xyz = [xyz[where[f]] if f in where else np.full(xyz.shape[1:], np.nan) for f in frames]
         self._sigma = [sigma[where[f]] if f in where else np.full(xyz.shape[1], np.nan) for f in frames]
         self._surface, self._settings = surface, settings
+        self._held = HeldSegments()
         self._pairs = [self._pair(t) for t in range(len(frames) - 1)]
 
     def steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
         """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`; None: not yet known)."""
         rows, sigma = self._pairs[t]
-        found = [self._limbs(i, rows, sigma, state) for i, state in ((t, a), (t + 1, b)) if state is not None]
+        found = [self._held.get((t, i), state, partial(self._limbs, i, rows, sigma, state))
+                 for i, state in ((t, a), (t + 1, b)) if state is not None]
         keep = np.flatnonzero((found[0] >= 0) & (found[0] == found[-1]))
         if not len(keep):
             return None

@@ -23,6 +23,13 @@ if TYPE_CHECKING:
 CROSS = [0, 2]  # the two axes across a bone
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b of vectors (…, 3), a fifth of numpy's time for few."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """The balls that make the surface of one bone's part (its own, its parent's, its children's), and the parameters that move them."""
@@ -127,9 +134,9 @@ class PartField:
         state, part, n = self.state, self.part, len(self.part.skeleton.base_dofs)
         moved, _ = part.tables
         axes = state.axes[part.dofs]
-        lever = np.cross(axes, state.head_m[part.skeleton.dof_bone[part.dofs]])  # a_k × o_k
+        lever = cross(axes, state.head_m[part.skeleton.dof_bone[part.dofs]])  # a_k × o_k
         g = self._bone_gradients
-        moments = np.cross(self.xyz_m[:, None], g)
+        moments = cross(self.xyz_m[:, None], g)
         table = np.concatenate([np.einsum("kd,di->kid", moved, lever), np.einsum("kd,di->kid", moved, -axes)], axis=1)
         table[:, :3, :n] = -axes[:n].T
         wrench = np.concatenate([g, moments], axis=2).reshape(len(g), -1)  # force and moment of each bone

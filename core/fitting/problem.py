@@ -190,7 +190,7 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
 def _free_columns(problem: Problem, motion: int, w: np.ndarray | float, rows: np.ndarray, columns: np.ndarray,
                   J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted transpose (c, n), columns (c,) and J (n, c) of a block without the shape parameters that are held."""
-    if columns[-1] >= motion and len(problem.free_shape) < len(problem.place_of_shape):
+    if len(columns) and columns[-1] >= motion and len(problem.free_shape) < len(problem.place_of_shape):
         place = np.where(columns < motion, columns, motion + problem.place_of_shape[np.maximum(columns - motion, 0)])
         keep = place >= np.where(columns < motion, 0, motion)
         columns, J = place[keep], J[:, keep]

@@ -6,6 +6,9 @@ is another part's or bends with the joint (the shoulder belongs to the trunk, wh
 points into the limb.
 """
 
+from collections.abc import Callable, Hashable
+from typing import Any
+
 import numpy as np
 
 from ..body.metaballs import STATIONS
@@ -13,37 +16,54 @@ from .cloud_points import CloudPoints
 from .state import CROSS, BodyState
 
 RADIUS_OF_SUM = 1 / 1.534  # limb radius / l of three balls a segment
+HARDLY_M = 0.0015
 FACING = 0.6  # least cosine between a point's normal and the limb's
 
 
-def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: float) -> tuple[np.ndarray, np.ndarray]:
+def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the points that belong to a limb (K,) and the limb's bone (K,).
 
-    `surface` (B, 2): fractions of each bone between which a surface is its own; `gate_m`: farthest distance from the limb's surface.
+    `surface` (B, 2): fractions of each bone between which a surface is its own; `gate_m` (B,) or for all:
+    farthest distance from the limb's surface.
     """
-    n = len(points.xyz_m)
+    n, gate = len(points.xyz_m), np.broadcast_to(gate_m, (len(state.lengths_m),))
     nearest, owner = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
     own = np.zeros(n, dtype=bool)
-    for b, rows in _candidates(points.xyz_m, state, gate_m):
+    for b, rows in _candidates(points.xyz_m, state, gate):
         gap, along, facing = _from_bone(points.xyz_m[rows], points.normals[rows], state, b)
         closer = gap < nearest[rows]
         rows = rows[closer]
         nearest[rows], owner[rows] = gap[closer], b
         own[rows] = ((along >= surface[b, 0]) & (along <= surface[b, 1]) & facing)[closer]
-    found = np.flatnonzero(own & (np.abs(nearest) < gate_m))
+    found = np.flatnonzero(own & (np.abs(nearest) < gate[owner]))
     return found, owner[found]
+
+
+class HeldSegments:
+    """Whose each point is, as long as the body has hardly moved since it was asked; points do not change sides for a millimetre."""
+
+    def __init__(self) -> None:
+        self._held: dict[Hashable, tuple[np.ndarray, Any]] = {}
+
+    def get(self, key: Hashable, state: BodyState, find: Callable[[], Any]) -> Any:
+        """What was found for `key` when the body was where it is now, within `HARDLY_M`; else what `find` finds now."""
+        tails = state.head_m + state.lengths_m[:, None] * state.R[:, :, 1]
+        now = np.concatenate([state.head_m, tails, state.balls.radii_m])
+        if key not in self._held or np.abs(self._held[key][0] - now).max() > HARDLY_M:
+            self._held[key] = (now, find())
+        return self._held[key][1]
 
 
 def crop(points: CloudPoints, state: BodyState, reach_m: float) -> CloudPoints:
     """The points within `reach_m` of the bones: what a fit near this posture can ever need."""
     near = np.zeros(len(points.xyz_m), dtype=bool)
-    for b, rows in _candidates(points.xyz_m, state, reach_m):
+    for b, rows in _candidates(points.xyz_m, state, np.full(len(state.lengths_m), reach_m)):
         near[rows] |= _from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] < reach_m
     return points.take(np.flatnonzero(near))
 
 
-def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: float) -> list[tuple[int, np.ndarray]]:
-    """For each bone with balls the points (K,) in a sphere that holds all within `reach_m` of its surface."""
+def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """For each bone with balls the points (K,) in a sphere that holds all within its `reach_m` (B,) of its surface."""
     bones = np.unique(state.balls.bone_index)
     widest = np.array([RADIUS_OF_SUM * state.balls.radii_m[state.balls.bone_index == b][:, CROSS].max() for b in bones])
     half = state.lengths_m[bones] / 2
@@ -51,7 +71,7 @@ def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: float) -> list[tup
     origin = middle.mean(axis=0)
     X, C = xyz_m - origin, middle - origin
     squares = np.einsum("ni,ni->n", X, X)[:, None] - 2 * X @ C.T + np.einsum("bi,bi->b", C, C)
-    near = squares <= (half + widest + reach_m) ** 2
+    near = squares <= (half + widest + reach_m[bones]) ** 2
     return [(int(b), np.flatnonzero(column)) for b, column in zip(bones, near.T)]
 
 

@@ -20,21 +20,22 @@ from ..body.shape import default_shape, scaled_shape
 from ..errors import InputError
 from ..geometry.rig import Rig
 from ..progress import Monitor
-from .acceleration import Acceleration
+from .acceleration import Acceleration, typical_acceleration
 from .body_motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from .click_frame import clicked_lengths, fit_click_frame
 from .clicks import read_clicks
 from .cloud_points import Cloud, CloudPoints, thinned
 from .conditions import Conditions
 from .frame_to_frame import follow
-from .inverse_kinematics import FIRM, clicked_stature, dof_priors
+from .inverse_kinematics import clicked_stature, dof_priors, lasting
 from .material_tracks import MaterialTracks, Trajectories
 from .observations import Observation
 from .problem import Problem, linearise, variance_factors
 from .robust import robust_scale
+from .segmentation import HeldSegments
 from .settings import FitSettings
 from .solver import Solution, solve
-from .state import BodyState, ShapeParameters
+from .state import BodyState, ShapeParameters, free_bones
 
 __all__ = ["BodyFit", "BodyMotion", "FitSettings", "fit_sequence"]
 
@@ -65,8 +66,9 @@ def fit_sequence(rig: Rig, model_name: str, clouds: Sequence[Cloud], joints: Map
     tracks = None
     if trajectories is not None and settings.use_trajectories:
         tracks = MaterialTracks(trajectories, [p.frame for p in points], fit.model.surface, settings)
-    motion, points = follow(fit, points, time_s, first, tracks, monitor)
-    problem = _whole_sequence(fit, points, time_s, tracks, clicked_lengths(fit, points[fit.click], first))
+    motion, points, known = follow(fit, points, time_s, first, tracks, monitor)
+    sigma = typical_acceleration(motion, known, time_s, _loosest(fit))
+    problem = _whole_sequence(fit, points, time_s, sigma, tracks, clicked_lengths(fit, points[fit.click], first))
     solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
     return _result(fit, points, time_s, solution, problem)
 
@@ -91,14 +93,23 @@ def _conditions(rig: Rig, model_name: str, frames: list[int], joints: Mapping[st
                       click=frames.index(click_frame), priors=priors)
 
 
-def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, tracks: MaterialTracks | None,
-                    lengths: tuple[np.ndarray, np.ndarray]) -> Problem:
+def _loosest(fit: Conditions) -> np.ndarray:
+    """The largest sigma (D,) of accelerations."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
     sigma[skeleton.layout.set("base")] = s.acceleration_m_s2
+    return sigma
+
+
+def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, sigma: np.ndarray, tracks: MaterialTracks | None,
+                    lengths: tuple[np.ndarray, np.ndarray]) -> Problem:
+    s = fit.settings
+    priors = lasting(fit.priors, time_s)
+
+    held = HeldSegments()
 
     def observe(t: int, state: BodyState) -> list[Observation]:
-        return [fit.surface(points[t], state), *([fit.clicks.observation] if t == fit.click else []), *fit.priors]
+        return [fit.surface(points[t], state, held=held), *([fit.clicks.observation] if t == fit.click else []), *priors]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
     return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),
@@ -142,9 +153,7 @@ def _covariance(problem: Problem, solution: Solution) -> tuple[np.ndarray, np.nd
 
 
 def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
-    bones = fit.model.skeleton.bones
-    free = [b for b in np.unique(fit.parameters.template.metaballs.bone_index) if any(dof.prior_sigma > FIRM for dof in bones[b].dofs)]
-    enough = counts[:, free] >= fit.settings.min_points
+    enough = counts[:, free_bones(fit.parameters)] >= fit.settings.min_points
     usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
     total = counts.sum(axis=1)
     few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))

@@ -8,8 +8,8 @@ from ..progress import Monitor
 from .problem import Linearised, Problem, Scales, cost, first_scales, linearise
 
 START_DAMPING, LARGEST_DAMPING = 1e-3, 1e8
-STEP_DONE = 2e-5  # rad, m, relative
-COST_DONE = 1e-5
+STEP_DONE = 1e-4  # rad, m, relative
+COST_DONE = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

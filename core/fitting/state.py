@@ -15,7 +15,9 @@ from ..body.shape import BodyShape
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
 from .part_field import CROSS, Part
 
-__all__ = ["CROSS", "BodyState", "ShapeParameters", "shape_vector"]
+__all__ = ["CROSS", "FIRM", "BodyState", "ShapeParameters", "free_bones", "shape_vector"]
+
+FIRM = float(np.radians(20.5))  # a DOF with a prior of a smaller sigma is believed firmly
 
 
 
@@ -64,6 +66,13 @@ class BodyState:
 def shape_vector(state: BodyState) -> np.ndarray:
     """(S,) of a body: ln of lengths and cross radii."""
     return np.log(np.concatenate([state.lengths_m, state.balls.radii_m[:, CROSS].ravel()]))
+
+
+def free_bones(parameters: "ShapeParameters") -> np.ndarray:
+    """Whether each bone (B,) has balls and a posture that must be seen, because the model does not believe it firmly beforehand."""
+    bones, found = parameters.skeleton.bones, np.zeros(parameters.n_lengths, dtype=bool)
+    found[parameters.template.metaballs.bone_index] = True
+    return found & np.array([any(dof.prior_sigma > FIRM for dof in bone.dofs) for bone in bones])
 
 
 class ShapeParameters:

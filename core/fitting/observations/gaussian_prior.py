@@ -1,15 +1,17 @@
 """Parameters believed to lie near a value: (θ − mean) / σ. Used for the prediction 2θ_i − θ_{i−1}, for weak beliefs about twist, for
 bone lengths and radii (in logarithms, so that σ is relative)."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..state import BodyState, shape_vector
+from .blocks import Block, FromBlocks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MotionPrior:
+class MotionPrior(FromBlocks):
     """Mean and sigma of every DOF (D,), rad or metres; an infinite sigma believes nothing."""
 
     mean: np.ndarray
@@ -21,11 +23,15 @@ class MotionPrior:
         """(D,)"""
         return (state.motion - self.mean) / self.sigma
 
-    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
-        """(D, D + S) or (D, D)"""
-        J = np.zeros((state.n_motion, state.n_motion + (state.n_shape if shape else 0)))
-        J[:, : state.n_motion] = np.diag(1 / np.broadcast_to(self.sigma, state.motion.shape))
-        return J
+    def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
+        """Diagonal, to the motion."""
+        every = np.arange(state.n_motion)
+        yield every, every, np.diag(1 / np.broadcast_to(self.sigma, state.motion.shape))
+
+    @property
+    def size(self) -> int:
+        """D."""
+        return len(self.mean)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..part_field import cross
 from ..state import BodyState
 from .blocks import Block, FromBlocks
 
@@ -91,7 +92,7 @@ def _derivative(state: BodyState, bone: int, xyz_m: np.ndarray) -> np.ndarray:
     """Of the local points of one bone, to the DOFs and lengths of its chain (N, 3, d + l)."""
     sk = state.skeleton
     dofs, lengths = state.parts[bone].chain
-    turns = np.cross(state.axes[dofs], xyz_m[:, None] - state.head_m[sk.dof_bone[dofs]])
+    turns = cross(state.axes[dofs], xyz_m[:, None] - state.head_m[sk.dof_bone[dofs]])
     turns[:, : len(sk.base_dofs)] = np.eye(3)
     stretch = state.lengths_m[lengths, None] * state.R[lengths, :, 1]
     moves = np.concatenate([turns, np.broadcast_to(stretch, (len(xyz_m), *stretch.shape))], axis=1)
