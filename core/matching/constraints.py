@@ -34,9 +34,15 @@ SAMPLE = 1000  # points that tell the rig's quality
 NEIGHBOUR_NOISE_PX = 0.05
 MEDIAN_OF_CHI2 = 0.4549
 SCATTER_SHARE = 0.3  # of the neighbours' scatter about their quadric: what the model does not follow
-LOOSER, LESS_ALIKE = 2.0, 0.15  # limits of a piece of surface: held by all views and its neighbours, it may look less alike in each
+# Limits of a piece of surface: held by all views and its neighbours, it may look less alike in each; and its sigma is honest,
+# on skin up to four times the naive one.
+LESS_SURE, LOOSER, LESS_ALIKE = 4.0, 2.0, 0.15
+    4.0,
+    2.0,
+    0.15,
+)  # an honest sigma is up to four times the naive one on skin; limits of a piece of surface: held by all views and its neighbours, it may look less alike in each
 MAX_STEEPNESS = 5.0  # change of depth per distance across
-OUTLINE_SIGMA_PX = 1.3  # across the ray, where no neighbour supports a point: at an outline the patch hangs over the body's edge
+OUTLINE_SIGMA_PX = 1.3  # across the ray where no neighbour supports a point: at an outline the patch hangs over the edge
 
 
 def constrain(
@@ -97,7 +103,7 @@ def _object_space(
     wide = replace(
         settings,
         patch_px=settings.patch_px + WINDOW_EXTRA_PX,
-        max_sigma_px=LOOSER * settings.max_sigma_px,
+        max_sigma_px=LESS_SURE * settings.max_sigma_px,
         max_sigma0=LOOSER * settings.max_sigma0,
         min_correlation=max(0.0, settings.min_correlation - LESS_ALIKE),
     )
