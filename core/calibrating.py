@@ -102,28 +102,12 @@ def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor, note: No
         raise InputError(
             f"The bar's length is given as {length_m:g} m; give the distance between the middles of its two targets in metres, such as 0.6."
         )
-    rows = row_grid(footage.interlaced)
     tracks, sizes = [], []
-    for view, (name, sequence) in enumerate(zip(footage.names, footage.sequences)):
-        found: list[Targets] = []
-        size, whole = (0, 0), 0
-        for n in range(footage.count):
-            monitor.step(f"targets {name}", n, footage.count)
-            image = sequence.read(n)
-            if n and image.shape[::-1] != size:
-                raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
-            size = (image.shape[1], image.shape[0])
-            if footage.mask is not None and footage.mask.shape != image.shape:
-                raise InputError(f"The mask has {footage.mask.shape[1]}×{footage.mask.shape[0]} pixels, view {name} {size[0]}×{size[1]}.")
-            targets = find_targets(rows.rows(image), None if footage.mask is None else rows.rows(footage.mask))
-            found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
-            whole += int((targets.status == TargetStatus.OK).sum() >= 2)
-            if note is not None:
-                note(name, len(found), whole)
-        monitor.step(f"targets {name}", footage.count, footage.count)
-        tracks.append(track_bar(found, float(size[0])))
+    for view in range(len(footage.names)):
+        track, size = _measure_view(footage, view, monitor, note)
+        _check_view(footage, view, track, size[0])
+        tracks.append(track)
         sizes.append(size)
-        _check_view(footage, view, tracks[-1], size[0])
     observations = BarObservations(
         names=footage.names,
         size_px=np.array(sizes, dtype=np.float64),
@@ -134,6 +118,28 @@ def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor, note: No
     )
     _check_positions(footage, observations)
     return MeasuredBar(tracks=tuple(tracks), observations=observations)
+
+
+def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note | None) -> tuple[BarTrack, tuple[int, int]]:
+    """The bar's track in one view, and the size of its images."""
+    name, sequence, rows = footage.names[view], footage.sequences[view], row_grid(footage.interlaced)
+    found: list[Targets] = []
+    size, whole = (0, 0), 0
+    for n in range(footage.count):
+        monitor.step(f"targets {name}", n, footage.count)
+        image = sequence.read(n)
+        if n and image.shape[::-1] != size:
+            raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
+        size = (image.shape[1], image.shape[0])
+        if footage.mask is not None and footage.mask.shape != image.shape:
+            raise InputError(f"The mask has {footage.mask.shape[1]}×{footage.mask.shape[0]} pixels, view {name} {size[0]}×{size[1]}.")
+        targets = find_targets(rows.rows(image), None if footage.mask is None else rows.rows(footage.mask))
+        found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
+        whole += int((targets.status == TargetStatus.OK).sum() >= 2)
+        if note is not None:
+            note(name, len(found), whole)
+    monitor.step(f"targets {name}", footage.count, footage.count)
+    return track_bar(found, float(size[0])), size
 
 
 def _in_frame(targets: Targets, xy_px: np.ndarray) -> Targets:
