@@ -37,10 +37,6 @@ SCATTER_SHARE = 0.3  # of the neighbours' scatter about their quadric: what the 
 # Limits of a piece of surface: held by all views and its neighbours, it may look less alike in each; and its sigma is honest,
 # on skin up to four times the naive one.
 LESS_SURE, LOOSER, LESS_ALIKE = 4.0, 2.0, 0.15
-    4.0,
-    2.0,
-    0.15,
-)  # an honest sigma is up to four times the naive one on skin; limits of a piece of surface: held by all views and its neighbours, it may look less alike in each
 MAX_STEEPNESS = 5.0  # change of depth per distance across
 OUTLINE_SIGMA_PX = 1.3  # across the ray where no neighbour supports a point: at an outline the patch hangs over the edge
 
