@@ -1,6 +1,7 @@
 """Jobs: the blocking driver, the worker thread, and everything that must stop it. The modal driver needs a window: tests/gui."""
 
 import importlib
+import sys
 import threading
 import time
 from pathlib import Path
@@ -49,6 +50,30 @@ def test_here_and_on_a_thread_give_the_same(jobs: ModuleType) -> None:
     there._thread.join()
     assert here.result == (499500, True) and there.result == (499500, False)
     assert here.fraction == there.fraction == 0.5
+
+
+def test_the_window_gets_its_turn_while_python_computes(jobs: ModuleType) -> None:
+    """A worker that never leaves the interpreter: the main thread still wakes within 50 ms (half the timer's tick) most of the time."""
+    before = sys.getswitchinterval()
+
+    def compute(monitor: object) -> None:
+        total = 0
+        for i in range(10**9):
+            total += i * i
+            if i % 1000 == 0:
+                monitor.step("counting", 0, 1)
+
+    job = jobs.Job(compute)
+    job.start()
+    waits = []
+    for _ in range(40):
+        began = time.perf_counter()
+        time.sleep(0.01)
+        waits.append(time.perf_counter() - began - 0.01)
+    assert sys.getswitchinterval() == pytest.approx(jobs.SWITCH_S, rel=1e-3)
+    job.cancel_and_join()
+    assert sys.getswitchinterval() == before
+    assert sorted(waits)[len(waits) // 2] < 0.05
 
 
 def test_cancelling_joins_within_a_second(jobs: ModuleType) -> None:
