@@ -1,5 +1,6 @@
-"""bpy.ops.tricap.build_scene(out="…", blend="…")"""
+"""bpy.ops.tricap.build_scene(out="…", blend="…", rest_pose="A", detail=1, exact_skin=False, simplify=0.0, colour="intensity")"""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import bpy
 from ...core.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
-from ..scene.build import SceneReport, write_scene
+from ..scene.build import SceneOptions, SceneReport, write_scene
+from ..scene.cloud import COLOURS
 from ..scene.contents import Contents, read_contents
+from ..scene.rest_pose import POSES
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -26,6 +29,17 @@ class BuildScene(JobOperator, bpy.types.Operator):
     blend: bpy.props.StringProperty(name="Save As", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                     description="Also save a copy of the file under this name; empty: do not save")
 
+    rest_pose: bpy.props.EnumProperty(name="Rest Pose", items=[(pose, f"{pose}-pose", "") for pose in POSES],  # type: ignore[valid-type]
+                                      description="In A-pose every channel is a number of motion.csv")
+    detail: bpy.props.IntProperty(name="Skin Detail", default=1, min=1, max=8,  # type: ignore[valid-type]
+                                  description="Pieces of each edge of the skin, by B-spline patches")
+    exact_skin: bpy.props.BoolProperty(name="Exact Skin", default=False,  # type: ignore[valid-type]
+                                       description="Also the skin of every frame, in a .pc2 beside the saved file; about 0.1 s a frame")
+    simplify: bpy.props.FloatProperty(name="Simplify", default=0.0, min=0.0, max=math.radians(10), subtype="ANGLE",  # type: ignore[valid-type]
+                                      description="Play an action with few keys within this angle; the measured one is kept. 0: measured")
+    colour: bpy.props.EnumProperty(name="Cloud Colour", items=[(c, c.capitalize(), "") for c in COLOURS])  # type: ignore[valid-type]
+    arrows: bpy.props.BoolProperty(name="Velocity Arrows", default=False)  # type: ignore[valid-type]
+
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Contents]:
         """Which folder is meant."""
         out = folders.output_folder(self.out, context.scene)
@@ -33,7 +47,9 @@ class BuildScene(JobOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, result: Contents) -> set[str]:
         """Build the scene from what was read."""
-        report = write_scene(result, Path(bpy.path.abspath(self.blend)) if self.blend else None)
+        options = SceneOptions(rest_pose=self.rest_pose, detail=self.detail, exact_skin=self.exact_skin, colour=self.colour,
+                               simplify_deg=math.degrees(self.simplify), arrows=self.arrows)
+        report = write_scene(result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         tell(self, report)
         return {"FINISHED"}
 
