@@ -16,7 +16,7 @@ from .cloud_points import CloudPoints
 from .state import CROSS, BodyState
 
 RADIUS_OF_SUM = 1 / 1.534  # limb radius / l of three balls a segment
-HARDLY_M = 0.0015
+HARDLY_M = 0.004
 FACING = 0.6  # least cosine between a point's normal and the limb's
 
 

@@ -11,14 +11,17 @@ from ..state import BodyState
 from .blocks import Block, FromBlocks
 from .clicked_joint import ClickedJoints
 from .equal_radii import EqualRadii
+from .foot_on_floor import FootOnFloor
 from .gaussian_prior import MotionPrior, ShapePrior
 from .joint_limit import JointLimits
+from .keypoint import Keypoints
 from .material_step import MaterialSteps, StepsFromFixed
+from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
 from .symmetry import Symmetry
 
-__all__ = ["Block", "ClickedJoints", "EqualRadii", "FromBlocks", "JointLimits", "MaterialSteps", "MotionPrior", "Observation",
-           "ShapePrior", "StepsFromFixed", "SurfacePoints", "Symmetry"]
+__all__ = ["Block", "ClickedJoints", "EqualRadii", "FootOnFloor", "FromBlocks", "JointLimits", "Keypoints", "MaterialSteps", "MotionPrior",
+           "Observation", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints", "Symmetry"]
 
 
 class Observation(Protocol):

@@ -46,6 +46,7 @@ class SurfacePoints(FromBlocks):
     crowding: np.ndarray | float = 1.0  # (N,) how many times less a point tells than if its error were its own
     form: str = "metric"  # or "paper"
     parts: tuple[_Scaled, ...] | None = None
+    moved: bool = False  # since `scaled`
     robust: bool = True
 
     def scaled(self, state: BodyState) -> "SurfacePoints":
@@ -62,6 +63,10 @@ class SurfacePoints(FromBlocks):
                 scale = np.clip(slope, SCALE_RANGE[0] * typical, SCALE_RANGE[1] * typical)
             parts.append(_Scaled(rows=rows, bone=int(b), field=field, scale=scale, log_radius=field.shares @ _log_radii(field)))
         return replace(self, parts=tuple(parts))
+
+    def at(self, xyz_m: np.ndarray) -> "SurfacePoints":
+        """The same weights at other places (N, 3)."""
+        return replace(self, xyz_m=xyz_m, moved=True)
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(N,)"""
@@ -94,7 +99,9 @@ class SurfacePoints(FromBlocks):
         return self.parts
 
     def _field(self, held: _Scaled, state: BodyState) -> PartField:
-        return held.field if state is held.field.state else PartField(state.parts[held.bone], state, held.field.xyz_m)
+        if state is held.field.state and not self.moved:
+            return held.field
+        return PartField(state.parts[held.bone], state, self.xyz_m[held.rows])
 
     def _unit(self, held: _Scaled, field: PartField) -> np.ndarray:
         return self.sigma_m[held.rows] * held.scale * np.exp(held.log_radius - held.field.shares @ _log_radii(field))

@@ -44,6 +44,7 @@ def test_known_body_from_one_sided_noise(make_scene) -> None:
     assert np.median([_elbow_errors(s, f) for s, f in zip(scenes, fits)]) < 0.7  # 0.20°
 
 
+@pytest.mark.slow
 def test_unknown_body_in_a_sequence(make_scene, other_person) -> None:
     errors, angles = [], []
     for seed in range(5):
@@ -55,6 +56,7 @@ def test_unknown_body_in_a_sequence(make_scene, other_person) -> None:
     assert np.median(angles) < 1.0  # 8 seeds: median 0.85°, worst 1.9°
 
 
+@pytest.mark.slow
 def test_gross_points_hardly_matter(make_scene) -> None:
     clean, dirty = [], []
     for seed in range(12):
@@ -64,6 +66,7 @@ def test_gross_points_hardly_matter(make_scene) -> None:
     assert np.mean(dirty) < 1.2 * np.mean(clean)  # 1.09
 
 
+@pytest.mark.slow
 def test_sigmas_are_honest(make_scene) -> None:
     z_joints, z_dofs = [], []
     for seed in range(40):
@@ -78,6 +81,7 @@ def test_sigmas_are_honest(make_scene) -> None:
     assert 0.8 < np.sqrt(np.mean(np.square(z_dofs))) < 1.25  # 1.09
 
 
+@pytest.mark.slow
 def test_starts_thirty_degrees_off_all_converge(make_scene) -> None:
     scene = make_scene(seed=1)
     fit = _conditions(scene.rig, scene.model, [0], scene.clicks, 0, KNOWN)

@@ -1,0 +1,151 @@
+"""The fit: speed of a whole body, and its solver beside scipy's on one problem, all in one run.
+
+    python dev.py bench fit [--json FILE]
+
+The scene is the model's own surface seen from the front, with 1 mm noise: 48 DOF, 57 balls, 4,000 points a frame. Times are CPU times.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from tricap.core.body.metaballs import field_and_derivatives
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import BodyShape, default_shape
+from tricap.core.body.skeleton import bone_frames, joint_positions
+from tricap.core.fitting import sequence
+from tricap.core.fitting.conditions import Conditions
+from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.solver import solve
+from tricap.core.geometry.camera import Camera
+from tricap.core.geometry.rig import Rig
+
+POINTS, NOISE_M, FPS = 4000, 0.001, 25.0
+
+
+def rig() -> Rig:
+    """Three cameras in a row, 4 m before the person."""
+    R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    matrix = np.array([[1000, 0, 384], [0, 1000, 288], [0, 0, 1.0]])
+    return Rig(cameras=tuple(Camera(name=name, size_px=(768, 576), matrix=matrix, R_cam_world=R, t_cam_world_m=-R @ np.array([x, -4.0, 0.0]))
+                             for name, x in zip("LCR", (-0.4, 0.0, 0.4))))
+
+
+def walk(shape: BodyShape, frames: int) -> np.ndarray:
+    """A motion (T, D): arms and legs swing against each other."""
+    motion, layout = np.zeros((frames, len(shape.skeleton.dofs))), shape.skeleton.layout
+    phase = 2 * np.pi * np.arange(frames) / FPS
+    for side, sign in (("R", 1.0), ("L", -1.0)):
+        motion[:, layout[f"hip.{side} flexion"]] = np.radians(25) * sign * np.sin(phase)
+        motion[:, layout[f"knee.{side} flexion"]] = np.radians(30 + 20 * sign * np.cos(phase))
+        motion[:, layout[f"shoulder.{side} flexion"]] = np.radians(20) * -sign * np.sin(phase)
+        motion[:, layout[f"elbow.{side} flexion"]] = np.radians(30)
+    motion[:, 1] = -0.04 * np.arange(frames)
+    return motion
+
+
+def cloud(shape: BodyShape, motion: np.ndarray, frame: int, random: np.random.Generator) -> SimpleNamespace:
+    """Points on the outside of the whole surface that look at the cameras, by bisection along rays from the bones."""
+    R, head = bone_frames(shape.skeleton, shape.lengths_m, motion)
+    bones = np.unique(shape.metaballs.bone_index)
+    bone = bones[random.choice(len(bones), 4 * POINTS, p=shape.lengths_m[bones] / shape.lengths_m[bones].sum())]
+    angle, along = random.uniform(0, 2 * np.pi, len(bone)), random.uniform(0.05, 0.95, len(bone))
+    axis = head[bone] + (along * shape.lengths_m[bone])[:, None] * R[bone, :, 1]
+    ray = np.cos(angle)[:, None] * R[bone, :, 0] + np.sin(angle)[:, None] * R[bone, :, 2]
+    low, high = np.zeros(len(bone)), np.full(len(bone), 0.3)
+    for _ in range(14):
+        middle = (low + high) / 2
+        F, gradient, *_ = field_and_derivatives(shape.metaballs, shape.lengths_m, R, head, axis + middle[:, None] * ray)
+        low, high = np.where(F > 0.5, middle, low), np.where(F > 0.5, high, middle)
+    normal = -gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    seen = np.flatnonzero(normal[:, 1] < -0.3)[:POINTS]
+    X = (axis + low[:, None] * ray)[seen] + NOISE_M * random.normal(size=(len(seen), 1)) * normal[seen]
+    return SimpleNamespace(frame=frame, xyz_m=X, normals=normal[seen], covariance_m2=np.broadcast_to(np.eye(3) * NOISE_M**2, (len(X), 3, 3)))
+
+
+def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
+    """CPU seconds of the stages, and the error of the joints [mm]."""
+    shape, random, cameras = default_shape(read_model("full")), np.random.default_rng(0), rig()
+    motion = walk(shape, frames)
+    clouds = [cloud(shape, m, t, random) for t, m in enumerate(motion)]
+    joints = joint_positions(shape.skeleton, shape.lengths_m, motion[0])
+    clicks = {name: {c.name: c.project(X) + random.uniform(-3, 3, 2) for c in cameras.cameras} for name, X in joints.items()}
+    spent: dict[str, float] = {}
+    real = {name: getattr(sequence, name) for name in ("follow", "solve", "fit_click_frame")}
+
+    def timed(name: str):
+        def call(*args, **kwargs):
+            began = time.process_time()
+            result = real[name](*args, **kwargs)
+            spent[name] = spent.get(name, 0.0) + time.process_time() - began
+            return result
+        return call
+
+    try:
+        for name in real:
+            setattr(sequence, name, timed(name))
+        fit = sequence.fit_sequence(cameras, "full", clouds, clicks, 0, np.arange(frames) / FPS, None, settings)
+    finally:
+        for name, function in real.items():
+            setattr(sequence, name, function)
+    true = np.stack(list(joint_positions(shape.skeleton, shape.lengths_m, motion).values()), axis=1)
+    return {"frames": frames, "points_a_frame": float(np.mean([len(c.xyz_m) for c in clouds])), "click_frame_s": spent["fit_click_frame"],
+            "frame_to_frame_ms_a_frame": 1e3 * spent["follow"] / max(frames - 1, 1), "sequence_ms_a_frame": 1e3 * spent["solve"] / frames,
+            "iterations": fit.iterations, "joints_mm": 1e3 * float(np.linalg.norm(fit.motion.joints_m - true, axis=2).mean())}
+
+
+def beside_scipy(settings: FitSettings) -> dict[str, float]:
+    """One frame's posture from 0.05 rad off: our solver, and scipy's with 2-point differences and with our Jacobian, on the same points."""
+    shape, random, cameras = default_shape(read_model("full")), np.random.default_rng(1), rig()
+    motion = walk(shape, 1)
+    points = sequence.thinned(cloud(shape, motion[0], 0, random), settings.voxel_m)
+    clicks = {name: {c.name: c.project(X) for c in cameras.cameras}
+              for name, X in joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()}
+    fit: Conditions = sequence._conditions(cameras, "full", [0], clicks, 0, settings)
+    vector = fit.parameters.vector()
+    start = motion[0] + random.normal(0, 0.05, motion.shape[1])
+    held = [fit.surface(points, fit.parameters.state(motion[0], vector)), *fit.priors]
+    weight = [1 / np.sqrt(np.broadcast_to(getattr(o, "crowding", 1.0), o.residual(fit.parameters.state(start, vector)).shape)) for o in held]
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        state = fit.parameters.state(x, vector)
+        return np.concatenate([w * o.residual(state) for o, w in zip(held, weight)])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        state = fit.parameters.state(x, vector)
+        return np.concatenate([w[:, None] * o.jacobian(state, shape=False) for o, w in zip(held, weight)])
+
+    def seconds(function) -> tuple[float, np.ndarray]:
+        began = time.process_time()
+        found = function()
+        return time.process_time() - began, found
+
+    problem = fit.problem(lambda t, state: held)
+    ours, x = seconds(lambda: solve(problem, start[None], vector, steps=30).motion[0])
+    two_point, x2 = seconds(lambda: least_squares(residual, start, xtol=1e-4, ftol=1e-4).x)
+    with_jacobian, x3 = seconds(lambda: least_squares(residual, start, jacobian, xtol=1e-4, ftol=1e-4).x)
+    cost = [float(residual(y) @ residual(y)) for y in (x, x2, x3)]
+    return {"points": len(points.xyz_m), "ours_s": ours, "scipy_2point_s": two_point, "scipy_jacobian_s": with_jacobian,
+            "ours_cost": cost[0], "scipy_2point_cost": cost[1], "scipy_jacobian_cost": cost[2]}
+
+
+def main() -> None:
+    """Print a table, and write it as JSON where it is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    settings = FitSettings()
+    result = {"sequence": [fit_times(frames, settings) for frames in (10, 20)], "one_frame": beside_scipy(settings)}
+    for row in (*result["sequence"], result["one_frame"]):
+        print("  ".join(f"{key} {value:.4g}" for key, value in row.items()))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()
