@@ -9,7 +9,7 @@ constructive solid geometry (Ricci 1973, Comput. J. 16),
 which is 2^(1/n) of the larger field where both are equal, and the larger field elsewhere: a fillet of 4 mm on a radius of 60 mm. Both
 parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A part ends inside its neighbour:
 
-    outermost root of  min( G/T , F_own/(τ T) ) = 1 ,   τ = 0.4                                            (2)
+    first exit of the ray, beyond the outermost F_b = T, from  min( G/T , F_own/(τ T) ) ≥ 1 ,   τ = 0.4    (2)
 
 with F_own the field of its own balls, so its mesh leaves the common surface only where the neighbour's is the body's surface.
 """
@@ -27,6 +27,7 @@ from .skin_rays import Rays, smooth
 BLEND_POWER = 4.0  # n of (1)
 OWN_SHARE = 0.4  # τ of (2): below ½, or two that reach T together would both stay below it
 STEP = 0.05  # march, in units of the reach
+FINE_STEP = 0.02  # … outwards, where a gap between two parts must not be stepped over
 SECANT_STEPS = 7
 LEAST_RHO_M = 1e-3  # where the field is too weak to surround the axis
 NOTHING = 1e-300
@@ -59,7 +60,7 @@ def part_root(shape: BodyShape, parts: tuple[Part, ...], index: int, R: np.ndarr
         own = np.flatnonzero(rays.bone == bone)
         if len(own):
             near = _joined_field(shape, parts, index, bone, R, head, rays, own)
-            rho[own] = outermost_root(near.log_ratio, rays.reach[own])
+            rho[own] = _connected_root(near, rays.reach[own])
             normals[own] = near.normals(rays.origin[own] + rho[own, None] * rays.direction[own])
     return rho, normals
 
@@ -90,6 +91,28 @@ def _secant(f: LogField, a: np.ndarray, b: np.ndarray, fa: np.ndarray, fb: np.nd
     return b
 
 
+def _connected_root(near: "_JoinedField", reach: np.ndarray) -> np.ndarray:
+    """ρ (N,) of (2): beyond the own surface as far as the joint one goes without a gap, or an arm beside the flank would be webbed."""
+    if not near.others:
+        return outermost_root(near.log_ratio, reach)
+    inner = outermost_root(near.log_own, reach)
+    every = np.arange(len(reach))
+    begins = near.log_ratio(inner, every)
+    outer, pending = inner.copy(), np.flatnonzero(begins >= 0)
+    step = FINE_STEP * reach
+    while len(pending):
+        outer[pending] = np.minimum(outer[pending] + step[pending], reach[pending])
+        inside = near.log_ratio(outer[pending], pending) >= 0
+        pending = pending[inside & (outer[pending] < reach[pending])]
+    low = np.where(outer > inner, np.maximum(outer - step, inner), inner)
+    f_low, f_outer = near.log_ratio(low, every), near.log_ratio(outer, every)
+    rho = np.where(f_outer >= 0, outer, _secant(near.log_ratio, low, outer, f_low, f_outer))
+    dives = np.flatnonzero(begins < 0)  # the neighbour's flesh alone is there: the part ends deeper inside
+    if len(dives):
+        rho[dives] = outermost_root(lambda r, which: near.log_ratio(r, dives[which]), inner[dives])
+    return rho
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _JoinedField:
     """The fields near one bone, on the rays of N of its vertices."""
@@ -112,6 +135,11 @@ class _JoinedField:
         ln = self._logs(self._terms(self.origin[which] + rho[:, None] * self.direction[which])[1])
         joined = self._joined(ln, self.fade[which])
         return np.minimum(joined, ln[:, 1] - np.log(OWN_SHARE)) if self.others else joined  # (2)
+
+    def log_own(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """ln of F_b/T at ρ (N',) on the rays `which` (N',)."""
+        terms = self._terms(self.origin[which] + rho[:, None] * self.direction[which])[1]
+        return np.asarray(np.log(np.maximum(terms @ self.chosen[0], NOTHING) / THRESHOLD))
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """−∇G/|∇G| (N, 3) at a point of each ray."""
