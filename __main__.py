@@ -1,10 +1,12 @@
 """`python -m tricap …`, and the console script `tricap`: the commands of the core joined with those that need Blender."""
 
+import os
 import sys
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command of the `tricap` command line; its exit code (see docs/formats.md)."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is there: its own threads would fight ours over small matrices
     from .addon import command
     from .addon.retarget import command as retargeting
     from .core import commands

@@ -7,7 +7,8 @@ that an affine patch averages away (SCIENCE §4), so that a round body is measur
 patch is wider than the unconstrained one and fades out (Gaussian window): its precision is that of the middle, not that of its rim.
 
 What the rig does not know is estimated from the points themselves: σ_c² = median of the squared shifts across the epipolar lines − their
-own variance (of a first adjustment in which these shifts are free).
+own variance (of a first adjustment in which these shifts are free). Where σ_c is large, the calibration contradicts the images, and the
+field is kept as it was matched.
 """
 
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in un
 SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SHARE = 0.1, 0.001, 1.0  # px/px and px/px² in the search view that moves fastest; of itself
 STIFF = 0.1  # of these sigmas in the second try
 FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
+MAX_RIG_SIGMA_PX = 0.3  # a rig that is worse knows less of a point's place than its own patch does
 SAMPLE = 1000  # points that tell the rig's quality
 NEIGHBOUR_NOISE_PX = 0.05
 MEDIAN_OF_CHI2 = 0.4549
@@ -123,6 +125,8 @@ def _object_space(
     every = np.arange(len(xy))
     sample = match(every[:: max(1, len(xy) // SAMPLE)], prior, FREE_SIGMA_PX)
     rig_sigma_px = _rig_sigma(sample.across_px[sample.ok], sample.across_sigma_px[sample.ok])
+    if rig_sigma_px > MAX_RIG_SIGMA_PX:
+        return field
     found = match(every, prior, max(MIN_SIGMA_C_PX, rig_sigma_px))
     again = np.flatnonzero(~found.ok)
     if neighbours and len(again):
