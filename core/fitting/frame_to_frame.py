@@ -13,14 +13,14 @@ from .cloud_points import CloudPoints
 from .conditions import Conditions
 from .material_tracks import MaterialTracks
 from .observations import MotionPrior, Observation, StepsFromFixed
-from .segmentation import crop
+from .segmentation import HeldSegments, crop
 from .solver import Solution, solve
 from .state import BodyState, free_bones
 
 LOST_SUPPORT = 0.6  # a frame with a smaller share of its neighbour's support is tried again
 COASTING = 5  # after so many frames without points the prediction stands still
 REACH_M = 0.20  # of the points looked at in one frame; half of it is kept for the adjustment of the sequence
-MOST_POINTS = 1200  # of a frame: enough for a start of the adjustment over the sequence
+MOST_POINTS = 1000  # of a frame: enough for a start of the adjustment over the sequence
 SLOWING = 0.7  # per frame, of what is not seen
 WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per frame, and at most
 
@@ -96,10 +96,10 @@ def _next_posture(fit: Conditions, points: CloudPoints, moved: StepsFromFixed | 
     sigma[skeleton.layout.set("base")] = s.prediction_sigma_m
     best, best_support = predictions[0], 0.0
     for start in predictions:
-        prior = MotionPrior(mean=start, sigma=sigma)
+        prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
 
-        def observe(t: int, state: BodyState, prior: MotionPrior = prior) -> list[Observation]:
-            return [fit.surface(points, state, wide), *([moved] if moved is not None else []), prior, *fit.priors]
+        def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
+            return [fit.surface(points, state, wide, held), *([moved] if moved is not None else []), prior, *fit.priors]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
         support = fit.support(points, solution.motion[0], first.vector)

@@ -8,6 +8,7 @@ The scene is the model's own surface seen from the front, with 1 mm noise: 48 DO
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,8 +33,9 @@ def rig() -> Rig:
     """Three cameras in a row, 4 m before the person."""
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     matrix = np.array([[1000, 0, 384], [0, 1000, 288], [0, 0, 1.0]])
-    return Rig(cameras=tuple(Camera(name=name, size_px=(768, 576), matrix=matrix, R_cam_world=R, t_cam_world_m=-R @ np.array([x, -4.0, 0.0]))
-                             for name, x in zip("LCR", (-0.4, 0.0, 0.4))))
+    places = zip("LCR", (-0.4, 0.0, 0.4))
+    return Rig(cameras=tuple(Camera(name=name, size_px=(768, 576), matrix=matrix, R_cam_world=R,
+                                    t_cam_world_m=-R @ np.array([x, -4.0, 0.0])) for name, x in places))
 
 
 def walk(shape: BodyShape, frames: int) -> np.ndarray:
@@ -65,7 +67,8 @@ def cloud(shape: BodyShape, motion: np.ndarray, frame: int, random: np.random.Ge
     normal = -gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     seen = np.flatnonzero(normal[:, 1] < -0.3)[:POINTS]
     X = (axis + low[:, None] * ray)[seen] + NOISE_M * random.normal(size=(len(seen), 1)) * normal[seen]
-    return SimpleNamespace(frame=frame, xyz_m=X, normals=normal[seen], covariance_m2=np.broadcast_to(np.eye(3) * NOISE_M**2, (len(X), 3, 3)))
+    covariance = np.broadcast_to(np.eye(3) * NOISE_M**2, (len(X), 3, 3))
+    return SimpleNamespace(frame=frame, xyz_m=X, normals=normal[seen], covariance_m2=covariance)
 
 
 def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
@@ -109,16 +112,18 @@ def beside_scipy(settings: FitSettings) -> dict[str, float]:
     fit: Conditions = sequence._conditions(cameras, "full", [0], clicks, 0, settings)
     vector = fit.parameters.vector()
     start = motion[0] + random.normal(0, 0.05, motion.shape[1])
-    held = [fit.surface(points, fit.parameters.state(motion[0], vector)), *fit.priors]
-    weight = [1 / np.sqrt(np.broadcast_to(getattr(o, "crowding", 1.0), o.residual(fit.parameters.state(start, vector)).shape)) for o in held]
+    there = fit.parameters.state(motion[0], vector)
+    surface = fit.surface(points, there)
+    surface = replace(surface, robust=False, sigma_m=surface.sigma_m * np.sqrt(surface.crowding), crowding=1.0).scaled(there)
+    held = [surface, *fit.priors]
 
     def residual(x: np.ndarray) -> np.ndarray:
         state = fit.parameters.state(x, vector)
-        return np.concatenate([w * o.residual(state) for o, w in zip(held, weight)])
+        return np.concatenate([o.residual(state) for o in held])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         state = fit.parameters.state(x, vector)
-        return np.concatenate([w[:, None] * o.jacobian(state, shape=False) for o, w in zip(held, weight)])
+        return np.concatenate([o.jacobian(state, shape=False) for o in held])
 
     def seconds(function) -> tuple[float, np.ndarray]:
         began = time.process_time()
