@@ -10,7 +10,6 @@ import os
 import shutil
 import signal
 import sys
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +17,8 @@ from typing import Any
 
 import cv2
 
-from . import calibrate_command, pipeline, store
+from . import calibrate_command, contour_command, pipeline, store, track2d_command
+from .arguments import frame_range, overrides
 from .errors import InputError
 from .geometry.rig import read_rig
 from .progress import Cancelled, Monitor
@@ -63,7 +63,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
     demo.set_defaults(run=_demo, json=False)
-    for add in (calibrate_command.add_command, *adders):
+    for add in (calibrate_command.add_command, track2d_command.add_command, contour_command.add_command, *adders):
         add(commands)
     for sub in commands.choices.values():
         sub.add_argument("--quiet", action="store_true", help="say nothing but errors")
@@ -95,7 +95,7 @@ def _stage_command(commands: Any, name: str, about: str, action: Callable[..., l
 
 def _stages(*names: str) -> Callable[[argparse.Namespace, Monitor], list[str]]:
     def action(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-        job = pipeline.open_run(args.take, args.out, _overrides(args.set), _frames(args.frames))
+        job = pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames))
         for name in names:
             getattr(pipeline, name)(job, monitor)
         return _summary(job, args.json)
@@ -104,7 +104,7 @@ def _stages(*names: str) -> Callable[[argparse.Namespace, Monitor], list[str]]:
 
 
 def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    job = pipeline.run(args.take, args.out, _overrides(args.set), monitor, restart=args.restart, frames=_frames(args.frames))
+    job = pipeline.run(args.take, args.out, overrides(args.set), monitor, restart=args.restart, frames=frame_range(args.frames))
     scene = _build_scene(job, args.parser, monitor)
     return _summary(job, args.json) + ([] if args.json else scene)
 
@@ -133,7 +133,7 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from .measuring import first_seeds
 
     footage = open_take(read_take(args.take))
-    settings = pipeline.settings_of(footage.take.settings, _overrides(args.set), str(args.take))
+    settings = pipeline.settings_of(footage.take.settings, overrides(args.set), str(args.take))
     frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
     where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor)
     near, far = where.depth_range_m
@@ -238,31 +238,6 @@ def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         str(score_run(take, out, monitor)),
         f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}   Blender file: {out / 'body.blend'}",
     ]
-
-
-def _overrides(pairs: list[str]) -> dict[str, dict[str, Any]]:
-    """--set GROUP.NAME=VALUE as tables; values are read as TOML, plain words as text."""
-    tables: dict[str, dict[str, Any]] = {}
-    for pair in pairs:
-        name, equals, text = pair.partition("=")
-        group, dot, knob = name.partition(".")
-        if not equals or not dot:
-            raise InputError(f"--set {pair} cannot be read; write GROUP.NAME=VALUE, such as matching.patch_px=17.")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text
-        tables.setdefault(group, {})[knob] = value
-    return tables
-
-
-def _frames(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    first, colon, last = text.partition(":")
-    if not colon or not first.isdecimal() or not last.isdecimal():
-        raise InputError(f"--frames {text} cannot be read; write the first frame and one after the last, such as 0:40.")
-    return int(first), int(last)
 
 
 @contextmanager

@@ -2,12 +2,13 @@
 
 Three filters, each a table (T, N) of statuses:
 
-thresholds   |v| ≤ v_max + 3 σ_v ,  |a| ≤ a_max + 3 σ_a: the limits stand above the noise of a difference (D'Apuzzo et al. 2000, §3.3)
+thresholds   |v| ≤ v_max + 3 σ_v ,  |a| ≤ a_max + 3 σ_a: the limits stand above the noise of a difference (D'Apuzzo et al. 2000, §3.3);
+             and a sigma not much larger than the recording's median
 voxels       as published: in each time step the velocity must agree with the median of the other trajectories in the same voxel,
              |v − v̄| ≤ max(3 · 1.4826 MAD, 0.15 |v̄| + 60 mm/s)                                                              (1)
 rigid        a limb that rotates has no common velocity, so here the point must go where the rigid motion of its neighbours takes it,
              over one step and over longer spans, in which what slides slowly gets far enough to be seen:
-             |X_{i+s} − X̂_{i+s}| ≤ max(√s d, 3.5 √(σ_i² + σ_{i+s}² + spread²))                                                  (2)
+             |X_{i+s} − X̂_{i+s}| ≤ max(√s d, 2 √(σ_i² + σ_{i+s}² + (1 + h) spread²)) ,  h: leverage of X̂             (2)
              X̂ from all neighbours or from those whose distance to the point stayed (neighbours.py), whichever is nearer.
 
              Neighbours that scatter by more than √s d have no common motion and say nothing; a trajectory of which they say nothing
@@ -26,12 +27,13 @@ from .neighbours import common_motion, nearest_neighbours, same_distance
 from .settings import TrackingSettings, TrackStatus
 
 SPANS = ((1, 1), (4, 2), (10, 5))  # frames, and every how many frames a span begins
-SIGMAS = 3.5
+SIGMAS = 2.0  # of the summed variance of all three coordinates
 MIN_MEMBERS = 5
 MOST_SPREAD = 1.0  # of √s d: neighbours that scatter more have no common motion
 MIN_SUPPORT = 0.5  # of a trajectory's steps must be confirmed
 VOXEL_MEMBERS, VOXEL_SLACK, VOXEL_PART = 4, 0.06, 0.15  # of (1): members, m/s, part of the mean velocity
 MOSTLY_FALSE = 0.5
+SHORTEST = 3  # frames of a trajectory that only the recording's end cuts off
 
 Progress = Callable[[float, float], None]
 
@@ -39,9 +41,11 @@ Progress = Callable[[float, float], None]
 def over_thresholds(
     velocity_m_s: np.ndarray, acceleration_m_s2: np.ndarray, sigma_m: np.ndarray, dt: float, settings: TrackingSettings
 ) -> np.ndarray:
-    """TOO_FAST or ACCELERATES (T, N) where a trajectory is or does so beyond its noise, else MEASURED."""
+    """TOO_FAST or ACCELERATES (T, N) where a trajectory is or does so beyond its noise, UNCERTAIN by its sigma, else MEASURED."""
     verdict = np.full(sigma_m.shape, TrackStatus.MEASURED, dtype=np.int8)
     noise = np.nan_to_num(sigma_m)
+    if noise.any():
+        verdict[noise > settings.max_sigma_ratio * np.median(noise[noise > 0])] = TrackStatus.UNCERTAIN
     with np.errstate(invalid="ignore"):
         jerky = np.linalg.norm(acceleration_m_s2, axis=2) > settings.max_acceleration + 3 * np.sqrt(6) * noise / dt**2
         fast = np.linalg.norm(velocity_m_s, axis=2) > settings.max_speed + 3 * noise / (np.sqrt(2) * dt)
@@ -134,7 +138,7 @@ def ask_neighbours(before_m: np.ndarray, after_m: np.ndarray, sigma_m: np.ndarra
 
     def ask(i: np.ndarray, weight: np.ndarray) -> np.ndarray:
         goal = common_motion(before_m[i], before_m[rows[i]], after_m[rows[i]], weight, slack / 2)
-        limit = np.maximum(slack, SIGMAS * np.hypot(sigma[i], goal.spread_m))
+        limit = np.maximum(slack, SIGMAS * np.sqrt(sigma[i] ** 2 + (1 + goal.leverage) * goal.spread_m**2))
         with np.errstate(invalid="ignore"):
             near = np.linalg.norm(after_m[i] - goal.xyz_m, axis=1) <= limit
         alike = (goal.members >= MIN_MEMBERS) & (goal.spread_m <= MOST_SPREAD * slack)
@@ -165,7 +169,7 @@ def cut(seen: np.ndarray, status: np.ndarray, settings: TrackingSettings) -> tup
     for n in np.flatnonzero(seen.any(axis=0)):
         for number in np.unique(piece[good[:, n], n]) if not mostly[n] else ():
             frames = good[:, n] & (piece[:, n] == number)
-            if frames.sum() >= settings.min_length:
+            if frames.sum() >= (settings.min_length if not frames[-1] else min(settings.min_length, SHORTEST)):
                 columns.append(n)
                 kept.append(frames)
                 statuses.append(np.where(seen[:, n] & ~frames & good[:, n], TrackStatus.OTHER_PIECE, status[:, n]))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..geometry.rotation import rotation_from_vector
+from ..geometry.rotation import cross_matrix, rotation_from_vector
 
 NEIGHBOURS = 14
 STEPS = 6
@@ -30,6 +30,7 @@ class Expectation:
     xyz_m: np.ndarray  # (N, 3); NaN with fewer than three neighbours
     spread_m: np.ndarray  # (N,) robust scatter of the neighbours about their common motion
     members: np.ndarray  # (N,) neighbours that share the motion
+    leverage: np.ndarray  # (N,) variance of the expected place in units of a neighbour's variance
 
 
 def nearest_neighbours(xyz_m: np.ndarray, among_m: np.ndarray, radius_m: float, *, same: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +69,21 @@ def common_motion(
             w = weight / (1 + (miss / (2 * np.maximum(spread, scale))[:, None]) ** 2) ** 2  # Geman & McClure
     members = (there & (miss < 3 * np.maximum(spread, scale)[:, None])).sum(axis=1)
     goal = np.einsum("nij,nj->ni", R, xyz_m - p0) + q0
-    return Expectation(xyz_m=np.where((there.sum(axis=1) >= 3)[:, None], goal, np.nan), spread_m=spread, members=members)
+    return Expectation(
+        xyz_m=np.where((there.sum(axis=1) >= 3)[:, None], goal, np.nan),
+        spread_m=spread,
+        members=members,
+        leverage=_leverage(xyz_m - p0, before_m - p0[:, None], w / np.maximum(w.max(axis=1, keepdims=True), 1e-12)),
+    )
+
+
+def _leverage(x: np.ndarray, p: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """1 / Σ w + tr([x]× J⁻¹ [x]×ᵀ) / 3, J the matrix of (1): how the errors of neighbours p (N, m, 3) act at x (N, 3)."""
+    J = -np.einsum("nm,nmi,nmj->nij", w, p, p, optimize=True)
+    J += np.eye(3) * (np.einsum("nm,nmi,nmi->n", w, p, p, optimize=True) + w.sum(axis=1) * NOISE_M**2 + 1e-15)[:, None, None]
+    X = cross_matrix(x)
+    turned = np.einsum("nij,njk,nik->n", X, np.linalg.inv(J), X, optimize=True) / 3
+    return 1 / np.maximum(w.sum(axis=1), 1e-12) + turned
 
 
 def _turn(P: np.ndarray, Q: np.ndarray, w: np.ndarray) -> np.ndarray:

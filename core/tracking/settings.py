@@ -31,10 +31,7 @@ class TrackingSettings:
         0.6, "Smallest part of a tracked patch that lies on the measured surface; less is the outline of the body.", low=0.0, high=1.0
     )
     regenerate_every: int = knob(
-        2, "Every so many frames, new points start where the surface has none (0: never).", unit="frames", low=0, high=1000
-    )
-    bridge_frames: int = knob(
-        3, "A point that is lost may be found again by its template within so many frames (0: never).", unit="frames", low=0, high=100
+        1, "Every so many frames, new points start where the surface has none (0: never).", unit="frames", low=0, high=1000
     )
     max_speed: float = knob(10.0, "Trajectories faster than this are cut.", unit="m/s", low=0.1, high=100.0)
     max_acceleration: float = knob(150.0, "Trajectories that accelerate more than this are cut.", unit="m/s²", low=1.0, high=10_000.0)
@@ -47,6 +44,7 @@ class TrackingSettings:
     max_deviation_mm: float = knob(
         2.5, "Deviation from the neighbours' motion that is always allowed in one frame.", unit="mm", low=0.1, high=100.0
     )
+    max_sigma_ratio: float = knob(2.5, "Largest sigma of a point, in units of the median over all points.", low=1.0, high=1000.0)
     min_length: int = knob(5, "Trajectories of fewer frames are removed.", unit="frames", low=2, high=1000)
     smooth_frames: int = knob(
         7, "Frames over which smoothed velocities and accelerations are taken (odd; 0: as they are).", unit="frames", low=0, high=99
@@ -72,3 +70,4 @@ class TrackStatus(IntEnum):
     NOT_RIGID = 13  # it leaves the rigid motion of its neighbours
     OTHER_PIECE = 14  # a frame of a trajectory that was cut; the other pieces stand in columns of their own
     UNSUPPORTED = 15  # it has no neighbours that could confirm it
+    UNCERTAIN = 16  # its sigma is much larger than others'

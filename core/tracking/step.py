@@ -7,9 +7,10 @@
     spatial   least squares matching of the reference view's patch in the other views of frame i + 1               (5)
     verify    Δ = x_s − x_t,  Δᵀ (K_s + K_t + Q)⁻¹ Δ ≤ s² χ²(0.999; 2), else once more in a bigger box, else stop   (6)
 
-s² in (6) is the variance component that the step's own points show: matching's covariances are too small where the noise is
-correlated, by a factor that differs from recording to recording. Kept: the reference view's controlled result, elsewhere the mean of
-temporal and spatial weighted by their covariances; then the point where the rays meet. Its covariance contains the drift over the body.
+s² in (6) is the variance component that the step's own points show, by their 90 % quantile: matching's covariances are too small where
+texture is weak against the noise, by a factor that differs from recording to recording. Kept: the reference view's controlled result,
+elsewhere the mean of temporal and spatial weighted by their covariances; then the point where the rays meet. Its covariance contains the
+drift over the body.
 """
 
 from collections.abc import Sequence
@@ -23,17 +24,17 @@ from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches, patch_offsets
 from ..progress import Monitor
+from .control import hold
 from .neighbours import common_motion, nearest_neighbours
 from .search import search_box
 from .settings import TrackingSettings, TrackStatus
 from .templates import Atlas, Templates, atlas
 from .tracked import TrackedFrame, rows_of
 
-CHI2, CHI2_MEDIAN = 13.82, 1.386  # two degrees of freedom: 0.999 and 0.5
+CHI2, CHI2_90 = 13.82, 4.605  # two degrees of freedom: 0.999 and 0.9
 MODEL_SIGMA_PX = 0.12  # Q of (6): what an affine patch cannot follow
-LARGEST_SCALE, PRIOR_POINTS = 5.0, 20  # of s; as many points as would have s = 1
+LARGEST_SCALE, PRIOR_POINTS = 3.0, 20  # of s; as many points as would have s = 1
 PREDICTED_BOX = 0.4  # of the box, for points whose velocity is known
-KEY_SIGMAS, KEY_JUMP_PX = 5.0, 1.0  # a key template's match further off than both is another place
 HARMLESS_M = 2e-3  # scatter of neighbours about their common motion
 TEMPLATE_SIGMA_PX = 0.02  # of the reference view's point in the intersection; its drift is added afterwards
 
@@ -192,35 +193,25 @@ def control(
     status: np.ndarray,
 ) -> tuple[TrackedFrame, list[Matches]]:
     """The points with their drift, and the temporal matches shifted to where the key templates say.  (4)"""
-    ref = temporal[view.reference]
-    good = status == TrackStatus.MEASURED
-    grown = np.where(good[:, None, None], points.drift + ref.covariance, points.drift)
-    shape = np.where(good[:, None, None], ref.shape @ points.key_shape, points.key_shape)
-    start = np.where(good[:, None], ref.xy, np.nan)
-    key = match_patches(tiles.spline, tiles.xy[tile_rows], [image], [start], [shape], view.matching, row_step=view.rows.step)[0]
-    away = np.linalg.norm(key.xy - ref.xy, axis=1)
-    sigma = np.sqrt(np.maximum(np.trace(grown + key.covariance, axis1=1, axis2=2), 0.0))
-    held = good & key.ok & (key.correlation >= view.tracking.drift_correlation) & (away <= np.maximum(KEY_JUMP_PX, KEY_SIGMAS * sigma))
-    shift, drift = np.zeros((len(good), 2)), grown.copy()
-    small = np.eye(2) * 1e-8
-    gain = grown[held] @ np.linalg.inv(grown[held] + key.covariance[held] + small)  # (1) of templates.py
-    shift[held] = np.einsum("nij,nj->ni", gain, key.xy[held] - ref.xy[held])
-    drift[held] = (np.eye(2) - gain) @ grown[held]
-    shape[held] = key.shape[held]
+    held = hold(
+        temporal[view.reference],
+        status == TrackStatus.MEASURED,
+        points.key_shape,
+        points.drift,
+        tiles,
+        tile_rows,
+        image,
+        view.matching,
+        view.tracking.drift_correlation,
+        view.rows.step,
+    )
     moved = [
-        replace(m, xy=m.xy + (shift if k == view.reference else np.einsum("nij,nj->ni", points.shape[:, k], shift)))
+        replace(m, xy=m.xy + (held.shift if k == view.reference else np.einsum("nij,nj->ni", points.shape[:, k], held.shift)))
         for k, m in enumerate(temporal)
     ]
-    renewed = good & ~held  # its present patch becomes the template
-    return (
-        replace(
-            points,
-            key_shape=np.where(renewed[:, None, None], np.eye(2), shape),
-            key_drift=points.key_drift + np.where(renewed[:, None, None], drift, 0.0),
-            drift=np.where(renewed[:, None, None], 0.0, drift),
-        ),
-        moved,
-    )
+    renewed = held.renewed[:, None, None]
+    key_drift = points.key_drift + np.where(renewed, held.drift, 0.0)
+    return replace(points, key_shape=held.key_shape, key_drift=key_drift, drift=np.where(renewed, 0.0, held.drift)), moved
 
 
 def match_spatially(
@@ -250,8 +241,8 @@ def match_spatially(
 def disagreement(view: TrackingView, temporal: Sequence[Matches], spatial: Sequence[Matches], status: np.ndarray) -> float:
     """s of (6): by how much temporal and spatial results differ more than their covariances say."""
     d2 = np.concatenate([_distance2(temporal[k], s)[status[:, k] == TrackStatus.MEASURED] for k, s in zip(view.others, spatial)])
-    middle = float(np.median(d2)) / CHI2_MEDIAN if len(d2) else 1.0
-    return float(np.sqrt(np.clip((len(d2) * middle + PRIOR_POINTS) / (len(d2) + PRIOR_POINTS), 1.0, LARGEST_SCALE**2)))
+    observed = float(np.quantile(d2, 0.9)) / CHI2_90 if len(d2) else 1.0
+    return float(np.sqrt(np.clip((len(d2) * observed + PRIOR_POINTS) / (len(d2) + PRIOR_POINTS), 1.0, LARGEST_SCALE**2)))
 
 
 def _distance2(t: Matches, s: Matches) -> np.ndarray:

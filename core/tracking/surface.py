@@ -17,7 +17,7 @@ from .settings import TrackStatus
 from .step import TrackingView, over_the_body
 from .tracked import TrackedFrame, born, joined
 
-BARE = 1.0  # a surface point with no tracked point within this many spacings starts a new trajectory
+BARE = 0.85  # a surface point with no tracked point within this many spacings starts a new trajectory
 STEEPEST_COSINE = 0.3  # between the normal and the ray
 DEPTH_SIGMAS, DEPTH_CELLS = 4.0, 1.0
 STEEPEST_SLOPE = 3.0  # change of depth per distance across, within one surface

@@ -43,7 +43,7 @@ def test_a_rotating_limb_loses_nothing(rate: float) -> None:
     random = np.random.default_rng(int(rate))
     true = limb(random, 150, np.array([0, 0, 1.4]), np.array([0.8, 0.6, 0.0]), rate, np.array([0.2, 0.1, 0.0]))
     kept = filter_trajectories(recording(true, random), SETTINGS)
-    assert kept.seen.shape[1] == 150 and kept.seen.mean() > 0.999
+    assert 150 <= kept.seen.shape[1] <= 153 and kept.seen.sum() > 0.998 * 150 * FRAMES
 
 
 def planted(kind: str, true: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

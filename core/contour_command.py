@@ -1,0 +1,114 @@
+"""`tricap contour`: the outline of the person in one view, frame after frame, carried by the trajectories."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from . import pipeline, store
+from .arguments import frame_range, overrides
+from .errors import InputError
+from .images.sequence import read_image
+from .progress import Monitor
+from .settings import nearest_name
+from .tracking.contour import Contour, ContourSettings, contour_of_mask, mask_of_points, predict_contour, relax_contour
+from .tracking.point_tables import read_polygon
+
+BACKGROUND_SIGMAS, CLOSING_PX = 4.0, 3
+
+
+def add_command(commands: Any) -> None:
+    """Join `contour` to the parser's commands."""
+    about = "the outline of the person in one view, tracked through the frames"
+    parser = commands.add_parser("contour", help=about, description=about[0].upper() + about[1:])
+    parser.add_argument("take", type=Path, metavar="TAKE", help="folder with take.toml")
+    parser.add_argument("--view", required=True, metavar="NAME", help="the view, such as C")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results; contours/NAME.csv is written")
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument("--polygon", type=Path, metavar="FILE", help="CSV with x,y of the outline in the first frame")
+    start.add_argument("--background", type=Path, metavar="FILE", help="image of the view without the person")
+    parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
+    parser.set_defaults(run=run, json=False)
+
+
+def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Track the contour (measures and tracks first where that is needed); the lines to show.
+
+    Raises:
+        InputError: the arguments or the take need mending.
+    """
+    job = pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames))
+    names = [v.name for v in job.footage.take.views]
+    if args.view not in names:
+        raise InputError(f"{args.take} has no view “{args.view}”.{nearest_name(args.view, names)}")
+    polygon = read_polygon(args.polygon) if args.polygon else None
+    background = read_image(args.background) if args.background else None
+    pipeline.track(job, monitor)
+    contours = dict(track_contour(job, names.index(args.view), ContourSettings(), polygon, background, monitor))
+    path = job.results.path("contours", f"{args.view}.csv")
+    store.write_text(path, _table(contours))
+    seen = float(np.mean([c.seen.mean() for c in contours.values()]))
+    return [f"{path}: the outline in {len(contours)} frames, {100 * seen:.0f} % of its vertices on an edge."]
+
+
+def track_contour(
+    job: pipeline.Run, view: int, settings: ContourSettings, polygon: np.ndarray | None, background: np.ndarray | None, monitor: Monitor
+) -> Iterator[tuple[int, Contour]]:
+    """(frame, contour) of one view; each predicted from the one before by the projected trajectories inside it.
+
+    The first contour is the polygon, what differs from the background, or the outline of the measured surface.
+
+    Raises:
+        InputError: there is nothing to start from.
+    """
+    camera, tracks = job.footage.rig.cameras[view], job.trajectories
+    assert tracks is not None
+    contour: Contour | None = None
+    for i, m in enumerate(job.measured):
+        monitor.step("contours", i, len(job.measured))
+        grey = whole_rows(job.footage.read(m.frame)[view], job.footage.take.interlaced)
+        if contour is None:
+            predicted = polygon if polygon is not None else _first(grey, camera.project(m.cloud.xyz_m), background, settings)
+            if len(predicted) < 8:
+                raise InputError(f"There is no outline to start from in frame {m.frame}; give one with --polygon.")
+        else:
+            predicted = predict_contour(contour.xy_px, camera.project(tracks.xyz_m[i - 1]), camera.project(tracks.xyz_m[i]))
+        contour = relax_contour(predicted, grey, settings)
+        yield m.frame, contour
+
+
+def whole_rows(image: np.ndarray, interlaced: str) -> np.ndarray:
+    """The frame with the rows of the other field, half a frame away in time, interpolated."""
+    if interlaced == "none":
+        return image
+    filled = image.copy()
+    kept = 0 if interlaced == "odd" else 1
+    other = np.arange(1 - kept, len(image), 2)
+    above, below = np.clip(other - 1, kept, None), other + 1
+    below = np.where(below < len(image), below, above)
+    filled[other] = 0.5 * (image[above] + image[below])
+    return filled
+
+
+def _first(grey: np.ndarray, points: np.ndarray, background: np.ndarray | None, settings: ContourSettings) -> np.ndarray:
+    if background is None:
+        return contour_of_mask(mask_of_points(points, (grey.shape[1], grey.shape[0]), 2 * settings.spacing_px), settings.spacing_px)
+    if background.shape != grey.shape:
+        raise InputError("The background image has another size than the view; take it with the same camera.")
+    difference = cv2.GaussianBlur(np.abs(grey - background).astype(np.float32), (0, 0), 1.5)
+    limit = max(float(np.median(difference)) * BACKGROUND_SIGMAS, 4.0)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * CLOSING_PX + 1,) * 2)
+    mask = cv2.morphologyEx((difference > limit).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    return contour_of_mask(mask, settings.spacing_px)
+
+
+def _table(contours: dict[int, Contour]) -> str:
+    lines = ["frame,vertex,x,y,normal_x,normal_y,sigma,on_edge"]
+    for frame, c in contours.items():
+        rows = np.column_stack([c.xy_px, c.normal, c.sigma_px])
+        lines += [f"{frame},{v}," + ",".join(f"{x:.4f}" for x in row) + f",{int(c.seen[v])}" for v, row in enumerate(rows)]
+    return "\n".join(lines) + "\n"

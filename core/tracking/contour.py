@@ -1,0 +1,176 @@
+"""Contours: snakes (Kass, Witkin & Terzopoulos 1988, doi:10.1007/BF00133570), carried from frame to frame by trajectories near by
+(D'Apuzzo et al. 2000, §5).
+
+    u(s) = Σ w_j (x_j,i+1 − x_j,i) / Σ w_j ,   w = exp(−d² / 2 ρ²) over projected trajectories inside the contour       (1)
+    (α D2 + β D4 + γ I) v ← γ v − ∂E/∂x ,   E = −|∇(G_σ * I)|²                                                        (2)
+
+v is the displacement from the predicted contour, not the contour itself: a snake then keeps the shape that it has, and neither shrinks
+nor loses its corners. D2, D4 are the circulant second and fourth differences, γ = 1. At the end every vertex goes to the largest gradient
+on its normal, and its sigma is that of the vertex of the parabola through the three largest values:
+
+    s = (g₋ − g₊) / 2 (g₋ − 2 g₀ + g₊) ,   σ_s = σ_g / (√2 |g₋ − 2 g₀ + g₊|)                                            (3)
+
+Full-frame pixels; contours are closed, with vertices at equal distances.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..settings import knob
+
+REACH_PX, RHO_PX = 40.0, 15.0  # of (1)
+LARGEST_FORCE_PX = 1.0
+LEAST_SIGMA_PX, UNSEEN_SIGMA_PX = 0.2, 3.0
+IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6
+EDGE_SIGMAS = 5.0  # of the gradient's noise: less is no edge
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ContourSettings:
+    """How a contour follows the edges of the image."""
+
+    spacing_px: float = knob(4.0, "Distance between the vertices.", unit="px", low=1.0, high=50.0)
+    blur_px: float = knob(1.5, "Blur of the image whose gradient attracts the contour.", unit="px", low=0.5, high=10.0)
+    search_px: float = knob(4.0, "How far along its normal a vertex looks for the edge at the end.", unit="px", low=1.0, high=30.0)
+    alpha: float = knob(0.05, "Resistance to stretching.", low=0.0, high=100.0)
+    beta: float = knob(2.0, "Resistance to bending.", low=0.0, high=100.0)
+    iterations: int = knob(60, "Steps of the snake.", low=1, high=5000)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Contour:
+    """A closed contour in one image: observations of the silhouette, each good across the contour only."""
+
+    xy_px: np.ndarray  # (V, 2)
+    normal: np.ndarray  # (V, 2) unit, outwards
+    sigma_px: np.ndarray  # (V,) along the normal; UNSEEN_SIGMA_PX where no edge was found
+    seen: np.ndarray  # (V,) whether there is an edge
+
+
+def contour_of_mask(mask: np.ndarray, spacing_px: float) -> np.ndarray:
+    """Vertices (V, 2) about the largest region of a mask (h, w); none where the mask is empty."""
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not outlines:
+        return np.zeros((0, 2))
+    largest = max(outlines, key=cv2.contourArea)[:, 0].astype(np.float64)
+    return resampled(largest, spacing_px) if len(largest) > 3 else np.zeros((0, 2))
+
+
+def mask_of_points(xy_px: np.ndarray, size_px: tuple[int, int], radius_px: float) -> np.ndarray:
+    """The region (h, w) that points (N, 2) cover, each a disc; small gaps closed, and shrunk again by the radius."""
+    mask = np.zeros(size_px[::-1], dtype=np.uint8)
+    inside = xy_px[np.isfinite(xy_px).all(axis=1)]
+    at = np.rint(inside).astype(np.int64)
+    at = at[(at >= 0).all(axis=1) & (at < np.array(size_px)).all(axis=1)]
+    mask[at[:, 1], at[:, 0]] = 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius_px) + 1,) * 2)
+    return cv2.erode(cv2.dilate(mask, disc), disc).astype(bool)
+
+
+def resampled(xy_px: np.ndarray, spacing_px: float, count: int | None = None) -> np.ndarray:
+    """The closed polygon (V, 2) with vertices at equal distances of about `spacing_px`, or with `count` vertices."""
+    closed = np.concatenate([xy_px, xy_px[:1]])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    count = count or max(8, round(length[-1] / spacing_px))
+    at = np.arange(count) / count * length[-1]
+    return np.stack([np.interp(at, length, closed[:, i]) for i in range(2)], axis=1)
+
+
+def predict_contour(xy_px: np.ndarray, before_px: np.ndarray, after_px: np.ndarray) -> np.ndarray:
+    """The contour (V, 2) displaced as the tracked points (N, 2) inside it, from `before_px` to `after_px`.  (1)
+
+    A vertex without points within REACH_PX takes the displacement of its neighbours on the contour.
+    """
+    polygon = xy_px.astype(np.float32).reshape(-1, 1, 2)
+    known = np.isfinite(before_px).all(axis=1) & np.isfinite(after_px).all(axis=1)
+    p, q = before_px[known], after_px[known]
+    inner = np.array([cv2.pointPolygonTest(polygon, (float(x), float(y)), True) > -2.0 for x, y in p], dtype=bool)
+    p, q = p[inner], q[inner]
+    if not len(p):
+        return xy_px.copy()
+    d2 = ((xy_px[:, None] - p) ** 2).sum(axis=2)
+    w = np.where(d2 <= REACH_PX**2, np.exp(-d2 / (2 * RHO_PX**2)), 0.0)
+    total = w.sum(axis=1)
+    near = total > 1e-6
+    if not near.any():
+        return xy_px + np.median(q - p, axis=0)
+    u = (w[near] @ (q - p)) / total[near, None]
+    places, n = np.flatnonzero(near), len(xy_px)
+    wrapped = np.concatenate([places - n, places, places + n])
+    return xy_px + np.stack([np.interp(np.arange(n), wrapped, np.tile(u[:, i], 3)) for i in range(2)], axis=1)
+
+
+def relax_contour(predicted_px: np.ndarray, grey: np.ndarray, settings: ContourSettings) -> Contour:
+    """Let a predicted contour (V, 2) find the edges of an image (h, w).  (2), (3)"""
+    n = len(predicted_px)
+    start = resampled(predicted_px, settings.spacing_px, n)
+    gradient = _gradient(grey, settings.blur_px)
+    strength = np.hypot(*gradient)
+    energy = -((strength / max(float(np.percentile(strength, 99)), 1e-6)) ** 2)
+    force = [-cv2.Sobel(energy, cv2.CV_32F, i, 1 - i, ksize=3, scale=1 / 8) * 4 for i in (1, 0)]
+    inverse = np.linalg.inv(_stiffness(n, settings))
+    v = np.zeros_like(start)
+    for _ in range(settings.iterations):
+        f = np.stack([_sample(part, start + v) for part in force], axis=1)
+        f /= np.maximum(1.0, np.linalg.norm(f, axis=1, keepdims=True) / LARGEST_FORCE_PX)
+        step = inverse @ (v + f) - v
+        v += step
+        if np.abs(step).max() < 0.02:
+            break
+    return _on_edges(start + v, gradient, grey, settings)
+
+
+def _stiffness(n: int, settings: ContourSettings) -> np.ndarray:
+    """α D2 + β D4 + γ I (n, n) of a closed contour, rows (β, −α − 4 β, 2 α + 6 β + 1, −α − 4 β, β)."""
+    a, b, eye = settings.alpha, settings.beta, np.eye(n)
+    return (2 * a + 6 * b + 1) * eye + sum(
+        c * np.roll(eye, s, axis=1) for c, s in ((-a - 4 * b, 1), (-a - 4 * b, -1), (b, 2), (b, -2))
+    )  # type: ignore[no-any-return]
+
+
+def _gradient(grey: np.ndarray, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
+    smooth = cv2.GaussianBlur(np.ascontiguousarray(grey, dtype=np.float32), (0, 0), blur_px)
+    return cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+
+
+def _on_edges(xy: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], grey: np.ndarray, settings: ContourSettings) -> Contour:
+    """Every vertex at the largest gradient along its normal, with sigma.  (3)"""
+    normal = outward_normals(xy)
+    s = np.arange(-round(settings.search_px) - 1, round(settings.search_px) + 2).astype(np.float64)
+    places = xy[:, None] + s[:, None] * normal[:, None]
+    across = np.abs(sum(_sample(g, places) * normal[:, None, i] for i, g in enumerate(gradient)))
+    best = across[:, 1:-1].argmax(axis=1) + 1
+    rows = np.arange(len(xy))
+    before, middle, after = (across[rows, best + d] for d in (-1, 0, 1))
+    bend = before - 2 * middle + after
+    noise = gradient_noise(grey, settings.blur_px)
+    seen = (bend < 0) & (before <= middle) & (after <= middle) & (middle > EDGE_SIGMAS * noise)
+    safe = np.where(seen, bend, -1.0)
+    offset = np.where(seen, s[best] + (before - after) / (2 * safe), 0.0)
+    sigma = np.where(seen, np.hypot(LEAST_SIGMA_PX, noise / (np.sqrt(2) * np.abs(safe))), UNSEEN_SIGMA_PX)
+    moved = xy + offset[:, None] * normal
+    return Contour(xy_px=moved, normal=outward_normals(moved), sigma_px=np.minimum(sigma, UNSEEN_SIGMA_PX), seen=seen)
+
+
+def gradient_noise(grey: np.ndarray, blur_px: float) -> float:
+    """Standard deviation of the blurred gradient by the image's own noise σ (Immerkær 1996): σ / (√(8 π) blur²)."""
+    response = np.abs(cv2.filter2D(np.ascontiguousarray(grey, dtype=np.float32), cv2.CV_32F, IMMERKAER))
+    sigma = max(0.3, 1.4826 * float(np.median(response)))
+    return sigma / (np.sqrt(8 * np.pi) * blur_px**2)
+
+
+def outward_normals(xy: np.ndarray) -> np.ndarray:
+    """Unit normals (V, 2) of a closed polygon, outwards whichever way it runs."""
+    tangent = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)
+    after = np.roll(xy, -1, axis=0)
+    turn = np.sign(np.sum(xy[:, 0] * after[:, 1] - after[:, 0] * xy[:, 1])) or 1.0
+    normal = turn * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+
+
+def _sample(image: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    at = np.ascontiguousarray(xy.reshape(-1, 2), dtype=np.float32)
+    values = cv2.remap(image, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return values.reshape(xy.shape[:-1]).astype(np.float64)

@@ -1,0 +1,99 @@
+"""Tables of points that a user chose, and of where they went (CSV)."""
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .. import store
+from ..errors import InputError
+from ..settings import nearest_name
+from .planar import PlanarTracks
+from .settings import TrackStatus
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ChosenPoints:
+    """Points by name. `views` is "" for each in a table of one camera; `joined` holds pairs of names to join with lines."""
+
+    names: tuple[str, ...]  # (N,)
+    views: tuple[str, ...]  # (N,)
+    xy_px: np.ndarray  # (N, 2)
+    joined: tuple[tuple[str, str], ...]
+
+
+def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
+    """Read a CSV with the columns point, x, y, of which `joined_to` (the name of another point) may be one, and `view` must if asked for.
+
+    Raises:
+        InputError: the file cannot be read, lacks a column, or has a row that is none.
+    """
+    needed = ("point", "x", "y", *(("view",) if with_views else ()))
+    try:
+        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
+    except OSError as error:
+        raise InputError(f"Cannot read the points {path}: {error.strerror or error}.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} is not a CSV table: {error}.") from error
+    if not rows:
+        raise InputError(f"{path} holds no points; write a line {','.join(needed)} and one line for each point.")
+    for name in needed:
+        if name not in rows[0]:
+            raise InputError(f"{path} has no column “{name}”; its first line must name the columns {', '.join(needed)}.")
+    xy = np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
+    names = tuple(row["point"].strip() for row in rows)
+    views = tuple((row["view"] or "").strip() if with_views else "" for row in rows)
+    if "" in names or len(set(zip(names, views))) < len(names):
+        raise InputError(f"{path} names a point twice or not at all; give every point its own name.")
+    joined = tuple((n, row["joined_to"].strip()) for n, row in zip(names, rows) if (row.get("joined_to") or "").strip())
+    for name, other in joined:
+        if other not in names:
+            raise InputError(f"{path} joins “{name}” to “{other}”, which is no point.{nearest_name(other, names)}")
+    return ChosenPoints(names=names, views=views, xy_px=xy, joined=joined)
+
+
+def _number(text: str | None, path: Path, line: int, column: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"Line {line} of {path} has {column} = {text!r}; write a pixel coordinate.")
+    return value
+
+
+def write_planar(path: Path, names: tuple[str, ...], tracks: PlanarTracks) -> None:
+    """CSV of frame, point, x, y, sigma, correlation, status; a point that is not seen has empty cells and says why.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    lines = ["frame,point,x,y,sigma,correlation,status"]
+    for t, frame in enumerate(tracks.frames):
+        for n, name in enumerate(names):
+            numbers = (*tracks.xy_px[t, n], tracks.sigma_px[t, n], tracks.correlation[t, n])
+            cells = [f"{v:.4f}" if np.isfinite(v) else "" for v in numbers]
+            lines.append(",".join([str(frame), _quoted(name), *cells, TrackStatus(int(tracks.status[t, n])).name.lower()]))
+    store.write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"' if any(c in name for c in ',"\n') else name
+
+
+def read_polygon(path: Path) -> np.ndarray:
+    """Vertices (V, 2) of a CSV with the columns x, y.
+
+    Raises:
+        InputError: the file cannot be read, or has fewer than three vertices.
+    """
+    try:
+        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"Cannot read the polygon {path}: {error}.") from error
+    if len(rows) < 3 or not {"x", "y"} <= set(rows[0]):
+        raise InputError(f"{path} is no polygon; write a line x,y and three lines of pixel coordinates or more.")
+    return np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
