@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from . import pipeline, store
 from .arguments import frame_range, overrides
@@ -18,6 +19,8 @@ from .tracking.contour import Contour, ContourSettings, contour_of_mask, mask_of
 from .tracking.point_tables import read_polygon
 
 BACKGROUND_SIGMAS, CLOSING_PX = 4.0, 3
+CLOSING_CELLS, ONE_PIECE = (2, 3, 4, 6), 0.9
+APART_PX, AGREEING = 8.0, 0.95  # a contour of which more than a twentieth is further from the measured outline begins anew
 
 
 def add_command(commands: Any) -> None:
@@ -77,6 +80,8 @@ def track_contour(
                 raise InputError(f"There is no outline to start from in frame {m.frame}; give one with --polygon.")
         else:
             predicted = predict_contour(contour.xy_px, camera.project(tracks.xyz_m[i - 1]), camera.project(tracks.xyz_m[i]))
+            if polygon is None:
+                predicted = _renewed(predicted, _outline(grey, camera.project(m.cloud.xyz_m), settings))
         contour = relax_contour(predicted, grey, settings)
         yield m.frame, contour
 
@@ -96,7 +101,7 @@ def whole_rows(image: np.ndarray, interlaced: str) -> np.ndarray:
 
 def _first(grey: np.ndarray, points: np.ndarray, background: np.ndarray | None, settings: ContourSettings) -> np.ndarray:
     if background is None:
-        return contour_of_mask(mask_of_points(points, (grey.shape[1], grey.shape[0]), 2 * settings.spacing_px), settings.spacing_px)
+        return _outline(grey, points, settings)
     if background.shape != grey.shape:
         raise InputError("The background image has another size than the view; take it with the same camera.")
     difference = cv2.GaussianBlur(np.abs(grey - background).astype(np.float32), (0, 0), 1.5)
@@ -104,6 +109,29 @@ def _first(grey: np.ndarray, points: np.ndarray, background: np.ndarray | None, 
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * CLOSING_PX + 1,) * 2)
     mask = cv2.morphologyEx((difference > limit).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     return contour_of_mask(mask, settings.spacing_px)
+
+
+def _outline(grey: np.ndarray, points: np.ndarray, settings: ContourSettings) -> np.ndarray:
+    """The outline of the measured surface; gaps are closed until nearly all of it is one piece."""
+    size = (grey.shape[1], grey.shape[0])
+    outline = np.zeros((0, 2))
+    for cells in CLOSING_CELLS:
+        mask = mask_of_points(points, size, cells * settings.spacing_px)
+        outline = contour_of_mask(mask, settings.spacing_px)
+        if len(outline) >= 8:
+            inside = np.zeros(mask.shape, dtype=np.uint8)
+            cv2.fillPoly(inside, [np.rint(outline).astype(np.int32)], 1)
+            if (mask & (inside > 0)).sum() >= ONE_PIECE * mask.sum():
+                break
+    return outline
+
+
+def _renewed(predicted: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """The predicted contour, or the frame's own outline where both differ too much: limbs crossed, or parted."""
+    if len(outline) < 8:
+        return predicted
+    there, back = (cKDTree(b).query(a)[0] for a, b in ((predicted, outline), (outline, predicted)))
+    return outline if max(np.quantile(there, AGREEING), np.quantile(back, AGREEING)) > APART_PX else predicted
 
 
 def _table(contours: dict[int, Contour]) -> str:

@@ -5,10 +5,18 @@
     (α D2 + β D4 + γ I) v ← γ v − ∂E/∂x ,   E = −|∇(G_σ * I)|²                                                        (2)
 
 v is the displacement from the predicted contour, not the contour itself: a snake then keeps the shape that it has, and neither shrinks
-nor loses its corners. D2, D4 are the circulant second and fourth differences, γ = 1. At the end every vertex goes to the largest gradient
-on its normal, and its sigma is that of the vertex of the parabola through the three largest values:
+nor loses its corners. D2, D4 are the circulant second and fourth differences, γ = 1. On printed cloth the largest gradient lies seldom
+at the outline, so besides −∂E/∂x every vertex is drawn to where its normal's grey values part best into two of different mean and
+contrast (the likelihood of two Gaussians; c runs along the normal):
 
-    s = (g₋ − g₊) / 2 (g₋ − 2 g₀ + g₊) ,   σ_s = σ_g / (√2 |g₋ − 2 g₀ + g₊|)                                            (3)
+    c → min  n₁ log σ₁²(s < c) + n₂ log σ₂²(s > c)                                                        (3)
+
+At the end every vertex goes to the largest gradient within a pixel or two of (3), and its sigma is that of the vertex of the parabola
+through the three largest values:
+
+    s = (g₋ − g₊) / 2 (g₋ − 2 g₀ + g₊) ,   σ_s = σ_g / (√2 |g₋ − 2 g₀ + g₊|)                                            (4)
+
+to which the scatter of the vertices about the snake is added.
 
 Full-frame pixels; contours are closed, with vertices at equal distances.
 """
@@ -22,8 +30,12 @@ from ..settings import knob
 
 REACH_PX, RHO_PX = 40.0, 15.0  # of (1)
 LARGEST_FORCE_PX = 1.0
+ROUGHNESS_VERTICES = 8
+LAST_PX = 2  # how far the largest gradient may lie from (3)
 LEAST_SIGMA_PX, UNSEEN_SIGMA_PX = 0.2, 3.0
 IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6
+PROFILE_PX, LEAST_VARIANCE = 6, 4.0  # of (3): length of a profile beyond the search, and what noise has
+REGION_EVERY, REGION_PULL = 10, 0.7
 EDGE_SIGMAS = 5.0  # of the gradient's noise: less is no edge
 
 
@@ -33,7 +45,7 @@ class ContourSettings:
 
     spacing_px: float = knob(4.0, "Distance between the vertices.", unit="px", low=1.0, high=50.0)
     blur_px: float = knob(1.5, "Blur of the image whose gradient attracts the contour.", unit="px", low=0.5, high=10.0)
-    search_px: float = knob(4.0, "How far along its normal a vertex looks for the edge at the end.", unit="px", low=1.0, high=30.0)
+    search_px: float = knob(6.0, "How far along its normal a vertex looks for the outline.", unit="px", low=1.0, high=30.0)
     alpha: float = knob(0.05, "Resistance to stretching.", low=0.0, high=100.0)
     beta: float = knob(2.0, "Resistance to bending.", low=0.0, high=100.0)
     iterations: int = knob(60, "Steps of the snake.", low=1, high=5000)
@@ -103,7 +115,7 @@ def predict_contour(xy_px: np.ndarray, before_px: np.ndarray, after_px: np.ndarr
 
 
 def relax_contour(predicted_px: np.ndarray, grey: np.ndarray, settings: ContourSettings) -> Contour:
-    """Let a predicted contour (V, 2) find the edges of an image (h, w).  (2), (3)"""
+    """Let a predicted contour (V, 2) find the edges of an image (h, w).  (2) to (4)"""
     n = len(predicted_px)
     start = resampled(predicted_px, settings.spacing_px, n)
     gradient = _gradient(grey, settings.blur_px)
@@ -112,14 +124,36 @@ def relax_contour(predicted_px: np.ndarray, grey: np.ndarray, settings: ContourS
     force = [-cv2.Sobel(energy, cv2.CV_32F, i, 1 - i, ksize=3, scale=1 / 8) * 4 for i in (1, 0)]
     inverse = np.linalg.inv(_stiffness(n, settings))
     v = np.zeros_like(start)
-    for _ in range(settings.iterations):
-        f = np.stack([_sample(part, start + v) for part in force], axis=1)
+    for iteration in range(settings.iterations):
+        if iteration % REGION_EVERY == 0:
+            normal = outward_normals(start + v)
+            goal = v + _parting(grey, start + v, normal, settings.search_px)[:, None] * normal
+        f = np.stack([_sample(part, start + v) for part in force], axis=1) + REGION_PULL * (goal - v)
         f /= np.maximum(1.0, np.linalg.norm(f, axis=1, keepdims=True) / LARGEST_FORCE_PX)
         step = inverse @ (v + f) - v
         v += step
-        if np.abs(step).max() < 0.02:
+        if np.abs(step).max() < 0.02 and iteration % REGION_EVERY:
             break
     return _on_edges(start + v, gradient, grey, settings)
+
+
+def _parting(grey: np.ndarray, xy: np.ndarray, normal: np.ndarray, search_px: float) -> np.ndarray:
+    """Where along its normal (V,) each vertex's grey values part best, from profiles through it and its neighbours.  (3)"""
+    reach = round(search_px) + PROFILE_PX
+    s = np.arange(-reach, reach + 1).astype(np.float64)
+    values = _sample(grey.astype(np.float32), xy[:, None] + s[:, None] * normal[:, None])
+    profiles = np.stack([np.roll(values, d, axis=0) for d in (-1, 0, 1)])
+    weight = np.ones_like(profiles)
+
+    def log_variance(part: slice) -> np.ndarray:
+        n = weight[:, :, part].sum(axis=(0, 2))
+        mean = profiles[:, :, part].sum(axis=(0, 2)) / n
+        square = (profiles[:, :, part] ** 2).sum(axis=(0, 2)) / n
+        return n * np.log(np.maximum(square - mean**2, LEAST_VARIANCE))
+
+    middle = range(PROFILE_PX, len(s) - PROFILE_PX)
+    cost = np.stack([log_variance(slice(None, c)) + log_variance(slice(c + 1, None)) for c in middle], axis=1)
+    return s[PROFILE_PX : len(s) - PROFILE_PX][cost.argmin(axis=1)]
 
 
 def _stiffness(n: int, settings: ContourSettings) -> np.ndarray:
@@ -138,7 +172,8 @@ def _gradient(grey: np.ndarray, blur_px: float) -> tuple[np.ndarray, np.ndarray]
 def _on_edges(xy: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], grey: np.ndarray, settings: ContourSettings) -> Contour:
     """Every vertex at the largest gradient along its normal, with sigma.  (3)"""
     normal = outward_normals(xy)
-    s = np.arange(-round(settings.search_px) - 1, round(settings.search_px) + 2).astype(np.float64)
+    snake, xy = xy, xy + np.clip(_parting(grey, xy, normal, 2.0), -1.0, 1.0)[:, None] * normal
+    s = np.arange(-LAST_PX - 1, LAST_PX + 2).astype(np.float64)
     places = xy[:, None] + s[:, None] * normal[:, None]
     across = np.abs(sum(_sample(g, places) * normal[:, None, i] for i, g in enumerate(gradient)))
     best = across[:, 1:-1].argmax(axis=1) + 1
@@ -149,9 +184,16 @@ def _on_edges(xy: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], grey: np.
     seen = (bend < 0) & (before <= middle) & (after <= middle) & (middle > EDGE_SIGMAS * noise)
     safe = np.where(seen, bend, -1.0)
     offset = np.where(seen, s[best] + (before - after) / (2 * safe), 0.0)
-    sigma = np.where(seen, np.hypot(LEAST_SIGMA_PX, noise / (np.sqrt(2) * np.abs(safe))), UNSEEN_SIGMA_PX)
     moved = xy + offset[:, None] * normal
+    sigma = np.hypot(LEAST_SIGMA_PX, noise / (np.sqrt(2) * np.abs(safe)))
+    sigma = np.where(seen, np.hypot(sigma, _roughness(np.einsum("ni,ni->n", moved - snake, normal))), UNSEEN_SIGMA_PX)
     return Contour(xy_px=moved, normal=outward_normals(moved), sigma_px=np.minimum(sigma, UNSEEN_SIGMA_PX), seen=seen)
+
+
+def _roughness(offset: np.ndarray) -> np.ndarray:
+    """Robust scatter (V,) of the vertices across the snake, over the neighbours on the contour: where other edges compete it is large."""
+    near = np.stack([np.roll(offset, d) for d in range(-ROUGHNESS_VERTICES, ROUGHNESS_VERTICES + 1)])
+    return 1.4826 * np.median(np.abs(near - np.median(near, axis=0)), axis=0)
 
 
 def gradient_noise(grey: np.ndarray, blur_px: float) -> float:
