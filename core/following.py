@@ -17,7 +17,7 @@ from .tracking.surface import on_surface, regenerate, start_tracks
 from .tracking.templates import Templates, cut_templates, no_templates
 from .tracking.tracked import TrackedFrame
 
-ALGORITHM = "tracking 3"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 4"  # part of every key: raise it when the same input gives other numbers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

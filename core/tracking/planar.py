@@ -22,7 +22,7 @@ from .settings import TrackingSettings, TrackStatus
 from .templates import Templates, atlas, cut_templates, no_templates
 
 RETURN_PX, RETURN_SIGMAS = 0.5, 3.0
-PREDICTED_BOX = 0.4
+KNOWN_BOX, UNKNOWN_BOX = (0.0, 0.4, 2.0), (0.0, 1.0, 2.0)  # of the box in each attempt, for points whose motion is known or not
 RETAKEN_CORRELATION = 0.9  # of a lost point with its template: more than in tracking, for nothing else speaks for it
 
 
@@ -123,10 +123,10 @@ def _step(
     known = np.isfinite(points.speed).all(axis=1)
     result, fresh = replace(points, seen=np.zeros(len(rows), dtype=bool), speed=np.full((len(rows), 2), np.nan)), []
     centre = np.where(known[:, None], points.xy + np.nan_to_num(points.speed), points.xy)
-    for attempt in (1, 2):
-        rest = np.flatnonzero(points.seen & ~result.seen)
+    for attempt in range(3):
+        rest = np.flatnonzero(points.seen & ~result.seen & (known | (attempt > 0)))
         if len(rest):
-            box = tracking.box_px * np.where(known[rest] & (attempt == 1), PREDICTED_BOX, attempt)
+            box = tracking.box_px * np.where(known[rest], KNOWN_BOX[attempt], UNKNOWN_BOX[attempt])
             start, best = search_box(now[0], after[0], points.xy[rest], centre[rest], box, matching.patch_px, 1)
             eye = np.tile(np.eye(2), (len(rest), 1, 1))
             start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)

@@ -11,8 +11,8 @@ def search_box(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) within `box` (N,) of `centre` (N, 2) where the patches about `xy` (N, 2) of `grey` correlate best in `next_grey`.
 
-    Gives the correlations (N,) too, −1 where a patch or its box leaves an image. Box sizes are full-frame pixels. One call of OpenCV per
-    point: correlating all boxes as arrays, by Fourier transform, takes 2 to 3 times as long at these sizes.
+    Gives the correlations (N,) too, −1 where a patch or its box leaves an image. Box sizes are full-frame pixels; without a box the
+    centre is the start. Cost: one call of OpenCV per point, 10 µs for a box of 5 px, 35 µs for 12 px.
     """
     _, _, (w, h) = patch_offsets(patch_px, row_step)
     best, start = np.full(len(xy), -1.0), np.array(centre)
@@ -22,7 +22,8 @@ def search_box(
     H, W = next_grey.shape
     x0, x1 = np.maximum(0, q[:, 0] - w - rx), np.minimum(W, q[:, 0] + w + rx + 1)
     y0, y1 = np.maximum(0, q[:, 1] - h - ry), np.minimum(H, q[:, 1] + h + ry + 1)
-    rows = np.flatnonzero(usable)
+    best[usable & (box == 0)] = 1.0  # nothing to search: the centre is the start
+    rows = np.flatnonzero(usable & (box > 0))
     spans = np.stack([p[:, 1] - h, p[:, 1] + h + 1, p[:, 0] - w, p[:, 0] + w + 1, y0, y1, x0, x1], axis=1)[rows].tolist()
     found = np.zeros((len(rows), 3))
     for i, (a, b, c, d, e, f, g, k) in enumerate(spans):

@@ -7,6 +7,9 @@
     spatial   least squares matching of the reference view's patch in the other views of frame i + 1               (5)
     verify    Δ = x_s − x_t,  Δᵀ (K_s + K_t + Q)⁻¹ Δ ≤ s² χ²(0.999; 2), else once more in a bigger box, else stop   (6)
 
+Most points move as predicted to within matching's range of convergence; they are matched from the prediction at once, and the boxes are
+searched for the others.
+
 s² in (6) is the variance component that the step's own points show, by their 90 % quantile: matching's covariances are too small where
 texture is weak against the noise, by a factor that differs from recording to recording. Kept: the reference view's controlled result,
 elsewhere the mean of temporal and spatial weighted by their covariances; then the point where the rays meet. Its covariance contains the
@@ -34,7 +37,7 @@ from .tracked import TrackedFrame, rows_of
 CHI2, CHI2_90 = 13.82, 4.605  # two degrees of freedom: 0.999 and 0.9
 MODEL_SIGMA_PX = 0.12  # Q of (6): what an affine patch cannot follow
 LARGEST_SCALE, PRIOR_POINTS = 3.0, 20  # of s; as many points as would have s = 1
-PREDICTED_BOX = 0.4  # of the box, for points whose velocity is known
+KNOWN_BOX, UNKNOWN_BOX = (0.0, 0.4, 1.0), (0.0, 1.0, 2.0)  # of the box in each attempt, for points whose motion is known or not
 HARMLESS_M = 2e-3  # scatter of neighbours about their common motion
 TEMPLATE_SIGMA_PX = 0.02  # of the reference view's point in the intersection; its drift is added afterwards
 
@@ -84,20 +87,20 @@ def track_step(
     n = len(current.identity)
     predicted, known = predict(current, before, view.tracking.neighbourhood_m)
     tiles = atlas(templates, current.identity)
-    reason = np.full(n, TrackStatus.LEFT_IMAGE, dtype=np.int8)
-    result, rest, scale = current, np.arange(n), None
-    for attempt in (1, 2):
-        box = view.tracking.box_px * np.where(known[rest], (PREDICTED_BOX, 1.0)[attempt - 1], attempt)
-        if monitor.cancelled:
-            monitor.step("tracks", attempt, 2)
-        found, status, scale = _attempt(view, current.select(rest), predicted[rest], box, tiles, rest, images, scale)
-        reason[rest] = status
-        good = status == TrackStatus.MEASURED
-        result = result.changed(rest[good], found.select(good))
-        rest = rest[~good & (status != TrackStatus.LEFT_IMAGE)]
-        if not len(rest):
-            break
-        predicted, known = _with_the_others(current, result, reason == TrackStatus.MEASURED, predicted, view.tracking.neighbourhood_m)
+    reason = np.full(n, TrackStatus.NOT_FOUND, dtype=np.int8)
+    result, scale = current, None
+    rest = np.flatnonzero(known)
+    for attempt in range(3):
+        if len(rest):
+            if monitor.cancelled:
+                monitor.step("tracks", attempt, 3)
+            box = view.tracking.box_px * np.where(known[rest], KNOWN_BOX[attempt], UNKNOWN_BOX[attempt])
+            found, status, scale = _attempt(view, current.select(rest), predicted[rest], box, tiles, rest, images, scale)
+            reason[rest] = status
+            good = status == TrackStatus.MEASURED
+            result = result.changed(rest[good], found.select(good))
+            predicted, known = _with_the_others(current, result, reason == TrackStatus.MEASURED, predicted, known, view.tracking)
+        rest = np.flatnonzero((reason != TrackStatus.MEASURED) & (reason != TrackStatus.LEFT_IMAGE))
     return replace(result, frame=frame, ended=np.zeros(0, np.int64), reason=np.zeros(0, np.int8)).without(
         reason != TrackStatus.MEASURED, reason
     )
@@ -120,12 +123,12 @@ def predict(current: TrackedFrame, before: TrackedFrame | None, radius_m: float)
 
 
 def _with_the_others(
-    current: TrackedFrame, result: TrackedFrame, found: np.ndarray, predicted: np.ndarray, radius_m: float
+    current: TrackedFrame, result: TrackedFrame, found: np.ndarray, predicted: np.ndarray, known: np.ndarray, settings: TrackingSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Better predictions for the points that were not found: the motion of their neighbours that were."""
-    goal, known = predicted.copy(), np.zeros(len(predicted), dtype=bool)
+    goal, known = predicted.copy(), known.copy()
     lost = np.flatnonzero(~found)
-    rows, there = nearest_neighbours(current.xyz_m[lost], current.xyz_m[found], radius_m)
+    rows, there = nearest_neighbours(current.xyz_m[lost], current.xyz_m[found], settings.neighbourhood_m)
     if there.any():
         moved = common_motion(
             current.xyz_m[lost], current.xyz_m[found][rows], result.xyz_m[found][rows], there.astype(float), HARMLESS_M
