@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.camera import Camera
+from ..geometry.small_matrices import invert_spd
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..progress import Monitor
@@ -354,10 +355,10 @@ def _scaled(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def solve_normals(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:
     """x (m, P) of N x = rhs, for normal matrices (m, P, P) whose unknowns have unlike units."""
     M, scale = _scaled(N)
-    return scale * np.linalg.solve(M, (scale * rhs)[..., None])[..., 0]
+    return scale * np.einsum("nij,nj->ni", invert_spd(M), scale * rhs)
 
 
 def inverse_normals(N: np.ndarray) -> np.ndarray:
     """N⁻¹ (m, P, P), for normal matrices whose unknowns have unlike units."""
     M, scale = _scaled(N)
-    return np.linalg.inv(M) * scale[:, :, None] * scale[:, None, :]
+    return invert_spd(M) * scale[:, :, None] * scale[:, None, :]
