@@ -88,8 +88,8 @@ def _mirrored(rig: Rig, fork: int, a: _Branch, b: _Branch) -> bool:
     apart = float(np.linalg.norm(end_a[:2] - end_b[:2]))
     level = abs(end_a[2] - end_b[2]) < 0.05 * size + 1e-9
     middle = np.linalg.norm((end_a + end_b)[:2]) / 2
-    return abs(a.length_m - b.length_m) < ALIKE * size and level and apart > 0.1 * size and bool(
-        np.linalg.norm(end_a) > 0.3 * size) and middle < 0.6 * apart + 0.25 * size
+    alike = abs(a.length_m - b.length_m) < ALIKE * size and level and apart > 0.1 * size
+    return bool(alike and np.linalg.norm(end_a) > 0.3 * size and middle < 0.6 * apart + 0.25 * size)
 
 
 def _sides(rig: Rig, legs: tuple[_Branch, _Branch], arms: tuple[_Branch, _Branch]) -> tuple[dict[str, tuple[str, ...]], bool]:
