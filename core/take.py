@@ -18,12 +18,15 @@ from .geometry.rig import Rig, read_rig
 from .images.fields import INTERLACE, RowGrid, row_grid
 from .images.sequence import Sequence, open_sequence
 from .settings import nearest_name
+from .values import frozen
 
 FORMAT, VERSION = "tricap-take", 1
 SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
-KEYS = ("format", "version", "fps", "interlaced", "rig", "reference_view", "frames", "views", "body", "seeds", "settings")
+KEYS = ("format", "version", "fps", "interlaced", "rig", "reference_view", "frames", "views", "body", "seeds", "keyframes", "corrections",
+        "settings")
 
+CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
@@ -48,6 +51,23 @@ class Seeds:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Correction:
+    """What the user saw to be wrong in one view, in full-frame pixels.
+
+    "trajectory": the trajectory nearest to `xy_px` (1, 2) in frame `frames.start` is removed.
+    "region": what is measured inside the polygon `xy_px` (n, 2), during `frames`, is left out.
+    """
+
+    kind: str
+    view: str
+    frames: range
+    xy_px: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xy_px", frozen(self.xy_px, (None, 2)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Take:
     """A recording. `folder` holds take.toml and the footage; `frames` is half-open, None means all."""
 
@@ -59,7 +79,11 @@ class Take:
     reference_view: str = ""
     frames: tuple[int, int] | None = None
     body_model: str | None = None
+    locked: tuple[str, ...] = ()  # degrees of freedom that are held at their rest value
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by degree of freedom, in degrees
     seeds: Seeds = field(default_factory=Seeds)
+    keyframes: tuple[Seeds, ...] = ()  # clicked joints of further frames, one entry per frame
+    corrections: tuple[Correction, ...] = ()
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -172,21 +196,25 @@ def _frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
 
 
 def _check_seeds(footage: Footage) -> None:
-    seeds, take = footage.take.seeds, footage.take
-    clicks = [(f"joint “{name}”", at) for name, at in seeds.joints.items()]
-    clicks += [(f"surface seed {i + 1}", at) for i, at in enumerate(seeds.surface)]
-    for label, at in clicks:
-        for view, xy in at.items():
-            if not footage.rig[view].sees(xy):
-                w, h = footage.rig[view].size_px
-                raise InputError(
-                    f"The {label} in view {view} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels; click it again."
-                )
-    if clicks and seeds.frame not in footage.frames:
-        raise InputError(
-            f"The seeds of {take.folder.name} belong to frame {seeds.frame}, which is not among the frames "
-            f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` under [seeds]."
-        )
+    for seeds in (footage.take.seeds, *footage.take.keyframes):
+        clicks = [(f"joint “{name}”", at) for name, at in seeds.joints.items()]
+        clicks += [(f"surface seed {i + 1}", at) for i, at in enumerate(seeds.surface)]
+        for label, at in clicks:
+            _check_inside(footage, label, at)
+        if clicks and seeds.frame not in footage.frames:
+            raise InputError(
+                f"The clicks of {footage.take.folder.name} in frame {seeds.frame} are not among the frames "
+                f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` in take.toml."
+            )
+
+
+def _check_inside(footage: Footage, label: str, at: Clicks) -> None:
+    for view, xy in at.items():
+        if not footage.rig[view].sees(xy):
+            w, h = footage.rig[view].size_px
+            raise InputError(
+                f"The {label} in view {view} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels; click it again."
+            )
 
 
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
@@ -207,7 +235,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     if not _is_number(fps) or not 0.1 <= float(fps) <= 10_000:
         raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
     body = _table(table, "body", where)
-    _known(body, ("model",), f"[body] of {where}")
+    _known(body, ("model", "locked", "limits"), f"[body] of {where}")
     if not isinstance(body.get("model", ""), str):
         raise InputError(f"`model` under [body] of {where} is {body['model']!r}; write the name of a body model, such as \"arm.R\".")
     return Take(
@@ -219,7 +247,11 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         reference_view=reference,
         frames=_range(table.get("frames"), where),
         body_model=_model(folder, body.get("model"), where),
+        locked=_locked(body.get("locked", []), where),
+        limits=_limits(body.get("limits", {}), where),
         seeds=_seeds(_table(table, "seeds", where), names, where),
+        keyframes=_keyframes(_list_of_tables(table, "keyframes", where), names, where),
+        corrections=tuple(_correction(c, names, where) for c in _list_of_tables(table, "corrections", where)),
         settings=_settings(_table(table, "settings", where), where),
     )
 
@@ -244,6 +276,49 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
     return tuple(views)
 
 
+def _locked(names: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise InputError(f'`locked` under [body] of {where} is {names!r}; write a list of degrees of freedom, such as ["elbow.R twist"].')
+    return tuple(names)
+
+
+def _limits(table: Any, where: str) -> Mapping[str, tuple[float, float]]:
+    if not isinstance(table, dict):
+        raise InputError(f'[body.limits] of {where} must be a table, such as "knee.R flexion" = [0, 140].')
+    for name, pair in table.items():
+        if not isinstance(pair, list) or len(pair) != 2 or not all(_is_number(v) for v in pair) or not pair[0] < pair[1]:
+            raise InputError(f"The limits of “{name}” in {where} are {pair!r}; write [lowest, highest] in degrees.")
+    return {name: (float(low), float(high)) for name, (low, high) in table.items()}
+
+
+def _keyframes(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: str) -> tuple[Seeds, ...]:
+    for table in tables:
+        _known(table, ("frame", "joints"), f"a [[keyframes]] of {where}")
+    keyframes = tuple(_seeds(table, views, where) for table in tables)
+    if len({k.frame for k in keyframes}) < len(keyframes):
+        raise InputError(f"Two [[keyframes]] of {where} are for the same frame; write their joints into one.")
+    return tuple(sorted(keyframes, key=lambda k: k.frame))
+
+
+def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Correction:
+    kind, view, label = table.get("kind"), table.get("view"), f"a [[corrections]] of {where}"
+    if kind not in CORRECTIONS:
+        raise InputError(f"`kind` of {label} is {kind!r}; write one of: {', '.join(CORRECTIONS)}.")
+    _known(table, ("kind", "view", *CORRECTIONS[kind]), label)
+    if view not in views:
+        raise InputError(f"`view` of {label} is {view!r}.{nearest_name(str(view), views)}")
+    frame = table.get("frame")
+    if kind == "region":
+        frames, corners = _range(table.get("frames"), label), table.get("polygon")
+    else:
+        frames, corners = (frame, frame + 1) if isinstance(frame, int) else None, [table.get("xy")]
+    wanted = 3 if kind == "region" else 1
+    if not isinstance(corners, list) or len(corners) < wanted or not all(_is_pixel(xy) for xy in corners) or frames is None:
+        need = "frames = [first, one after the last] and a polygon of three or more" if kind == "region" else "a frame and xy, one"
+        raise InputError(f"The correction “{kind}” of {where} needs {need} pixel coordinates [x, y].")
+    return Correction(kind=kind, view=view, frames=range(*frames), xy_px=np.array(corners, dtype=np.float64))
+
+
 def _seeds(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Seeds:
     _known(table, ("frame", "surface", "joints"), f"[seeds] of {where}")
     frame, surface, joints = table.get("frame", 0), table.get("surface", []), table.get("joints", {})
@@ -262,7 +337,7 @@ def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
         raise InputError(f"The {label} must name views and pixels, such as {{ {views[0]} = [312.0, 180.5] }}.")
     _known(at, views, label)
     for view, xy in at.items():
-        if not isinstance(xy, list) or len(xy) != 2 or not all(_is_number(v) for v in xy):
+        if not _is_pixel(xy):
             raise InputError(f"The {label} in view {view} is {xy!r}; write two pixel coordinates [x, y].")
     return {view: np.array(xy, dtype=np.float64) for view, xy in at.items()}
 
@@ -300,10 +375,21 @@ def _table(table: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
     return value
 
 
+def _list_of_tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
+    value = table.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise InputError(f"`{key}` of {where} must be written as [[{key}]] tables.")
+    return value
+
+
 def _known(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
     for key in table:
         if key not in known:
             raise InputError(f"{where} has an unknown key “{key}”.{nearest_name(str(key), known)}")
+
+
+def _is_pixel(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(_is_number(v) for v in value)
 
 
 def _is_number(value: Any) -> TypeGuard[float]:

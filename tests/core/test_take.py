@@ -55,6 +55,21 @@ def test_everything_that_it_says(tmp_path: Path) -> None:
     assert read_take(tmp_path / "take.toml").folder == take.folder
 
 
+def test_corrections_and_keyframes(tmp_path: Path) -> None:
+    more = (
+        '[body]\nmodel = "arm.R"\nlocked = ["elbow.R twist"]\n[body.limits]\n"elbow.R flexion" = [0, 140]\n'
+        + KEYFRAME + KEYFRAME.replace("frame = 3", "frame = 1")
+        + '[[corrections]]\nkind = "trajectory"\nview = "L"\nframe = 4\nxy = [3, 4.5]\n'
+        + '[[corrections]]\nkind = "region"\nview = "C"\nframes = [2, 9]\npolygon = [[0, 0], [9, 0], [0, 9.5]]\n'
+    )
+    take = read(tmp_path, text(more=more))
+    assert take.locked == ("elbow.R twist",) and take.limits == {"elbow.R flexion": (0.0, 140.0)}
+    assert [k.frame for k in take.keyframes] == [1, 3] and take.keyframes[1].joints["elbow.R"]["L"].tolist() == [5, 5]
+    one, region = take.corrections
+    assert (one.kind, one.view, one.frames, one.xy_px.tolist()) == ("trajectory", "L", range(4, 5), [[3, 4.5]])
+    assert (region.kind, region.view, region.frames, region.xy_px.shape) == ("region", "C", range(2, 9), (3, 2))
+
+
 def test_what_may_be_left_out(tmp_path: Path) -> None:
     take = read(tmp_path, text(dict(rig=None)))
     assert (take.reference_view, take.interlaced, take.frames, take.body_model) == ("C", "none", None, None)
@@ -63,6 +78,9 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
     assert two.reference_view == "C"
 
 
+KEYFRAME = '[[keyframes]]\nframe = 3\n[keyframes.joints]\n"elbow.R" = { L = [5, 5], C = [5, 5] }\n'
+REGION = '[[corrections]]\nkind = "region"\nview = "C"\nframes = [2, 9]\n'
+TRAJECTORY = REGION.replace("region", "trajectory").replace("frames = [2, 9]", "frame = 1")
 SEED, JOINT = "[seeds]\n", "[seeds.joints]\n"
 FAULTS = {
     "not TOML": ("fps = \n", "is not a TOML file"),
@@ -114,6 +132,20 @@ FAULTS = {
     "click of three": (text(more=JOINT + '"elbow.R" = { L = [1, 2, 3] }\n'), "is \\[1, 2, 3\\]; write two pixel coordinates"),
     "click NaN": (text(more=JOINT + '"elbow.R" = { L = [nan, 2] }\n'), "joint “elbow.R” of .* in view L is \\[nan, 2\\]"),
     "click of words": (text(more=JOINT + '"elbow.R" = { L = ["1", 2] }\n'), "write two pixel coordinates"),
+    "locked a word": (text(more='[body]\nlocked = "elbow.R twist"\n'), "`locked` under \\[body\\] of .* write a list"),
+    "limits a list": (text(more="[body]\nlimits = [1, 2]\n"), "\\[body.limits\\] of .* must be a table"),
+    "limits turned": (text(more='[body.limits]\n"knee.R flexion" = [140, 0]\n'), "limits of “knee.R flexion” in .* are \\[140, 0\\]"),
+    "keyframes a table": (text(more="[keyframes]\nframe = 3\n"), "must be written as \\[\\[keyframes\\]\\] tables"),
+    "two keyframes alike": (text(more=KEYFRAME + KEYFRAME), "Two \\[\\[keyframes\\]\\] of .* are for the same frame"),
+    "surface in a keyframe": (text(more="[[keyframes]]\nframe = 3\nsurface = []\n"), "unknown key “surface”"),
+    "keyframe of an unknown joint": (text(more=KEYFRAME.replace("elbow.R", "elbow.r")), "Did you mean “elbow.R”?"),
+    "corrections a table": (text(more="[corrections]\nframe = 3\n"), "must be written as \\[\\[corrections\\]\\] tables"),
+    "correction of no kind": (text(more="[[corrections]]\nframe = 3\n"), "`kind` of .* is None; write one of: trajectory, region"),
+    "correction of no view": (text(more='[[corrections]]\nkind = "region"\n'), "`view` of .* is None"),
+    "region without polygon": (text(more=REGION), "needs frames = .* and a polygon of three or more"),
+    "region of two corners": (text(more=REGION + "polygon = [[1, 2], [3, 4]]\n"), "a polygon of three or more"),
+    "region of a keyframe": (text(more=REGION + "frame = 3\n"), "unknown key “frame”"),
+    "trajectory without pixel": (text(more=TRAJECTORY), "a frame and xy"),
     "settings a word": (text(dict(settings='"x"')), "\\[settings\\] of .* must be a table"),
     "setting outside a group": (text(more="[settings]\npatch_px = 13\n"), "such as \\[settings.matching\\]; “patch_px” is none"),
 }
@@ -207,8 +239,10 @@ def test_seeds_outside_the_image(footage: Path, xy: tuple[float, float]) -> None
 
 def test_seeds_of_a_frame_that_is_not_there(footage: Path) -> None:
     clicked = '[seeds]\nframe = 5\n[seeds.joints]\n"elbow.R" = { L = [5, 5], C = [5, 5] }\n'
-    with pytest.raises(InputError, match="belong to frame 5, which is not among the frames 0 to 4"):
+    with pytest.raises(InputError, match="clicks of .* in frame 5 are not among the frames 0 to 4"):
         open_take(rewrite(footage, more=clicked))
+    with pytest.raises(InputError, match="clicks of .* in frame 5"):
+        open_take(rewrite(footage, more=KEYFRAME.replace("frame = 3", "frame = 5")))
     assert open_take(rewrite(footage, more="[seeds]\nframe = 5\n")).frames == range(5)  # without clicks it means nothing
 
 
