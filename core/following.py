@@ -1,4 +1,8 @@
-"""Tracking of a whole take: the points of each frame followed into the next, in the order of time, with a checkpoint per frame."""
+"""Tracking of a whole take: the points of each frame followed into the next, in the order of time, with a checkpoint per frame.
+
+A frame in which next to nothing is found, black in one view or lost by the recorder, is left out: the points go on from the frame before it
+into the one after.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -15,9 +19,10 @@ from .tracking.settings import TrackingSettings
 from .tracking.step import FramePair, TrackingView, track_step
 from .tracking.surface import on_surface, regenerate, start_tracks
 from .tracking.templates import Templates, cut_templates, no_templates
-from .tracking.tracked import TrackedFrame
+from .tracking.tracked import TrackedFrame, nothing
 
-ALGORITHM = "tracking 4"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 5"  # part of every key: raise it when the same input gives other numbers
+DROPOUT = 0.1  # of the points: where fewer are found in a frame, it is the frame that is missing
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -30,7 +35,9 @@ class _State:
     born: int  # the next identity
 
     def after(self, tracked: TrackedFrame, cut: Templates) -> "_State":
-        """The state after a frame, with the templates that were cut in it."""
+        """The state after a frame, with the templates that were cut in it; a frame that was left out changes nothing."""
+        if self.current is not None and not len(tracked.identity) and not len(tracked.ended):
+            return self
         return _State(
             before=self.current,
             current=tracked,
@@ -63,10 +70,11 @@ def track_frames(
             tracked = _advance(view, state, images, following, m, i, monitor)
             done = tracked, _cut(view, tracked, following)
             _checkpoint(results, *done, key)
-            images = following
         else:
-            images = None
-        state = state.after(*done)
+            following = None
+        after = state.after(*done)
+        images = images if after is state else following
+        state = after
         yield done[0]
 
 
@@ -95,6 +103,8 @@ def _advance(
         return start_tracks(m.field, m.cloud, view)
     pair = FramePair(grey=images.grey, spline=images.spline, next_grey=following.grey, next_spline=following.spline)
     tracked = track_step(view, state.before, state.current, state.templates, pair, m.frame, monitor)
+    if len(tracked.identity) < DROPOUT * len(state.current.identity) and m.frame - state.current.frame <= view.tracking.bridge_frames:
+        return nothing(m.frame, len(view.cameras))
     tracked = on_surface(tracked, m.field, m.cloud, view)
     every = view.tracking.regenerate_every
     return regenerate(tracked, m.field, m.cloud, view, state.born) if every and index % every == 0 else tracked

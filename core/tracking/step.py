@@ -83,9 +83,9 @@ def track_step(
     frame: int,
     monitor: Monitor,
 ) -> TrackedFrame:
-    """Follow all points of `current` to `frame`, the second of the two frames of `images`."""
+    """Follow all points of `current` to `frame`, the second of the two frames of `images`; frames between may be missing."""
     n = len(current.identity)
-    predicted, known = predict(current, before, view.tracking.neighbourhood_m)
+    predicted, known = predict(current, before, frame, view.tracking.neighbourhood_m)
     tiles = atlas(templates, current.identity)
     reason = np.full(n, TrackStatus.NOT_FOUND, dtype=np.int8)
     result, scale = current, None
@@ -106,13 +106,14 @@ def track_step(
     )
 
 
-def predict(current: TrackedFrame, before: TrackedFrame | None, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+def predict(current: TrackedFrame, before: TrackedFrame | None, frame: int, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Predicted positions (N, 3), and for which points a motion is known: their own, or that of neighbours.  (1)"""
     if before is None or not len(before.identity):
         return current.xyz_m, np.zeros(len(current.identity), dtype=bool)
     at = rows_of(before.identity, current.identity)
     known = at >= 0
-    goal = np.where(known[:, None], 2 * current.xyz_m - before.xyz_m[at], current.xyz_m)
+    ahead = (frame - current.frame) / max(1, abs(current.frame - before.frame))
+    goal = np.where(known[:, None], current.xyz_m + abs(ahead) * (current.xyz_m - before.xyz_m[at]), current.xyz_m)
     new = np.flatnonzero(~known)
     if len(new) and known.any():
         rows, there = nearest_neighbours(current.xyz_m[new], current.xyz_m[known], radius_m)

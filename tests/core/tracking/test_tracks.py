@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -132,3 +133,16 @@ def test_kinematics_are_exact_for_a_parabola() -> None:
     tracks = assemble([step(i, [0], path[i]) for i in range(8)], 25.0)
     assert np.allclose(tracks.velocity_m_s[1:-1, 0], np.stack([0.5 - 4 * t, 6 * t, 0 * t], axis=1)[1:-1])
     assert np.allclose(tracks.acceleration_m_s2[1:-1, 0], [-4, 6, 0])
+
+
+def test_a_black_frame_is_bridged(tmp_path: Path, scenes: Any) -> None:
+    """One view is black in frame 2: the points go on in frame 3 under the same identity, in the right places."""
+    bodies = moving_plane(scenes, 5)
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
+    black = cv2.imencode(".png", np.zeros((150, 200), np.uint8))[1].tobytes()
+    (take / "C" / "0002.png").write_bytes(black)
+    tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out")), 25.0)
+    seen = tracks.seen
+    assert not seen[2].any() and (seen[1] & seen[3]).sum() > 0.8 * seen[1].sum()
+    error, on_it = errors(bodies, tracks, 0.035)
+    assert np.nanmax(np.linalg.norm(error[:, on_it, :2], axis=2)) < 1.0 * scenes.pixel_m

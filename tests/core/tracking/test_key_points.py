@@ -1,0 +1,53 @@
+"""Key points on a turning plane: places, distances and sigmas against the truth; clicks that are wrong or too few."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.errors import InputError
+from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.images.fields import RowGrid
+from tricap.core.matching.least_squares import MatchingSettings
+from tricap.core.progress import Monitor
+from tricap.core.tracking.key_points import KeyPoints, distances, track_key_points
+from tricap.core.tracking.settings import TrackingSettings, TrackStatus
+from tricap.core.tracking.step import TrackingView
+
+FRAMES = 8
+
+
+def follow(scenes: Any, off_px: float, views: tuple[str, ...] = ("L", "C", "R")) -> tuple[KeyPoints, np.ndarray]:
+    rig = scenes.three_cameras()
+    plane = scenes.Body(half_m=(0.24, 0.18), R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
+    bodies = [plane.moved(rotation_from_vector(np.array([0.0, 0.01, 0.03]) * i), [0.008 * i, -0.003 * i, 0.002 * i]) for i in range(FRAMES)]
+    own = np.array([[-0.08, -0.05, 0], [0.08, -0.05, 0], [0.08, 0.05, 0], [-0.08, 0.05, 0], [0.0, 0.0, 0.0]])
+    truth = np.stack([own @ b.R.T + b.t for b in bodies])
+    random = np.random.default_rng(0)
+    seeing = [c for c in rig.cameras if c.name in views]
+    clicks = {
+        str(n): {c.name: c.project(truth[0, n]) + (c.name != "C") * off_px * random.uniform(-1, 1, 2) for c in seeing} for n in range(5)
+    }
+    view = TrackingView(
+        cameras=rig.cameras, reference=1, rows=RowGrid(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7
+    )
+    read = lambda i: [scenes.render(c, [bodies[i]], noise=1.5, seed=i) for c in rig.cameras]  # noqa: E731
+    return track_key_points(read, range(FRAMES), clicks, view, Monitor()), truth
+
+
+@pytest.mark.parametrize(("off_px", "views"), [(0.0, ("L", "C", "R")), (2.5, ("L", "C", "R")), (0.5, ("C", "R"))])
+def test_key_points(scenes: Any, off_px: float, views: tuple[str, ...]) -> None:
+    points, truth = follow(scenes, off_px, views)
+    assert (points.status == TrackStatus.MEASURED).all()
+    error = points.xyz_m - truth
+    assert np.abs(error[..., :2]).max() < 0.5 * scenes.pixel_m and np.abs(error[..., 2]).max() < 0.012
+    change = [distances(points, a, b) - np.linalg.norm(truth[:, a] - truth[:, b], axis=1) for a in range(5) for b in range(a)]
+    assert np.sqrt(np.mean(np.square(change))) < 1e-3
+    z = np.linalg.norm(error, axis=2) / points.sigma_m
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.8  # forty points
+    assert points.xy_px.shape == (FRAMES, 5, 3, 2) and np.isfinite(points.xy_px).all()
+
+
+def test_one_click_is_not_enough(scenes: Any) -> None:
+    with pytest.raises(InputError, match="two views"):
+        follow(scenes, 0.0, ("C",))
