@@ -80,6 +80,23 @@ def sweep_seeds(
     return approximations_at_depth(cameras, reference, rows, xy[good], depth[good])
 
 
+def sweep_ray(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    rows: RowGrid,
+    xy: np.ndarray,
+    settings: MatchingSettings,
+    depth_range_m: tuple[float, float] | None = None,
+) -> float | None:
+    """Depth [m] at which the patch about `xy` (2,) (rows' pixels) of the FIRST image is in all others; None where that is not clear."""
+    at = _textured(images[0], settings, rows, np.asarray(xy, dtype=np.float64)[None])
+    if not len(at):
+        return None
+    inverse = _inverse_depths(cameras, 0, *(depth_range_m or _default_range(cameras)))
+    depth, good = _peaks(_sweep_scores(images, cameras, 0, rows, settings, at, inverse), inverse)
+    return float(depth[0]) if good[0] else None
+
+
 def _textured(image: SplineImage, settings: MatchingSettings, rows: RowGrid, xy: np.ndarray) -> np.ndarray:
     u, v, half = patch_offsets(settings.patch_px, rows.step)
     xy = xy[image.inside(xy, np.array(half) + 3.0)]

@@ -1,0 +1,181 @@
+"""What one click says about the other views: the epipolar curve, and the place that looks alike on it.
+
+A pixel's ray X(w) = C + d / w (w: inverse depth) is a straight line in another camera's undistorted image,
+
+    (a, b)(w) = (p_x w + q_x, p_y w + q_y) / (p_z w + q_z) ,   p = R' C + t' ,  q = R' d                                (1)
+
+which the lens bends into a curve (camera.py, (3)–(5)). Along it the click's patch is looked for by the plane sweep of the seeds (Collins
+1996), and the winner is refined by least squares matching (Gruen 1985). Where texture is too poor or repeats, nothing is proposed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..geometry.intersection import forward_intersection
+from ..images.fields import RowGrid
+from ..images.sampling import SplineImage
+from .least_squares import MatchingSettings, match_patches
+from .seeds import approximations_at_depth, sweep_ray
+
+CURVE_STEP_PX = 6.0
+NEAREST_M = 0.05  # of the ray, when nothing is known
+FIELD_MARGIN = 1.05  # of the frame corner's radius: the lens is not calibrated further out
+LARGER_PX = (0, 8, 16)  # patches tried one after the other
+MAX_MISS_PX = 2.5  # distance of a match from its epipolar curve
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Proposal:
+    """Where a point clicked in one view was found in another. Full-frame pixels."""
+
+    xy_px: np.ndarray  # (2,)
+    sigma_px: float  # along the worse axis
+    correlation: float  # of the patches; the smallest of those that tell the place
+
+
+def epipolar_curve(camera: Camera, xy_px: np.ndarray, other: Camera, depth_range_m: tuple[float, float] | None = None) -> np.ndarray:
+    """The ray of pixel `xy_px` (2,) of `camera` as a polyline (M, 2) in the frame of `other`; M = 0 where it is not in sight.
+
+    `depth_range_m`: nearest and farthest depth in `camera`; without it from 5 cm to infinity. The polyline's corners lie on the curve, and
+    its edges within a thousandth of a pixel for any usual lens.
+    """
+    near, far = depth_range_m or (NEAREST_M, np.inf)
+    p = other.to_camera(camera.centre_m)
+    q = other.R_cam_world @ camera.rays(np.asarray(xy_px, dtype=np.float64))
+    ends = _ahead(p, q, 1 / far, 1 / near)
+    if ends is None:
+        return np.zeros((0, 2))
+    w, h = other.size_px
+    corners = other.directions(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
+    inside = _in_disc(*ends, FIELD_MARGIN * float(np.linalg.norm(corners[:, :2], axis=1).max()))
+    if inside is None:
+        return np.zeros((0, 2))
+    start, end = inside
+    count = 2 + int(np.linalg.norm(end - start) * other.focal_px / CURVE_STEP_PX)
+    ab = start + (end - start) * np.linspace(0, 1, count)[:, None]
+    rays = np.concatenate([ab, np.ones((count, 1))], axis=1)
+    curve = other.project((rays - other.t_cam_world_m) @ other.R_cam_world)
+    return curve[other.sees(curve, -CURVE_STEP_PX)]
+
+
+def _ahead(p: np.ndarray, q: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Both ends (2,) of (1) for inverse depths low … high, as far as they lie before the camera."""
+    least = 1e-3 * float(np.linalg.norm(q))
+    at = [p * w + q for w in (low, high)]
+    if at[0][2] < least and at[1][2] < least:
+        return None
+    for i in (0, 1):
+        if at[i][2] < least:
+            share = (least - at[1 - i][2]) / (at[i][2] - at[1 - i][2])
+            at[i] = at[1 - i] + share * (at[i] - at[1 - i])
+    return at[0][:2] / at[0][2], at[1][:2] / at[1][2]
+
+
+def _in_disc(a: np.ndarray, b: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """The part of the segment from a to b (2,) that lies in a disc about the origin."""
+    along = b - a
+    A, B, C = float(along @ along), float(a @ along), float(a @ a) - radius**2
+    if A == 0.0:
+        return (a, b) if C <= 0 else None
+    root = B * B - A * C
+    if root <= 0:
+        return None
+    s, t = max((-B - np.sqrt(root)) / A, 0.0), min((-B + np.sqrt(root)) / A, 1.0)
+    return (a + s * along, a + t * along) if s <= t else None
+
+
+def propose(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    rows: RowGrid,
+    view: int,
+    xy_px: np.ndarray,
+    settings: MatchingSettings,
+    depth_range_m: tuple[float, float] | None = None,
+) -> tuple[Proposal | None, ...]:
+    """The surface point at pixel `xy_px` (2,) of view number `view` in every view; None where it cannot be told, and in `view` itself.
+
+    All other views are asked together, with larger and larger patches; where only some answer, the rays tell the place in the rest. If none
+    answers, they are asked one by one, with large patches only: a small one has doubles on its curve. `depth_range_m` (in `view`) narrows
+    the search. Cost: about 10 ms for three views of 768×576.
+    """
+    at = rows.from_frame(np.asarray(xy_px, dtype=np.float64))
+    others = [k for k in range(len(cameras)) if k != view]
+    together = [(others, larger) for larger in LARGER_PX]
+    alone = [([k], larger) for k in others for larger in LARGER_PX[1:]] if len(others) > 1 else []
+    found: dict[int, Proposal] = {}
+    for group, larger in together + alone:
+        if found and (group == others or group[0] in found):
+            continue
+        which, patch = (view, *group), replace(settings, patch_px=min(settings.patch_px + larger, 51))
+        found |= _find([images[k] for k in which], [cameras[k] for k in which], rows, at, patch, depth_range_m, group)
+        if found and group == others:
+            found = _where_rays_meet(cameras, {view: Proposal(xy_px=rows.to_frame(at), sigma_px=0.1, correlation=1.0)} | found)
+            break
+    return tuple(found.get(k) if k != view else None for k in range(len(cameras)))
+
+
+def where_rays_meet(cameras: Sequence[Camera], clicks: Mapping[int, np.ndarray], sigma_px: float) -> tuple[Proposal | None, ...]:
+    """Where the point clicked in two views or more (view number → pixel (2,)) lies in the others; None in views that cannot see it.
+
+    The clicks' sigma enters the proposals' sigmas.
+    """
+    known = {k: Proposal(xy_px=np.asarray(xy, dtype=np.float64), sigma_px=sigma_px, correlation=1.0) for k, xy in clicks.items()}
+    found = _where_rays_meet(cameras, known) if len(known) > 1 else known
+    return tuple(found.get(k) if k not in clicks else None for k in range(len(cameras)))
+
+
+def _where_rays_meet(cameras: Sequence[Camera], known: Mapping[int, Proposal]) -> dict[int, Proposal]:
+    """The known places, and those of their forward intersection in the other views."""
+    xy, K = np.full((1, len(cameras), 2), np.nan), np.tile(np.eye(2), (1, len(cameras), 1, 1))
+    for k, place in known.items():
+        xy[0, k], K[0, k] = place.xy_px, np.eye(2) * place.sigma_px**2
+    point, found = forward_intersection(cameras, xy, K), dict(known)
+    if not np.isfinite(point.xyz_m).all() or point.rms_residual_px[0] > max(MAX_MISS_PX, 3 * max(p.sigma_px for p in known.values())):
+        return found
+    for k in set(range(len(cameras))) - set(known):
+        at, J = cameras[k].project_with_jacobian(point.xyz_m[0])
+        if cameras[k].sees(at):
+            sigma = np.sqrt(np.diag(J @ point.covariance_m2[0] @ J.T).max())
+            found[k] = Proposal(xy_px=at, sigma_px=float(sigma), correlation=min(p.correlation for p in known.values()))
+    return found
+
+
+def _find(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    rows: RowGrid,
+    at: np.ndarray,
+    settings: MatchingSettings,
+    depth_range_m: tuple[float, float] | None,
+    names: Sequence[int],
+) -> dict[int, Proposal]:
+    """Sweep and matching of the patch about `at` (rows' pixels) of the first image in the others."""
+    depth = sweep_ray(images, cameras, rows, at, settings, depth_range_m)
+    if depth is None:
+        return {}
+    start = approximations_at_depth(cameras, 0, rows, at[None], np.array([depth]))
+    every = range(1, len(images))
+    matches = match_patches(
+        images[0], at[None], images[1:], [start.xy[:, k] for k in every], [start.shape[:, k] for k in every], settings, row_step=rows.step
+    )
+    found = {}
+    for k, match in zip(every, matches):
+        xy = rows.to_frame(match.xy[0])
+        if match.ok[0] and cameras[k].sees(xy) and _miss(cameras[0], rows.to_frame(at), cameras[k], xy) <= MAX_MISS_PX:
+            sigma = np.sqrt(np.diag(rows.covariance_to_frame(match.covariance[0])))
+            found[names[k - 1]] = Proposal(xy_px=xy, sigma_px=float(sigma.max()), correlation=float(match.correlation[0]))
+    return found
+
+
+def _miss(camera: Camera, xy_px: np.ndarray, other: Camera, at_px: np.ndarray) -> float:
+    """Distance [px] of a pixel of `other` from the epipolar curve of a pixel of `camera`."""
+    curve = epipolar_curve(camera, xy_px, other)
+    if len(curve) < 2:
+        return np.inf
+    a, along = curve[:-1], np.diff(curve, axis=0)
+    share = np.clip(np.einsum("ij,ij->i", at_px - a, along) / np.maximum(np.einsum("ij,ij->i", along, along), 1e-12), 0, 1)
+    return float(np.linalg.norm(a + share[:, None] * along - at_px, axis=1).min())
