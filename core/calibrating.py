@@ -183,6 +183,12 @@ class CalibratedRig:
     quality: Quality
     verdict: verdict.Verdict
 
+    @property
+    def bar(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frames (T,) in which both ends of the bar were measured, and the ends (T, 2, 3) [m] in the world."""
+        known = (self.calibration.used.sum(axis=1) >= 2).all(axis=1)
+        return self.calibration.observations.frames[known], self.calibration.network.ends_m[known]
+
 
 def calibrate_rig(
     observations: BarObservations, monitor: Monitor, *, focal_px: float | None = None, floor_frames: tuple[int, ...] = ()
@@ -208,6 +214,7 @@ def calibrate_rig(
         "predicted_error_m": quality.predicted.rms_m,
         "held_out_length_rms_m": quality.held_out.rms_m,
         "verdict": judged.sentence,
+        "floor": bool(floor_frames),
     }
     cameras = calibration.network.cameras(observations.names, observations.size_px)
     return CalibratedRig(rig=Rig(cameras=cameras, metadata=metadata), calibration=calibration, quality=quality, verdict=judged)

@@ -15,14 +15,18 @@ from ...core.geometry.camera import Camera
 from ...core.geometry.rig import Rig
 from ..scene import axes, clips
 from ..scene.cameras import add_camera, frame_render
+from ..scene.surroundings import add_bar
 
 COLLECTION = "Tricap Rig"
 EXACT = "tricap_exact"
 SAME = 2e-6  # relative: what single precision leaves of a number
 
 
-def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]], tracks: dict[str, BarTrack]) -> list[bpy.types.Object]:
+def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]], tracks: dict[str, BarTrack],
+                  bar: tuple[np.ndarray, np.ndarray] | None = None) -> list[bpy.types.Object]:
     """Cameras in a collection of their own, with their footage behind them and the measured targets as tracks over it.
+
+    `bar`: frames (T,) and ends (T, 2, 3) [m] of the reference bar, which is shown as well.
 
     A rig that was built before is replaced.
     """
@@ -43,6 +47,8 @@ def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]]
             if camera.name in tracks:
                 add_tracks(clip, tracks[camera.name], camera.size_px)
         made.append(camera_object)
+    if bar is not None:
+        add_bar(collection, *bar)
     middle = made[len(made) // 2]
     scene.camera = middle
     frame_render(scene, rig[middle["tricap_view"]])

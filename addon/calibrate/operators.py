@@ -63,7 +63,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
         """Build the cameras and tell the verdict."""
         files = {name: list(s.files()) for name, s in zip(result.footage.names, result.footage.sequences)}
         tracks = dict(zip(result.footage.names, result.measured.tracks))
-        build_cameras(context.scene, result.result.rig, files, tracks)
+        build_cameras(context.scene, result.result.rig, files, tracks, result.result.bar)
         verdict, props = result.result.verdict, context.scene.tricap_calibrate
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)

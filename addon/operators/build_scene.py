@@ -1,4 +1,4 @@
-"""bpy.ops.tricap.build_scene(out="…", blend="…", rest_pose="A", detail=1, exact_skin=False, simplify=0.0, colour="intensity")"""
+"""bpy.ops.tricap.build_scene(out="…", blend="…", rest_pose="A", detail=1, exact_skin=False, simplify=0.0, colour="intensity", …)"""
 
 import math
 from collections.abc import Callable
@@ -34,7 +34,9 @@ class BuildScene(JobOperator, bpy.types.Operator):
     detail: bpy.props.IntProperty(name="Skin Detail", default=1, min=1, max=8,  # type: ignore[valid-type]
                                   description="Pieces of each edge of the skin, by B-spline patches")
     exact_skin: bpy.props.BoolProperty(name="Exact Skin", default=False,  # type: ignore[valid-type]
-                                       description="Also the skin of every frame, in a .pc2 beside the saved file; about 0.1 s a frame")
+                                       description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file")
+    implicit: bpy.props.BoolProperty(name="Implicit Surface", default=False,  # type: ignore[valid-type]
+                                     description="Also the surface of the exact field in the middle frame, to check skins against")
     simplify: bpy.props.FloatProperty(name="Simplify", default=0.0, min=0.0, max=math.radians(10), subtype="ANGLE",  # type: ignore[valid-type]
                                       description="Play an action with few keys within this angle; the measured one is kept. 0: measured")
     colour: bpy.props.EnumProperty(name="Cloud Colour", items=[(c, c.capitalize(), "") for c in COLOURS])  # type: ignore[valid-type]
@@ -42,13 +44,13 @@ class BuildScene(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Contents]:
         """Which folder is meant."""
-        out = folders.output_folder(self.out, context.scene)
-        return lambda monitor: read_contents(out, monitor)
+        out, skins = folders.output_folder(self.out, context.scene), self.exact_skin
+        return lambda monitor: read_contents(out, monitor, skins=skins)
 
     def finish(self, context: bpy.types.Context, result: Contents) -> set[str]:
         """Build the scene from what was read."""
         options = SceneOptions(rest_pose=self.rest_pose, detail=self.detail, exact_skin=self.exact_skin, colour=self.colour,
-                               simplify_deg=math.degrees(self.simplify), arrows=self.arrows)
+                               simplify_deg=math.degrees(self.simplify), arrows=self.arrows, implicit=self.implicit)
         report = write_scene(result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         tell(self, report)
         return {"FINISHED"}

@@ -5,7 +5,8 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from scipy.spatial import cKDTree
 from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
-from . import action, armature, cameras, clips, metaballs, skin
+from . import action, armature, cameras, clips, implicit, metaballs, skin, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import at_rest
@@ -32,7 +33,8 @@ class SceneOptions:
     """What a user may want otherwise."""
 
     detail: int = 1  # the skin's level of detail: pieces of each edge
-    exact_skin: bool = False  # also the skin of every frame, as a mesh cache beside the .blend
+    exact_skin: bool = False  # also the skin of every frame, as the run found it: a mesh cache beside the .blend
+    implicit: bool = False  # also the implicit surface itself, in the middle frame
     rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
     simplify_deg: float = 0.0  # above 0: the armature plays a second action with few keys, within this tolerance
     colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
@@ -63,7 +65,7 @@ def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = 
         Cancelled: the monitor was cancelled; the scene is unchanged.
     """
     monitor = monitor or Monitor()
-    return write_scene(read_contents(Path(out), monitor), blend, options, monitor)
+    return write_scene(read_contents(Path(out), monitor, skins=options.exact_skin), blend, options, monitor)
 
 
 def write_scene(contents: Contents, blend: Path | None = None, options: SceneOptions = DEFAULTS,
@@ -88,6 +90,9 @@ def write_scene(contents: Contents, blend: Path | None = None, options: SceneOpt
             add_arrows(collection, contents.trajectories)
         counts["trajectories"] = contents.trajectories["xyz_m"].shape[1]
     counts |= _add_body(collection, contents, warnings, options, blend, monitor)
+    surroundings.add_lights(collection)
+    if contents.footage is not None and contents.footage.rig.metadata.get("floor") is True:
+        surroundings.add_floor(collection)
     scene.frame_set(scene.frame_start)
     if blend is not None:
         save_blend(Path(blend))
@@ -133,13 +138,28 @@ def save_blend(path: Path) -> None:
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.blend")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, relative_remap=True, compress=True)
+        with _caches_beside(path):
+            bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, relative_remap=True, compress=True)
         os.replace(part, path)
     except (OSError, RuntimeError) as error:
         raise InputError(f"Cannot write {path}: {str(error).strip()} Choose another folder or free some space.") from error
     finally:
         if part.exists():
             part.unlink()
+
+
+@contextmanager
+def _caches_beside(path: Path) -> Iterator[None]:
+    """While the file is saved, mesh caches beside it are named relative to it, so that both can be moved together."""
+    modifiers = [m for o in bpy.data.objects for m in o.modifiers if m.type == "MESH_CACHE"]
+    kept = [(m, m.filepath) for m in modifiers if not m.filepath.startswith("//") and Path(m.filepath).parent == path.parent]
+    for modifier, file in kept:
+        modifier.filepath = "//" + Path(file).name
+    try:
+        yield
+    finally:
+        for modifier, file in kept:
+            modifier.filepath = file
 
 
 def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, contents: Contents, warnings: list[str]) -> int:
@@ -199,16 +219,15 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
         return {}
     n = len(shape.skeleton.dof_names)
     values, sigma = (motion.values, motion.sigma) if motion is not None else (np.zeros((0, n)), np.zeros((0, n)))
+    measured_shape = shape
     shape, values, sigma = at_rest(shape, values, sigma, options.rest_pose)
     armature_object = armature.add_armature(collection, shape)
     flesh = metaballs.add_metaballs(collection, armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
-    exact = motion is not None and options.exact_skin
     try:
         skin_object = skin.add_skin(collection, armature_object, shape, options.detail)
-        if exact and blend is not None:
-            cache = Path(blend).resolve().with_suffix(".pc2")
-            other = skin.add_exact_skin(collection, shape, motion.frames, values, cache, monitor, options.detail)
+        if contents.skins is not None and blend is not None:
+            other = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
             for part in flesh:
                 part.hide_set(True)
                 part.hide_render = True
@@ -219,6 +238,11 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
         skin_object.hide_set(True)  # it lies in the metaballs' or the exact skin's surface
         skin_object.hide_render = True
         counts["skin faces"] = len(skin_object.data.polygons)
+    if options.implicit:
+        row = len(values) // 2
+        posture, frame = (values[row], int(motion.frames[row])) if motion is not None else (np.zeros(n), contents.frames[0])
+        if np.isfinite(posture).all():
+            implicit.add_implicit(collection, shape, posture, frame, monitor)
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
         counts["frames of motion"] = len(motion.frames)

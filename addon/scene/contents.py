@@ -13,13 +13,24 @@ import numpy as np
 
 from ...core import store
 from ...core.body.shape import BodyShape, read_body
+from ...core.body.skin_mesh import SkinSettings
 from ...core.errors import InputError
 from ...core.motion.ply import Ply, read_ply
 from ...core.motion.tables import MotionTable, read_motion
 from ...core.progress import Monitor
+from ...core.settings import from_table
 from ...core.take import Footage, open_take, read_take
 
 DEFAULT_FPS = 25.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameSkins:
+    """The skins that a run wrote: frames (T,) rising, vertices_m (T, V, 3) float32, and how finely they are sampled."""
+
+    frames: np.ndarray
+    vertices_m: np.ndarray
+    settings: SkinSettings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,6 +44,7 @@ class Contents:
     trajectories: Mapping[str, np.ndarray] | None = None
     shape: BodyShape | None = None
     motion: MotionTable | None = None
+    skins: FrameSkins | None = None  # only where they were asked for
     warnings: tuple[str, ...] = ()
 
     @property
@@ -49,8 +61,8 @@ class Contents:
         return (int(min(known)), int(max(known))) if known else (0, 0)
 
 
-def read_contents(out: Path, monitor: Monitor) -> Contents:
-    """Read the folder OUT of a run, and the take it was made from.
+def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Contents:
+    """Read the folder OUT of a run, and the take it was made from; on request also the skin of every frame.
 
     Raises:
         InputError: OUT is no folder of results, or a file in it is damaged.
@@ -72,7 +84,7 @@ def read_contents(out: Path, monitor: Monitor) -> Contents:
     motion = _motion(out / "motion.csv", shape, warnings)
     monitor.step("reading results", 3, 3)
     return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
-                   warnings=tuple(warnings))
+                   skins=_skins(run, out / "skin", monitor, warnings) if skins else None, warnings=tuple(warnings))
 
 
 def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage | None:
@@ -95,6 +107,22 @@ def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Pl
         monitor.step("reading clouds", i, len(files))
         clouds[frame] = read_ply(path)
     return clouds
+
+
+def _skins(run: Mapping[str, Any], folder: Path, monitor: Monitor, warnings: list[str]) -> FrameSkins | None:
+    files = {int(path.stem): path for path in folder.glob("*.ply") if path.stem.isdigit()}
+    if not files:
+        warnings.append(f"No exact skin in the scene: {folder} holds no skins; run the fit again.")
+        return None
+    vertices = []
+    for i, frame in enumerate(sorted(files)):
+        monitor.step("reading skins", i, len(files))
+        vertices.append(read_ply(files[frame]).xyz_m.astype("<f4"))
+        if len(vertices[-1]) != len(vertices[0]):
+            raise InputError(f"{files[frame]} has {len(vertices[-1])} points, the skins before {len(vertices[0])}; run the fit again.")
+    table = run.get("settings", {}).get("skin", {}) if isinstance(run.get("settings"), dict) else {}
+    settings = from_table(SkinSettings, table, "[skin] of run.json")
+    return FrameSkins(frames=np.array(sorted(files)), vertices_m=np.stack(vertices), settings=settings)
 
 
 def _optional(path: Path, what: str, read: Callable[[Path], Any], warnings: list[str]) -> Any:

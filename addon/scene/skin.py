@@ -1,7 +1,8 @@
 """The polygonal skin: core's skin as quads with texture coordinates, bound to the armature, and on request exact in every frame.
 
-The armature deforms the skin of the rest pose by blending bones. The exact skin, the implicit surface of every frame's posture found
-anew, is a mesh cache beside the .blend (PC2, Blender's Mesh Cache modifier): shape keys would put 120 MB into a file of 1,000 frames.
+The armature deforms the skin of the rest pose by blending bones. The exact skin is the run's own, the implicit surface of every frame's
+posture found anew, as a mesh cache beside the .blend (PC2, Blender's Mesh Cache modifier): shape keys would put 120 MB into a file of
+1,000 frames.
 """
 
 import struct
@@ -14,10 +15,12 @@ from ...core import store
 from ...core.body.shape import BodyShape
 from ...core.body.skin import Skin, SkinSettings, body_skin
 from ...core.body.skin_patches import corner_uv, refined
-from ...core.progress import Monitor
+from ...core.errors import InputError
 from . import paint
+from .contents import FrameSkins
 
 NAME, EXACT_NAME = "Skin", "Exact skin"
+CACHE_MODIFIER = "Every frame"
 SKIN_COLOUR = (0.80, 0.52, 0.41)
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
@@ -36,30 +39,24 @@ def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object
     return skin_object
 
 
-def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, frames: np.ndarray, values: np.ndarray, cache: Path,
-                   monitor: Monitor | None = None, detail: int = 1) -> bpy.types.Object:
-    """The skin as it is in every frame: frames (T,) in order, values (T, D) rad and metres. Writes `cache` (.pc2).
-
-    Frames without a fit, or missing, hold the posture before them. About 0.1 s a frame for a whole body.
+def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: FrameSkins, cache: Path) -> bpy.types.Object:
+    """The skin as the run found it in every frame. Writes `cache` (.pc2); missing frames hold the skin before them.
 
     Raises:
-        InputError: the body has no metaballs, or the cache cannot be written.
-        Cancelled: the monitor was cancelled; no cache is written.
+        InputError: the skins are not those of this body, or the cache cannot be written.
     """
-    monitor = monitor or Monitor()
-    row_of = {int(frame): row for frame, row in zip(frames, values) if np.isfinite(row).all()}
-    known = sorted(row_of)
-    samples: list[np.ndarray] = []
-    skin = _skin(shape, row_of[known[0]], detail)
-    for frame in range(known[0], known[-1] + 1):
-        monitor.step("exact skin", frame - known[0], known[-1] + 1 - known[0])
-        samples.append(_skin(shape, row_of[frame], detail).vertices_m.astype("<f4") if frame in row_of else samples[-1])
-    head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(skin.vertices_m), float(known[0]), 1.0, len(samples))
-    store.write_bytes(cache, head + b"".join(sample.tobytes() for sample in samples))
-    skin_object = _mesh_object(collection, EXACT_NAME, skin)
-    modifier = skin_object.modifiers.new("Every frame", "MESH_CACHE")
+    rest = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), skins.settings)
+    if rest.vertices_m.shape != skins.vertices_m.shape[1:]:
+        raise InputError(f"The run's skins have {skins.vertices_m.shape[1]} points, that of body.toml {len(rest.vertices_m)}; "
+                         "run the fit again.")
+    first, last = int(skins.frames[0]), int(skins.frames[-1])
+    held = np.searchsorted(skins.frames, np.arange(first, last + 1), side="right") - 1
+    head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(rest.vertices_m), float(first), 1.0, len(held))
+    store.write_bytes(cache, head + skins.vertices_m[held].tobytes())
+    skin_object = _mesh_object(collection, EXACT_NAME, rest)
+    modifier = skin_object.modifiers.new(CACHE_MODIFIER, "MESH_CACHE")
     modifier.cache_format, modifier.filepath = "PC2", str(cache)
-    modifier.frame_start = float(known[0])
+    modifier.frame_start = float(first)
     return skin_object
 
 

@@ -80,11 +80,17 @@ def write_rig(path: Path, rig: Rig) -> None:
         lines.append("")
     lines += ["[metadata]", 'unit = "m"']
     lines += [
-        f"{k if re.fullmatch('[A-Za-z0-9_-]+', k) else _text(k)} = {_text(v) if isinstance(v, str) else _number(v)}"
+        f"{k if re.fullmatch('[A-Za-z0-9_-]+', k) else _text(k)} = {_value(v)}"
         for k, v in rig.metadata.items()
-        if k != "unit" and isinstance(v, (str, int, float)) and not isinstance(v, bool)
+        if k != "unit" and isinstance(v, (str, int, float))
     ]
     store.write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def _value(value: str | int | float) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return _text(value) if isinstance(value, str) else _number(value)
 
 
 def _camera(key: str, entry: Any, path: Path, unit_m: float) -> Camera:

@@ -14,11 +14,12 @@ from tricap.core import store
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape, write_body
 from tricap.core.body.skeleton import joint_positions
+from tricap.core.body.skin import body_skin
 from tricap.core.fitting.body_motion import BodyMotion
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.motion.ply import write_cloud
+from tricap.core.motion.ply import write_cloud, write_mesh
 from tricap.core.motion.tables import write_joints, write_motion
 
 if importlib.util.find_spec("bpy"):
@@ -56,7 +57,7 @@ def small_rig() -> Rig:
         centre = np.array([x - 0.2, -2.2, 0.0])
         cameras.append(Camera(name=name, size_px=SIZE, matrix=matrix, distortions=np.array([-0.12, 0.05, 6e-4, -4e-4, 0.01]),
                               R_cam_world=R, t_cam_world_m=-R @ centre))
-    return Rig(cameras=tuple(cameras), metadata={})
+    return Rig(cameras=tuple(cameras), metadata={"floor": True})
 
 
 def arm() -> tuple[BodyShape, np.ndarray, np.ndarray]:
@@ -99,6 +100,9 @@ def small_run(tmp_path: Path) -> SmallRun:
         joint_sigma_m=np.full((len(FRAMES), len(joints)), 1e-3), status=("fitted",) * len(FRAMES), sigma0=np.ones(len(FRAMES)))
     write_joints(out / "joints.csv", fit)
     write_motion(out / "motion.csv", fit, shape.skeleton)
+    for frame, posture in zip(FRAMES, motion):
+        skin = body_skin(shape, posture)
+        write_mesh(out / "skin" / f"{frame:04d}.ply", skin.vertices_m, skin.faces)
     random = np.random.default_rng(7)
     for i, frame in enumerate(FRAMES):
         n = 40 + i

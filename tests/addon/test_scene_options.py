@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tricap.core import store
+from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
@@ -20,15 +22,80 @@ from .test_scene_body import animated, curves, world_vertices
 def test_the_exact_skin_is_the_skin_of_every_frame(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     from tricap.addon.scene.build import SceneOptions, build_scene
 
-    build_scene(small_run.out, tmp_path / "body.blend", options=SceneOptions(exact_skin=True))
-    assert (tmp_path / "body.pc2").is_file()
-    empty.ops.wm.open_mainfile(filepath=str(tmp_path / "body.blend"))
+    (small_run.out / "skin" / f"{FRAMES[2]:04d}.ply").unlink()
+    build_scene(small_run.out, tmp_path / "body.blend", options=SceneOptions(exact_skin=True, rest_pose="T"))
+    for name in ("body.blend", "body.pc2"):  # both may be moved together
+        (tmp_path / "elsewhere é").mkdir(exist_ok=True)
+        (tmp_path / name).rename(tmp_path / "elsewhere é" / name)
+    empty.ops.wm.open_mainfile(filepath=str(tmp_path / "elsewhere é" / "body.blend"))
     for frame, motion in zip(FRAMES, small_run.motion):
         empty.context.scene.frame_set(frame)
-        exact = body_skin(small_run.shape, motion).vertices_m  # the table keeps nine digits
+        known = small_run.motion[1] if frame == FRAMES[2] else motion  # a missing frame holds the one before
+        exact = body_skin(small_run.shape, known).vertices_m  # the table keeps nine digits
         assert np.abs(world_vertices(empty, empty.data.objects["Exact skin"]) - exact).max() < 1e-5
+
+
+def test_exact_skins_that_cannot_be(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.scene.build import SceneOptions, build_scene
+
+    wanted = SceneOptions(exact_skin=True)
     with pytest.raises(InputError, match="give the Blender file a name"):
-        build_scene(small_run.out, options=SceneOptions(exact_skin=True))
+        build_scene(small_run.out, options=wanted)
+    store.write_json(small_run.out / "run.json", {"take": str(small_run.take), "settings": {"skin": {"rays": 24}}})
+    report = build_scene(small_run.out, tmp_path / "a.blend", options=wanted)
+    assert any("run's skins have" in warning for warning in report.warnings) and not (tmp_path / "a.pc2").exists()
+    store.write_json(small_run.out / "run.json", {"take": str(small_run.take), "settings": {"skin": {"rays": "many"}}})
+    with pytest.raises(InputError, match="rays"):
+        build_scene(small_run.out, tmp_path / "a.blend", options=wanted)
+    for path in (small_run.out / "skin").iterdir():
+        path.unlink()
+    store.write_json(small_run.out / "run.json", {"take": str(small_run.take)})
+    assert any("holds no skins" in warning for warning in build_scene(small_run.out, tmp_path / "a.blend", options=wanted).warnings)
+
+
+def test_the_implicit_surface_is_that_of_the_field(empty: ModuleType, small_run: SmallRun) -> None:
+    import bmesh
+
+    from tricap.addon.scene.build import SceneOptions, build_scene
+
+    build_scene(small_run.out, options=SceneOptions(implicit=True))
+    middle = len(FRAMES) // 2
+    checked = empty.data.objects[f"Implicit surface {FRAMES[middle]:04d}"]
+    points = world_vertices(empty, checked)
+    R, head = bone_frames(small_run.shape.skeleton, small_run.shape.lengths_m, small_run.motion[middle])
+    assert np.abs(field(small_run.shape.metaballs, small_run.shape.lengths_m, R, head, points) - 0.5).max() < 0.012
+    mesh = bmesh.new()
+    mesh.from_mesh(checked.data)
+    assert all(edge.is_manifold for edge in mesh.edges) and mesh.calc_volume(signed=True) > 0
+    mesh.free()
+
+
+def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+    from tricap.core.geometry.rig import Rig, write_rig
+
+    build_scene(small_run.out)
+    from mathutils import Vector
+
+    lights = [o for o in empty.data.objects if o.type == "LIGHT"]
+    assert len(lights) == 2 and all((o.matrix_world.to_3x3() @ Vector((0, 0, -1))).z < -0.4 for o in lights)
+    assert np.abs(world_vertices(empty, empty.data.objects["Floor"])[:, 2]).max() == 0
+    write_rig(small_run.take / "rig.toml", Rig(cameras=small_run.rig.cameras, metadata={}))
+    build_scene(small_run.out)
+    assert "Floor" not in empty.data.objects and sum(o.type == "LIGHT" for o in empty.data.objects) == 2
+
+
+def test_the_bar_of_a_calibration_moves(empty: ModuleType) -> None:
+    from tricap.addon.scene.surroundings import add_bar
+
+    ends = np.random.default_rng(1).uniform(-1, 1, (3, 2, 3))
+    bar = add_bar(empty.context.scene.collection, np.array([2, 5, 9]), ends)
+    for row, frame in ((0, 2), (2, 9)):
+        empty.context.scene.frame_set(frame)
+        points = world_vertices(empty, bar)
+        assert len(points) and np.linalg.norm(points[:, None] - ends[row], axis=-1).min(axis=1).max() < 0.01
+    empty.context.scene.frame_set(4)
+    assert not len(world_vertices(empty, bar))
 
 
 @pytest.mark.parametrize("model", ["arm.R", "full"])

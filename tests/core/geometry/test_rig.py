@@ -40,7 +40,7 @@ def some_rig() -> Rig:
                    distortions=random.normal(0, 0.1, 5), affinity=random.normal(0, 1e-3, 2) * (name != "L"),
                    R_cam_world=rotation_from_vector(random.uniform(-2, 2, 3)), t_cam_world_m=random.normal(0, 2, 3))
         )  # fmt: skip
-    metadata = dict(source="bundle “1”\nsecond line", sigma0=np.float64(0.1234567890123456789), count=12, bar_length_m=0.6)
+    metadata = dict(source="bundle “1”\nsecond line", sigma0=np.float64(0.1234567890123456789), count=12, bar_length_m=0.6, floor=True)
     return Rig(cameras=tuple(cameras), metadata=metadata | {"a key": 1.5, "unit": "mm"})
 
 
