@@ -17,7 +17,7 @@ def take_folder(given: str, scene: bpy.types.Scene) -> Path:
     chosen = given or scene.tricap.take
     if not chosen:
         raise InputError("Choose the take first: the folder of a recording, with take.toml in it.")
-    folder = _absolute(chosen)
+    folder = absolute(chosen)
     if not folder.is_dir():
         raise InputError(f"The take {folder} is no folder; choose the folder that holds take.toml.")
     return folder
@@ -31,7 +31,7 @@ def output_folder(given: str, scene: bpy.types.Scene, take: str = "") -> Path:
     """
     chosen = given or scene.tricap.out
     if chosen:
-        return _absolute(chosen)
+        return absolute(chosen)
     folder = take_folder(take, scene)
     beside = Path(bpy.data.filepath).parent if bpy.data.filepath else folder.parent
     return beside / f"{folder.name}_tricap"
@@ -48,7 +48,20 @@ def check_writable(folder: Path) -> None:
         raise InputError(f"Cannot write into {existing}; choose another output folder.")
 
 
-def _absolute(path: str) -> Path:
+def absolute(path: str) -> Path:
+    """The full path of one that a user chose.
+
+    Raises:
+        InputError: it is relative to a .blend that was never saved.
+    """
     if path.startswith("//") and not bpy.data.filepath:
         raise InputError(f"The folder {path} is relative to the Blender file, which was never saved; save it or choose a full path.")
     return Path(bpy.path.abspath(path)).resolve()
+
+
+def for_user(path: Path) -> str:
+    """A path as the panel keeps it: relative to the .blend where that is saved on the same disk, so that both can be moved together."""
+    try:
+        return bpy.path.relpath(str(path)) if bpy.data.filepath else str(path)
+    except ValueError:  # another drive
+        return str(path)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core import pipeline
 from ..core import settings as knobs
+from . import take_properties
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 GROUPS: list[type] = []  # the PropertyGroup classes, in order of registration
@@ -49,7 +50,7 @@ def group_class(name: str, settings: type) -> type:
 
 def touched(group: bpy.types.PropertyGroup, settings: type) -> dict[str, Any]:
     """The knobs that were set in Blender, as a plain table for `core.settings.from_table`."""
-    return {field.name: _exact(getattr(group, field.name), field.default)
+    return {field.name: exact(getattr(group, field.name), field.default)
             for field in dataclasses.fields(settings) if group.is_property_set(field.name)}
 
 
@@ -64,12 +65,32 @@ def overrides(scene: bpy.types.Scene) -> dict[str, dict[str, Any]]:
     return {name: table for name, table in tables.items() if table}
 
 
+def check_settings(tables: Mapping[str, Mapping[str, Any]], where: str) -> None:
+    """See that a take's [settings] are what the stages know.
+
+    Raises:
+        InputError: an unknown name, or a value that cannot be.
+    """
+    pipeline.settings_of(tables, {}, where)
+
+
+def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]]) -> None:
+    """Show a take's [settings] as what was touched, and nothing else."""
+    for name, settings in stages().items():
+        group, table = getattr(scene.tricap, name), tables.get(name, {})
+        for field in dataclasses.fields(settings):
+            if field.name in table:
+                setattr(group, field.name, type(field.default)(table[field.name]))
+            else:
+                group.property_unset(field.name)
+
+
 def stages() -> Mapping[str, type]:
     """Settings class of every stage, by the name it has in take.toml."""
     return pipeline.SETTINGS
 
 
-def _exact(value: Any, default: Any) -> Any:
+def exact(value: Any, default: Any = 0.0) -> Any:
     """Blender keeps floats in single precision; the shortest decimal that is stored alike is what the user typed."""
     return float(str(np.float32(value))) if isinstance(default, float) else value
 
@@ -84,10 +105,11 @@ def register() -> None:
                                         description="Folder for the results; empty: beside the .blend, or beside the take"),
         "last": bpy.props.StringProperty(name="Result", description="What the last run found"),
     }
+    annotations |= take_properties.annotations()
     annotations |= {name: bpy.props.PointerProperty(type=group) for name, group in groups.items()}
     body = {"__annotations__": annotations, "__doc__": "Tricap's part of the scene."}
     scene_group = type("Tricap_scene", (bpy.types.PropertyGroup,), body)
-    GROUPS[:] = [*groups.values(), scene_group]
+    GROUPS[:] = [take_properties.View, *groups.values(), scene_group]
     for group in GROUPS:
         bpy.utils.register_class(group)
     bpy.types.Scene.tricap = bpy.props.PointerProperty(type=scene_group)

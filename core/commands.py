@@ -4,10 +4,8 @@ Exit codes: 0 done, 2 the input needs mending (one sentence on stderr), 130 canc
 """
 
 import argparse
-import glob
 import json
 import os
-import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -17,12 +15,13 @@ from typing import Any
 
 import cv2
 
-from . import calibrate_command, contour_command, pipeline, store, track2d_command
+from . import calibrate_command, contour_command, pipeline, track2d_command
 from .arguments import frame_range, overrides
 from .errors import InputError
 from .geometry.rig import read_rig
 from .progress import Cancelled, Monitor
-from .take import open_take, read_take, take_of_text
+from .take import open_take, read_take
+from .take_file import footage_entry, make_take, new_table, take_of_table
 
 Adder = Callable[[Any], None]  # adds a sub-command to the parser; the command's `run(args, monitor)` gives the lines to show
 
@@ -154,71 +153,16 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     views = [tuple(v.split("=", 1)) for v in args.views]
     if any(len(v) != 2 or not all(v) for v in views):
         raise InputError("Write each view as NAME=FILE, such as L=left.mp4.")
-    lines = ['format = "tricap-take"', "version = 1", f"fps = {args.fps!r}", f'interlaced = "{args.interlaced}"', 'rig = "rig.toml"', ""]
-    links: list[tuple[Path, Path]] = []
-    for name, source in views:
-        line, link = _footage(folder, name, Path(source))
-        lines += ["[[views]]", f"name = {json.dumps(name)}", line, ""]
-        links.append(link)
-    if args.model:
-        lines += ["[body]", f"model = {json.dumps(args.model)}", ""]
-    text = "\n".join(lines)
-    take = take_of_text(text, folder / "take.toml")
+    entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
+    table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
+    take = take_of_table(folder, table)
     if args.rig:
         rig = read_rig(args.rig)
         for view in take.views:
             rig[view.name]
-    _make_take(folder, text, links, args.rig)
+    make_take(folder, table, links, args.rig)
     note = "" if args.rig else " Copy or calibrate rig.toml into it."
     return [f"{folder}: a take of {len(views)} views.{note}"]
-
-
-def _footage(folder: Path, name: str, source: Path) -> tuple[str, tuple[Path, Path]]:
-    """What take.toml says of a view's footage, and the link that it needs: (where, to what)."""
-    if not source.exists():
-        raise InputError(f"The footage {source} of view {name} is missing; check the path.")
-    if source.is_dir():
-        endings = sorted({p.suffix for p in source.iterdir() if p.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")})
-        if len(endings) != 1:
-            raise InputError(
-                f"The folder {source} of view {name} holds {'no images' if not endings else 'images of several kinds'}; it needs one kind."
-            )
-        said, target = f"images = {json.dumps(f'{glob.escape(name)}/*{endings[0]}')}", folder / name
-    else:
-        said, target = f"movie = {json.dumps(name + source.suffix)}", folder / f"{name}{source.suffix}"
-    if target.exists() and not target.samefile(source):
-        raise InputError(f"{target} is there already and is not the footage {source}; choose another folder or another name for the view.")
-    return said, (target, source)
-
-
-def _make_take(folder: Path, text: str, links: list[tuple[Path, Path]], rig: Path | None) -> None:
-    """Write the folder; what was linked or copied goes again if something fails."""
-    made: list[Path] = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for target, source in links:
-            if not target.exists():
-                made.append(target)
-                _link(target, source)
-        if rig:
-            store.write_bytes(folder / "rig.toml", rig.read_bytes())
-        store.write_text(folder / "take.toml", text)
-    except (OSError, InputError) as error:
-        for target in made:
-            if target.is_dir() and not target.is_symlink():
-                shutil.rmtree(target, ignore_errors=True)
-            else:
-                target.unlink(missing_ok=True)
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"Cannot make the take {folder}: {error.strerror or error}. Choose another folder.") from error
-
-
-def _link(target: Path, source: Path) -> None:
-    try:
-        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
-    except OSError:
-        (shutil.copytree if source.is_dir() else shutil.copy2)(source, target)
 
 
 def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:

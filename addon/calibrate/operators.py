@@ -50,8 +50,8 @@ class Calibrate(JobOperator, bpy.types.Operator):
         props = context.scene.tricap_calibrate
         if not (self.bar or props.bar):
             raise InputError("Choose the bar's footage first: the folder with a folder of images, or a movie, per camera.")
-        folder = folders._absolute(self.bar or props.bar)
-        out = folders._absolute(self.out) if self.out else folder.parent / "rig.toml"
+        folder = folders.absolute(self.bar or props.bar)
+        out = folders.absolute(self.out) if self.out else folder.parent / "rig.toml"
         folders.check_writable(out.parent)
         # Blender keeps single precision; what was typed is the shortest decimal that is stored alike.
         length, interlaced = float(f"{self.length_m or props.length_m:.7g}"), props.interlaced
@@ -90,7 +90,7 @@ class ImportRig(ImportHelper, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Read the file and build its cameras."""
         try:
-            rig = read_any(folders._absolute(self.filepath))
+            rig = read_any(folders.absolute(self.filepath))
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -113,7 +113,7 @@ class ExportRig(ExportHelper, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Read the scene and write the file."""
         try:
-            rig, path = rig_of_scene(context.scene), folders._absolute(self.filepath)
+            rig, path = rig_of_scene(context.scene), folders.absolute(self.filepath)
             if self.layout_name == "tricap":
                 write_rig(path, rig)
             else:

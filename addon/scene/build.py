@@ -174,7 +174,7 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
         camera_object = cameras.add_camera(collection, camera)
         camera_object["tricap_interlaced"] = take.interlaced
         files = sequence.files()
-        clip = clips.load_clip(f"Footage {view.name}", files[0], camera)
+        clip = clips.clip_of_view(scene, view.name, files[0], camera)
         clip.frame_start = -view.offset_frames
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")

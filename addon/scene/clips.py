@@ -5,17 +5,53 @@ from pathlib import Path
 
 import bpy
 
+from ...core.errors import InputError
 from ...core.geometry.camera import Camera
+from ...core.images.sequence import open_sequence
+from .. import folders
 from . import axes
 
 
 def load_clip(name: str, first_file: Path, camera: Camera) -> bpy.types.MovieClip:
-    """The image sequence that begins with `first_file`, or the movie, as a clip that starts at scene frame 0."""
-    clip = bpy.data.movieclips.load(str(first_file))
-    clip.name = name
-    clip.frame_start = 0
+    """The image sequence that begins with `first_file`, or the movie, as a clip with the camera's lens."""
+    clip = open_clip(name, first_file)
     set_lens(clip, camera)
     return clip
+
+
+def open_clip(name: str, first_file: Path) -> bpy.types.MovieClip:
+    """The image sequence that begins with `first_file`, or the movie, as a clip that starts at scene frame 0.
+
+    Raises:
+        InputError: Blender cannot read it.
+    """
+    try:
+        clip = bpy.data.movieclips.load(str(first_file))
+    except RuntimeError as error:
+        raise InputError(f"Blender cannot read the footage {first_file} ({str(error).strip()}); convert it to H.264 or PNG.") from error
+    clip.name = name
+    clip.filepath = folders.for_user(first_file)
+    clip.frame_start = 0
+    return clip
+
+
+def clip_of_view(scene: bpy.types.Scene, name: str, first_file: Path, camera: Camera) -> bpy.types.MovieClip:
+    """The clip that the project has for a view, if it shows this file, else a new one; with the camera's lens."""
+    project = getattr(scene, "tricap", None)  # the command `tricap scene` builds without the add-on's properties
+    own = next((view.clip for view in project.views if view.name == name and view.clip is not None), None) if project else None
+    if own is None or Path(bpy.path.abspath(own.filepath)).resolve() != first_file.resolve():
+        return load_clip(f"Footage {name}", first_file, camera)
+    set_lens(own, camera)
+    return own
+
+
+def first_file(folder: Path, images: str | None, movie: str | None, view: str) -> Path:
+    """The file by which Blender opens the footage of a view of the take in `folder`.
+
+    Raises:
+        InputError: the footage is missing.
+    """
+    return open_sequence(folder, images=images, movie=movie, view=view).files()[0]
 
 
 def set_lens(clip: bpy.types.MovieClip, camera: Camera) -> None:

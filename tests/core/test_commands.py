@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import commands, pipeline
+from tricap.core import commands, pipeline, take_file
 from tricap.core.errors import InputError
 from tricap.core.progress import Cancelled, Monitor
 from tricap.core.take import open_take, read_take
@@ -302,7 +302,7 @@ def test_new_leaves_nothing_when_the_disk_is_full(take: Path, tmp_path: Path, mo
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(commands.store, "write_text", full)
+    monkeypatch.setattr(take_file.store, "write_text", full)
     made = tmp_path / "made"
     assert commands.main(["new", str(made), "--views", *(f"{v}={take / v}" for v in "LC")]) == 2
     assert "No space left on device" in capfd.readouterr().err and not any(made.iterdir())

@@ -1,0 +1,290 @@
+"""The project: a take on disk, beside the .blend, that says in take.toml what the scene says, so that the panel's buttons and the `tricap`
+command give the same numbers.
+
+    scene (views, clips, clicks, knobs)  ── write ──▶  TAKE/take.toml, footage linked into TAKE
+    TAKE/take.toml                       ── open_take ──▶  scene
+
+A scene is bound to a take once it has views of its own. Without views, a take that is merely named is run as its file stands.
+Other parts of the add-on that keep something of take.toml in the scene add a function to `WRITERS` (scene → table) and `READERS`.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..core import store
+from ..core.errors import InputError
+from ..core.geometry.rig import Rig, read_rig
+from ..core.take import Take
+from ..core.take_file import Table, new_table, read_table, take_of_table, write_table
+from . import folders, properties, seeds
+from .scene import clips
+
+ENDING, RESULTS, VIEW_KEY = "_tricap", "results", "tricap_view"
+WRITERS: list[Callable[[bpy.types.Scene, Table], None]] = []
+READERS: list[Callable[[bpy.types.Scene, Table], None]] = []
+_seen: set[str] = set()  # digests of what this session read from or wrote into take.toml
+
+
+def bound(scene: bpy.types.Scene) -> bool:
+    """Whether the scene has footage of its own, so that its take.toml is written from it."""
+    return len(scene.tricap.views) > 0
+
+
+def folder_of(scene: bpy.types.Scene) -> Path:
+    """The project's folder; it need not exist yet.
+
+    Raises:
+        InputError: none was chosen, and the .blend was never saved.
+    """
+    if scene.tricap.take:
+        return folders.absolute(scene.tricap.take)
+    if not bpy.data.filepath:
+        raise InputError("Save the Blender file first (the project's folder is made beside it), or choose a folder for the project.")
+    blend = Path(bpy.data.filepath)
+    return blend.with_name(blend.stem + ENDING).resolve()
+
+
+def make_folder(scene: bpy.types.Scene) -> Path:
+    """The project's folder, made where it was not there; the scene remembers it and the folder for results in it.
+
+    Raises:
+        InputError: see `folder_of`; it cannot be written to, or holds the take of another file.
+    """
+    folder = folder_of(scene)
+    if not bound(scene) and (folder / "take.toml").exists():
+        raise InputError(f"{folder} holds a take already; press Open Take to go on with it, or choose another folder for the project.")
+    folders.check_writable(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"Cannot make the folder {folder}: {error.strerror or error}. Choose another place for the project.") from error
+    scene.tricap.take = folders.for_user(folder)
+    if not scene.tricap.out:
+        scene.tricap.out = folders.for_user(folder / RESULTS)
+    return folder
+
+
+def clips_of(scene: bpy.types.Scene) -> dict[str, bpy.types.MovieClip]:
+    """The clip of every view, in the order of the views.
+
+    Raises:
+        InputError: a clip was deleted.
+    """
+    for view in scene.tricap.views:
+        if view.clip is None:
+            raise InputError(f"The movie clip of view {view.name} was deleted; press Reload Footage.")
+    return {view.name: view.clip for view in scene.tricap.views}
+
+
+def view_of(scene: bpy.types.Scene, clip: bpy.types.MovieClip | None) -> Any:
+    """The view (name, clip, images or movie, offset_frames) that a clip shows, or None."""
+    return next((view for view in scene.tricap.views if clip is not None and view.clip == clip), None)
+
+
+def rig_of(scene: bpy.types.Scene) -> Rig | None:
+    """The project's cameras, None where there are none yet.
+
+    Raises:
+        InputError: rig.toml is damaged.
+    """
+    path = take(scene).rig_path
+    return read_rig(path) if path.exists() else None
+
+
+def take(scene: bpy.types.Scene) -> Take:
+    """The take as the scene says it now; nothing is written.
+
+    Raises:
+        InputError: something is missing or cannot be.
+    """
+    folder = folder_of(scene)
+    return take_of_table(folder, table(scene))
+
+
+def write(scene: bpy.types.Scene, *, overwrite: bool = False) -> Path:
+    """Write take.toml as the scene says it, if it differs; gives the project's folder.
+
+    Raises:
+        InputError: the folder is gone or read-only, the scene's values cannot be, or somebody else changed the file (unless `overwrite`).
+    """
+    folder = existing_folder(scene)
+    if not overwrite and changed_outside(scene):
+        raise InputError(f"{folder / 'take.toml'} was changed outside this file; press Reload Take to take that over, or Keep Mine.")
+    write_table(folder, table(scene))
+    remember(scene, folder)
+    return folder
+
+
+def edit(scene: bpy.types.Scene, change: Callable[[Table], None]) -> None:
+    """Write take.toml with a change of something that the scene does not keep itself.
+
+    Raises:
+        InputError: see `write`; the changed table is no take.
+    """
+    folder = write(scene)
+    edited = read_table(folder)
+    change(edited)
+    write_table(folder, edited)
+    remember(scene, folder)
+
+
+def existing_folder(scene: bpy.types.Scene) -> Path:
+    """The project's folder.
+
+    Raises:
+        InputError: it is not there any more.
+    """
+    folder = folder_of(scene)
+    if not folder.is_dir():
+        raise InputError(f"The project's folder {folder} is not there; move it back, or choose where it is now.")
+    return folder
+
+
+def changed_outside(scene: bpy.types.Scene) -> bool:
+    """Whether take.toml says something that this scene neither read nor wrote."""
+    path = folder_of(scene) / "take.toml"
+    return path.exists() and store.digest(path) not in {scene.tricap.take_digest, *_seen}
+
+
+def remember(scene: bpy.types.Scene, folder: Path) -> None:
+    """The file is now what the scene says."""
+    digest = store.digest(folder / "take.toml")
+    _seen.add(digest)
+    scene.tricap.take_digest = digest
+
+
+def table(scene: bpy.types.Scene) -> Table:
+    """What take.toml is to say: what the file says, with what the scene keeps put in its place.
+
+    Raises:
+        InputError: a clip was deleted, or the file that is there is no take.
+    """
+    props, old = scene.tricap, read_table(folder_of(scene))
+    made = dict(old) or new_table([])
+    made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": [_view_entry(view) for view in props.views]}
+    _put(made, "reference_view", props.reference_view)
+    _put(made, "frames", None if props.all_frames else [props.first_frame, props.last_frame + 1])
+    _put(made, "body", {**old.get("body", {}), "model": model_of(scene)} if model_of(scene) else None)
+    _put_clicks(scene, made)
+    _put(made, "settings", properties.overrides(scene))
+    for writer in WRITERS:
+        writer(scene, made)
+    return _kept_alike(made, old)
+
+
+def open_take(scene: bpy.types.Scene, folder: Path) -> None:
+    """Show a take in the scene: its footage as clips, its clicks as tracks, its values and settings in the panel.
+
+    Raises:
+        InputError: it is no take, or its footage cannot be opened; the scene is as it was.
+    """
+    said = read_table(folder)
+    if not said:
+        raise InputError(f"{folder} is not a take: there is no take.toml in it. Add footage to make one.")
+    opened = take_of_table(folder, said)
+    properties.check_settings(opened.settings, str(folder / "take.toml"))
+    files = {view.name: clips.first_file(folder, view.images, view.movie, view.name) for view in opened.views}
+    props = scene.tricap
+    props.take = folders.for_user(folder)
+    show_views(scene, said["views"], files)
+    props.fps, props.interlaced, props.reference_view = opened.fps, opened.interlaced, said.get("reference_view", "")
+    props.all_frames = opened.frames is None
+    if opened.frames:
+        props.first_frame, props.last_frame = opened.frames[0], opened.frames[1] - 1
+    _show_model(scene, said.get("body", {}).get("model", ""))
+    _show_clicks(scene, opened)
+    properties.show_settings(scene, opened.settings)
+    for reader in READERS:
+        reader(scene, said)
+    remember(scene, folder)
+
+
+def show_views(scene: bpy.types.Scene, entries: list[Table], files: dict[str, Path]) -> None:
+    """Make the scene's views those of `entries` ([[views]]), with a clip each; a clip that shows the file already is kept."""
+    props = scene.tricap
+    kept = {view.name: view.clip for view in props.views if view.clip is not None}
+    props.views.clear()
+    for entry in entries:
+        name, path = entry["name"], files[entry["name"]]
+        clip = kept.get(name)
+        if clip is None or Path(bpy.path.abspath(clip.filepath)).resolve() != path.resolve():
+            clip = clips.open_clip(f"Footage {name}", path)
+        view = props.views.add()
+        view.clip = clip
+        view.name = name
+        view.images, view.movie = entry.get("images", ""), entry.get("movie", "")
+        view.offset_frames = entry.get("offset_frames", 0)
+
+
+def model_of(scene: bpy.types.Scene) -> str:
+    """The body model as take.toml names it, "" for none."""
+    props = scene.tricap
+    return {"none": "", "own": props.model_file}.get(props.model, props.model)
+
+
+def _show_model(scene: bpy.types.Scene, name: str) -> None:
+    props = scene.tricap
+    known = {item.identifier for item in props.bl_rna.properties["model"].enum_items}
+    props.model = name if name in known else "own" if name else "none"
+    props.model_file = name if props.model == "own" else ""
+
+
+def _view_entry(view: Any) -> Table:
+    entry = {"name": view.name, "images": view.images, "movie": view.movie, "offset_frames": view.offset_frames}
+    return {key: value for key, value in entry.items() if value or key == "name"}
+
+
+def _put(made: Table, key: str, value: Any) -> None:
+    """A key with its value, or no such key where there is nothing to say."""
+    if value:
+        made[key] = value
+    else:
+        made.pop(key, None)
+
+
+def _put_clicks(scene: bpy.types.Scene, made: Table) -> None:
+    """[seeds] and [[keyframes]] from the clips; a pixel that the file has in more decimals than Blender is left as it is."""
+    shown, frame = clips_of(scene), scene.tricap.seed_frame
+    sizes = {view: tuple(clip.size) for view, clip in shown.items()}
+    joints, surface = seeds.clicks(shown, frame)
+    old, old_keys = made.get("seeds", {}), {k.get("frame", 0): k for k in made.get("keyframes", [])}
+    joints = _same_pixels(joints, old.get("joints", {}), sizes)
+    before = dict(enumerate(old.get("surface", [])))
+    surface = [*_same_pixels(dict(enumerate(surface)), before, sizes).values()]
+    said = {"frame": frame, "surface": surface, "joints": joints}
+    _put(made, "seeds", {k: v for k, v in said.items() if v or k == "frame"} if frame or joints or surface else None)
+    others = sorted({f for clip in shown.values() for f in seeds.frames_of(clip)} - {frame})
+    keyframes = [(f, _same_pixels(seeds.clicks(shown, f)[0], old_keys.get(f, {}).get("joints", {}), sizes)) for f in others]
+    _put(made, "keyframes", [{"frame": f, "joints": clicked} for f, clicked in keyframes if clicked])
+
+
+def _same_pixels(new: dict[Any, Any], old: dict[Any, Any], sizes: dict[str, tuple[int, int]]) -> dict[Any, Any]:
+    def same(name: Any, view: str, xy: list[float]) -> list[float]:
+        before = old.get(name, {}).get(view)
+        return before if before is not None and seeds.alike(before, xy, sizes[view]) else xy
+
+    return {name: {view: same(name, view, xy) for view, xy in at.items()} for name, at in new.items()}
+
+
+def _show_clicks(scene: bpy.types.Scene, opened: Take) -> None:
+    shown = clips_of(scene)
+    scene.tricap.seed_frame = opened.seeds.frame
+    for clip in shown.values():
+        seeds.clear(clip)
+    for group in (opened.seeds, *opened.keyframes):
+        numbered = {f"seed {i + 1}": at for i, at in enumerate(group.surface)}
+        for name, at in {**group.joints, **numbered}.items():
+            for view, xy in at.items():
+                seeds.set_click(shown[view], name, group.frame, (float(xy[0]), float(xy[1])))
+
+
+def _kept_alike(new: Any, old: Any) -> Any:
+    """`new`, where a number that single precision cannot tell from the old one is the old one."""
+    if isinstance(new, dict) and isinstance(old, dict):
+        return {key: _kept_alike(value, old.get(key)) for key, value in new.items()}
+    numbers = isinstance(new, float) and isinstance(old, (int, float)) and not isinstance(old, bool)
+    return old if numbers and np.float32(new) == np.float32(old) else new

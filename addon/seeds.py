@@ -1,0 +1,120 @@
+"""What was clicked: native tracking tracks in the clips of the views, one track per joint or surface seed, a marker per clicked frame.
+
+A track is named exactly like the joint ("elbow.R"); surface seeds are "seed 1", "seed 2", … Frame t of the take is frame t of the scene; a
+clip counts its own frames from 1. Markers that a tracker set (not keyed) and disabled ones are no clicks. Blender cannot be without the
+last marker of a track, so a click that is taken back there is disabled.
+"""
+
+import re
+from collections.abc import Iterator
+
+import bpy
+import numpy as np
+
+from ..core.take import JOINTS
+from .scene import axes
+
+SURFACE = re.compile(r"seed (\d+)")
+Clicks = dict[str, dict[str, list[float]]]  # name -> view -> [x, y] in full-frame pixels
+
+
+def clip_frame(clip: bpy.types.MovieClip, frame: int) -> int:
+    """The clip's own number of the scene's frame `frame`."""
+    return frame - clip.frame_start + 1
+
+
+def scene_frame(clip: bpy.types.MovieClip, own: int) -> int:
+    """The scene's number of the clip's own frame."""
+    return own + clip.frame_start - 1
+
+
+def is_seed(name: str) -> bool:
+    """Whether a track of this name is a click of ours."""
+    return name in JOINTS or SURFACE.fullmatch(name) is not None
+
+
+def set_click(clip: bpy.types.MovieClip, name: str, frame: int, xy_px: tuple[float, float]) -> bpy.types.MovieTrackingTrack:
+    """Put a click (pixels; the centre of the top-left pixel is (0, 0)) into a frame of the scene; gives its track."""
+    own = clip_frame(clip, frame)
+    track = clip.tracking.tracks.get(name)
+    if track is None:
+        track = clip.tracking.tracks.new(name=name, frame=own)
+    u, v = axes.uv_from_pixel(np.array(xy_px, dtype=np.float64), tuple(clip.size))
+    marker = track.markers.insert_frame(own, co=(float(u), float(v)))
+    marker.mute = False
+    for other in list(track.markers):
+        if other.mute and other.frame != own:
+            track.markers.delete_frame(other.frame)
+    return track
+
+
+def remove_click(clip: bpy.types.MovieClip, name: str, frame: int) -> bool:
+    """Take a click back; False where there was none."""
+    track = clip.tracking.tracks.get(name)
+    own = clip_frame(clip, frame)
+    marker = _keyed(track, own) if track is not None else None
+    if marker is None:
+        return False
+    if len(track.markers) == 1:
+        marker.mute = True
+    else:
+        track.markers.delete_frame(own)
+    return True
+
+
+def click(clip: bpy.types.MovieClip, name: str, frame: int) -> list[float] | None:
+    """The pixel [x, y] of a click, or None where there is none in that frame."""
+    track = clip.tracking.tracks.get(name)
+    marker = _keyed(track, clip_frame(clip, frame)) if track is not None else None
+    return None if marker is None else pixel_of(marker.co, tuple(clip.size))
+
+
+def frames_of(clip: bpy.types.MovieClip) -> set[int]:
+    """The scene's frames in which the clip has clicks."""
+    return {scene_frame(clip, m.frame) for track in _tracks(clip) for m in track.markers if m.is_keyed and not m.mute}
+
+
+def clicks(clips: dict[str, bpy.types.MovieClip], frame: int) -> tuple[Clicks, list[dict[str, list[float]]]]:
+    """The clicks of one frame in all views: joints by name, in the order of the skeleton, and surface seeds in the order of their numbers."""
+    found: Clicks = {}
+    for view, clip in clips.items():
+        for track in _tracks(clip):
+            marker = _keyed(track, clip_frame(clip, frame))
+            if marker is not None:
+                found.setdefault(track.name, {})[view] = pixel_of(marker.co, tuple(clip.size))
+    joints = {name: found[name] for name in JOINTS if name in found}
+    numbered = sorted((int(n[1]), name) for name in found if (n := SURFACE.fullmatch(name)))
+    return joints, [found[name] for _, name in numbered]
+
+
+def clear(clip: bpy.types.MovieClip) -> None:
+    """Take back every click in the clip."""
+    for track in list(_tracks(clip)):
+        for own in [m.frame for m in track.markers]:
+            remove_click(clip, track.name, scene_frame(clip, own))
+
+
+def pixel_of(co: tuple[float, float], size_px: tuple[int, int]) -> list[float]:
+    """The pixel [x, y] with the fewest decimals among those that Blender, in single precision, keeps alike."""
+    exact = axes.pixel_from_uv(np.array(co, dtype=np.float64), size_px)
+    stored = np.float32(co)
+    for digits in range(10):
+        short = np.round(exact, digits)
+        if np.array_equal(np.float32(axes.uv_from_pixel(short, size_px)), stored):
+            return [float(v) for v in short]
+    return [float(v) for v in exact]
+
+
+def alike(a: list[float], b: list[float], size_px: tuple[int, int]) -> bool:
+    """Whether two pixels are one marker to Blender."""
+    uv = [np.float32(axes.uv_from_pixel(np.array(xy, dtype=np.float64), size_px)) for xy in (a, b)]
+    return bool(np.array_equal(uv[0], uv[1]))
+
+
+def _tracks(clip: bpy.types.MovieClip) -> Iterator[bpy.types.MovieTrackingTrack]:
+    return (track for track in clip.tracking.tracks if is_seed(track.name))
+
+
+def _keyed(track: bpy.types.MovieTrackingTrack, own: int) -> bpy.types.MovieTrackingMarker | None:
+    marker = track.markers.find_frame(own, exact=True)
+    return marker if marker is not None and marker.is_keyed and not marker.mute else None

@@ -1,0 +1,155 @@
+"""The project: take.toml and the scene say the same, exactly, whichever was first; nothing is written in vain or over somebody's change."""
+
+import importlib
+import shutil
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tricap.core.take_file import read_table, write_table
+
+from .conftest import small_rig, write_take
+
+CLICKS = {
+    "seeds": {"frame": 3, "surface": [{"L": [20.5, 30.0], "C": [21.0, 31.123456789]}],
+              "joints": {"elbow.R": {"L": [61.2, 80.5], "R": [59.13, 79.0]}, "wrist.R": {"C": [100.0, 0.0], "R": [190.5, 143.25]}}},
+    "keyframes": [{"frame": 6, "joints": {"elbow.R": {"L": [70.7, 80.1], "C": [71.9, 80.0]}}}],
+    "settings": {"matching": {"patch_px": 17}, "growing": {"spacing_px": 6}},
+}  # fmt: skip
+
+
+@pytest.fixture
+def project(blender: ModuleType) -> ModuleType:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    return importlib.import_module("bl_ext.user_default.tricap.addon.project")
+
+
+@pytest.fixture
+def seeds(project: ModuleType) -> ModuleType:
+    return importlib.import_module("bl_ext.user_default.tricap.addon.seeds")
+
+
+@pytest.fixture
+def take(tmp_path: Path) -> Path:
+    folder = tmp_path / "swing é"
+    write_take(folder, small_rig())
+    table = read_table(folder)
+    table["views"][0]["offset_frames"] = 2
+    table["frames"] = [0, 6]
+    write_table(folder, table | CLICKS)
+    return folder
+
+
+def test_a_take_goes_into_the_scene_and_out_exactly(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    scene = blender.context.scene
+    before = (take / "take.toml").read_text(encoding="utf-8")
+    project.open_take(scene, take)
+    assert [v.name for v in scene.tricap.views] == ["L", "C", "R"] and scene.tricap.seed_frame == 3
+    assert scene.tricap.matching.patch_px == 17 and scene.tricap.model == "arm.R" and scene.tricap.last_frame == 5
+    assert project.table(scene) == read_table(take)
+    assert project.write(scene) == take and (take / "take.toml").read_text(encoding="utf-8") == before, "nothing changed: not rewritten"
+    (take / "take.toml").unlink()
+    project.write(scene)
+    again = read_table(take)
+    assert again["seeds"]["joints"] == CLICKS["seeds"]["joints"] and again["keyframes"] == CLICKS["keyframes"]
+    project.open_take(scene, take)
+    assert project.table(scene) == again
+
+
+def test_clicks_lie_where_the_image_shows_them(project: ModuleType, seeds: ModuleType, blender: ModuleType, take: Path) -> None:
+    scene = blender.context.scene
+    project.open_take(scene, take)
+    clip = project.clips_of(scene)["L"]  # its image of take frame 3 is number 5, the clip's own 6
+    assert clip.frame_start == -2 and clip["tricap_view"] == "L"
+    marker = clip.tracking.tracks["elbow.R"].markers.find_frame(6)
+    assert marker.co[:] == pytest.approx([(61.2 + 0.5) / 192, 1 - (80.5 + 0.5) / 144], abs=1e-6)
+    seeds.set_click(clip, "elbow.R", 3, (62.0, 81.0))
+    assert project.table(scene)["seeds"]["joints"]["elbow.R"] == {"L": [62.0, 81.0], "R": [59.13, 79.0]}
+    marker.co = (0.5, 0.5)  # as by dragging
+    assert seeds.click(clip, "elbow.R", 3) == [95.5, 71.5]
+    assert seeds.remove_click(clip, "elbow.R", 3) and not seeds.remove_click(clip, "elbow.R", 3)
+    assert seeds.remove_click(clip, "elbow.R", 6) and len(clip.tracking.tracks["elbow.R"].markers) == 1, "the last one is only disabled"
+    assert seeds.click(clip, "elbow.R", 6) is None and seeds.frames_of(clip) == {3}
+    seeds.set_click(clip, "elbow.R", 4, (1.0, 2.0))
+    assert [(m.frame, m.mute) for m in clip.tracking.tracks["elbow.R"].markers] == [(7, False)]
+
+
+def test_what_the_panel_does_not_edit_stays(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    scene = blender.context.scene
+    extra = {"corrections": [{"kind": "trajectory", "view": "C", "frame": 4, "xy": [1.5, 2.5]}],
+             "body": {"model": "arm.R", "locked": ["elbow.R twist"], "limits": {"elbow.R flexion": [0.0, 120.0]}}}  # fmt: skip
+    write_table(take, read_table(take) | extra)
+    project.open_take(scene, take)
+    scene.tricap.fps = 50.0
+    project.write(scene)
+    said = read_table(take)
+    assert said["fps"] == 50.0 and {k: said[k] for k in extra} == extra
+    project.edit(scene, lambda table: table["body"].update(locked=[]))
+    assert read_table(take)["body"]["locked"] == []
+    with pytest.raises(project.InputError, match="must be a table"):
+        project.edit(scene, lambda table: table.update(body=3))
+    assert read_table(take)["body"]["model"] == "arm.R"
+
+
+def test_somebody_elses_change_is_not_written_over(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    scene = blender.context.scene
+    project.open_take(scene, take)
+    write_table(take, read_table(take) | {"fps": 100.0})
+    with pytest.raises(project.InputError, match="changed outside this file; press Reload Take"):
+        project.write(scene)
+    assert read_table(take)["fps"] == 100.0
+    project.write(scene, overwrite=True)
+    assert read_table(take)["fps"] == 29.97
+    scene.tricap.fps, scene.tricap.take_digest = 60.0, "of an older state, after undo"
+    project.write(scene)
+    assert read_table(take)["fps"] == 60.0
+
+
+def test_a_saved_file_knows_its_project_and_both_can_be_moved(project: ModuleType, blender: ModuleType, take: Path, tmp_path: Path) -> None:
+    blend = tmp_path / "a" / "shot.blend"
+    blend.parent.mkdir()
+    shutil.move(str(take), blend.parent / "kick")
+    blender.ops.wm.save_as_mainfile(filepath=str(blend))
+    project.open_take(blender.context.scene, blend.parent / "kick")
+    said = project.table(blender.context.scene)
+    blender.ops.wm.save_mainfile()
+    shutil.move(str(tmp_path / "a"), tmp_path / "b")
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "b" / "shot.blend"))
+    scene = blender.context.scene
+    assert project.folder_of(scene) == tmp_path / "b" / "kick" and project.table(scene) == said
+    assert project.clips_of(scene)["C"].size[:] == (192, 144)
+    shutil.move(str(tmp_path / "b" / "kick"), tmp_path / "elsewhere")
+    with pytest.raises(project.InputError, match="is not there; move it back, or choose where it is now"):
+        project.write(scene)
+
+
+def test_where_a_new_project_lies(project: ModuleType, blender: ModuleType, tmp_path: Path) -> None:
+    scene = blender.context.scene
+    with pytest.raises(project.InputError, match="Save the Blender file first"):
+        project.make_folder(scene)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "my shot é.blend"))
+    scene = blender.context.scene
+    assert project.make_folder(scene) == tmp_path / "my shot é_tricap" and (tmp_path / "my shot é_tricap").is_dir()
+    assert (scene.tricap.take, scene.tricap.out) == ("//my shot é_tricap", "//my shot é_tricap/results")
+    write_take(tmp_path / "other", small_rig())
+    scene.tricap.take = str(tmp_path / "other")
+    with pytest.raises(project.InputError, match="holds a take already; press Open Take"):
+        project.make_folder(scene)
+
+
+def test_a_deleted_clip_is_told_and_a_wrong_take_changes_nothing(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    scene = blender.context.scene
+    project.open_take(scene, take)
+    (take / "broken").mkdir()
+    for text, words in (("", "no take.toml"), ("[settings.maching]\n", "Did you mean “matching”")):
+        if text:
+            shutil.copy(take / "take.toml", take / "broken" / "take.toml")
+            with open(take / "broken" / "take.toml", "a", encoding="utf-8") as file:
+                file.write("\n" + text)
+        with pytest.raises(project.InputError, match=words):
+            project.open_take(scene, take / "broken")
+    assert project.folder_of(scene) == take
+    blender.data.movieclips.remove(project.clips_of(scene)["C"])
+    with pytest.raises(project.InputError, match="clip of view C was deleted; press Reload Footage"):
+        project.table(scene)
