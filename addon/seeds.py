@@ -75,7 +75,7 @@ def frames_of(clip: bpy.types.MovieClip) -> set[int]:
 
 
 def clicks(clips: dict[str, bpy.types.MovieClip], frame: int) -> tuple[Clicks, list[dict[str, list[float]]]]:
-    """The clicks of one frame in all views: joints by name, in the order of the skeleton, and surface seeds in the order of their numbers."""
+    """The clicks of one frame in all views: joints by name, in the skeleton's order, and surface seeds in the order of their numbers."""
     found: Clicks = {}
     for view, clip in clips.items():
         for track in _tracks(clip):
