@@ -4,6 +4,7 @@ Every stage asks the stages before it for their results; what is checkpointed is
 """
 
 import time
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from . import store
 from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
+from .correcting import corrected_cloud, corrected_tracks
 from .errors import InputError
 from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
@@ -32,9 +34,9 @@ from .results import Results
 from .settings import from_table, nearest_name, to_table
 from .surface.cloud import PointCloud, SurfaceSettings
 from .take import Footage, open_take, read_take
-from .tracking.settings import TrackingSettings
+from .tracking.settings import TrackingSettings, TrackStatus
 from .tracking.tracked import TrackedFrame
-from .tracking.trajectories import Trajectories, assemble, filter_trajectories
+from .tracking.trajectories import Trajectories, assemble
 
 SETTINGS: dict[str, type] = {
     "enhance": EnhanceSettings,
@@ -47,7 +49,9 @@ SETTINGS: dict[str, type] = {
 }
 Overrides = Mapping[str, Mapping[str, Any]]
 DOUBTFUL_RESIDUAL_PX = 1.0
-DERIVED = ("trajectories.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend")  # what is made of the clouds
+DERIVED = (  # what is made of the clouds
+    "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"
+)  # fmt: skip
 
 
 @dataclass(kw_only=True)
@@ -64,8 +68,12 @@ class Run:
 
     @property
     def clouds(self) -> list[PointCloud]:
-        """The clouds in the order of time."""
-        return [m.cloud for m in self.measured]
+        """The clouds in the order of time, as the user corrected them."""
+        return [self.corrected(m.cloud) for m in self.measured]
+
+    def corrected(self, cloud: PointCloud) -> PointCloud:
+        """A cloud without what the user took out."""
+        return corrected_cloud(cloud, self.footage.take.corrections, self.footage.rig)
 
     def warn(self, sentence: str) -> None:
         """Note something that the user should know."""
@@ -166,7 +174,7 @@ def measure(run: Run, monitor: Monitor) -> None:
     done = []
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
-            run.results.write_cloud(m.cloud)
+            run.results.write_cloud(run.corrected(m.cloud))
             done.append(m)
     except Cancelled as stop:
         raise Cancelled(
@@ -212,9 +220,14 @@ def track(run: Run, monitor: Monitor) -> None:
             "Stopped: the surface of all frames is kept, and the tracks as far as they are; the same command goes on from there."
         ) from stop
     raw = assemble(steps, run.footage.take.fps)
-    run.trajectories = filter_trajectories(raw, s["tracking"], monitor)
-    run.results.write_trajectories(run.trajectories, {"format": "tricap-trajectories", "version": 1, "fps": run.footage.take.fps})
-    seen = run.trajectories.seen
+    filtered, missed = corrected_tracks(raw, run.footage.take.corrections, run.footage.rig, s["tracking"], monitor)
+    run.trajectories = filtered.kept
+    run.results.write_trajectories(filtered, run.footage.take.fps)
+    seen, why = filtered.kept.seen, Counter(TrackStatus(int(r)).words for r in filtered.reason)
+    for sentence in missed:
+        run.warn(sentence)
+    if not seen.shape[1] and raw.seen.any():
+        run.warn(f"No trajectory was kept of {raw.seen.shape[1]}: most were removed as “{why.most_common(1)[0][0]}”.")
     run.finish_stage(
         "track",
         began,
@@ -222,6 +235,7 @@ def track(run: Run, monitor: Monitor) -> None:
         trajectories=int(seen.shape[1]),
         points_per_frame=float(seen.sum(axis=1).mean()),
         mean_length_frames=float(seen.sum(axis=0).mean()) if seen.shape[1] else 0.0,
+        reasons=dict(why.most_common()),
         sigma_mm=1e3 * _median([run.trajectories.sigma_m[seen]]),
     )
 

@@ -15,10 +15,12 @@ from . import store
 from .errors import InputError
 from .motion.ply import write_cloud
 from .surface.cloud import PointCloud
-from .tracking.trajectories import Trajectories
+from .tracking.trajectories import Filtered
 
 FORMAT, VERSION = "tricap-run", 1
-OURS = ("clouds", "trajectories.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend")  # what a run replaces
+OURS = (  # what a run replaces
+    "clouds", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"
+)  # fmt: skip
 
 
 class Results:
@@ -80,10 +82,11 @@ class Results:
             self.cloud_path(cloud.frame), xyz_m=cloud.xyz_m, sigma_m=cloud.sigma_m, normals=cloud.normals, intensity=cloud.intensity
         )
 
-    def write_trajectories(self, trajectories: Trajectories, header: Mapping[str, Any]) -> None:
-        """trajectories.npz"""
-        arrays = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in trajectories.arrays().items()}
-        store.save(self.path("trajectories.npz"), arrays, header)
+    def write_trajectories(self, filtered: Filtered, fps: float) -> None:
+        """trajectories.npz, and trajectories_raw.npz with those that the filters or the user removed."""
+        for name, arrays in (("", filtered.kept.arrays() | {"source": filtered.source}), ("_raw", filtered.arrays())):
+            single = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in arrays.items()}
+            store.save(self.path(f"trajectories{name}.npz"), single, {"format": f"tricap-trajectories{name}", "version": 1, "fps": fps})
 
     def read_run(self) -> dict[str, Any]:
         """run.json, or an empty table where there is none yet.

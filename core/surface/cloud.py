@@ -4,7 +4,7 @@ Filters (D'Apuzzo et al. 2000, §2.3): a point must agree with its neighbours an
 intersection's covariance and half of the curvature correction, for what remains of it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.ndimage import label
@@ -51,6 +51,10 @@ class PointCloud:
     def sigma_m(self) -> np.ndarray:
         """(N,) root of the trace of the covariance: the mean error of position."""
         return np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
+
+    def select(self, rows: np.ndarray) -> "PointCloud":
+        """The cloud with only these rows (a mask or indices)."""
+        return PointCloud(frame=self.frame, **{f.name: getattr(self, f.name)[rows] for f in fields(PointCloud) if f.name != "frame"})
 
 
 def clean_field(field: TripletField, camera: Camera, reference: int, settings: SurfaceSettings) -> TripletField:

@@ -19,6 +19,7 @@ in more than half of its steps goes altogether.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -156,23 +157,36 @@ def ask_neighbours(before_m: np.ndarray, after_m: np.ndarray, sigma_m: np.ndarra
     return answer
 
 
-def cut(seen: np.ndarray, status: np.ndarray, settings: TrackingSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pieces of the trajectories: source column (M,), which frames each piece keeps (T, M), and its statuses (T, M).
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Pieces:
+    """M pieces of N trajectories over T frames."""
+
+    source: np.ndarray  # (M,) the trajectory
+    kept: np.ndarray  # (T, M) which frames the piece keeps
+    status: np.ndarray  # (T, M) TrackStatus
+    verdict: np.ndarray  # (T, N) on the frames of the trajectories: MEASURED where some piece keeps it
+
+
+def cut(seen: np.ndarray, status: np.ndarray, settings: TrackingSettings) -> Pieces:
+    """Cut trajectories where they are false.
 
     `seen` (T, N): frames with a position; `status`: MEASURED or the reason against it. A gap (not seen, no reason against) cuts nothing.
     """
+    T = len(seen)
+    shortest = max(2, min(settings.min_length, T))
     good = seen & (status == TrackStatus.MEASURED)
     false = seen & ~good
     mostly = false.sum(axis=0) > MOSTLY_FALSE * np.maximum(seen.sum(axis=0), 1)
     piece = np.cumsum(false, axis=0)
     columns, kept, statuses = [], [], []
+    verdict = np.where(good, TrackStatus.TOO_SHORT, status).astype(np.int8)
     for n in np.flatnonzero(seen.any(axis=0)):
         for number in np.unique(piece[good[:, n], n]) if not mostly[n] else ():
             frames = good[:, n] & (piece[:, n] == number)
-            if frames.sum() >= (settings.min_length if not frames[-1] else min(settings.min_length, SHORTEST)):
+            if frames.sum() >= (shortest if not frames[-1] else min(shortest, SHORTEST)):
                 columns.append(n)
                 kept.append(frames)
                 statuses.append(np.where(seen[:, n] & ~frames & good[:, n], TrackStatus.OTHER_PIECE, status[:, n]))
-    T = len(seen)
+                verdict[frames, n] = TrackStatus.MEASURED
     stack = [np.array(a, dtype=d).reshape(-1, T).T for a, d in ((kept, bool), (statuses, np.int8))]
-    return np.array(columns, dtype=np.int64), stack[0], stack[1]
+    return Pieces(source=np.array(columns, dtype=np.int64), kept=stack[0], status=stack[1], verdict=verdict)

@@ -48,7 +48,9 @@ class TrackingSettings:
         2.5, "Deviation from the neighbours' motion that is always allowed in one frame.", unit="mm", low=0.1, high=100.0
     )
     max_sigma_ratio: float = knob(2.5, "Largest sigma of a point, in units of the median over all points.", low=1.0, high=1000.0)
-    min_length: int = knob(5, "Trajectories of fewer frames are removed.", unit="frames", low=2, high=1000)
+    min_length: int = knob(
+        5, "Trajectories of fewer frames are removed, in a shorter recording those that do not last.", unit="frames", low=2, high=1000
+    )
     smooth_frames: int = knob(
         7, "Frames over which smoothed velocities and accelerations are taken (odd; 0: as they are).", unit="frames", low=0, high=99
     )
@@ -74,3 +76,9 @@ class TrackStatus(IntEnum):
     OTHER_PIECE = 14  # a frame of a trajectory that was cut; the other pieces stand in columns of their own
     UNSUPPORTED = 15  # it has no neighbours that could confirm it
     UNCERTAIN = 16  # its sigma is much larger than others'
+    REMOVED_BY_USER = 17  # a correction of take.toml
+
+    @property
+    def words(self) -> str:
+        """As a user reads it."""
+        return self.name.lower().replace("_", " ")

@@ -1,7 +1,8 @@
 """Trajectories: position, velocity and acceleration of every tracked point, raw and smoothed (kinematics.py), and why it ended."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -64,9 +65,44 @@ def assemble(steps: Sequence[TrackedFrame], fps: float, smooth_frames: int = SMO
     return with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames)
 
 
-def filter_trajectories(raw: Trajectories, settings: TrackingSettings, monitor: Monitor | None = None) -> Trajectories:
-    """What is left of the trajectories after the filters (filters.py), in pieces; the frames that went carry the reason."""
-    monitor = monitor or Monitor()
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Filtered:
+    """Trajectories after the filters, and all of them as they were before, with the verdict on each frame."""
+
+    kept: Trajectories  # pieces, M
+    source: np.ndarray  # (M,) the column of `raw` that a piece is of
+    raw: Trajectories  # N; status: MEASURED where kept, or why the frame went, or why the trajectory ended there
+
+    @property
+    def reason(self) -> np.ndarray:
+        """(N,) one TrackStatus for each raw trajectory: the end of one that was kept, what removed most frames of one that was not.
+
+        MEASURED: it was kept to the end of the recording.
+        """
+        status, seen = self.raw.status, self.raw.seen
+        against = np.stack([(status == s).sum(axis=0) for s in TrackStatus])
+        against[[TrackStatus.ABSENT, TrackStatus.MEASURED]] = 0
+        last = np.where(status != TrackStatus.ABSENT, np.arange(len(status))[:, None], -1).max(axis=0, initial=-1)
+        end = status[last, np.arange(status.shape[1])]
+        kept = (seen & (status == TrackStatus.MEASURED)).any(axis=0)
+        return np.where(kept, end, against.argmax(axis=0)).astype(np.int8)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of trajectories_raw.npz."""
+        raw = self.raw
+        return {"frames": raw.frames, "xyz_m": raw.xyz_m, "status": raw.status, "reason": self.reason}
+
+
+def filter_trajectories(
+    raw: Trajectories, settings: TrackingSettings, monitor: Monitor | None = None, left_out: np.ndarray | None = None
+) -> Filtered:
+    """What is left of the trajectories after the filters (filters.py), in pieces; the frames that went carry the reason.
+
+    What the user takes out, `left_out` (T, N), is seen by no filter, and leaves gaps.
+    """
+    monitor, every = monitor or Monitor(), raw
+    if left_out is not None and left_out.any():
+        raw = _without(raw, left_out)
     dt = float(np.median(np.diff(raw.time_s))) if len(raw.time_s) > 1 else 1.0
     verdict = over_thresholds(raw.velocity_m_s, raw.acceleration_m_s2, raw.sigma_m, dt, settings)
     if settings.uniformity == "voxels":
@@ -77,10 +113,26 @@ def filter_trajectories(raw: Trajectories, settings: TrackingSettings, monitor: 
         more = verdict
     verdict = np.where(verdict == TrackStatus.MEASURED, more, verdict)
     status = np.where(raw.seen, verdict, raw.status)
-    source, kept, status = cut(raw.seen, status, settings)
-    xyz, sigma = raw.xyz_m[:, source].copy(), raw.sigma_m[:, source].copy()
-    xyz[~kept], sigma[~kept] = np.nan, np.nan
-    return with_kinematics(raw.frames, raw.time_s, xyz, sigma, status, settings.smooth_frames)
+    pieces = cut(raw.seen, status, settings)
+    xyz, sigma = raw.xyz_m[:, pieces.source].copy(), raw.sigma_m[:, pieces.source].copy()
+    xyz[~pieces.kept], sigma[~pieces.kept] = np.nan, np.nan
+    kept = with_kinematics(raw.frames, raw.time_s, xyz, sigma, pieces.status, settings.smooth_frames)
+    return Filtered(kept=kept, source=pieces.source, raw=replace(every, status=pieces.verdict))
+
+
+def _without(raw: Trajectories, gone: np.ndarray) -> Trajectories:
+    xyz, sigma = (np.where(gone if a.ndim == 2 else gone[..., None], np.nan, a) for a in (raw.xyz_m, raw.sigma_m))
+    status = np.where(gone, TrackStatus.REMOVED_BY_USER, raw.status)
+    return with_kinematics(raw.frames, raw.time_s, xyz, sigma, status, 0)
+
+
+def picked(trajectories: Trajectories, columns: np.ndarray) -> Trajectories:
+    """Only these trajectories (a mask or indices)."""
+    names = ("xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status")
+    values: dict[str, Any] = {n: getattr(trajectories, n)[:, columns] for n in names}
+    for name, k in (("raw", trajectories.raw), ("smooth", trajectories.smooth)):
+        values[name] = k and Kinematics(**{f.name: getattr(k, f.name)[:, columns] for f in fields(Kinematics)})
+    return replace(trajectories, **values)
 
 
 def with_kinematics(

@@ -10,7 +10,7 @@ from tricap.core.errors import InputError
 from tricap.core.motion.ply import read_ply
 from tricap.core.results import Results
 from tricap.core.surface.cloud import PointCloud
-from tricap.core.tracking.trajectories import Trajectories
+from tricap.core.tracking.trajectories import Filtered, Trajectories
 
 ARRAYS = dict(x=np.arange(6.0).reshape(2, 3))
 
@@ -88,12 +88,14 @@ def test_clouds_and_trajectories(tmp_path: Path) -> None:
     sigma = np.where(np.isnan(xyz[..., 0]), np.nan, 1e-3)
     tracks = Trajectories(frames=np.arange(3), time_s=np.arange(3) / 25, xyz_m=xyz, velocity_m_s=xyz, acceleration_m_s2=xyz,
                           sigma_m=sigma, status=np.isfinite(sigma))  # fmt: skip
-    results.write_trajectories(tracks, {"format": "tricap-trajectories"})
+    results.write_trajectories(Filtered(kept=tracks, source=np.arange(4), raw=tracks), 25.0)
     arrays, header = store.load(tmp_path / "trajectories.npz")
     assert header["format"] == "tricap-trajectories" and arrays["xyz_m"].shape == (3, 4, 3)
     assert np.array_equal(np.isnan(arrays["xyz_m"][..., 0]), np.isnan(xyz[..., 0])) and arrays["time_s"].dtype == np.float64
     with np.load(tmp_path / "trajectories.npz", allow_pickle=False) as promised:
         assert {"time_s", "frames", "xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status"} <= set(promised.files)
+    with np.load(tmp_path / "trajectories_raw.npz", allow_pickle=False) as removed:
+        assert {"frames", "xyz_m", "status", "reason"} <= set(removed.files) and removed["reason"].shape == (4,)
     with pytest.raises(ValueError, match="sigma_m|covariance"):
         PointCloud(**{n: getattr(cloud, n) for n in PointCloud.__dataclass_fields__} | dict(covariance_m2=K[:4]))
 

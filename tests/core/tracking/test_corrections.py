@@ -1,0 +1,79 @@
+"""Corrections by hand: polygons, regions and clicked trajectories; the verdict on every raw trajectory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tricap.core.correcting import corrected_cloud, corrected_tracks
+from tricap.core.geometry.camera import Camera
+from tricap.core.geometry.rig import Rig
+from tricap.core.progress import Monitor
+from tricap.core.surface.cloud import PointCloud
+from tricap.core.take import Correction
+from tricap.core.tracking.corrections import inside_polygon
+from tricap.core.tracking.settings import TrackingSettings, TrackStatus
+from tricap.core.tracking.trajectories import Trajectories, filter_trajectories, with_kinematics
+
+CAMERA = Camera(name="C", size_px=(400, 300), matrix=np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]))
+RIG = Rig(cameras=(CAMERA,), metadata={})
+SETTINGS = TrackingSettings(uniformity="off")
+FRAMES = 12
+L_SHAPE = np.array([[0, 0], [10, 0], [10, 10], [5, 10], [5, 5], [0, 5]], dtype=float)
+
+
+def test_inside_polygon() -> None:
+    xy = np.array([[1, 1], [9, 9], [2, 8], [11, 1], [np.nan, 1]])
+    assert inside_polygon(xy, L_SHAPE).tolist() == [True, True, False, False, False]
+    assert inside_polygon(xy, L_SHAPE[::-1]).tolist() == [True, True, False, False, False]
+
+
+def row(frames: int = FRAMES, columns: int = 9) -> Trajectories:
+    """Points 20 px apart in a row that moves 2 px a frame to the right, 2 m away."""
+    u = 100 + 20.0 * np.arange(columns) + 2.0 * np.arange(frames)[:, None]
+    xyz = CAMERA.points_at_depth(np.stack([u, np.full_like(u, 150)], axis=-1).reshape(-1, 2), 2.0).reshape(frames, columns, 3)
+    status = np.full((frames, columns), TrackStatus.MEASURED, dtype=np.int8)
+    return with_kinematics(np.arange(frames), np.arange(frames) / 25, xyz, np.full((frames, columns), 1e-4), status, 0)
+
+
+def click(x: float, y: float, frame: int) -> Correction:
+    return Correction(kind="trajectory", view="C", frames=range(frame, frame + 1), xy_px=np.array([[x, y]]))
+
+
+def region(frames: range, x0: float, x1: float) -> Correction:
+    return Correction(kind="region", view="C", frames=frames, xy_px=np.array([[x0, 140], [x1, 140], [x1, 160], [x0, 160]], dtype=float))
+
+
+def test_a_clicked_trajectory_goes_whole() -> None:
+    filtered, missed = corrected_tracks(row(), [click(147, 152, 3), click(10, 10, 3)], RIG, SETTINGS, Monitor())  # column 2 is at 146
+    assert filtered.source.tolist() == [0, 1, 3, 4, 5, 6, 7, 8] and filtered.kept.seen.all()
+    assert (filtered.raw.status[:, 2] == TrackStatus.REMOVED_BY_USER).all() and filtered.raw.seen.all()
+    assert filtered.reason[2] == TrackStatus.REMOVED_BY_USER and filtered.reason[3] == TrackStatus.MEASURED
+    assert len(missed) == 1 and "(10, 10)" in missed[0]
+
+
+def test_a_region_leaves_gaps_and_takes_the_points_of_the_clouds() -> None:
+    take_out = [region(range(4, 7), 135, 165)]
+    raw = row()
+    filtered, missed = corrected_tracks(raw, take_out, RIG, SETTINGS, Monitor())
+    u = CAMERA.project(raw.xyz_m.reshape(-1, 3))[:, 0].reshape(raw.seen.shape)
+    gone = (u > 135) & (u < 165) & ((np.arange(FRAMES) >= 4) & (np.arange(FRAMES) < 7))[:, None]
+    assert gone.any() and not missed
+    assert np.array_equal(filtered.raw.status == TrackStatus.REMOVED_BY_USER, gone)
+    assert np.array_equal(filtered.kept.seen, ~gone) and np.array_equal(filtered.kept.status == TrackStatus.REMOVED_BY_USER, gone)
+    n = raw.seen.shape[1]
+    cloud = PointCloud(frame=4, xyz_m=raw.xyz_m[4], covariance_m2=np.tile(np.eye(3), (n, 1, 1)), normals=np.zeros((n, 3)),
+                       intensity=np.arange(n), xy_px=np.zeros((n, 1, 2)), residual_px=np.zeros(n))  # fmt: skip
+    assert np.array_equal(corrected_cloud(cloud, take_out, RIG).intensity, np.flatnonzero(~gone[4]))
+    assert corrected_cloud(replace(cloud, frame=7), take_out, RIG).intensity.size == n
+
+
+@pytest.mark.parametrize("frames", [2, 3, 4])
+def test_a_short_recording_keeps_what_lasts(frames: int) -> None:
+    raw = row(frames)
+    assert filter_trajectories(raw, SETTINGS).kept.seen.all()
+    xyz = raw.xyz_m.copy()
+    xyz[1:, 0] = np.nan
+    short = with_kinematics(raw.frames, raw.time_s, xyz, raw.sigma_m, np.where(np.isnan(xyz[..., 0]), 0, 1), 0)
+    filtered = filter_trajectories(short, SETTINGS)
+    assert 0 not in filtered.source and filtered.reason[0] == TrackStatus.TOO_SHORT
