@@ -32,6 +32,7 @@ from .progress import Cancelled, Monitor
 from .report.pages import write_report
 from .results import Results
 from .settings import from_table, nearest_name, to_table
+from .stages import CONCERNS, DERIVED, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
 from .take import Footage, open_take, read_take
 from .tracking.settings import TrackingSettings, TrackStatus
@@ -49,9 +50,6 @@ SETTINGS: dict[str, type] = {
 }
 Overrides = Mapping[str, Mapping[str, Any]]
 DOUBTFUL_RESIDUAL_PX = 1.0
-DERIVED = (  # what is made of the clouds
-    "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"
-)  # fmt: skip
 
 
 @dataclass(kw_only=True)
@@ -61,6 +59,7 @@ class Run:
     footage: Footage
     settings: dict[str, Any]
     results: Results
+    keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
     account: dict[str, Any] = field(default_factory=dict)
     measured: list[MeasuredFrame] = field(default_factory=list)
     trajectories: Trajectories | None = None
@@ -82,7 +81,8 @@ class Run:
 
     def finish_stage(self, stage: str, began: float, **figures: Any) -> None:
         """Note what a stage took and found, and write run.json."""
-        self.account["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), **figures}
+        key = self.keys.get(stage, self.keys.get("fit", ""))
+        self.account["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
         self.results.write_run(self.account)
 
     def __str__(self) -> str:
@@ -155,11 +155,11 @@ def open_run(
         "stages": {},
         "warnings": [],
     }
-    if all(before.get(name) == account[name] for name in ("take", "frames", "settings", "inputs")):
-        account["stages"] = before.get("stages", {})
-    elif before:
-        results.remove(*DERIVED)  # made with other settings or of another take: it must not stand beside the new
-    return Run(footage=footage, settings=settings, results=results, account=account)
+    keys = stage_keys(footage, settings)
+    account["stages"] = kept = still_good(before, keys)
+    if before:  # what was made otherwise must not stand beside the new
+        results.remove(*(name for stage, c in CONCERNS.items() if stage not in kept for name in c.files))
+    return Run(footage=footage, settings=settings, results=results, keys=keys, account=account)
 
 
 def measure(run: Run, monitor: Monitor) -> None:

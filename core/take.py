@@ -159,15 +159,15 @@ def take_of_text(text: str, path: Path) -> Take:
     return _take(table, path.parent.resolve(), str(path))
 
 
-def open_take(take: Take) -> Footage:
-    """Open the footage and the rig of a take and check that they belong together.
+def open_take(take: Take, sequences: tuple[Sequence, ...] | None = None) -> Footage:
+    """Open the footage (unless `sequences` are the opened views) and the rig of a take and check that they belong together.
 
     Raises:
         InputError: a view without camera or images, views of unequal length, frames or seeds outside the footage.
     """
     rig = read_rig(take.rig_path)
     cameras = tuple(rig[v.name] for v in take.views)
-    sequences = tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
+    sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
     footage = Footage(take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=_frames(take, sequences))
     _check_seeds(footage)
     return footage

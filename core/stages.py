@@ -1,0 +1,99 @@
+"""What each stage depends on, said once: the run removes and the panel calls stale exactly what a change concerns.
+
+The key of a stage is a digest of all that its result depends on, the stages before it included. run.json carries the key with which each
+stage was done; a stage is stale when its key now is another. Footage counts by names and sizes: checkpoints look at its content.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from . import following, measuring, store
+from .errors import InputError
+from .take import Footage, Seeds, Take
+
+STAGES = ("measure", "track", "fit")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Concern:
+    """What concerns a stage and no stage before it."""
+
+    settings: tuple[str, ...]  # groups of knobs
+    take: Callable[[Footage], Any]  # what take.toml, rig.toml and the footage say, as values with a `repr`
+    files: tuple[str, ...]  # what the stage leaves in OUT and no run may leave standing once it is stale
+
+
+def _seen(footage: Footage) -> Any:
+    """The images, the cameras, and where the person is."""
+    take = footage.take
+    regions = [c for c in _corrections(take) if c[0] == "region"]
+    views = [(v.name, v.offset_frames) for v in take.views]
+    files = [[_name_and_size(path) for path in s.files()] for s in footage.sequences]
+    rig = store.digest(take.rig_path)
+    return views, files, rig, take.interlaced, take.reference_view, footage.frames, _clicked(take.seeds), regions, measuring.ALGORITHM
+
+
+def _followed(footage: Footage) -> Any:
+    return footage.take.fps, [c for c in _corrections(footage.take) if c[0] == "trajectory"], following.ALGORITHM
+
+
+def _fitted(footage: Footage) -> Any:
+    take = footage.take
+    model = take.body_model
+    own = store.digest(Path(model)) if model and Path(model).is_file() else ""
+    return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes]
+
+
+CONCERNS: dict[str, Concern] = {
+    "measure": Concern(settings=("enhance", "matching", "growing", "surface"), take=_seen, files=()),
+    "track": Concern(settings=("tracking",), take=_followed, files=("trajectories.npz", "trajectories_raw.npz")),
+    "fit": Concern(
+        settings=("fitting", "skin"),
+        take=_fitted,
+        files=("joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
+    ),
+}
+DERIVED = tuple(name for concern in CONCERNS.values() for name in concern.files)
+
+
+def stage_keys(footage: Footage, settings: Mapping[str, Any]) -> dict[str, str]:
+    """The key of every stage, for opened footage and the settings of a run.
+
+    Raises:
+        InputError: footage, rig or model have gone.
+    """
+    keys, before = {}, ""
+    try:
+        for stage, concern in CONCERNS.items():
+            before = store.digest(before, repr([settings[name] for name in concern.settings]), repr(concern.take(footage)))
+            keys[stage] = before
+    except OSError as error:
+        raise InputError(f"Cannot read {error.filename}: {error.strerror or error}.") from error
+    return keys
+
+
+def stage_of(group: str) -> str:
+    """The stage that a group of knobs concerns first."""
+    return next(stage for stage, concern in CONCERNS.items() if group in concern.settings)
+
+
+def still_good(run: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any]:
+    """The stages in a run.json that were done with these keys; the report is as good as the fit."""
+    keys = {**keys, "report": keys["fit"]}
+    stages: dict[str, Any] = run.get("stages", {})
+    return {name: entry for name, entry in stages.items() if entry.get("key") == keys.get(name, "")}
+
+
+def _name_and_size(path: Path) -> tuple[str, int]:
+    return path.name, path.stat().st_size
+
+
+def _clicked(seeds: Seeds) -> Any:
+    clicks = [*seeds.joints.items(), *((f"surface {i}", at) for i, at in enumerate(seeds.surface))]
+    return seeds.frame, [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
+
+
+def _corrections(take: Take) -> list[Any]:
+    return [(c.kind, c.view, c.frames, c.xy_px.tolist()) for c in take.corrections]
