@@ -26,6 +26,7 @@ REQUIREMENTS = {
 BLENDER = {(3, 11): "4.5 LTS", (3, 13): "5.2 LTS"}
 WINDOWS = os.name == "nt"
 STAMP = "tricap-setup.txt"
+LONG_BENCHES = ("resume",)  # run when they are named only
 # What an extension consists of; everything else in the repository is for developers.
 SHIPPED_FILES = ("blender_manifest.toml", "__init__.py", "__main__.py", "LICENSE")
 SHIPPED_FOLDERS = {"core": (".py", ".toml"), "addon": (".py", ".toml", ".json")}
@@ -185,8 +186,9 @@ def test(everything: bool, pytest_arguments: list[str]) -> int:
 
 
 def bench(stage: str | None, json_path: str | None) -> int:
-    """Run tests/bench/<stage>.py, or all of them; each takes `--json FILE`, and their results become one file."""
-    stages = sorted(path for path in (ROOT / "tests" / "bench").glob("[!_]*.py") if stage in (None, path.stem))
+    """Run tests/bench/<stage>.py, or all but the long ones; each takes `--json FILE`, and their results become one file."""
+    found = sorted((ROOT / "tests" / "bench").glob("[!_]*.py"))
+    stages = [path for path in found if path.stem == stage or (stage is None and path.stem not in LONG_BENCHES)]
     if not stages:
         sys.exit(f"There is no benchmark{f' named “{stage}”' if stage else ' yet'} in tests/bench.")
     results = {}

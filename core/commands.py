@@ -94,18 +94,19 @@ def _stage_command(commands: Any, name: str, about: str, action: Callable[..., l
 
 def _stages(*names: str) -> Callable[[argparse.Namespace, Monitor], list[str]]:
     def action(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-        job = pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames))
-        for name in names:
-            getattr(pipeline, name)(job, monitor)
-        return _summary(job, args.json)
+        with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
+            for name in names:
+                getattr(pipeline, name)(job, monitor)
+            return _summary(job, args.json)
 
     return action
 
 
 def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    job = pipeline.run(args.take, args.out, overrides(args.set), monitor, restart=args.restart, frames=frame_range(args.frames))
-    scene = _build_scene(job, args.parser, monitor)
-    return _summary(job, args.json) + ([] if args.json else scene)
+    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), restart=args.restart) as job:
+        pipeline.all_stages(job, monitor)
+        scene = _build_scene(job, args.parser, monitor)
+        return _summary(job, args.json) + ([] if args.json else scene)
 
 
 def _build_scene(job: pipeline.Run, parser: argparse.ArgumentParser, monitor: Monitor) -> list[str]:

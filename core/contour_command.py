@@ -44,16 +44,16 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     Raises:
         InputError: the arguments or the take need mending.
     """
-    job = pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames))
-    names = [v.name for v in job.footage.take.views]
-    if args.view not in names:
-        raise InputError(f"{args.take} has no view “{args.view}”.{nearest_name(args.view, names)}")
-    polygon = read_polygon(args.polygon) if args.polygon else None
-    background = read_image(args.background) if args.background else None
-    pipeline.track(job, monitor)
-    contours = dict(track_contour(job, names.index(args.view), ContourSettings(), polygon, background, monitor))
-    path = job.results.path("contours", f"{args.view}.csv")
-    store.write_text(path, _table(contours))
+    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
+        names = [v.name for v in job.footage.take.views]
+        if args.view not in names:
+            raise InputError(f"{args.take} has no view “{args.view}”.{nearest_name(args.view, names)}")
+        polygon = read_polygon(args.polygon) if args.polygon else None
+        background = read_image(args.background) if args.background else None
+        pipeline.track(job, monitor)
+        contours = dict(track_contour(job, names.index(args.view), ContourSettings(), polygon, background, monitor))
+        path = job.results.path("contours", f"{args.view}.csv")
+        store.write_text(path, _table(contours))
     seen = float(np.mean([c.seen.mean() for c in contours.values()]))
     return [f"{path}: the outline in {len(contours)} frames, {100 * seen:.0f} % of its vertices on an edge."]
 

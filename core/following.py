@@ -55,9 +55,10 @@ def track_frames(
     monitor: Monitor,
 ) -> Iterator[TrackedFrame]:
     """Follow the surface through the frames (in the order of time)."""
-    view = tracking_view(footage, matching, tracking, float(np.median([m.field.limit_px for m in measured])))
+    limit_px = float(np.median([m.field.limit_px for m in measured]))
+    view = tracking_view(footage, matching, tracking, limit_px)
     state = _State(before=None, current=None, templates=no_templates(view.half_patch), born=0)
-    key = store.digest(ALGORITHM, repr((matching, tracking)))
+    key = store.digest(ALGORITHM, repr((matching, tracking, limit_px)))
     images: FrameImages | None = None
     for i, m in enumerate(measured):
         monitor.step("tracks", i, len(measured))

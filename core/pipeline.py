@@ -5,7 +5,8 @@ Every stage asks the stages before it for their results; what is checkpointed is
 
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -113,35 +114,50 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
     return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
 
 
+@contextmanager
 def open_run(
     take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None, *, restart: bool = False
-) -> Run:
-    """Open a take and the folder for its results. Everything that can be checked before computing is checked here.
+) -> Iterator[Run]:
+    """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
     What an earlier run with other footage, settings or frames left in OUT is removed once it is replaced; `restart` removes it now.
 
     Raises:
-        InputError: the take, the rig, the settings or the folder need mending.
+        InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
     """
     take = read_take(take_folder)
     settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
     footage = open_take(take)
     if frames is not None:
-        if frames[0] not in footage.frames or frames[1] - 1 not in footage.frames or frames[0] >= frames[1]:
-            raise InputError(
-                f"Frames {frames[0]}:{frames[1]} are not among the take's frames {footage.frames.start}:{footage.frames.stop}; "
-                "choose others."
-            )
-        footage = Footage(take=take, rig=footage.rig, sequences=footage.sequences, frames=range(*frames))
+        footage = _only(footage, frames)
     for name, at in take.seeds.joints.items():
         clicked_depth(footage, name, at)
     if take.body_model is not None:
         read_model(take.body_model)
-    results = Results(out)
-    if restart:
-        results.remove("cache", *DERIVED)
-    before = {} if restart else results.read_run()
-    account = {
+    keys = stage_keys(footage, settings)
+    with Results(out).opened() as results:
+        if restart:
+            results.remove("clouds", *DERIVED, "cache")  # the cache last: it marks the folder as ours
+        before = {} if restart else results.read_run()
+        account = _account(footage, settings)
+        account["stages"] = kept = still_good(before, keys)
+        if before:  # what was made otherwise must not stand beside the new
+            results.remove(*(name for stage, c in CONCERNS.items() if stage not in kept for name in c.files))
+        yield Run(footage=footage, settings=settings, results=results, keys=keys, account=account)
+
+
+def _only(footage: Footage, frames: tuple[int, int]) -> Footage:
+    if frames[0] not in footage.frames or frames[1] - 1 not in footage.frames or frames[0] >= frames[1]:
+        raise InputError(
+            f"Frames {frames[0]}:{frames[1]} are not among the take's frames {footage.frames.start}:{footage.frames.stop}; choose others."
+        )
+    return Footage(take=footage.take, rig=footage.rig, sequences=footage.sequences, frames=range(*frames))
+
+
+def _account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What run.json says before anything was computed."""
+    take = footage.take
+    return {
         "take": str(take.folder),
         "frames": [footage.frames.start, footage.frames.stop],
         "fps": take.fps,
@@ -155,11 +171,6 @@ def open_run(
         "stages": {},
         "warnings": [],
     }
-    keys = stage_keys(footage, settings)
-    account["stages"] = kept = still_good(before, keys)
-    if before:  # what was made otherwise must not stand beside the new
-        results.remove(*(name for stage, c in CONCERNS.items() if stage not in kept for name in c.files))
-    return Run(footage=footage, settings=settings, results=results, keys=keys, account=account)
 
 
 def measure(run: Run, monitor: Monitor) -> None:
@@ -297,6 +308,7 @@ def fit(run: Run, monitor: Monitor) -> None:
 def report(run: Run, monitor: Monitor) -> None:
     """report/report.html with its pictures."""
     began = time.perf_counter()
+    run.account["stages"].pop("report", None)  # a page does not tell of the page before it
     write_report(run.results, run.footage, run.account, run.clouds, run.trajectories, run.body, monitor)
     run.finish_stage("report", began)
 
@@ -316,11 +328,15 @@ def run(
         InputError: something of the input needs mending; nothing that was computed is lost.
         Cancelled: what is done is kept.
     """
-    monitor = monitor or Monitor()
-    job = open_run(take_folder, out, overrides, frames, restart=restart)
-    for stage in (measure, track, fit, report):
-        stage(job, monitor)
+    with open_run(take_folder, out, overrides, frames, restart=restart) as job:
+        all_stages(job, monitor or Monitor())
     return job
+
+
+def all_stages(run: Run, monitor: Monitor) -> None:
+    """Measure, track, fit and report, as `run` does, of an opened take."""
+    for stage in (measure, track, fit, report):
+        stage(run, monitor)
 
 
 def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:

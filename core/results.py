@@ -5,7 +5,8 @@ A checkpoint carries the digest of everything that it depends on; one that does 
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from . import store
 from .errors import InputError
+from .lock import NAME, locked
 from .motion.ply import write_cloud
 from .surface.cloud import PointCloud
 from .tracking.trajectories import Filtered
@@ -44,6 +46,19 @@ class Results:
         if not os.access(self.folder, os.W_OK):
             raise InputError(f"The folder {folder} is read-only; choose another place for the results.")
 
+    @contextmanager
+    def opened(self) -> Iterator["Results"]:
+        """Keep other runs out of the folder, and clear away what a killed run left half written.
+
+        Raises:
+            InputError: another run is at work in it.
+        """
+        with locked(self.folder):
+            for folder in (self.folder, *(self.path(name) for name in ("clouds", "skin", "report")), *self.path("cache").glob("*/")):
+                for path in [*folder.glob(".*.part"), *folder.glob(".*.part.blend")]:
+                    self.remove(str(path.relative_to(self.folder)))
+            yield self
+
     def path(self, *names: str) -> Path:
         """A file or folder inside OUT."""
         return self.folder.joinpath(*names)
@@ -68,13 +83,21 @@ class Results:
         store.save(self.path("cache", stage, f"{name}.npz"), arrays, {"key": key}, compress=False)
 
     def remove(self, *names: str) -> None:
-        """Remove a result of an earlier run, a file or a folder, if it is there."""
+        """Remove a result of an earlier run, a file or a folder, if it is there.
+
+        Raises:
+            InputError: it cannot be removed.
+        """
         for name in names:
             path = self.path(name)
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+            try:
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+            except OSError as error:
+                said = f"Cannot remove {path}: {error.strerror or error}. Close what uses it, or choose another folder."
+                raise InputError(said) from error
 
     def write_cloud(self, cloud: PointCloud) -> None:
         """clouds/NNNN.ply"""
@@ -108,9 +131,12 @@ class Results:
 
 
 def _not_ours(folder: Path) -> list[str]:
-    """What lies in a folder under the name of a result or as `cache` though no run wrote there. A run stopped early leaves a cache."""
+    """What lies in a folder under the name of a result or as `cache` though no run wrote there.
+
+    A run stopped early leaves a cache, and a killed one its lock.
+    """
     cache = folder / "cache"
-    if (folder / "run.json").exists():
+    if (folder / "run.json").exists() or (folder / NAME).exists():
         return []
     if cache.is_dir() and all(p.is_dir() and all(f.suffix in (".npz", ".part") for f in p.iterdir()) for p in cache.iterdir()):
         return []

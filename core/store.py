@@ -121,9 +121,16 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def digest(*parts: bytes | str | Path) -> str:
-    """A short SHA-256 over bytes, texts and the contents of files."""
+    """A short SHA-256 over bytes, texts and the contents of files.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
     total = hashlib.sha256()
     for part in parts:
-        data = part.read_bytes() if isinstance(part, Path) else part.encode() if isinstance(part, str) else part
+        try:
+            data = part.read_bytes() if isinstance(part, Path) else part.encode() if isinstance(part, str) else part
+        except OSError as error:
+            raise InputError(f"Cannot read {part!s}: {error.strerror or error}; put it back and run again.") from error
         total.update(len(data).to_bytes(8, "little") + data)
     return total.hexdigest()[:16]
