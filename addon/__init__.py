@@ -6,9 +6,10 @@ from types import ModuleType
 def _modules() -> tuple[ModuleType, ...]:
     from . import command, jobs, operators, panels, properties
     from .calibrate import registration as calibrate
+    from .clicking import registration as clicking
     from .retarget import registration
 
-    return jobs, properties, operators, panels, calibrate, registration, command
+    return jobs, properties, operators, panels, calibrate, registration, clicking, command
 
 
 def register() -> None:

@@ -1,0 +1,1 @@
+"""Clicking joints and surface seeds in the Clip Editor."""

@@ -1,0 +1,134 @@
+"""What is drawn over the footage while clicking: the name at the cursor, the figure, epipolar lines, and proposals."""
+
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..overlay import canvas
+from ..overlay.canvas import Canvas, Colour
+from .figure import figure
+from .session import ClickSession
+
+PRESENT: Colour = (1.0, 0.75, 0.1, 1.0)
+OFFER: Colour = (0.3, 1.0, 0.45, 1.0)
+LINES: tuple[Colour, ...] = ((0.35, 0.8, 1.0, 0.9), (1.0, 0.5, 0.9, 0.9), (1.0, 0.9, 0.4, 0.9), (0.6, 0.6, 1.0, 0.9))
+PAPER: Colour = (0.05, 0.05, 0.05, 0.65)
+BODY: Colour = (0.75, 0.75, 0.78, 1.0)
+DONE: Colour = (0.3, 0.9, 0.4, 1.0)
+OPEN: Colour = (0.25, 0.25, 0.28, 1.0)
+FIGURE_PX, MARGIN_PX = 190.0, 12.0
+OFFER_PX = 11.0
+
+_handle: list[Any] = []
+_shown: dict[str, Any] = {"session": None, "mouse": (-1, -1)}
+
+
+def begin(session: ClickSession) -> None:
+    """Draw for this session from now on."""
+    end()
+    _shown["session"] = session
+    _handle.append(bpy.types.SpaceClipEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
+
+
+def end() -> None:
+    """Draw nothing more."""
+    _shown["session"] = None
+    while _handle:
+        bpy.types.SpaceClipEditor.draw_handler_remove(_handle.pop(), "WINDOW")
+
+
+def move_mouse(x: int, y: int) -> None:
+    """Where the mouse is, in window pixels."""
+    _shown["mouse"] = (x, y)
+
+
+def _draw() -> None:
+    session, context = _shown["session"], bpy.context
+    clip = canvas.clip_of(context.area)
+    if session is None or clip is None:
+        return
+    view = next((view for view, mine in session.clips.items() if mine == clip), None)
+    if view is not None:
+        draw_session(session, view, Canvas(context.region, tuple(clip.size)), _shown["mouse"])
+
+
+def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[int, int]) -> None:
+    """Everything of a session in one region."""
+    for other, curve in session.curves(view).items():
+        colour = LINES[session.views.index(other) % len(LINES)]
+        canvas.draw_lines(canvas.line_batch(canvas.chain(sheet.to_region(curve))), 1.5, colour)
+    at = session.clicks().get(view)
+    if at is not None:
+        canvas.draw_lines(canvas.line_batch(canvas.cross(sheet.to_region(at), 12.0, 3.0)), 2.0, PRESENT)
+    offer = session.proposals.get(view)
+    if offer is not None:
+        centre = sheet.to_region(offer.xy_px)
+        parts = np.concatenate([canvas.ring(centre, OFFER_PX), canvas.cross(centre, OFFER_PX + 5, OFFER_PX - 4)])
+        canvas.draw_lines(canvas.line_batch(parts), 2.0, OFFER)
+        canvas.text(f"{session.name}? ±{max(offer.sigma_px, 0.1):.1f} px", centre[0] + OFFER_PX + 6, centre[1] + 6, OFFER, size=11)
+    _draw_headline(session, view, sheet)
+    draw_figure(session, sheet)
+    x, y = mouse[0] - sheet.region.x, mouse[1] - sheet.region.y
+    if session.name and 0 <= x < sheet.region.width and 0 <= y < sheet.region.height:
+        canvas.text(session.name, x + 16, y + 10, PRESENT, size=15)
+
+
+def headline(session: ClickSession, view: str) -> str:
+    """What to do now in a view, in words."""
+    if not session.name:
+        return "All clicked"
+    what = f"{session.turn + 1} of {len(session.names)}: {session.name}"
+    if view in session.clicks():
+        return f"{what}, clicked here"
+    if view in session.proposals:
+        return f"{what}: Return takes the green ring, or click elsewhere"
+    if session.asking:
+        return f"{what}: looking for it…"
+    if session.clicks():
+        return f"{what}: click it on the line" if session.curves(view) else f"{what}: click it here too"
+    return f"{what}: click it"
+
+
+def _draw_headline(session: ClickSession, view: str, sheet: Canvas) -> None:
+    scale = bpy.context.preferences.system.ui_scale
+    top = sheet.region.height - 60 * scale
+    canvas.text(f"View {view}   frame {session.frame}", 14 * scale + _left(sheet), top, (0.85, 0.85, 0.85, 1.0), size=12)
+    canvas.text(headline(session, view), 14 * scale + _left(sheet), top - 20 * scale, PRESENT, size=14)
+    if session.problem:
+        canvas.text(session.problem, 14 * scale + _left(sheet), top - 40 * scale, (1.0, 0.5, 0.4, 1.0), size=11)
+
+
+def _left(sheet: Canvas) -> float:
+    """Width of what lies over the left of the region: the tool bar."""
+    tools = [r for r in bpy.context.area.regions if r.type == "TOOLS" and r.width > 1] if bpy.context.area else []
+    return float(sum(r.width for r in tools if r.x < sheet.region.x + r.width))
+
+
+def draw_figure(session: ClickSession, sheet: Canvas) -> None:
+    """The figure in the lower left corner: the present joint ringed, clicked ones green."""
+    shape, scale = figure(), bpy.context.preferences.system.ui_scale
+    size = min(FIGURE_PX * scale, 0.4 * sheet.region.height)
+    known = [name for name in session.names if name in shape.joints]
+    if not known or size < 60:
+        return
+    corner = np.array([MARGIN_PX * scale + _left(sheet), MARGIN_PX * scale])
+    width, foot = shape.width * size + 24 * scale, 18 * scale
+    canvas.fill(canvas.rectangle(corner[0], corner[1], width, size + foot + 12 * scale), PAPER)
+    base = corner + (12 * scale, foot + 4 * scale)
+    canvas.fill(base + size * shape.triangles, BODY)
+    for name in known:
+        clicked = len(session.clicks(name))
+        colour = PRESENT if name == session.name else DONE if clicked > 1 else OPEN
+        canvas.fill(_dot(base + size * shape.joints[name], (4.5 if name == session.name else 3.0) * scale), colour)
+    if session.name in shape.joints:
+        at = base + size * shape.joints[session.name]
+        canvas.draw_lines(canvas.line_batch(canvas.ring(at, 9 * scale)), 2.5, PRESENT)
+    canvas.text("R", base[0], corner[1] + 6 * scale, (0.8, 0.8, 0.8, 1.0), size=11)
+    canvas.text("L", base[0] + shape.width * size - 8 * scale, corner[1] + 6 * scale, (0.8, 0.8, 0.8, 1.0), size=11)
+
+
+def _dot(centre: np.ndarray, radius: float, corners: int = 12) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, corners + 1)
+    rim = centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.stack([np.broadcast_to(centre, rim[1:].shape), rim[:-1], rim[1:]], axis=1)

@@ -1,0 +1,109 @@
+"""Finds a click's proposals on a thread of its own: the window stays alive while images are read and matched. No Blender in here."""
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import InputError
+from ...core.geometry.camera import Camera
+from ...core.images.sampling import SplineImage
+from ...core.matching.least_squares import MatchingSettings
+from ...core.matching.proposals import Proposal, propose
+from ...core.take import Footage
+
+KEPT_FRAMES = 2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Question:
+    """A click: what was clicked where."""
+
+    name: str
+    frame: int
+    view: int
+    xy_px: np.ndarray  # (2,)
+    depth_range_m: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Answer:
+    """The proposals, one or None per view; or the sentence that says why there are none."""
+
+    question: Question
+    proposals: tuple[Proposal | None, ...]
+    problem: str = ""
+
+
+_open: list["Finder"] = []
+
+
+class Finder:
+    """One question at a time; the latest replaces those that still wait."""
+
+    def __init__(self, footage: Footage, settings: MatchingSettings) -> None:
+        self._footage, self._settings = footage, settings
+        self._images: dict[int, list[SplineImage]] = {}
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="tricap proposals")
+        self._pending: Future[Answer] | None = None
+        _open.append(self)
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """The cameras in the order of the views."""
+        return self._footage.rig.cameras
+
+    def prepare(self, frame: int) -> None:
+        """Read and prepare the images of a frame, before the first click."""
+        self._pool.submit(self._load, frame)
+
+    def ask(self, question: Question) -> None:
+        """Look for the proposals of a click; `poll` gives them."""
+        if self._pending is not None:
+            self._pending.cancel()
+        self._pending = self._pool.submit(self._answer, question)
+
+    def poll(self) -> Answer | None:
+        """The answer to the latest question, once, when it is there."""
+        if self._pending is None or not self._pending.done() or self._pending.cancelled():
+            return None
+        answer, self._pending = self._pending.result(), None
+        return answer
+
+    def wait(self) -> Answer | None:
+        """The answer to the latest question, however long it takes."""
+        if self._pending is not None and not self._pending.cancelled():
+            self._pending.result()
+        return self.poll()
+
+    def close(self) -> None:
+        """End the thread; what it is doing is finished first (well below a second)."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        if self in _open:
+            _open.remove(self)
+
+    def _answer(self, question: Question) -> Answer:
+        nothing: tuple[Any, ...] = (None,) * len(self.cameras)
+        try:
+            images = self._load(question.frame)
+        except InputError as error:
+            return Answer(question=question, proposals=nothing, problem=str(error))
+        rows, asked = self._footage.take.rows, question
+        found = propose(images, self.cameras, rows, asked.view, asked.xy_px, self._settings, asked.depth_range_m)
+        return Answer(question=question, proposals=found)
+
+    def _load(self, frame: int) -> list[SplineImage]:
+        if frame not in self._images:
+            while len(self._images) >= KEPT_FRAMES:
+                self._images.pop(next(iter(self._images)))
+            rows = self._footage.take.rows
+            self._images[frame] = [SplineImage(rows.rows(image)) for image in self._footage.read(frame)]
+        return self._images[frame]
+
+
+def close_all(*_: Any) -> None:
+    """End all threads (another file is loaded, Blender quits, the add-on is disabled)."""
+    for finder in list(_open):
+        finder.close()

@@ -1,0 +1,321 @@
+"""bpy.ops.tricap.click_joints() and .click_seeds() in the window; .click(name="elbow.R", view="C", x=430, y=260) from scripts."""
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import bpy
+
+from ...core import pipeline
+from ...core.body.model_file import read_model
+from ...core.errors import InputError
+from ...core.take import JOINTS, Seeds, open_take
+from .. import project, properties, seeds
+from ..overlay import canvas
+from . import draw
+from .finder import Finder
+from .session import ClickSession, free_seed_names, joints_of
+
+TICK_S, SNAP_PX = 0.05, 14.0
+NUMBERS = ("ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE")
+KEYS = "Click: set    Return: take the proposals    S / right click: skip    Backspace: back    Tab, 1…9: view    Esc: done"
+
+
+class ClickOperator:
+    """A modal operator about a `ClickSession`: turns events into its methods, everything else passes through (zoom, pan, G, time line)."""
+
+    session: ClickSession
+    timer: Any = None
+    running: ClassVar[list["ClickOperator"]] = []
+
+    def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
+        """What is clicked, one after the other."""
+        raise NotImplementedError
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Begin; opens the views where no Clip Editor shows one."""
+        if self.running:
+            self.report({"WARNING"}, "You are clicking already; press Esc in a view to end that.")  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        try:
+            self.session, said = begin_session(context.scene, self.names)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        if said:
+            self.report({"WARNING"}, said)  # type: ignore[attr-defined]
+        if not [area for area in canvas.clip_areas(context.window) if self._view(area) is not None]:
+            bpy.ops.tricap.open_views()
+        draw.begin(self.session)
+        draw.move_mouse(event.mouse_x, event.mouse_y)
+        self.running[:] = [self]
+        self.timer = context.window_manager.event_timer_add(TICK_S, window=context.window)
+        context.window_manager.modal_handler_add(self)
+        self._show(context)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """One event."""
+        try:
+            if event.type == "TIMER":
+                self.session.show_frame(context.scene.frame_current)
+                if self.session.poll():
+                    self._show(context)
+                return {"PASS_THROUGH"}
+            if event.type == "MOUSEMOVE":
+                draw.move_mouse(event.mouse_x, event.mouse_y)
+                canvas.redraw_clips(context)
+                return {"PASS_THROUGH"}
+            return self._act(context, event)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+            return self._end(context)
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Blender ends the operator (another file, quitting)."""
+        self.clear(context)
+
+    def clear(self, context: bpy.types.Context) -> None:
+        """Nothing is watched or drawn any more."""
+        draw.end()
+        self.running.clear()
+        if self.session.finder is not None:
+            self.session.finder.close()
+        if self.timer is not None:
+            context.window_manager.event_timer_remove(self.timer)
+            self.timer = None
+        if context.workspace is not None:
+            context.workspace.status_text_set(None)
+        canvas.redraw_clips(context)
+
+    def _act(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        area = area_under(context.window, event.mouse_x, event.mouse_y)
+        view = self._view(area) if area is not None else None
+        undo = event.type == "Z" and (event.ctrl or event.oskey)
+        if undo and event.value == "PRESS":
+            self.session.back()
+        elif view is None or area is None:
+            return {"PASS_THROUGH"}
+        elif event.type == "ESC" and event.value == "PRESS":
+            return self._end(context)
+        elif not self._act_in(area, view, event):
+            return {"PASS_THROUGH"}
+        if not self.session.name:
+            return self._end(context)
+        self._show(context)
+        return {"RUNNING_MODAL"}
+
+    def _act_in(self, area: bpy.types.Area, view: str, event: bpy.types.Event) -> bool:
+        """Do what an event over a view means; False where it is not ours."""
+        key, session = event.type, self.session
+        ours = key in ("LEFTMOUSE", "RIGHTMOUSE", "RET", "NUMPAD_ENTER", "BACK_SPACE", "S", "TAB", *NUMBERS[: len(session.views)])
+        if not ours or event.ctrl or event.alt or event.shift or event.oskey:
+            return False
+        if event.value != "PRESS":
+            return True
+        if key == "LEFTMOUSE":
+            region = canvas.window_region(area)
+            sheet = canvas.Canvas(region, tuple(session.clips[view].size))
+            session.click(view, sheet.to_image((event.mouse_x - region.x, event.mouse_y - region.y)), SNAP_PX / max(sheet.zoom, 1e-6))
+            self._turn_to_next(area, bpy.context.window)
+        elif key in ("RET", "NUMPAD_ENTER"):
+            session.accept()
+            self._turn_to_next(area, bpy.context.window)
+        elif key == "BACK_SPACE":
+            session.back()
+        elif key in ("S", "RIGHTMOUSE"):
+            session.skip()
+        else:
+            shown = session.views.index(view)
+            step = (shown + 1) % len(session.views) if key == "TAB" else NUMBERS.index(key)
+            show_view(area, session.clips[session.views[step]])
+        return True
+
+    def _turn_to_next(self, area: bpy.types.Area, window: bpy.types.Window) -> None:
+        """With a single Clip Editor: show the next view in which the joint is not clicked yet."""
+        mine, wanted = [a for a in canvas.clip_areas(window) if self._view(a) is not None], self.session.next_view()
+        if len(mine) == 1 and wanted is not None:
+            show_view(area, self.session.clips[wanted])
+
+    def _view(self, area: bpy.types.Area) -> str | None:
+        clip = canvas.clip_of(area)
+        return next((view for view, mine in self.session.clips.items() if mine == clip), None) if clip is not None else None
+
+    def _show(self, context: bpy.types.Context) -> None:
+        if context.workspace is not None:
+            context.workspace.status_text_set(f"{self.session.name}    {KEYS}")
+        canvas.redraw_clips(context)
+
+    def _end(self, context: bpy.types.Context) -> set[str]:
+        self.clear(context)
+        session = self.session
+        if not session.changed:
+            return {"CANCELLED"}
+        done = sum(len(session.clicks(name)) > 1 for name in session.names)
+        self.report({"INFO"}, f"Frame {session.frame}: {done} of them are clicked in two views or more.")  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+
+class ClickJoints(ClickOperator, bpy.types.Operator):
+    """Click the joints of the body model, one after the other, in each view. After a click in one view the others show the line on which
+    the joint lies, and where it probably is. In another frame than that of the first clicks this adds a keyframe for the fit"""
+
+    bl_idname = "tricap.click_joints"
+    bl_label = "Click Joints"
+    bl_options = {"REGISTER", "UNDO"}
+
+    only: bpy.props.StringProperty(name="Only", description="Click this joint alone; empty: all of the model")  # type: ignore[valid-type]
+    hidden: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Ask for Hidden Joints", description="Ask also for chest, spine and collarbones, which hardly anyone can see from outside")
+
+    def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
+        """The joints of the chosen model."""
+        if self.only:
+            return [self.only]
+        return joints_of(model_joints(context.scene), hidden=self.hidden)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Clicking needs a window."""
+        self.report({"ERROR"}, "Clicking needs Blender's window; scripts use bpy.ops.tricap.click(name=…, view=…, x=…, y=…).")
+        return {"CANCELLED"}
+
+
+class GoToFrame(bpy.types.Operator):
+    """Show this frame"""
+
+    bl_idname = "tricap.go_to_frame"
+    bl_label = "Go to Frame"
+    bl_options = {"REGISTER", "UNDO"}
+
+    frame: bpy.props.IntProperty(name="Frame", description="Number of the frame")  # type: ignore[valid-type]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Move the scene there."""
+        context.scene.frame_set(self.frame)
+        return {"FINISHED"}
+
+
+class ClickSeeds(ClickOperator, bpy.types.Operator):
+    """Click points of the surface, each in two views or more. You need not: they are found automatically. It helps where the person is
+    not the nearest thing in sight, or where there is little texture"""
+
+    bl_idname = "tricap.click_seeds"
+    bl_label = "Click Surface Seeds"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
+        """Seeds without end."""
+        return free_seed_names(clips, context.scene.frame_current)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Clicking needs a window."""
+        self.report({"ERROR"}, "Clicking needs Blender's window; scripts use bpy.ops.tricap.click(name=\"seed 1\", view=…, x=…, y=…).")
+        return {"CANCELLED"}
+
+
+class Click(bpy.types.Operator):
+    """Put a joint or a surface seed at a pixel of a view, as a click would"""
+
+    bl_idname = "tricap.click"
+    bl_label = "Set a Click"
+    bl_options = {"REGISTER", "UNDO"}
+
+    name: bpy.props.StringProperty(name="Name", description="A joint, such as elbow.R, or “seed 1”, “seed 2”, …")  # type: ignore[valid-type]
+    view: bpy.props.StringProperty(name="View", description="Name of the view")  # type: ignore[valid-type]
+    x: bpy.props.FloatProperty(name="X", description="Pixels from the middle of the left column")  # type: ignore[valid-type]
+    y: bpy.props.FloatProperty(name="Y", description="Pixels from the middle of the top row, downwards")  # type: ignore[valid-type]
+    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the scene's present frame")  # type: ignore[valid-type]
+    remove: bpy.props.BoolProperty(name="Remove", description="Take the click back instead")  # type: ignore[valid-type]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Set or take back one click."""
+        try:
+            clips = project.clips_of(context.scene)
+            if not seeds.is_seed(self.name):
+                raise InputError(f"“{self.name}” is no joint; known are {', '.join(JOINTS)} and “seed 1”, “seed 2”, …")
+            if self.view not in clips:
+                raise InputError(f"There is no view “{self.view}”; known are {', '.join(clips) or 'none, add footage first'}.")
+            clip, frame = clips[self.view], context.scene.frame_current if self.frame < 0 else self.frame
+            if not (-0.5 <= self.x <= clip.size[0] - 0.5 and -0.5 <= self.y <= clip.size[1] - 0.5):
+                raise InputError(f"({self.x:g}, {self.y:g}) lies outside the image of {clip.size[0]}×{clip.size[1]} pixels.")
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if self.remove:
+            return {"FINISHED"} if seeds.remove_click(clip, self.name, frame) else {"CANCELLED"}
+        note_first_frame(context.scene, clips, frame)
+        exact = properties.exact
+        seeds.set_click(clip, self.name, frame, (exact(self.x), exact(self.y)))
+        return {"FINISHED"}
+
+
+def begin_session(scene: bpy.types.Scene, names: Any) -> tuple[ClickSession, str]:
+    """A session for the scene's present frame, and what to warn of.
+
+    Raises:
+        InputError: there is no footage, or no model to click joints of.
+    """
+    clips = project.clips_of(scene)
+    if not clips:
+        raise InputError("Add the footage first: there is no view to click in.")
+    wanted = names(bpy.context, clips)
+    finder, said = make_finder(scene)
+    note_first_frame(scene, clips, scene.frame_current)
+    session = ClickSession(clips, wanted, scene.frame_current, finder)
+    if not session.name:  # all clicked already: begin again at the first, to look at them or to mend them
+        session.go_to(session.names[0])
+    if finder is not None:
+        finder.prepare(session.frame)
+    return session, said
+
+
+def make_finder(scene: bpy.types.Scene) -> tuple[Finder | None, str]:
+    """What finds proposals; None, and why, where cameras or images are missing."""
+    try:
+        take = project.take(scene)
+        footage = open_take(replace(take, seeds=Seeds(), keyframes=(), corrections=(), frames=None))
+        settings = pipeline.settings_of(take.settings, properties.overrides(scene), "take.toml")["matching"]
+    except InputError as error:
+        return None, f"No epipolar lines and proposals: {error}"
+    return Finder(footage, settings), ""
+
+
+def model_joints(scene: bpy.types.Scene) -> tuple[str, ...]:
+    """The joints of the scene's body model.
+
+    Raises:
+        InputError: none is chosen, or its file is faulty.
+    """
+    name = project.take(scene).body_model
+    if name is None:
+        raise InputError("Choose a body model first: it tells which joints to click.")
+    return read_model(name).skeleton.joint_names
+
+
+def note_first_frame(scene: bpy.types.Scene, clips: dict[str, bpy.types.MovieClip], frame: int) -> None:
+    """The first clicks of all say which frame is that of the seeds."""
+    if not any(seeds.frames_of(clip) for clip in clips.values()):
+        scene.tricap.seed_frame = frame
+
+
+def area_under(window: bpy.types.Window, x: int, y: int) -> bpy.types.Area | None:
+    """The Clip Editor whose picture lies under a place of the window; None over its sidebar, header or tools."""
+    for area in window.screen.areas:
+        if area.x <= x < area.x + area.width and area.y <= y < area.y + area.height:
+            inside = {r.type for r in area.regions if r.width > 1 and r.x <= x < r.x + r.width and r.y <= y < r.y + r.height}
+            return area if canvas.clip_of(area) is not None and inside == {"WINDOW"} else None
+    return None
+
+
+def show_view(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
+    """Show another view in a Clip Editor."""
+    area.spaces.active.clip = clip
+    area.tag_redraw()
+
+
+def stop_clicking() -> None:
+    """End a running session (its class is unregistered)."""
+    for operator in list(ClickOperator.running):
+        operator.clear(bpy.context)
+
+
+CLASSES = (ClickJoints, ClickSeeds, Click, GoToFrame)

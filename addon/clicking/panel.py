@@ -1,0 +1,66 @@
+"""The section “Clicks” in the Clip Editor's sidebar."""
+
+import bpy
+
+from ...core.errors import InputError
+from .. import project, seeds
+from .operators import model_joints
+from .session import joints_of
+
+
+class ClipPanel:
+    """Where Tricap's sections of the Clip Editor live."""
+
+    bl_space_type = "CLIP_EDITOR"
+    bl_region_type = "UI"
+    bl_category = "Tricap"
+
+
+class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
+    """Joints and surface seeds."""
+
+    bl_label = "Clicks"
+    bl_order = 0
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Buttons, and which joints are clicked in how many views."""
+        layout, scene = self.layout, context.scene
+        if not scene.tricap.views:
+            layout.label(text="Add footage first: 3-D view, sidebar, tab Tricap.", icon="INFO")
+            return
+        view = project.view_of(scene, context.space_data.clip)
+        if view is not None:
+            layout.label(text=f"View {view.name}", icon="CAMERA_DATA")
+        layout.operator("tricap.open_views", icon="WINDOW")
+        row = layout.row()
+        row.scale_y = 1.4
+        row.operator("tricap.click_joints", icon="RESTRICT_SELECT_OFF")
+        layout.operator("tricap.click_seeds", icon="STICKY_UVS_DISABLE", text="Click Surface Seeds (optional)")
+        self._draw_frame(layout, scene)
+        self._draw_joints(layout, scene)
+
+    def _draw_frame(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+        first = scene.tricap.seed_frame
+        if scene.frame_current == first:
+            layout.label(text=f"Frame {first}: the first clicks", icon="KEYTYPE_KEYFRAME_VEC")
+        else:
+            row = layout.row()
+            row.label(text=f"Frame {scene.frame_current}: a keyframe", icon="KEYTYPE_EXTREME_VEC")
+            row.operator("tricap.go_to_frame", text=f"Go to {first}").frame = first
+
+    def _draw_joints(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+        try:
+            clips, names = project.clips_of(scene), joints_of(model_joints(scene))
+        except InputError as error:
+            layout.label(text=str(error), icon="ERROR")
+            return
+        grid = layout.column(align=True)
+        for name in names:
+            at = [view for view, clip in clips.items() if seeds.click(clip, name, scene.frame_current) is not None]
+            row = grid.row(align=True)
+            row.label(text=name, icon="CHECKMARK" if len(at) > 1 else "LAYER_USED" if at else "BLANK1")
+            row.label(text=" ".join(at))
+            row.operator("tricap.click_joints", text="", icon="EYEDROPPER").only = name
+
+
+CLASSES = (TRICAP_PT_clicks,)

@@ -1,0 +1,225 @@
+"""What happens while joints or surface seeds are clicked, free of events and drawing: whose turn it is, what was clicked, what is proposed.
+
+The clicks themselves are native tracking tracks and are read from there each time, so that dragging one with G, Blender's undo and this
+session never contradict each other.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+
+from ...core.errors import InputError
+from ...core.fitting.clicks import intersection
+from ...core.matching.foreground import around_clicks
+from ...core.matching.proposals import Proposal, epipolar_curve, where_rays_meet
+from .. import seeds
+from .finder import Answer, Finder, Question
+
+CLICK_SIGMA_PX = 3.0
+ARMS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("shoulder", "elbow", "wrist"))
+LEGS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("hip", "knee", "ankle", "toe"))
+ORDER = ("head", "neck", *ARMS, "pelvis", *LEGS)
+HIDDEN = ("chest", "spine", "clavicle.R", "clavicle.L")  # inside the trunk: hardly anyone can say where
+
+
+@dataclass
+class _Step:
+    """What one action changed: whose turn it was before, and the clicks (frame, name, view) with what was there before."""
+
+    turn: int
+    before: list[tuple[int, str, str, list[float] | None]] = field(default_factory=list)
+
+
+class ClickSession:
+    """Clicks of `names`, one after the other, in the clips of all views (in the order of the cameras)."""
+
+    def __init__(self, clips: Mapping[str, bpy.types.MovieClip], names: Sequence[str], frame: int, finder: Finder | None) -> None:
+        if not names:
+            raise InputError("There is nothing to click: choose a body model first.")
+        self._clip_names = {view: clip.name for view, clip in clips.items()}  # undo makes other objects of them
+        self.names, self.frame, self.finder = list(names), frame, finder
+        self.views = list(clips)
+        self.turn = 0
+        self.proposals: dict[str, Proposal] = {}
+        self.asking, self.problem = False, ""
+        self._history: list[_Step] = []
+        self.go_to_next(from_turn=0)
+
+    @property
+    def clips(self) -> dict[str, bpy.types.MovieClip]:
+        """The clip of every view.
+
+        Raises:
+            InputError: one was deleted or renamed meanwhile.
+        """
+        found = {view: bpy.data.movieclips.get(name) for view, name in self._clip_names.items()}
+        for view, clip in found.items():
+            if clip is None:
+                raise InputError(f"The movie clip of view {view} was deleted or renamed while clicking; what was clicked before is kept.")
+        return found
+
+    @property
+    def name(self) -> str:
+        """What is to be clicked now; "" when all is done."""
+        return self.names[self.turn] if self.turn < len(self.names) else ""
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything was clicked that stands."""
+        return any(step.before for step in self._history)
+
+    def clicks(self, name: str | None = None) -> dict[str, np.ndarray]:
+        """Where a joint (the present one) was clicked in this frame: view → pixel (2,)."""
+        name = self.name if name is None else name
+        found = {view: seeds.click(clip, name, self.frame) for view, clip in self.clips.items()} if name else {}
+        return {view: np.array(xy) for view, xy in found.items() if xy is not None}
+
+    def click(self, view: str, xy_px: np.ndarray, snap_px: float = 0.0) -> None:
+        """Put the present joint there; a click within `snap_px` of the proposal takes the proposal."""
+        if not self.name:
+            return
+        offer = self.proposals.get(view)
+        if offer is not None and np.linalg.norm(offer.xy_px - xy_px) <= snap_px:
+            xy_px = offer.xy_px
+        self._put({view: xy_px})
+
+    def accept(self) -> None:
+        """Take all proposals, and go on to the next joint."""
+        if self.name and self.proposals:
+            self._put({view: offer.xy_px for view, offer in self.proposals.items()})
+        elif self.name:
+            self.skip()
+
+    def skip(self) -> None:
+        """Leave the present joint as it is and go on to the next."""
+        if self.name:
+            self._history.append(_Step(turn=self.turn))
+            self.go_to_next(self.turn + 1)
+
+    def back(self) -> bool:
+        """Undo the last action; without one, go to the joint before. False where there is none."""
+        if self._history:
+            step = self._history.pop()
+            self.turn = step.turn
+            for frame, name, view, xy in reversed(step.before):
+                if xy is None:
+                    seeds.remove_click(self.clips[view], name, frame)
+                else:
+                    seeds.set_click(self.clips[view], name, frame, (xy[0], xy[1]))
+        elif self.turn > 0:
+            self.turn -= 1
+        else:
+            return False
+        self.look()
+        return True
+
+    def go_to(self, name: str) -> None:
+        """Make it the turn of a joint."""
+        self.turn = self.names.index(name)
+        self.look()
+
+    def go_to_next(self, from_turn: int) -> None:
+        """The turn of the first joint from there on that is not yet clicked in two views."""
+        self.turn = from_turn
+        while self.name and len(self.clicks()) >= min(2, len(self.views)):
+            self.turn += 1
+        self.look()
+
+    def show_frame(self, frame: int) -> None:
+        """The scene shows another frame: what is clicked now belongs to it."""
+        if frame != self.frame:
+            self.frame = frame
+            self.go_to_next(0)
+
+    def look(self) -> None:
+        """Ask for the proposals that go with what is clicked now."""
+        self.proposals, self.problem, self.asking = {}, "", False
+        clicked = self.clicks()
+        if self.finder is None or not clicked or len(clicked) == len(self.views):
+            return
+        if len(clicked) > 1:
+            number = {self.views.index(view): xy for view, xy in clicked.items()}
+            self._offer(where_rays_meet(self.finder.cameras, number, CLICK_SIGMA_PX))
+            return
+        ((view, xy),) = clicked.items()
+        at = self.views.index(view)
+        self.asking = True
+        self.finder.ask(Question(name=self.name, frame=self.frame, view=at, xy_px=xy, depth_range_m=self._depth_range(at)))
+
+    def poll(self) -> bool:
+        """Take the finder's answer when it is there; True when something changed."""
+        answer = self.finder.poll() if self.finder is not None else None
+        return answer is not None and self.take_answer(answer)
+
+    def take_answer(self, answer: Answer) -> bool:
+        """An answer that belongs to the present question; True when it does."""
+        asked, clicked = answer.question, self.clicks()
+        here = clicked.get(self.views[asked.view])
+        if (asked.name, asked.frame, len(clicked)) != (self.name, self.frame, 1) or here is None or not np.array_equal(here, asked.xy_px):
+            return False
+        self.asking, self.problem = False, answer.problem
+        self._offer(answer.proposals)
+        return True
+
+    def curves(self, view: str) -> dict[str, np.ndarray]:
+        """The epipolar curves (M, 2) of the present joint's clicks in other views, by the view that was clicked."""
+        if self.finder is None:
+            return {}
+        camera = dict(zip(self.views, self.finder.cameras))
+        found = {other: epipolar_curve(camera[other], xy, camera[view]) for other, xy in self.clicks().items() if other != view}
+        return {other: curve for other, curve in found.items() if len(curve) > 1}
+
+    def next_view(self) -> str | None:
+        """The first view in which the present joint is not clicked yet."""
+        clicked = self.clicks()
+        return next((view for view in self.views if view not in clicked), None) if self.name else None
+
+    def _put(self, at: Mapping[str, np.ndarray]) -> None:
+        step = _Step(turn=self.turn)
+        for view, xy in at.items():
+            clip = self.clips[view]
+            inside = np.clip(xy, -0.5, np.array(clip.size) - 0.5)
+            step.before.append((self.frame, self.name, view, seeds.click(clip, self.name, self.frame)))
+            _select(clip, seeds.set_click(clip, self.name, self.frame, (float(inside[0]), float(inside[1]))))
+        self._history.append(step)
+        if len(self.clicks()) == len(self.views):
+            self.go_to_next(self.turn + 1)
+        else:
+            self.look()
+
+    def _offer(self, proposals: Sequence[Proposal | None]) -> None:
+        clicked = self.clicks()
+        self.proposals = {view: p for view, p in zip(self.views, proposals) if p is not None and view not in clicked}
+
+    def _depth_range(self, view: int) -> tuple[float, float] | None:
+        """Depths of the body in one camera, from the other joints clicked in this frame."""
+        assert self.finder is not None
+        cameras, depths = self.finder.cameras, []
+        for name in self.names:
+            at = self.clicks(name) if name != self.name else {}
+            if len(at) > 1:
+                seen = [cameras[self.views.index(v)] for v in at]
+                depths.append(cameras[view].to_camera(intersection(seen, np.array(list(at.values()))))[2])
+        known = [depth for depth in depths if np.isfinite(depth) and depth > 0]
+        return around_clicks(np.array(known)).depth_range_m if known else None
+
+
+def _select(clip: bpy.types.MovieClip, track: bpy.types.MovieTrackingTrack) -> None:
+    """Select only this track, so that G moves it."""
+    for other in clip.tracking.tracks:
+        other.select = other == track
+    clip.tracking.tracks.active = track
+
+
+def joints_of(model_joints: Sequence[str], *, hidden: bool = False) -> list[str]:
+    """The joints of a model in the order in which they are asked for; those inside the trunk come last, if at all."""
+    return [name for name in (*ORDER, *(HIDDEN if hidden else ())) if name in model_joints]
+
+
+def free_seed_names(clips: Mapping[str, bpy.types.MovieClip], frame: int, count: int = 200) -> list[str]:
+    """Names for surface seeds: those half clicked in this frame, then new ones."""
+    taken = {name for name in (f"seed {i}" for i in range(1, count))
+             if sum(seeds.click(clip, name, frame) is not None for clip in clips.values()) > 1}
+    return [name for name in (f"seed {i}" for i in range(1, count)) if name not in taken]

@@ -1,0 +1,293 @@
+"""Clicking joints, without the window's events: whose turn it is, native tracks, epipolar lines, proposals, undo, the views' workspace."""
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
+from tricap.core.synthetic.truth import Truth, read_truth
+
+ADDON = "bl_ext.user_default.tricap.addon"
+
+
+def module(name: str) -> ModuleType:
+    return importlib.import_module(f"{ADDON}.{name}")
+
+
+@pytest.fixture(scope="module")
+def arm_take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clicking") / "arm é"
+    make_arm_take(folder, ArmTakeSettings(frames=3, width_px=384, interlaced="none"))
+    return folder
+
+
+@pytest.fixture
+def scene(blender: ModuleType, arm_take: Path) -> Iterator[Any]:
+    """The arm in the scene, nothing clicked yet."""
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene = blender.context.scene
+    module("project").open_take(scene, arm_take)
+    scene.frame_set(0)
+    for clip in module("project").clips_of(scene).values():
+        module("seeds").clear(clip)
+    yield scene
+    module("clicking.finder").close_all()
+
+
+@pytest.fixture
+def session(scene: Any) -> Any:
+    operators = module("clicking.operators")
+    names = lambda context, clips: module("clicking.session").joints_of(operators.model_joints(context.scene))  # noqa: E731
+    session, said = operators.begin_session(scene, names)
+    assert not said
+    return session
+
+
+@pytest.fixture(scope="module")
+def truth(arm_take: Path) -> Truth:
+    return read_truth(arm_take)
+
+
+def sleeve_point(session: Any, truth: Truth, which: int) -> np.ndarray:
+    """A point of cloth that all cameras see."""
+    rows = np.flatnonzero(truth.visible[session.frame] & truth.textured)
+    return truth.vertices_m[session.frame, np.random.default_rng(8).permutation(rows)[which]]
+
+
+def test_a_click_gives_lines_and_a_proposal_that_is_right(session: Any, truth: Truth) -> None:
+    assert session.names == ["shoulder.R", "elbow.R", "wrist.R"] and session.name == "shoulder.R"
+    camera = dict(zip(session.views, session.finder.cameras))
+    errors = []
+    for which in range(8):
+        X = sleeve_point(session, truth, which)
+        session.click("C", camera["C"].project(X))
+        assert session.asking and list(session.curves("L")) == ["C"] and not session.curves("C")
+        answer = session.finder.wait()
+        assert answer is not None and session.take_answer(answer)
+        errors += [np.linalg.norm(offer.xy_px - camera[view].project(X)) for view, offer in session.proposals.items()]
+        assert session.back()
+    assert len(errors) >= 12 and np.median(errors) < 0.5 and np.mean(np.array(errors) < 1.0) >= 0.75
+
+
+def test_return_takes_the_proposals_and_goes_on(session: Any, truth: Truth, scene: Any) -> None:
+    camera = dict(zip(session.views, session.finder.cameras))
+    elbow = truth.joints_m["RightArm"][0]
+    session.click("L", camera["L"].project(elbow))
+    session.click("R", camera["R"].project(elbow))
+    assert set(session.proposals) == {"C"}, "two rays meet: no image is needed"
+    assert np.linalg.norm(session.proposals["C"].xy_px - camera["C"].project(elbow)) < 0.1
+    session.accept()
+    assert session.name == "elbow.R" and set(session.clicks("shoulder.R")) == {"L", "C", "R"}
+    clip = module("project").clips_of(scene)["C"]
+    track = clip.tracking.tracks["shoulder.R"]
+    assert track.select and clip.tracking.tracks.active == track, "G moves it"
+    track.markers[0].co = (0.5, 0.5)
+    assert np.allclose(session.clicks("shoulder.R")["C"], (np.array(clip.size) - 1) / 2, atol=1e-4)
+    table = module("project").table(scene)
+    assert set(table["seeds"]["joints"]["shoulder.R"]) == {"L", "C", "R"} and table["seeds"]["frame"] == 0
+
+
+def test_skip_back_and_undo(session: Any) -> None:
+    session.skip()
+    assert session.name == "elbow.R" and not session.changed
+    session.click("C", np.array([100.0, 80.0]))
+    session.click("C", np.array([120.0, 90.0]))
+    assert np.allclose(session.clicks()["C"], [120, 90], atol=1e-4) and session.changed
+    assert session.back() and np.allclose(session.clicks()["C"], [100, 80], atol=1e-4)
+    assert session.back() and not session.clicks() and session.name == "elbow.R"
+    assert session.back() and session.name == "shoulder.R" and not session.back()
+    session.click("C", np.array([-50.0, 1e4]))
+    assert np.allclose(session.clicks()["C"], [-0.5, 287.5], atol=1e-3), "a click beside the image is put at its edge"
+
+
+def test_a_click_near_the_proposal_takes_it(session: Any, truth: Truth) -> None:
+    camera = dict(zip(session.views, session.finder.cameras))
+    X = sleeve_point(session, truth, 0)
+    session.click("C", camera["C"].project(X))
+    session.take_answer(session.finder.wait())
+    offer = session.proposals["L"].xy_px
+    session.click("L", offer + [3.0, 2.0], snap_px=5.0)
+    assert np.allclose(session.clicks()["L"], offer, atol=1e-3)
+    session.back()
+    session.click("L", offer + [30.0, 2.0], snap_px=5.0)
+    assert np.allclose(session.clicks()["L"], offer + [30.0, 2.0], atol=1e-3)
+
+
+def test_a_late_answer_is_not_taken_for_another_joint(session: Any) -> None:
+    session.click("C", np.array([150.0, 120.0]))
+    late = session.finder.wait()
+    session.skip()
+    assert late is not None and not session.take_answer(late) and not session.proposals
+
+
+def test_all_done_and_another_frame(session: Any, scene: Any) -> None:
+    for _ in session.names:
+        for view in session.views:
+            session.click(view, np.array([150.0, 120.0]))
+    assert session.name == "" and session.next_view() is None
+    session.accept()
+    session.skip()
+    session.click("C", np.array([1.0, 1.0]))
+    session.show_frame(2)
+    assert session.name == "shoulder.R" and not session.clicks()
+    session.click("C", np.array([151.0, 120.0]))
+    session.click("R", np.array([150.0, 120.0]))
+    keyframes = module("project").table(scene)["keyframes"]
+    assert keyframes == [{"frame": 2, "joints": {"shoulder.R": {"C": [151.0, 120.0], "R": [150.0, 120.0]}}}]
+    assert session.back() and session.back() and session.back() and session.frame == 2
+
+
+def test_the_first_clicks_say_the_frame(blender: ModuleType, scene: Any) -> None:
+    operators, clips = module("clicking.operators"), module("project").clips_of(scene)
+    scene.frame_set(2)
+    operators.note_first_frame(scene, clips, 2)
+    assert scene.tricap.seed_frame == 2
+    assert blender.ops.tricap.click(name="elbow.R", view="C", x=430.3 / 2, y=100.1, frame=1) == {"FINISHED"}
+    assert scene.tricap.seed_frame == 1
+    assert module("project").table(scene)["seeds"]["joints"] == {"elbow.R": {"C": [215.15, 100.1]}}
+    assert blender.ops.tricap.click(name="wrist.R", view="C", x=5, y=5) == {"FINISHED"}
+    assert scene.tricap.seed_frame == 1 and module("project").table(scene)["keyframes"][0]["frame"] == 2
+    assert blender.ops.tricap.click(name="elbow.R", view="C", frame=1, remove=True) == {"FINISHED"}
+    assert blender.ops.tricap.click(name="elbow.R", view="C", frame=1, remove=True) == {"CANCELLED"}
+
+
+@pytest.mark.parametrize(("wrong", "why"), [
+    ({"name": "elbow"}, "is no joint"), ({"name": "elbow.R", "view": "X"}, "no view “X”"),
+    ({"name": "elbow.R", "view": "C", "x": 1e4}, "outside the image")])  # fmt: skip
+def test_a_wrong_click_is_told(blender: ModuleType, scene: Any, wrong: dict[str, Any], why: str) -> None:
+    with pytest.raises(RuntimeError, match=why):
+        blender.ops.tricap.click(**wrong)
+
+
+def test_clicking_needs_footage_model_and_window(blender: ModuleType, scene: Any) -> None:
+    with pytest.raises(RuntimeError, match="needs Blender's window"):
+        blender.ops.tricap.click_joints()
+    scene.tricap.model = "none"
+    with pytest.raises(module("jobs").InputError, match="body model first"):
+        module("clicking.operators").model_joints(scene)
+    scene.tricap.views.clear()
+    with pytest.raises(module("jobs").InputError, match="footage first"):
+        module("clicking.operators").begin_session(scene, lambda context, clips: ["elbow.R"])
+    assert not blender.ops.tricap.open_views.poll()
+
+
+def test_without_a_rig_one_can_click_but_nothing_is_proposed(blender: ModuleType, scene: Any, arm_take: Path) -> None:
+    rig = arm_take / "rig.toml"
+    rig.rename(arm_take / "other.toml")
+    try:
+        session, said = module("clicking.operators").begin_session(scene, lambda context, clips: ["elbow.R"])
+    finally:
+        (arm_take / "other.toml").rename(rig)
+    assert "rig" in said and session.finder is None
+    session.click("C", np.array([20.0, 20.0]))
+    assert not session.curves("L") and not session.proposals and not session.asking
+
+
+def test_undo_takes_the_clicks_back(blender: ModuleType, scene: Any) -> None:
+    blender.ops.ed.undo_push(message="before")
+    blender.ops.tricap.click(name="elbow.R", view="C", x=20, y=20)
+    blender.ops.ed.undo_push(message="after")
+    blender.ops.ed.undo()
+    scene = blender.context.scene
+    assert "seeds" not in module("project").table(scene)
+    blender.ops.ed.redo()
+    assert module("project").table(blender.context.scene)["seeds"]["joints"] == {"elbow.R": {"C": [20.0, 20.0]}}
+
+
+def test_a_deleted_clip_is_told(blender: ModuleType, session: Any, scene: Any) -> None:
+    blender.data.movieclips.remove(module("project").clips_of(scene)["L"])
+    with pytest.raises(module("jobs").InputError, match="view L was deleted"):
+        session.clicks()
+
+
+def lay_out(window: Any, clips: list[Any]) -> list[str]:
+    return list(module("clicking.open_views").lay_out(window, clips))
+
+
+def test_the_views_share_the_largest_area(blender: ModuleType, scene: Any) -> None:
+    window = blender.context.window_manager.windows[0]
+    clips = list(module("project").clips_of(scene).values())
+    others = {area.type for area in window.screen.areas} - {"VIEW_3D"}
+    assert lay_out(window, clips[:2]) == ["rows", "columns", "shown"]
+    shown = [area.spaces.active.clip for area in window.screen.areas if area.type == "CLIP_EDITOR"]
+    assert set(shown) == set(clips[:2]) and len(shown) == 2
+    lay_out(window, clips)
+    editors = [area for area in window.screen.areas if area.type == "CLIP_EDITOR"]
+    assert {a.spaces.active.clip for a in editors} == set(clips) and len(editors) == 3
+    assert all(area.spaces.active.mode == "TRACKING" for area in editors) and others <= {area.type for area in window.screen.areas}
+
+
+class _Region(SimpleNamespace):
+    """A region as the window has it; one that was never drawn does not know where its picture lies."""
+
+    x, y, width, height = 100, 50, 700, 500
+
+    @property
+    def view2d(self) -> Any:
+        return SimpleNamespace(region_to_view=lambda x, y: ((x - 60) / 576, (y - 30) / 432))
+
+
+def test_events_become_actions(blender: ModuleType, session: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    window = blender.context.window_manager.windows[0]
+    lay_out(window, list(session.clips.values()))
+    area = next(a for a in window.screen.areas if module("overlay.canvas").clip_of(a) == session.clips["C"])
+    operators = module("clicking.operators")
+    operator = SimpleNamespace(session=session, _turn_to_next=lambda area, window: None)
+    region = _Region()
+    monkeypatch.setattr(operators.canvas, "window_region", lambda area: region)
+
+    def event(key: str, value: str = "PRESS", **more: Any) -> Any:
+        held = dict(ctrl=False, alt=False, shift=False, oskey=False, mouse_x=region.x + 30, mouse_y=region.y + 40)
+        return SimpleNamespace(type=key, value=value, **held | more)
+
+    act = operators.ClickOperator._act_in
+    for key in ("MIDDLEMOUSE", "WHEELUPMOUSE", "G", "SPACE", "NUMPAD_1", "FOUR"):
+        assert not act(operator, area, "C", event(key)), f"{key} is Blender's"
+    assert not act(operator, area, "C", event("LEFTMOUSE", ctrl=True)) and act(operator, area, "C", event("LEFTMOUSE", "RELEASE"))
+    assert not session.changed
+    assert act(operator, area, "C", event("LEFTMOUSE"))
+    assert np.allclose(session.clicks()["C"], [-0.5, 287.5 - 10 / 1.5], atol=1e-3)
+    assert session.changed and act(operator, area, "C", event("BACK_SPACE")) and not session.clicks()
+    assert act(operator, area, "C", event("S")) and session.name == "elbow.R"
+    assert act(operator, area, "C", event("TAB")) and area.spaces.active.clip == session.clips["R"]
+    assert act(operator, area, "C", event("ONE")) and area.spaces.active.clip == session.clips["L"]
+
+
+def test_the_canvas_goes_there_and_back(blender: ModuleType) -> None:
+    sheet = module("overlay.canvas").Canvas(_Region(), (384, 288))
+    xy = np.array([[0.0, 0.0], [383.0, 287.0], [20.25, 100.5]])
+    assert np.allclose(sheet.to_image(sheet.to_region(xy)), xy, atol=1e-9) and sheet.zoom == pytest.approx(1.5)
+    assert np.allclose(sheet.to_region(np.array([0.0, 0.0])), [60.75, 30 + 432 - 0.75]), "the top left pixel's middle"
+
+
+def test_the_figure_stands_upright_with_its_right_on_the_left() -> None:
+    from tricap.addon.clicking.figure import figure
+
+    shape = figure()
+    assert shape.triangles.reshape(-1, 2).min() >= 0 and shape.triangles[..., 1].max() == pytest.approx(1.0)
+    at = shape.joints
+    assert at["wrist.R"][0] < at["shoulder.R"][0] < at["neck"][0] < at["shoulder.L"][0] < at["wrist.L"][0] < shape.width
+    assert at["ankle.R"][1] < at["knee.R"][1] < at["hip.R"][1] < at["shoulder.R"][1] < at["head"][1]
+    for name in ("elbow.L", "knee.R", "head", "pelvis"):
+        inside = any(_holds(triangle, at[name]) for triangle in shape.triangles)
+        assert inside, f"{name} lies on the body"
+
+
+def _holds(t: np.ndarray, p: np.ndarray) -> bool:
+    sides = [np.cross(np.append(t[(i + 1) % 3] - t[i], 0), np.append(p - t[i], 0))[2] for i in range(3)]
+    return min(sides) >= 0 or max(sides) <= 0
+
+
+def test_the_order_of_the_joints() -> None:
+    from tricap.addon.clicking.session import joints_of
+    from tricap.core.body.model_file import read_model
+
+    every = read_model("full").skeleton.joint_names
+    asked = joints_of(every)
+    assert asked[0] == "head" and "chest" not in asked and "crown" not in asked and "chest" in joints_of(every, hidden=True)
+    assert joints_of(read_model("leg.L").skeleton.joint_names) == ["hip.L", "knee.L", "ankle.L"]
