@@ -18,10 +18,10 @@ from .take import Footage
 from .tracking.settings import TrackingSettings
 from .tracking.step import FramePair, TrackingView, track_step
 from .tracking.surface import on_surface, regenerate, start_tracks
-from .tracking.templates import Templates, cut_templates, no_templates
+from .tracking.templates import Templates, Tiles, cut_tiles, no_templates
 from .tracking.tracked import TrackedFrame, nothing
 
-ALGORITHM = "tracking 5"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 6"  # part of every key: raise it when the same input gives other numbers
 DROPOUT = 0.1  # of the points: where fewer are found in a frame, it is the frame that is missing
 
 
@@ -34,14 +34,14 @@ class _State:
     templates: Templates
     born: int  # the next identity
 
-    def after(self, tracked: TrackedFrame, cut: Templates) -> "_State":
+    def after(self, tracked: TrackedFrame, cut: Tiles, view: TrackingView) -> "_State":
         """The state after a frame, with the templates that were cut in it; a frame that was left out changes nothing."""
         if self.current is not None and not len(tracked.identity) and not len(tracked.ended):
             return self
         return _State(
             before=self.current,
             current=tracked,
-            templates=self.templates.only(tracked.identity).with_tiles(cut),
+            templates=self.templates.only(tracked.identity).with_tiles(cut, view.matching, view.rows.step),
             born=max([self.born, *(tracked.identity[-1:] + 1)]),
         )
 
@@ -57,7 +57,7 @@ def track_frames(
     """Follow the surface through the frames (in the order of time)."""
     limit_px = float(np.median([m.field.limit_px for m in measured]))
     view = tracking_view(footage, matching, tracking, limit_px)
-    state = _State(before=None, current=None, templates=no_templates(view.half_patch), born=0)
+    state = _State(before=None, current=None, templates=no_templates(view.matching, view.rows.step), born=0)
     key = store.digest(ALGORITHM, repr((matching, tracking, limit_px)))
     images: FrameImages | None = None
     for i, m in enumerate(measured):
@@ -73,7 +73,7 @@ def track_frames(
             _checkpoint(results, *done, key)
         else:
             following = None
-        after = state.after(*done)
+        after = state.after(*done, view)
         images = images if after is state else following
         state = after
         yield done[0]
@@ -111,20 +111,21 @@ def _advance(
     return regenerate(tracked, m.field, m.cloud, view, state.born) if every and index % every == 0 else tracked
 
 
-def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Templates:
-    """The key templates that begin in this frame: of new points, and of those that outgrew theirs."""
+def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Tiles:
+    """The tiles of the key templates that begin in this frame: of new points, and of those that outgrew theirs."""
     fresh = (tracked.key_shape == np.eye(2)).all(axis=(1, 2))
-    return cut_templates(images.spline[view.reference], tracked.identity[fresh], tracked.xy[fresh, view.reference], view.half_patch)
+    at = tracked.xy[fresh, view.reference]
+    return cut_tiles(images.spline[view.reference], tracked.identity[fresh], at, view.matching, view.rows.step)
 
 
-def _checkpoint(results: Results, tracked: TrackedFrame, cut: Templates, key: str) -> None:
-    arrays = tracked.arrays() | {f"cut_{f.name}": getattr(cut, f.name) for f in fields(Templates)}
+def _checkpoint(results: Results, tracked: TrackedFrame, cut: Tiles, key: str) -> None:
+    arrays = tracked.arrays() | {f"cut_{f.name}": getattr(cut, f.name) for f in fields(Tiles)}
     results.save_checkpoint("tracks", f"{tracked.frame:04d}", key, arrays)
 
 
-def _from_checkpoint(results: Results, frame: int, key: str) -> tuple[TrackedFrame, Templates] | None:
+def _from_checkpoint(results: Results, frame: int, key: str) -> tuple[TrackedFrame, Tiles] | None:
     arrays = results.load_checkpoint("tracks", f"{frame:04d}", key)
     if arrays is None:
         return None
-    cut = Templates(**{f.name: arrays.pop(f"cut_{f.name}") for f in fields(Templates)})
+    cut = Tiles(**{f.name: arrays.pop(f"cut_{f.name}") for f in fields(Tiles)})
     return TrackedFrame(frame=frame, **arrays), cut

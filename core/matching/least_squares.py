@@ -21,6 +21,7 @@ Coordinates are pixels of the images given (a field's rows count as rows).
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -37,6 +38,7 @@ MAX_STEP_PX = 2.0
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
 MIN_CONDITION = 1e-6
 PARAMETERS = 8
+PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "offset", "spread", "textured")  # arrays of a template side
 NOISE_ENERGY = 4.0  # of a gradient [grey values² / px²]: less is noise, not texture
 
 
@@ -133,7 +135,7 @@ def match_patches(
     def work(span: slice) -> list[Matches]:
         if monitor is not None and monitor.cancelled:
             monitor.step("matching", span.start, n)
-        patches = _Templates(template, xy[span], settings, row_step, None if template_shape is None else template_shape[span])
+        patches = PatchTemplates(template, xy[span], settings, row_step, None if template_shape is None else template_shape[span])
         return [patches.find(g, s[span], A[span]) for g, s, A in zip(searches, starts, shapes)]
 
     if len(spans) > 1:
@@ -144,13 +146,32 @@ def match_patches(
     return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
 
 
+def prepare_templates(image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int) -> "PatchTemplates":
+    """The template side of the patches about `xy` (N, 2), to be matched many times."""
+    spans = [slice(i, min(i + CHUNK, len(xy))) for i in range(0, max(1, len(xy)), CHUNK)]
+    return PatchTemplates.joined([PatchTemplates(image, xy[span], settings, row_step, None) for span in spans])
+
+
+def match_prepared(templates: "PatchTemplates", rows: np.ndarray, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
+    """Find the prepared templates `rows` (N,) in an image, from positions `start` (N, 2) and shapes (N, 2, 2)."""
+    spans = [slice(i, min(i + CHUNK, len(rows))) for i in range(0, max(1, len(rows)), CHUNK)]
+
+    def work(span: slice) -> Matches:
+        return templates.select(rows[span]).find(image, start[span], shape[span])
+
+    if len(spans) == 1:
+        return work(spans[0])
+    with ThreadPoolExecutor(THREADS) as pool:
+        return join_matches(list(pool.map(work, spans)))
+
+
 def join_matches(parts: Sequence[Matches]) -> Matches:
     """One after the other, rows kept in order."""
     names = Matches.__dataclass_fields__
     return Matches(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
-class _Templates:
+class PatchTemplates:
     """The template side of a chunk: patches, gradients, and the inverse of the reduced normal matrix."""
 
     def __init__(self, image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int, shape: np.ndarray | None) -> None:
@@ -172,6 +193,21 @@ class _Templates:
         self.inverse = invert_spd(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
         self.offset, self.spread = self._centre_of_gravity()
         self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
+
+    def select(self, rows: np.ndarray) -> "PatchTemplates":
+        """Only these rows (a mask or indices)."""
+        chosen = copy(self)
+        for name in PER_PATCH:
+            setattr(chosen, name, getattr(self, name)[rows])
+        return chosen
+
+    @staticmethod
+    def joined(parts: "Sequence[PatchTemplates]") -> "PatchTemplates":
+        """One after the other; all of one size of patch."""
+        whole = copy(parts[0])
+        for name in PER_PATCH:
+            setattr(whole, name, np.concatenate([getattr(part, name) for part in parts]))
+        return whole
 
     def _sample(self, image: SplineImage, xy: np.ndarray, shape: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Patch and its gradients by fourth-order central differences, all in one look-up with a border of two."""

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.small_matrices import invert_spd
 from ..images.sampling import SplineImage
-from ..matching.least_squares import Matches, MatchingSettings, match_patches
-from .templates import Atlas
+from ..matching.least_squares import Matches
+from .templates import Templates
 
 SIGMAS, JUMP_PX = 5.0, 1.0  # a key template's match further off than both is another place
 
@@ -26,23 +27,21 @@ def hold(
     good: np.ndarray,
     key_shape: np.ndarray,
     drift: np.ndarray,
-    tiles: Atlas,
-    tile_rows: np.ndarray,
+    templates: Templates,
+    identity: np.ndarray,
     image: SplineImage,
-    settings: MatchingSettings,
     min_correlation: float,
-    row_step: int,
 ) -> Held:
     """Match the key templates of the `good` points about their temporal results, and adjust."""
     grown = np.where(good[:, None, None], drift + temporal.covariance, drift)
     shape = np.where(good[:, None, None], temporal.shape @ key_shape, key_shape)
     start = np.where(good[:, None], temporal.xy, np.nan)
-    key = match_patches(tiles.spline, tiles.xy[tile_rows], [image], [start], [shape], settings, row_step=row_step)[0]
+    key = templates.match(identity, image, start, shape)
     away = np.linalg.norm(key.xy - temporal.xy, axis=1)
     sigma = np.sqrt(np.maximum(np.trace(grown + key.covariance, axis1=1, axis2=2), 0.0))
     held = good & key.ok & (key.correlation >= min_correlation) & (away <= np.maximum(JUMP_PX, SIGMAS * sigma))
     shift, left = np.zeros((len(good), 2)), grown.copy()
-    gain = grown[held] @ np.linalg.inv(grown[held] + key.covariance[held] + np.eye(2) * 1e-8)
+    gain = grown[held] @ invert_spd(grown[held] + key.covariance[held] + np.eye(2) * 1e-8)
     shift[held] = np.einsum("nij,nj->ni", gain, key.xy[held] - temporal.xy[held])
     left[held] = (np.eye(2) - gain) @ grown[held]
     shape[held] = key.shape[held]

@@ -16,7 +16,7 @@ from ..progress import Monitor
 from .search import search_box
 from .settings import TrackStatus
 from .step import FramePair, TrackingView, intersect, match_spatially, track_step
-from .templates import cut_templates, no_templates
+from .templates import cut_tiles, no_templates
 from .tracked import TrackedFrame, born
 
 CLICK_SIGMA_PX, CLICK_REACH_PX = 2.0, 6.0
@@ -77,7 +77,8 @@ def _follow(
     spline = [SplineImage(g) for g in grey]
     current, before = _first(grey, spline, clicks, frames[0], view), None
     ref = view.reference
-    templates = no_templates(view.half_patch).with_tiles(cut_templates(spline[ref], current.identity, current.xy[:, ref], view.half_patch))
+    how = view.matching, view.rows.step
+    templates = no_templates(*how).with_tiles(cut_tiles(spline[ref], current.identity, current.xy[:, ref], *how), *how)
     yield current
     for i, frame in enumerate(frames[1:]):
         monitor.step("tracks", i, len(frames) - 1)
@@ -86,8 +87,8 @@ def _follow(
         pair = FramePair(grey=grey, spline=spline, next_grey=next_grey, next_spline=next_spline)
         tracked = track_step(view, before, current, templates, pair, frame, monitor)
         fresh = (tracked.key_shape == np.eye(2)).all(axis=(1, 2))
-        new = cut_templates(next_spline[ref], tracked.identity[fresh], tracked.xy[fresh, ref], view.half_patch)
-        templates, before, current = templates.only(tracked.identity).with_tiles(new), current, tracked
+        new = cut_tiles(next_spline[ref], tracked.identity[fresh], tracked.xy[fresh, ref], *how)
+        templates, before, current = templates.only(tracked.identity).with_tiles(new, *how), current, tracked
         grey, spline = next_grey, next_spline
         yield tracked
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..images.sampling import SplineImage
-from ..matching.least_squares import MatchingSettings, match_patches, patch_offsets
+from ..matching.least_squares import MatchingSettings, match_patches
 from ..progress import Monitor
 from .control import hold
 from .search import search_box
 from .settings import TrackingSettings, TrackStatus
-from .templates import Templates, atlas, cut_templates, no_templates
+from .templates import Templates, atlas, cut_tiles, no_templates
 
 RETURN_PX, RETURN_SIGMAS = 0.5, 3.0
 KNOWN_BOX, UNKNOWN_BOX = (0.0, 0.4, 2.0), (0.0, 1.0, 2.0)  # of the box in each attempt, for points whose motion is known or not
@@ -83,10 +83,9 @@ def _follow(
     tracking: TrackingSettings,
     monitor: Monitor,
 ) -> Iterator[_Points]:
-    half = patch_offsets(matching.patch_px, 1)[2]
     grey = read(frames[0])
     image, n = SplineImage(grey), len(xy)
-    templates = no_templates(half).with_tiles(cut_templates(image, np.arange(n), xy, half))
+    templates = no_templates(matching, 1).with_tiles(cut_tiles(image, np.arange(n), xy, matching, 1), matching, 1)
     none = np.zeros((n, 2, 2))
     points = _Points(
         xy=xy,
@@ -104,7 +103,7 @@ def _follow(
         next_grey = read(frame)
         following = SplineImage(next_grey)
         points, fresh = _step(points, templates, (grey, image), (next_grey, following), matching, tracking)
-        templates = templates.with_tiles(cut_templates(following, fresh, points.xy[fresh], half))
+        templates = templates.with_tiles(cut_tiles(following, fresh, points.xy[fresh], matching, 1), matching, 1)
         grey, image = next_grey, following
         yield points
 
@@ -119,7 +118,6 @@ def _step(
 ) -> tuple[_Points, np.ndarray]:
     """One frame on; and which points need their present patch as a new template."""
     rows = np.arange(len(points.xy))
-    tiles = atlas(templates, rows)
     known = np.isfinite(points.speed).all(axis=1)
     result, fresh = replace(points, seen=np.zeros(len(rows), dtype=bool), speed=np.full((len(rows), 2), np.nan)), []
     centre = np.where(known[:, None], points.xy + np.nan_to_num(points.speed), points.xy)
@@ -132,8 +130,8 @@ def _step(
             start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)
             there = match_patches(now[1], points.xy[rest], [after[1]], [start], [eye], matching)[0]
             good = there.ok & _returns(now[1], after[1], points.xy[rest], there.xy, there.shape, there.covariance, matching)
-            held = hold(there, good, points.key_shape[rest], points.drift[rest], tiles, rest, after[1], matching,
-                        tracking.drift_correlation, 1)  # fmt: skip
+            held = hold(there, good, points.key_shape[rest], points.drift[rest], templates, rest, after[1],
+                        tracking.drift_correlation)  # fmt: skip
             if attempt == 2:  # far from where it was expected: the template must agree
                 good &= ~held.renewed | (there.correlation >= RETAKEN_CORRELATION)
             why = np.where(best < tracking.min_correlation, TrackStatus.NOT_FOUND, TrackStatus.NOT_MATCHED)
@@ -146,9 +144,10 @@ def _step(
     waiting = np.flatnonzero(~points.seen & (points.reason != TrackStatus.LEFT_IMAGE))
     if len(waiting):
         box = np.full(len(waiting), float(tracking.box_px))
-        start, best = search_box(tiles.grey, after[0], tiles.xy[waiting], points.xy[waiting], box, matching.patch_px, 1)
+        grey, tiles = atlas(templates.tiles.select(waiting))
+        start, best = search_box(grey, after[0], tiles, points.xy[waiting], box, matching.patch_px, 1)
         start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)
-        key = match_patches(tiles.spline, tiles.xy[waiting], [after[1]], [start], [points.key_shape[waiting]], matching)[0]
+        key = templates.match(waiting, after[1], start, points.key_shape[waiting])
         good = key.ok & (key.correlation >= max(RETAKEN_CORRELATION, tracking.drift_correlation))
         result = _with(result, waiting, good, points, key.xy, key.shape, key.covariance, points.key_drift[waiting], key.correlation,
                        points.reason[waiting])  # fmt: skip

@@ -23,6 +23,7 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
+from ..geometry.small_matrices import invert_spd
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches, patch_offsets
@@ -31,7 +32,7 @@ from .control import hold
 from .neighbours import common_motion, nearest_neighbours
 from .search import search_box
 from .settings import TrackingSettings, TrackStatus
-from .templates import Atlas, Templates, atlas
+from .templates import Templates
 from .tracked import TrackedFrame, rows_of
 
 CHI2, CHI2_90 = 13.82, 4.605  # two degrees of freedom: 0.999 and 0.9
@@ -86,7 +87,6 @@ def track_step(
     """Follow all points of `current` to `frame`, the second of the two frames of `images`; frames between may be missing."""
     n = len(current.identity)
     predicted, known = predict(current, before, frame, view.tracking.neighbourhood_m)
-    tiles = atlas(templates, current.identity)
     reason = np.full(n, TrackStatus.NOT_FOUND, dtype=np.int8)
     result, scale = current, None
     rest = np.flatnonzero(known)
@@ -95,7 +95,7 @@ def track_step(
             if monitor.cancelled:
                 monitor.step("tracks", attempt, 3)
             box = view.tracking.box_px * np.where(known[rest], KNOWN_BOX[attempt], UNKNOWN_BOX[attempt])
-            found, status, scale = _attempt(view, current.select(rest), predicted[rest], box, tiles, rest, images, scale)
+            found, status, scale = _attempt(view, current.select(rest), predicted[rest], box, templates, images, scale)
             reason[rest] = status
             good = status == TrackStatus.MEASURED
             result = result.changed(rest[good], found.select(good))
@@ -144,8 +144,7 @@ def _attempt(
     points: TrackedFrame,
     predicted: np.ndarray,
     box: np.ndarray,
-    tiles: Atlas,
-    tile_rows: np.ndarray,
+    templates: Templates,
     images: FramePair,
     scale: float | None,
 ) -> tuple[TrackedFrame, np.ndarray, float]:
@@ -161,7 +160,7 @@ def _attempt(
         mark(status[:, k], ~images.next_spline[k].inside(centre, 1.0), TrackStatus.LEFT_IMAGE)
         mark(status[:, k], correlation < view.tracking.min_correlation, TrackStatus.NOT_FOUND)
     temporal = _temporal(view, points, start, images, status)
-    points, temporal = control(view, points, temporal, tiles, tile_rows, images.next_spline[view.reference], status[:, view.reference])
+    points, temporal = control(view, points, temporal, templates, images.next_spline[view.reference], status[:, view.reference])
     spatial = match_spatially(view, points, [m.xy for m in temporal], images.next_spline, status)
     scale = scale or disagreement(view, temporal, spatial, status)
     xy, K_xy, shape = _verify(view, points, temporal, spatial, status, scale)
@@ -191,8 +190,7 @@ def control(
     view: TrackingView,
     points: TrackedFrame,
     temporal: list[Matches],
-    tiles: Atlas,
-    tile_rows: np.ndarray,
+    templates: Templates,
     image: SplineImage,
     status: np.ndarray,
 ) -> tuple[TrackedFrame, list[Matches]]:
@@ -202,12 +200,10 @@ def control(
         status == TrackStatus.MEASURED,
         points.key_shape,
         points.drift,
-        tiles,
-        tile_rows,
+        templates,
+        points.identity,
         image,
-        view.matching,
         view.tracking.drift_correlation,
-        view.rows.step,
     )
     moved = [
         replace(m, xy=m.xy + (held.shift if k == view.reference else np.einsum("nij,nj->ni", points.shape[:, k], held.shift)))
@@ -254,7 +250,7 @@ def _distance2(t: Matches, s: Matches) -> np.ndarray:
     K = s.covariance + t.covariance + np.eye(2) * MODEL_SIGMA_PX**2
     K = np.where(np.isfinite(K), K, np.eye(2))
     step = s.xy - t.xy
-    return np.einsum("ni,nij,nj->n", step, np.linalg.inv(K), step)
+    return np.einsum("ni,nij,nj->n", step, invert_spd(K), step)
 
 
 def _verify(
@@ -274,10 +270,9 @@ def _verify(
 
 def _weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     xy, K = a.xy.copy(), a.covariance.copy()
-    small = np.eye(2) * 1e-8
-    P, Q = np.linalg.inv(a.covariance[rows] + small), np.linalg.inv(b.covariance[rows] + small)
-    K[rows] = np.linalg.inv(P + Q)
-    xy[rows] = np.einsum("nij,nj->ni", K[rows], np.einsum("nij,nj->ni", P, a.xy[rows]) + np.einsum("nij,nj->ni", Q, b.xy[rows]))
+    gain = K[rows] @ invert_spd(K[rows] + b.covariance[rows] + np.eye(2) * 1e-8)
+    xy[rows] += np.einsum("nij,nj->ni", gain, (b.xy - a.xy)[rows])
+    K[rows] -= gain @ K[rows]
     return xy, K
 
 
