@@ -78,16 +78,16 @@ def headline(session: ClickSession, view: str) -> str:
     """What to do now in a view, in words."""
     if not session.name:
         return "All clicked"
-    what = f"{session.turn + 1} of {len(session.names)}: {session.name}"
+    what = f"{session.name} ({session.turn + 1}/{len(session.names)})"
     if view in session.clicks():
-        return f"{what}, clicked here"
+        return f"{what}: clicked here"
     if view in session.proposals:
-        return f"{what}: Return takes the green ring, or click elsewhere"
+        return f"{what}: Return takes the ring"
     if session.asking:
         return f"{what}: looking for it…"
     if session.clicks():
-        return f"{what}: click it on the line" if session.curves(view) else f"{what}: click it here too"
-    return f"{what}: click it"
+        return f"{what}: click on the line" if session.curves(view) else f"{what}: click here too"
+    return f"{what}: click"
 
 
 def _draw_headline(session: ClickSession, view: str, sheet: Canvas) -> None:

@@ -104,6 +104,7 @@ def _show(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
     space = area.spaces.active
     space.mode, space.view = "TRACKING", "CLIP"
     space.clip = clip
+    space.show_disabled = False  # clicks that were taken back
     space.show_region_toolbar = False
     space.show_region_ui = False
     space.clip_user.use_render_undistorted = False

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ...core import pipeline
-from ...core.body.model_file import read_model
+from ...core.body.model_file import joint_depths_m, read_model
 from ...core.errors import InputError
 from ...core.take import JOINTS, Seeds, open_take
 from .. import project, properties, seeds
@@ -260,7 +260,7 @@ def begin_session(scene: bpy.types.Scene, names: Any) -> tuple[ClickSession, str
     wanted = names(bpy.context, clips)
     finder, said = make_finder(scene)
     note_first_frame(scene, clips, scene.frame_current)
-    session = ClickSession(clips, wanted, scene.frame_current, finder)
+    session = ClickSession(clips, wanted, scene.frame_current, finder, _depths(scene))
     if not session.name:  # all clicked already: begin again at the first, to look at them or to mend them
         session.go_to(session.names[0])
     if finder is not None:
@@ -289,6 +289,11 @@ def model_joints(scene: bpy.types.Scene) -> tuple[str, ...]:
     if name is None:
         raise InputError("Choose a body model first: it tells which joints to click.")
     return read_model(name).skeleton.joint_names
+
+
+def _depths(scene: bpy.types.Scene) -> dict[str, float]:
+    name = project.take(scene).body_model
+    return joint_depths_m(read_model(name)) if name is not None else {}
 
 
 def note_first_frame(scene: bpy.types.Scene, clips: dict[str, bpy.types.MovieClip], frame: int) -> None:

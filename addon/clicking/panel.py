@@ -35,7 +35,7 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         row = layout.row()
         row.scale_y = 1.4
         row.operator("tricap.click_joints", icon="RESTRICT_SELECT_OFF")
-        layout.operator("tricap.click_seeds", icon="STICKY_UVS_DISABLE", text="Click Surface Seeds (optional)")
+        layout.operator("tricap.click_seeds", icon="STICKY_UVS_DISABLE", text="Click Seeds (optional)")
         self._draw_frame(layout, scene)
         self._draw_joints(layout, scene)
 
@@ -58,8 +58,7 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         for name in names:
             at = [view for view, clip in clips.items() if seeds.click(clip, name, scene.frame_current) is not None]
             row = grid.row(align=True)
-            row.label(text=name, icon="CHECKMARK" if len(at) > 1 else "LAYER_USED" if at else "BLANK1")
-            row.label(text=" ".join(at))
+            row.label(text=f"{name}   {' '.join(at)}", icon="CHECKMARK" if len(at) > 1 else "LAYER_USED" if at else "BLANK1")
             row.operator("tricap.click_joints", text="", icon="EYEDROPPER").only = name
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.fitting.clicks import intersection
 from ...core.matching.foreground import around_clicks
-from ...core.matching.proposals import Proposal, epipolar_curve, where_rays_meet
+from ...core.matching.proposals import Proposal, below_surface, epipolar_curve, where_rays_meet
 from .. import seeds
 from .finder import Answer, Finder, Question
 
@@ -33,13 +33,17 @@ class _Step:
 
 
 class ClickSession:
-    """Clicks of `names`, one after the other, in the clips of all views (in the order of the cameras)."""
+    """Clicks of `names`, one after the other, in the clips of all views (in the order of the cameras).
 
-    def __init__(self, clips: Mapping[str, bpy.types.MovieClip], names: Sequence[str], frame: int, finder: Finder | None) -> None:
+    `depths_m` says how deep a joint lies below the skin; what is not in it lies on the surface.
+    """
+
+    def __init__(self, clips: Mapping[str, bpy.types.MovieClip], names: Sequence[str], frame: int, finder: Finder | None,
+                 depths_m: Mapping[str, float] | None = None) -> None:
         if not names:
             raise InputError("There is nothing to click: choose a body model first.")
         self._clip_names = {view: clip.name for view, clip in clips.items()}  # undo makes other objects of them
-        self.names, self.frame, self.finder = list(names), frame, finder
+        self.names, self.frame, self.finder, self.depths_m = list(names), frame, finder, dict(depths_m or {})
         self.views = list(clips)
         self.turn = 0
         self.proposals: dict[str, Proposal] = {}
@@ -160,7 +164,10 @@ class ClickSession:
         if (asked.name, asked.frame, len(clicked)) != (self.name, self.frame, 1) or here is None or not np.array_equal(here, asked.xy_px):
             return False
         self.asking, self.problem = False, answer.problem
-        self._offer(answer.proposals)
+        found = answer.proposals
+        if self.finder is not None and self.name in self.depths_m:
+            found = below_surface(self.finder.cameras, asked.view, asked.xy_px, found, self.depths_m[self.name])
+        self._offer(found)
         return True
 
     def curves(self, view: str) -> dict[str, np.ndarray]:

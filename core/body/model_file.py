@@ -63,6 +63,15 @@ def read_model(name: str | Path) -> BodyModel:
     return _model(table, path)
 
 
+def joint_depths_m(model: BodyModel) -> dict[str, float]:
+    """How deep [m] each joint lies below the skin, seen from the front: the mean radius of the bones that meet there."""
+    found: dict[str, list[float]] = {}
+    for bone, radii in zip(model.skeleton.bones, model.visible_radii_m):
+        for joint, radius in ((bone.head_joint, radii[0, 1]), (bone.tail_joint, radii[2, 1])):
+            found.setdefault(joint, []).extend([float(radius)] if np.isfinite(radius) else [])
+    return {joint: float(np.mean(radii)) for joint, radii in found.items() if radii}
+
+
 def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
     """A model without some bones and all that hangs on them.
 

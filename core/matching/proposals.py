@@ -24,6 +24,7 @@ CURVE_STEP_PX = 6.0
 NEAREST_M = 0.05  # of the ray, when nothing is known
 FIELD_MARGIN = 1.05  # of the frame corner's radius: the lens is not calibrated further out
 LARGER_PX = (0, 8, 16)  # patches tried one after the other
+DEPTH_SHARE = 0.4  # of a joint's depth below the skin is unknown: bodies differ
 MAX_MISS_PX = 2.5  # distance of a match from its epipolar curve
 
 
@@ -126,6 +127,32 @@ def where_rays_meet(cameras: Sequence[Camera], clicks: Mapping[int, np.ndarray],
     known = {k: Proposal(xy_px=np.asarray(xy, dtype=np.float64), sigma_px=sigma_px, correlation=1.0) for k, xy in clicks.items()}
     found = _where_rays_meet(cameras, known) if len(known) > 1 else known
     return tuple(found.get(k) if k not in clicks else None for k in range(len(cameras)))
+
+
+def below_surface(
+    cameras: Sequence[Camera], view: int, xy_px: np.ndarray, surface: Sequence[Proposal | None], depth_m: float
+) -> tuple[Proposal | None, ...]:
+    """Where a point lies that was clicked at `xy_px` (2,) in view number `view`, `depth_m` behind the surface that was found there.
+
+    A joint is clicked on what is seen, but lies inside the limb: seen from aside, not where the surface's texture is. The proposals' sigmas
+    hold DEPTH_SHARE of that depth, for nobody knows it better.
+    """
+    known = {k: place for k, place in enumerate(surface) if place is not None}
+    if not known:
+        return tuple(surface)
+    xy, K = np.full((1, len(cameras), 2), np.nan), np.tile(np.eye(2), (1, len(cameras), 1, 1))
+    for k, place in {view: Proposal(xy_px=xy_px, sigma_px=0.1, correlation=1.0), **known}.items():
+        xy[0, k], K[0, k] = place.xy_px, np.eye(2) * place.sigma_px**2
+    depth = float(cameras[view].to_camera(forward_intersection(cameras, xy, K).xyz_m)[0, 2])
+    ray = cameras[view].rays(np.asarray(xy_px, dtype=np.float64))
+    point = cameras[view].centre_m + ray * (depth + depth_m)
+    sure, found = min(p.correlation for p in known.values()), []
+    for k, camera in enumerate(cameras):
+        at, J = camera.project_with_jacobian(point)
+        sigma = np.hypot(np.linalg.norm(J @ ray) * DEPTH_SHARE * depth_m, known[k].sigma_px if k in known else 0.5)
+        seen = k != view and bool(camera.sees(at))
+        found.append(Proposal(xy_px=at, sigma_px=float(sigma), correlation=sure) if seen else None)
+    return tuple(found)
 
 
 def _where_rays_meet(cameras: Sequence[Camera], known: Mapping[int, Proposal]) -> dict[int, Proposal]:

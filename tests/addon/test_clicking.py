@@ -60,6 +60,7 @@ def sleeve_point(session: Any, truth: Truth, which: int) -> np.ndarray:
 
 
 def test_a_click_gives_lines_and_a_proposal_that_is_right(session: Any, truth: Truth) -> None:
+    session.depths_m.clear()  # as of points on the surface
     assert session.names == ["shoulder.R", "elbow.R", "wrist.R"] and session.name == "shoulder.R"
     camera = dict(zip(session.views, session.finder.cameras))
     errors = []
@@ -72,6 +73,16 @@ def test_a_click_gives_lines_and_a_proposal_that_is_right(session: Any, truth: T
         errors += [np.linalg.norm(offer.xy_px - camera[view].project(X)) for view, offer in session.proposals.items()]
         assert session.back()
     assert len(errors) >= 12 and np.median(errors) < 0.5 and np.mean(np.array(errors) < 1.0) >= 0.75
+
+
+def test_a_joint_is_proposed_where_it_is_inside_the_limb(session: Any, truth: Truth) -> None:
+    camera = dict(zip(session.views, session.finder.cameras))
+    for name, joint in (("shoulder.R", "RightArm"), ("elbow.R", "RightForeArm")):
+        session.click("C", camera["C"].project(truth.joints_m[joint][0]))
+        assert session.name == name and session.take_answer(session.finder.wait())
+        for view in "LR":
+            assert np.linalg.norm(session.proposals[view].xy_px - camera[view].project(truth.joints_m[joint][0])) < 2.5
+        session.accept()
 
 
 def test_return_takes_the_proposals_and_goes_on(session: Any, truth: Truth, scene: Any) -> None:

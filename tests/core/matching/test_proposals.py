@@ -8,7 +8,7 @@ from tricap.core.geometry.camera import Camera
 from tricap.core.images.fields import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import MatchingSettings
-from tricap.core.matching.proposals import epipolar_curve, propose, where_rays_meet
+from tricap.core.matching.proposals import below_surface, epipolar_curve, propose, where_rays_meet
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.truth import Truth, read_truth
 from tricap.core.take import Footage, open_take, read_take
@@ -107,6 +107,20 @@ def test_where_the_rays_of_two_clicks_meet(arm: tuple[Footage, Truth, list[Splin
     assert where_rays_meet(cameras, {0: clicks[0]}, 2.0) == (None, None, None)
     clicks[1] = clicks[1] + [0.0, 60.0]  # not the same point: nothing can be said
     assert where_rays_meet(cameras, clicks, 2.0) == (None, None, None)
+
+
+def test_a_joint_is_proposed_below_the_surface_that_is_seen(arm: tuple[Footage, Truth, list[SplineImage]]) -> None:
+    footage, truth, images = arm
+    cameras = footage.rig.cameras
+    for name, depth in (("RightArm", 0.05), ("RightForeArm", 0.042)):
+        joint = truth.joints_m[name][0]
+        xy = cameras[1].project(joint)
+        surface = propose(images, cameras, footage.take.rows, 1, xy, MatchingSettings())
+        inside = below_surface(cameras, 1, xy, surface, depth)
+        for k in (0, 2):
+            before, after = (np.linalg.norm(p[k].xy_px - cameras[k].project(joint)) for p in (surface, inside))  # type: ignore[union-attr]
+            assert after < 3.0 < before and after < 1.5 * inside[k].sigma_px  # type: ignore[union-attr]
+        assert inside[1] is None and below_surface(cameras, 1, xy, (None, None, None), depth) == (None, None, None)
 
 
 def test_nothing_is_proposed_without_texture(arm: tuple[Footage, Truth, list[SplineImage]]) -> None:
