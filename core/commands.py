@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from . import calibrate_command, contour_command, pipeline, track2d_command
+from . import calibrate_command, contour_command, pipeline, points_command, track2d_command
 from .arguments import frame_range, overrides
 from .errors import InputError
 from .geometry.rig import read_rig
@@ -55,7 +55,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     _new_command(commands)
     _stage_command(commands, "seeds", "show the depth and number of the surface seeds that are found", _seeds, out=False)
     _stage_command(commands, "measure", "the surface of each frame", _stages("measure"))
-    _stage_command(commands, "track", "trajectories of the surface's points", _stages("measure", "track"))
+    points_command.add_arguments(_stage_command(commands, "track", "trajectories of the surface's points, or of chosen ones", _track))
     _stage_command(commands, "fit", "the body's shape and motion", _stages("measure", "track", "fit"))
     everything = _stage_command(commands, "run", "all of it, from the images to the Blender file; a stopped run goes on", _run)
     everything.add_argument("--restart", action="store_true", help="begin anew instead of going on")
@@ -100,6 +100,10 @@ def _stages(*names: str) -> Callable[[argparse.Namespace, Monitor], list[str]]:
             return _summary(job, args.json)
 
     return action
+
+
+def _track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    return points_command.run(args, monitor) if args.points else _stages("measure", "track")(args, monitor)
 
 
 def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:

@@ -129,7 +129,7 @@ def open_run(
     settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
     footage = open_take(take)
     if frames is not None:
-        footage = _only(footage, frames)
+        footage = only_frames(footage, frames)
     for name, at in take.seeds.joints.items():
         clicked_depth(footage, name, at)
     if take.body_model is not None:
@@ -146,7 +146,12 @@ def open_run(
         yield Run(footage=footage, settings=settings, results=results, keys=keys, account=account)
 
 
-def _only(footage: Footage, frames: tuple[int, int]) -> Footage:
+def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:
+    """The footage with only these frames, half-open.
+
+    Raises:
+        InputError: the take has not all of them.
+    """
     if frames[0] not in footage.frames or frames[1] - 1 not in footage.frames or frames[0] >= frames[1]:
         raise InputError(
             f"Frames {frames[0]}:{frames[1]} are not among the take's frames {footage.frames.start}:{footage.frames.stop}; choose others."

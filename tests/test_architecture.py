@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS = (
     "errors progress settings values store lock geometry images matching calibration surface tracking "
     "body fitting motion take take_file results measuring following correcting calibrating report stages pipeline "
-    "arguments calibrate_command track2d_command contour_command commands"
+    "arguments calibrate_command track2d_command contour_command points_command commands"
 ).split()
 SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}
 THIRD_PARTY = {"numpy", "scipy", "cv2"}

@@ -5,7 +5,7 @@ counts, temporal against spatial matching and the rays' residuals (step.py). A p
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from .templates import cut_tiles, no_templates
 from .tracked import TrackedFrame, born
 
 CLICK_SIGMA_PX, CLICK_REACH_PX = 2.0, 6.0
+LARGEST_MISFIT_PX, MISFITS = 4.0, 2.5  # rays of the first frame may miss by so much; later by so many of its medians
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -75,7 +76,10 @@ def _follow(
 ) -> Iterator[TrackedFrame]:
     grey = list(read(frames[0]))
     spline = [SplineImage(g) for g in grey]
-    current, before = _first(grey, spline, clicks, frames[0], view), None
+    current, before = _first(grey, spline, clicks, frames[0], replace(view, limit_px=max(view.limit_px, LARGEST_MISFIT_PX))), None
+    miss = _misfit_px(current, view)
+    view = replace(view, limit_px=max(view.limit_px, MISFITS * float(np.median(miss)) if len(miss) else 0.0))
+    current = current.without(miss > view.limit_px, TrackStatus.RAYS_MISS)
     ref = view.reference
     how = view.matching, view.rows.step
     templates = no_templates(*how).with_tiles(cut_tiles(spline[ref], current.identity, current.xy[:, ref], *how), *how)
@@ -91,6 +95,12 @@ def _follow(
         templates, before, current = templates.only(tracked.identity).with_tiles(new, *how), current, tracked
         grey, spline = next_grey, next_spline
         yield tracked
+
+
+def _misfit_px(points: TrackedFrame, view: TrackingView) -> np.ndarray:
+    """(N,) by how much the rays miss: what the rig and the synchronization are worth, too."""
+    away = [view.rows.to_frame(points.xy[:, k]) - camera.project(points.xyz_m) for k, camera in enumerate(view.cameras)]
+    return np.sqrt(np.nanmean(np.sum(np.square(away), axis=2), axis=0))
 
 
 def _first(

@@ -11,6 +11,7 @@ import numpy as np
 from .. import store
 from ..errors import InputError
 from ..settings import nearest_name
+from .key_points import KeyPoints
 from .planar import PlanarTracks
 from .settings import TrackStatus
 
@@ -78,6 +79,28 @@ def write_planar(path: Path, names: tuple[str, ...], tracks: PlanarTracks) -> No
             cells = [f"{v:.4f}" if np.isfinite(v) else "" for v in numbers]
             lines.append(",".join([str(frame), _quoted(name), *cells, TrackStatus(int(tracks.status[t, n])).name.lower()]))
     store.write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def write_key_points(
+    space: Path, images: Path, names: tuple[str, ...], views: tuple[str, ...], fps: float, points: KeyPoints
+) -> None:
+    """Two CSVs: frame, time_s, point, x, y, z, sigma, status (metres, world); and frame, view, point, x, y (full-frame pixels).
+
+    A point that is not seen has empty cells and says why. In a view that does not show it, it has no row.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    lines, pixels = ["frame,time_s,point,x,y,z,sigma,status"], ["frame,view,point,x,y"]
+    for t, frame in enumerate(points.frames):
+        for n, name in enumerate(map(_quoted, names)):
+            cells = [f"{v:.6f}" if np.isfinite(v) else "" for v in (*points.xyz_m[t, n], points.sigma_m[t, n])]
+            status = TrackStatus(int(points.status[t, n])).name.lower()
+            lines.append(",".join([str(frame), f"{frame / fps:.6f}", name, *cells, status]))
+            seen = [(view, *xy) for view, xy in zip(views, points.xy_px[t, n]) if np.isfinite(xy).all()]
+            pixels.extend(f"{frame},{_quoted(view)},{name},{x:.4f},{y:.4f}" for view, x, y in seen)
+    for path, text in ((space, lines), (images, pixels)):
+        store.write_text(path, "\n".join(text) + "\n")
 
 
 def _quoted(name: str) -> str:

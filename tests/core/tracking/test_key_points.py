@@ -1,10 +1,13 @@
 """Key points on a turning plane: places, distances and sigmas against the truth; clicks that are wrong or too few."""
 
+import csv
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tricap.core.commands import main
 from tricap.core.errors import InputError
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.images.fields import RowGrid
@@ -51,3 +54,24 @@ def test_key_points(scenes: Any, off_px: float, views: tuple[str, ...]) -> None:
 def test_one_click_is_not_enough(scenes: Any) -> None:
     with pytest.raises(InputError, match="two views"):
         follow(scenes, 0.0, ("C",))
+
+
+def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """`tricap track --points` from a frame in the middle: both ways, in space within 1 mm across the line of sight."""
+    bodies = [scenes.Body().moved(np.eye(3), [0.01 * i, 0.0, 0.0]) for i in range(4)]
+    rig = scenes.three_cameras()
+    take = scenes.write_take(tmp_path / "take", rig, [[b] for b in bodies], noise=1.0)
+    true = np.array([[0.03, 0.02, 0.0]]) @ bodies[2].R.T + bodies[2].t
+    lines = ["point,view,x,y", *(f"nose,{c.name},{c.project(true)[0][0]:.2f},{c.project(true)[0][1]:.2f}" for c in rig.cameras[:2])]
+    (tmp_path / "points.csv").write_text("\n".join(lines))
+    command = ["track", str(take), "--out", str(tmp_path / "out"), "--points", str(tmp_path / "points.csv"), "--quiet"]
+    assert main([*command, "--points-frame", "2"]) == 0
+    rows = list(csv.DictReader((tmp_path / "out" / "points3d.csv").open(encoding="utf-8")))
+    found = np.array([[float(r[a]) for a in "xyz"] for r in rows])
+    assert [r["frame"] for r in rows] == list("0123") and {r["status"] for r in rows} == {"measured"}
+    assert np.abs(found - true - [[0.01 * (i - 2), 0, 0] for i in range(4)])[:, :2].max() < 1e-3
+    pixels = list(csv.DictReader((tmp_path / "out" / "points2d.csv").open(encoding="utf-8")))
+    assert len(pixels) == 12 and {p["view"] for p in pixels} == {"L", "C", "R"}
+    assert main([*command, "--points-frame", "9"]) == 2 and "--points-frame 9" in capsys.readouterr().err
+    (tmp_path / "points.csv").write_text("point,view,x,y\nnose,L,20,2000\n")
+    assert main(command) == 2 and "outside the image" in capsys.readouterr().err
