@@ -23,6 +23,7 @@ from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
 from .fitting.settings import FitSettings
 from .following import track_frames
+from .frame_table import frame_table, write_frame_table
 from .images.enhance import EnhanceSettings
 from .matching.growing import GrowingSettings
 from .matching.least_squares import MatchingSettings
@@ -84,6 +85,7 @@ class Run:
         """Note what a stage took and found, and write run.json."""
         key = self.keys.get(stage, self.keys.get("fit", ""))
         self.account["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
+        write_frame_table(self.results.path("frames.csv"), frame_table(self.clouds, self.trajectories, self.body))
         self.results.write_run(self.account)
 
     def __str__(self) -> str:

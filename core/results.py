@@ -21,7 +21,8 @@ from .tracking.trajectories import Filtered
 
 FORMAT, VERSION = "tricap-run", 1
 OURS = (  # what a run replaces
-    "clouds", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"
+    "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report",
+    "body.blend",
 )  # fmt: skip
 
 

@@ -52,7 +52,7 @@ CONCERNS: dict[str, Concern] = {
     "fit": Concern(
         settings=("fitting", "skin"),
         take=_fitted,
-        files=("joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
+        files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
     ),
 }
 DERIVED = tuple(name for concern in CONCERNS.values() for name in concern.files)

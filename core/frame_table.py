@@ -1,0 +1,109 @@
+"""frames.csv: how good every frame is, in one row, for the panel's graph and for whoever looks for the bad ones."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from . import store
+from .errors import InputError
+from .fitting.body_motion import FITTED, BodyFit
+from .surface.cloud import PointCloud
+from .tracking.trajectories import Trajectories
+
+COLUMNS = ("points", "sigma_mm", "residual_px", "tracks", "track_sigma_mm", "fit_sigma0", "joint_sigma_mm")
+FEWER_IS_WORSE = ("points", "tracks")
+WORDS = {
+    "points": "few points",
+    "sigma_mm": "points uncertain",
+    "residual_px": "rays miss",
+    "tracks": "few tracks",
+    "track_sigma_mm": "tracks uncertain",
+    "fit_sigma0": "body beside the points",
+    "joint_sigma_mm": "joints uncertain",
+}
+BAD = 1.5  # times worse than in half of the frames
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameTable:
+    """T frames. NaN where a stage did not run or had nothing in a frame; medians over the frame's points."""
+
+    frames: np.ndarray  # (T,)
+    values: dict[str, np.ndarray]  # (T,) by COLUMNS
+    fit: tuple[str, ...]  # (T,) "" where no body was fitted, else a status of the fit
+
+    def badness(self) -> tuple[np.ndarray, tuple[str, ...]]:
+        """How many times worse than in half of the frames each frame is (T,), in what is worst about it, and what that is in words."""
+        ratio = np.ones((len(COLUMNS), len(self.frames)))
+        for i, name in enumerate(COLUMNS):
+            value = self.values[name]
+            known = np.isfinite(value) & (value > 0)
+            if known.any():
+                middle = float(np.median(value[known]))
+                worse = middle / np.maximum(value, 0.01 * middle) if name in FEWER_IS_WORSE else value / middle
+                ratio[i] = np.where(np.isfinite(value), worse, 1.0)
+        worst = ratio.argmax(axis=0) if len(self.frames) else np.zeros(0, dtype=int)
+        much = ratio.max(axis=0)
+        words = [WORDS[COLUMNS[k]] if r >= BAD else "" for k, r in zip(worst, much)]
+        for t, state in enumerate(self.fit):
+            if state not in ("", FITTED):
+                much[t], words[t] = max(much[t], 2 * BAD), f"fit {state}"
+        return much, tuple(words)
+
+
+def frame_table(clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
+    """The table of a run, as far as it is."""
+    frames = np.array([c.frame for c in clouds], dtype=np.int64)
+    values = {name: np.full(len(frames), np.nan) for name in COLUMNS}
+    values["points"] = np.array([float(len(c.xyz_m)) for c in clouds])
+    values["sigma_mm"] = 1e3 * _medians([c.sigma_m for c in clouds])
+    values["residual_px"] = _medians([c.residual_px for c in clouds])
+    if trajectories is not None:
+        for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
+            at = np.searchsorted(frames, trajectories.frames[t])
+            values["tracks"][at] = trajectories.seen[t].sum()
+            values["track_sigma_mm"][at] = 1e3 * _medians([trajectories.sigma_m[t][trajectories.seen[t]]])[0]
+    fit = [""] * len(frames)
+    if body is not None:
+        motion = body.motion
+        for t in np.flatnonzero(np.isin(motion.frames, frames)):
+            at = int(np.searchsorted(frames, motion.frames[t]))
+            fit[at] = motion.status[t]
+            values["fit_sigma0"][at], values["joint_sigma_mm"][at] = motion.sigma0[t], 1e3 * _medians([motion.joint_sigma_m[t]])[0]
+    return FrameTable(frames=frames, values=values, fit=tuple(fit))
+
+
+def write_frame_table(path: Path, table: FrameTable) -> None:
+    """Write frames.csv; an empty cell is what is not known."""
+    lines = [",".join(("frame", *COLUMNS, "fit"))]
+    for t, frame in enumerate(table.frames):
+        cells = [f"{v:.4g}" if np.isfinite(v) else "" for v in (table.values[name][t] for name in COLUMNS)]
+        lines.append(",".join((str(int(frame)), *cells, table.fit[t])))
+    store.write_text(path, "\n".join(lines) + "\n")
+
+
+def read_frame_table(path: Path) -> FrameTable:
+    """Read frames.csv.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    try:
+        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8"))))
+        return FrameTable(
+            frames=np.array([int(r["frame"]) for r in rows], dtype=np.int64),
+            values={name: np.array([float(r[name]) if r[name] else np.nan for r in rows]) for name in COLUMNS},
+            fit=tuple(r["fit"] or "" for r in rows),
+        )
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}; run the take again.") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged; run the take again.") from error
+
+
+def _medians(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.array([float(np.median(p)) if len(p) else np.nan for p in parts])
