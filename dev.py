@@ -302,6 +302,24 @@ def blender_extension(command: str, *arguments: object) -> None:
         sys.exit(f"Blender's extension tool found a fault ({command}):\n{done.stdout}{done.stderr}")
 
 
+def gui_test(out: str, scripts: list[str]) -> int:
+    """Tricap in a true Blender window (tests/gui). Debian's Blender has Python 3.14 and a scipy of its own; OpenCV's wheel fits any."""
+    with tempfile.TemporaryDirectory() as folder:
+        package = build_for_window(Path(folder))
+        return run(venv_program("python"), ROOT / "tests" / "gui" / "run.py", "--package", package, "--out", Path(out).absolute(), *scripts)
+
+
+def build_for_window(out: Path) -> Path:
+    """The extension with only those wheels that serve every Python."""
+    import tomllib
+
+    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+    wheels = [name for name in manifest["wheels"] if "-abi3-" in name and wheel_platform(name) == "linux-x64"]
+    for wheel in wheels:
+        fetch_wheel(ROOT / wheel)
+    return build_one(manifest, "linux-x64", wheels, out)
+
+
 # ---- the command line ------------------------------------------------------------------------------------------------
 
 
@@ -321,6 +339,9 @@ def parser() -> argparse.ArgumentParser:
     part = commands.add_parser("bench", help="performance and accuracy, stage by stage")
     part.add_argument("stage", nargs="?", help="only this stage")
     part.add_argument("--json", metavar="FILE", help="write the results to FILE")
+    part = commands.add_parser("gui-test", help="the workflow in a true Blender window (set up in .gui; Linux, as root)")
+    part.add_argument("--out", default=str(ROOT / "out" / "gui"), help="folder of pictures and logs (default: out/gui)")
+    part.add_argument("script", nargs="*", help="only these scripts")
     commands.add_parser("lint", help="style and types")
     return top
 
@@ -340,6 +361,8 @@ def main() -> int:
         build(options.platform, options.out, not options.without_wheels)
     if options.command == "bench":
         return bench(options.stage, options.json)
+    if options.command == "gui-test":
+        return gui_test(options.out, options.script)
     return lint() if options.command == "lint" else 0
 
 

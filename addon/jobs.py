@@ -122,7 +122,7 @@ class JobOperator:
 
     job: Job
     timer: Any = None
-    last_words: ClassVar[str] = "Stopped. What was finished is kept."
+    last_words: ClassVar[str] = "What was finished is kept."
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
         """Main thread: read everything from Blender and return the computation."""
@@ -225,7 +225,9 @@ def _redraw(context: bpy.types.Context) -> None:
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
-                area.tag_redraw()
+                for region in area.regions:
+                    if region.type == "UI":  # not the view itself: a heavy scene would be drawn ten times a second
+                        region.tag_redraw()
 
 
 def register() -> None:

@@ -40,7 +40,8 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
             build.enabled = bool(props.take or props.out)
             build.operator("tricap.build_scene", icon="ARMATURE_DATA")
         if not props.take and not props.out:
-            layout.label(text="Choose the folder of a recording.", icon="INFO")
+            layout.label(text="Choose the folder of a recording, or see how it works:", icon="INFO")
+            layout.operator("tricap.load_sample", icon="PLAY")
         found = layout.column(align=True)
         for part in props.last.split(", ") if props.last else ():
             found.label(text=part)

@@ -9,6 +9,8 @@ import bpy
 from ...core.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
+from ..scene import armature
+from ..scene import build as scene_build
 from ..scene.build import SceneOptions, SceneReport, write_scene
 from ..scene.cloud import COLOURS
 from ..scene.contents import Contents, read_contents
@@ -54,6 +56,21 @@ class BuildScene(JobOperator, bpy.types.Operator):
         report = write_scene(result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         tell(self, report)
         return {"FINISHED"}
+
+
+def put_into_scene(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents) -> None:
+    """Build the scene and tell what it has; the first time, turn the 3-D views to the body."""
+    first = scene_build.COLLECTION not in bpy.data.collections
+    tell(operator, write_scene(contents))
+    body = bpy.data.objects.get(armature.NAME)
+    if first and body is not None and context.window is not None and not bpy.app.background:
+        for item in context.selected_objects:
+            item.select_set(False)
+        body.select_set(True)
+        for area in (a for a in context.window.screen.areas if a.type == "VIEW_3D"):
+            region = next(r for r in area.regions if r.type == "WINDOW")
+            with context.temp_override(area=area, region=region):
+                bpy.ops.view3d.view_selected()
 
 
 def tell(operator: bpy.types.Operator, report: SceneReport) -> None:

@@ -10,9 +10,8 @@ from ...core import pipeline
 from ...core.progress import Monitor
 from .. import folders, properties
 from ..jobs import JobOperator
-from ..scene.build import write_scene
 from ..scene.contents import Contents, read_contents
-from .build_scene import RELATIVE, tell
+from .build_scene import RELATIVE, put_into_scene
 
 
 class Run(JobOperator, bpy.types.Operator):
@@ -42,7 +41,7 @@ class Run(JobOperator, bpy.types.Operator):
         report, results = result
         context.scene.tricap.last = str(report)
         if results is not None:
-            tell(self, write_scene(results))
+            put_into_scene(self, context, results)
         self.report({"INFO"}, str(report))
         return {"FINISHED"}
 

@@ -93,11 +93,21 @@ def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor
     write_rig(folder / "rig.toml", studio.rig)
     visible = []
     for frame in range(settings.frames):
-        monitor.step(STAGE, frame, settings.frames)
-        visible.append(_film_frame(folder, studio, frame))
+        visible.append(_film_frame(folder, studio, frame, monitor))
     store.write_bytes(folder / "truth.npz", _truth(studio, np.array(visible)))
     store.write_text(folder / "take.toml", _take_toml(studio))
-    monitor.step(STAGE, settings.frames, settings.frames)
+    monitor.step(STAGE, 1, 1)
+
+
+def is_arm_take(folder: Path) -> bool:
+    """True for a complete recording that `make_arm_take` made."""
+    return (folder / "take.toml").is_file() and _made_here(folder)
+
+
+def _made_here(folder: Path) -> bool:
+    """True when the rig of the folder bears our mark."""
+    rig = folder / "rig.toml"
+    return rig.exists() and MARK in rig.read_text(encoding="utf-8", errors="replace")
 
 
 def _studio(settings: ArmTakeSettings) -> _Studio:
@@ -148,10 +158,8 @@ def arm_rig(width_px: int) -> Rig:
 
 def _clear(folder: Path) -> None:
     """Make way for a new recording. Only a recording of ours is removed; rig.toml, which marks it, stays until it is replaced."""
-    rig = folder / "rig.toml"
     try:
-        ours = rig.exists() and MARK in rig.read_text(encoding="utf-8", errors="replace")
-        if folder.exists() and not ours and any(folder.iterdir()):
+        if folder.exists() and not _made_here(folder) and any(folder.iterdir()):
             raise InputError(f"{folder} is not empty and holds no sample recording; choose a new folder for it.")
         for name in ("take.toml", "truth.npz"):
             (folder / name).unlink(missing_ok=True)
@@ -162,7 +170,7 @@ def _clear(folder: Path) -> None:
         raise InputError(f"Cannot make room for a recording in {folder}: {error.strerror or error}; choose another folder.") from error
 
 
-def _film_frame(folder: Path, studio: _Studio, frame: int) -> np.ndarray:
+def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> np.ndarray:
     """Write one frame of all views; return which vertices (V,) all of them see in the rows that are kept."""
     settings, kept = studio.settings, row_grid(studio.settings.interlaced)
     instants = [frame / settings.fps] + ([(frame + 0.5) / settings.fps] if kept.step == 2 else [])
@@ -170,6 +178,7 @@ def _film_frame(folder: Path, studio: _Studio, frame: int) -> np.ndarray:
     scene = joined(bodies[0])
     seen = np.ones(len(scene.vertices_m), dtype=bool)
     for i, camera in enumerate(studio.rig.cameras):
+        monitor.step(STAGE, frame * len(VIEWS) + i, settings.frames * len(VIEWS))
         sensor = SENSORS[camera.name]
         layers = [paint(camera, parts, studio.noise, studio.backdrops[i]) for parts in bodies]
         seen &= seen_vertices(camera, scene.vertices_m, scene.normals, layers[0])

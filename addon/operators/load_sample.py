@@ -1,0 +1,50 @@
+"""bpy.ops.tricap.load_sample()"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.progress import Monitor
+from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
+from .. import folders
+from ..jobs import JobOperator
+from ..scene.contents import Contents
+from .build_scene import put_into_scene
+from .run import measure
+
+NAME = "tricap_sample"
+EXTENSION = __package__.rpartition(".addon")[0]
+SAMPLE = ArmTakeSettings(frames=12, fps=15.0, width_px=512, interlaced="none")
+
+
+class LoadSample(JobOperator, bpy.types.Operator):
+    """Make a small sample recording of a moving arm on this computer, measure it, and build the scene; about half a minute"""
+
+    bl_idname = "tricap.load_sample"
+    bl_label = "Load Sample and Run"
+    bl_options = {"UNDO"}
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, Any, Contents | None]]:
+        """Where the recording and its results go: beside the .blend, or among the extension's own files while there is none."""
+        base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
+        folders.check_writable(base)
+        return lambda monitor: make_and_measure(base / NAME, monitor)
+
+    def finish(self, context: bpy.types.Context, result: tuple[Path, Any, Contents | None]) -> set[str]:
+        """Choose the sample as the scene's take, and build the scene."""
+        take, report, results = result
+        props = context.scene.tricap
+        props.take, props.out, props.last = str(take), "", str(report)
+        if results is not None:
+            put_into_scene(self, context, results)
+        self.report({"INFO"}, str(report))
+        return {"FINISHED"}
+
+
+def make_and_measure(take: Path, monitor: Monitor) -> tuple[Path, Any, Contents | None]:
+    """The computation, free of bpy. A sample that is there already, with whatever was changed in it, is measured as it is."""
+    if not is_arm_take(take):
+        make_arm_take(take, SAMPLE, monitor)
+    return take, *measure(take, take.with_name(f"{take.name}_tricap"), {}, True, monitor)

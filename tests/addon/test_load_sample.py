@@ -1,0 +1,63 @@
+"""Load Sample and Run: offline, beside the .blend or among the extension's files, and the same numbers as the command line's."""
+
+import dataclasses
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tricap.core import pipeline
+from tricap.core.synthetic.arm import make_arm_take
+from tricap.core.synthetic.score import score_run
+
+
+@pytest.fixture
+def small(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The operator's module, with a recording that is quicker to make."""
+    from bl_ext.user_default.tricap.addon.operators import load_sample
+
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    monkeypatch.setattr(load_sample, "SAMPLE", dataclasses.replace(load_sample.SAMPLE, frames=4, width_px=256))
+    return load_sample
+
+
+def test_beside_the_file_with_the_commands_numbers(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:
+    folder = tmp_path / "mon élan"
+    folder.mkdir()
+    blender.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+    assert blender.ops.tricap.load_sample() == {"FINISHED"}
+    out = folder / "tricap_sample_tricap"
+    make_arm_take(tmp_path / "sample", small.SAMPLE)
+    pipeline.run(tmp_path / "sample", tmp_path / "out")
+    assert (out / "motion.csv").read_bytes() == (tmp_path / "out" / "motion.csv").read_bytes()
+    scene = blender.context.scene
+    assert Path(scene.tricap.take) == folder / "tricap_sample" and "body fitted" in scene.tricap.last
+    assert blender.data.objects["Body"].animation_data.action is not None
+    (folder / "tricap_sample" / "take.toml").write_text((folder / "tricap_sample" / "take.toml").read_text() + "# mine\n")
+    assert blender.ops.tricap.load_sample() == {"FINISHED"}
+    assert (folder / "tricap_sample" / "take.toml").read_text().endswith("# mine\n"), "a sample that is there is kept"
+
+
+def test_without_a_file_it_lies_among_the_extensions_own(blender: ModuleType, small: ModuleType) -> None:
+    assert blender.ops.tricap.load_sample() == {"FINISHED"}
+    place = Path(blender.utils.extension_path_user("bl_ext.user_default.tricap"))
+    assert Path(blender.context.scene.tricap.take) == place / "tricap_sample"
+    assert (place / "tricap_sample_tricap" / "motion.csv").is_file()
+
+
+def test_a_folder_of_the_users_is_left_alone(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "tricap_sample").mkdir()
+    (tmp_path / "tricap_sample" / "precious.txt").write_text("mine")
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    with pytest.raises(RuntimeError, match="holds no sample recording"):
+        blender.ops.tricap.load_sample()
+    assert [path.name for path in (tmp_path / "tricap_sample").iterdir()] == ["precious.txt"]
+
+
+@pytest.mark.slow
+def test_the_whole_sample_is_close_to_its_truth(blender: ModuleType, tmp_path: Path) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert blender.ops.tricap.load_sample() == {"FINISHED"}
+    score = score_run(tmp_path / "tricap_sample", tmp_path / "tricap_sample_tricap")
+    assert score.joints is not None and score.joints.mpjpe_mm < 10, str(score)

@@ -1,0 +1,56 @@
+"""A new user's first minute: Load Sample and Run, Esc, again, and an arm that moves."""
+
+import os
+import time
+
+import bpy
+import drive
+
+ESC_S = 1.0
+SAMPLE_S = 60.0
+
+
+def steps() -> drive.Steps:
+    area = yield from drive.sidebar("VIEW_3D", "Tricap")
+    yield from drive.shot("1_first_run")
+    state = bpy.context.window_manager.tricap
+    yield from drive.press(area, "tricap.load_sample")
+    yield from drive.wait_for(lambda: state.running and state.progress > 0, 20, "a job runs and tells how far it is")
+    yield from drive.shot("2_running")
+    yield from stopped_by_esc(area)
+    began = time.monotonic()
+    yield from drive.press(area, "tricap.load_sample")
+    drive.check(state.running, "the job was started again")
+    yield from drive.wait_for(lambda: not state.running, SAMPLE_S * drive.slowness(), "the sample is made and measured")
+    drive.say(f"it took {time.monotonic() - began:.1f} s, load of the machine {os.getloadavg()[0]:.1f}")
+    drive.need("Body" in bpy.data.objects, "there is a body")
+    yield from moves(bpy.data.objects["Body"])
+    for line in drive.reports():
+        drive.say("Blender said:", line)
+    yield from drive.shot("3_done")
+
+
+def stopped_by_esc(area: bpy.types.Area) -> drive.Steps:
+    """Esc ends the job within a second, with a message, and leaves the scene as it was."""
+    before, pressed = set(bpy.data.objects.keys()), time.monotonic()
+    yield from drive.move(*drive.middle(area))
+    yield from drive.key("ESC")
+    yield from drive.wait_for(lambda: not bpy.context.window_manager.tricap.running, 30, "Esc ends the job")
+    took = time.monotonic() - pressed
+    drive.check(took < ESC_S * drive.slowness(), f"Esc took {took:.2f} s")
+    drive.check(set(bpy.data.objects.keys()) == before, "the scene is as it was")
+    yield from drive.settle()
+    drive.check(any("Stopped" in line for line in drive.reports()), "the message says that it was stopped")
+
+
+def moves(body: bpy.types.Object) -> drive.Steps:
+    """The right arrow key goes through the frames, and the wrist with it."""
+    scene, area = bpy.context.scene, drive.area_of("VIEW_3D")
+    yield from drive.move(*drive.middle(area))
+    bone = body.pose.bones[-1]
+    start, frame = (body.matrix_world @ bone.tail).copy(), scene.frame_current
+    for _ in range(6):
+        yield from drive.key("RIGHT_ARROW")
+    yield from drive.settle()
+    path = (body.matrix_world @ bone.tail - start).length
+    drive.check(scene.frame_current == frame + 6 and path > 0.02, f"six frames on, {bone.name} has moved by {path * 1e3:.0f} mm")
