@@ -13,6 +13,7 @@ from ...core.motion.retarget.mapping import Preset, RigMap, apply_preset, find_m
 from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig
+from ...core.motion.retarget.steering import controls_of
 from ...core.motion.retarget.turns import angle_of, transposed
 from ...core.progress import Monitor
 from .read import read_motion, read_rig, with_soles
@@ -52,13 +53,15 @@ def presets() -> list[Preset]:
     return [read_preset(path) for path in sorted(PRESETS.glob("*.json"))]
 
 
-def map_of(rig: Rig, map_file: Path | None = None) -> RigMap:
-    """The mapping from a file, or as found.
+def map_of(rig: Rig, map_file: Path | None = None, *, steer: bool = False) -> RigMap:
+    """The mapping from a file, or as found; of a rig with controls, the controls if it is to be steered, else the bones that follow.
 
     Raises:
         InputError: the file is no mapping of this rig, or nothing was recognised.
     """
-    return apply_preset(rig, read_preset(map_file)) if map_file is not None else find_map(rig, presets())
+    if map_file is not None:
+        return apply_preset(rig, read_preset(map_file))
+    return find_map(rig, [preset for preset in presets() if steer or preset.steering is None])
 
 
 def read_target(armature_object: bpy.types.Object, map_file: Path | None = None) -> Target:
@@ -68,7 +71,9 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None)
         InputError: it is no armature that can be mapped.
     """
     rig = read_rig(armature_object)
-    rig_map = map_of(rig, map_file)
+    rig_map = map_of(rig, map_file, steer=True)
+    if rig_map.steering is not None:
+        rig = controls_of(rig, rig_map.steering, rig_map.bones)
     rig = with_soles(rig, armature_object, rig_map)
     low = min([float(points[:, 2].min()) for points in rig.sole_m.values()] or [float(rig.head_m[:, 2].min())])
     origin = float(armature_object.matrix_world.translation.z)
@@ -84,7 +89,8 @@ def transfer(source: Motion, source_map: RigMap, target: Target, settings: Retar
 def apply(armature_object: bpy.types.Object, source: Motion, source_map: RigMap, target: Target, result: Retargeted, name: str,
           tolerance_deg: float = 0.0) -> Outcome:
     """Write the action and play some frames of it. Main thread."""
-    written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg)
+    steering = target.rig_map.steering
+    written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg, properties=steering.properties if steering else {})
     figures = measure(source, source_map, result.motion, target.rig_map, result.contacts, target.floor_m)
     notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source_map.missing]
     if written.muted:

@@ -129,7 +129,7 @@ class FindMap(bpy.types.Operator):
         props = context.scene.tricap_retarget
         try:
             rig = read_rig(armature_of("", props.target, "target"))
-            rig_map = apply.map_of(rig, Path(bpy.path.abspath(self.file)) if self.file else None)
+            rig_map = apply.map_of(rig, Path(bpy.path.abspath(self.file)) if self.file else None, steer=True)
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -19,6 +19,7 @@ from ...core.motion.retarget.roles import part_of
 from ...core.motion.retarget.transfer import alignments
 
 NAME = "Tricap preview"
+KEPT = "tricap_before_preview"  # of the target: the properties that steer its controls, as they were
 
 
 def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, target: bpy.types.Object, rig: Rig, rig_map: RigMap
@@ -46,6 +47,7 @@ def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, t
     if "hips" in aligned:
         _carry(collection, source, source_map.bones["hips"][0], target, rig_map.bones["hips"][0],
                leg_ratio(source_rig, source_map, rig, rig_map))
+    _steer(target, rig_map)
     collection.hide_viewport = collection.hide_render = True
     return count
 
@@ -57,11 +59,28 @@ def remove_preview(target: bpy.types.Object) -> int:
         for constraint in [c for c in bone.constraints if c.name.startswith(NAME)]:
             bone.constraints.remove(constraint)
             count += 1
+    for name, values in target.pop(KEPT, {}).items():
+        for key, value in values.items() if name in target.pose.bones else ():
+            target.pose.bones[name][key] = value
     if not any(c.name.startswith(NAME) for o in bpy.data.objects if o.type == "ARMATURE" for b in o.pose.bones for c in b.constraints):
         for collection in [c for c in bpy.data.collections if c.name.startswith(NAME)]:
             bpy.data.batch_remove(list(collection.objects))
             bpy.data.collections.remove(collection)
     return count
+
+
+def _steer(target: bpy.types.Object, rig_map: RigMap) -> None:
+    """Set what lets the controls steer the rig (FK instead of IK), and keep what it was."""
+    kept: dict[str, dict[str, float]] = {}
+    for name, values in rig_map.steering.properties.items() if rig_map.steering is not None else ():
+        bone = target.pose.bones.get(name)
+        for key, value in values.items() if bone is not None else ():
+            if key in bone:
+                kept.setdefault(name, {})[key] = bone[key]
+                bone[key] = type(bone[key])(value)
+    if kept:
+        target[KEPT] = kept
+        target.update_tag()
 
 
 def _empty(collection: bpy.types.Collection, source: bpy.types.Object, bone: str, K: np.ndarray, name: str) -> bpy.types.Object:

@@ -105,11 +105,13 @@ VRM = {"hips": "hips", "head": "head"} | {
 def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> Rig:
     """The rig with the points under its feet, from the skins that it moves: where they would touch a floor tilted this way and that."""
     wanted = [name for side in "LR" for part in ("foot", "toe") for name in rig_map.bones.get(f"{part}.{side}", ())]
+    instead = rig_map.steering.skin if rig_map.steering is not None else {}
+    meant = {instead.get(name, name): name for name in wanted}
     points: dict[str, list[np.ndarray]] = {}
     for skin in [o for o in bpy.data.objects if o.type == "MESH"]:
         if armature_object not in (modifier.object for modifier in skin.modifiers if modifier.type == "ARMATURE"):
             continue
-        groups = {group.index: group.name for group in skin.vertex_groups if group.name in wanted}
+        groups = {group.index: meant[group.name] for group in skin.vertex_groups if group.name in meant}
         if not groups:
             continue
         place = np.empty(3 * len(skin.data.vertices))

@@ -1,5 +1,6 @@
 """A retargeted motion as an action of the target: all keys of a curve at once, in the bones' own rotation modes."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import bpy
@@ -24,10 +25,12 @@ class Written:
     muted: tuple[str, ...]
 
 
-def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tolerance_deg: float = 0.0) -> Written:
+def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tolerance_deg: float = 0.0,
+                 properties: Mapping[str, Mapping[str, float]] | None = None) -> Written:
     """Give the target a new action with the motion; its former one is kept in the file. Main thread only.
 
-    `tolerance_deg`: leave out keys as long as no rotation is off by more; 0 keys every frame.
+    `tolerance_deg`: leave out keys as long as no rotation is off by more; 0 keys every frame. `properties`: by bone, custom properties
+    that the action sets once, such as FK instead of IK.
     """
     former = target.animation_data.action if target.animation_data else None
     if former is not None:
@@ -47,7 +50,7 @@ def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tol
         values = location_values(target, bone, result, b, shift_m)
         keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2 * float(np.ptp(rig.head_m, axis=0).max()) / scale_of(target))
         keys += _key(action, target, f"{bone.path_from_id()}.location", frames[keep], values[keep], bone.name)
-    keys += _rest_of_the_rest(action, target, result)
+    keys += _rest_of_the_rest(action, target, result) + _set_properties(action, target, properties or {}, frames[:1])
     return Written(action=action, keys=keys, muted=_mute(target, result))
 
 
@@ -88,17 +91,33 @@ def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, frames: n
 def _rest_of_the_rest(action: bpy.types.Action, target: bpy.types.Object, result: Retargeted) -> int:
     """One key that puts to rest what the motion does not drive but an earlier pose has left turned or shifted."""
     rig, keys = result.motion.rig, 0
-    for b, name in enumerate(rig.names):
-        bone = target.pose.bones[name]
+    steered = {driver.data_path for driver in target.animation_data.drivers}
+    for bone in target.pose.bones:
+        b = rig.index.get(bone.name, -1)  # of a control rig, the controls alone
         rotation = CHANNEL.get(bone.rotation_mode, ("rotation_euler", 3))[0]
         for channel in (rotation, "location", "scale"):
-            if (channel == rotation and result.driven[b]) or (channel == "location" and (b == result.carrier or b in result.loose_m)):
+            keyed = (channel == rotation and result.driven[b]) or (channel == "location" and (b == result.carrier or b in result.loose_m))
+            if (b >= 0 and keyed) or f"{bone.path_from_id()}.{channel}" in steered:
                 continue
             now, rest = np.array(getattr(bone, channel)), np.array(REST[channel], dtype=float)
             moved = abs(now[0]) > 1e-6 if channel == "rotation_axis_angle" else np.abs(now - rest).max() > 1e-6
             if moved:
                 setattr(bone, channel, rest)
                 keys += _key(action, target, f"{bone.path_from_id()}.{channel}", result.motion.frames[:1], rest[None], bone.name)
+    return keys
+
+
+def _set_properties(action: bpy.types.Action, target: bpy.types.Object, properties: Mapping[str, Mapping[str, float]],
+                    at: np.ndarray) -> int:
+    """One key for each custom property that the rig has."""
+    keys = 0
+    for name, values in properties.items():
+        bone = target.pose.bones.get(name)
+        for key, value in values.items() if bone is not None else ():
+            if key in bone:
+                bone[key] = type(bone[key])(value)
+                path = f'{bone.path_from_id()}["{bpy.utils.escape_identifier(key)}"]'
+                keys += _key(action, target, path, at, np.full((1, 1), value), name)
     return keys
 
 

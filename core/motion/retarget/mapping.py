@@ -16,6 +16,7 @@ from ...settings import nearest_name
 from .names import Reading, read_name
 from .rig import Rig
 from .roles import ARM, FINGERS, LEG, ROLES, SIDES, sided
+from .steering import Steering
 
 NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm", "forearm", "thigh", "shin")))
 
@@ -29,6 +30,7 @@ class RigMap:
     missing: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     origin: str = "names"
+    steering: Steering | None = None  # of a rig whose mapped bones are controls
 
     def first(self, role: str) -> str | None:
         """The bone at whose head the part begins."""
@@ -43,6 +45,7 @@ class Preset:
     bones: Map[str, tuple[str, ...]]
     twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
     prefixes: tuple[str, ...] = ("",)
+    steering: Steering | None = None
 
 
 def read_preset(path: Path) -> Preset:
@@ -59,7 +62,32 @@ def read_preset(path: Path) -> Preset:
     if not isinstance(sides, dict) or set(sides) != {"L", "R"} or not all(isinstance(x, str) for x in [*sides.values(), *prefixes]):
         raise InputError(f"{path} has odd “sides” or “prefixes”; write {{\"L\": \"Left\", \"R\": \"Right\"}} and a list of texts.")
     parts = {key: _by_role(table.get(key, {}), sides, key, path) for key in ("bones", "twist")}
-    return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), **parts)
+    steering = _steering(table["steering"], sides, path) if "steering" in table else None
+    return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), steering=steering, **parts)
+
+
+def _steering(table: Any, sides: Map[str, str], path: Path) -> Steering:
+    """The part “steering” of a preset; "{s}" in a bone's name stands for both sides."""
+    if not isinstance(table, dict) or not isinstance(table.get("follows"), dict):
+        raise InputError(f"{path} says nothing of how controls follow each other; “steering” needs a table “follows” with a name by name.")
+
+    def both(part: Any) -> dict[str, Any]:
+        return {str(key).replace("{s}", side): value.replace("{s}", side) if isinstance(value, str) else value
+                for key, value in (part.items() if isinstance(part, dict) else ()) for side in sides.values()}
+
+    follows, skin, properties = (both(table.get(key)) for key in ("follows", "skin", "properties"))
+    if not all(isinstance(name, str) for name in [*follows.values(), *skin.values()]):
+        raise InputError(f"{path} has something else than names of bones in “follows” or “skin” of “steering”.")
+    for name in follows:
+        line = [name]
+        while (above := follows.get(line[-1])) is not None:
+            if above in line:
+                raise InputError(f"{path} lets “{name}” follow itself; mend “follows” of “steering”.")
+            line.append(above)
+    for values in properties.values():
+        if not isinstance(values, dict) or not all(isinstance(v, (int, float)) for v in values.values()):
+            raise InputError(f"{path} needs numbers by name in “properties” of “steering”.")
+    return Steering(follows=follows, properties=properties, skin=skin)
 
 
 def _by_role(table: Any, sides: Map[str, str], key: str, path: Path) -> dict[str, tuple[str, ...]]:
@@ -82,8 +110,11 @@ def write_map(path: Path, rig_map: RigMap, name: str) -> None:
     Raises:
         InputError: the file cannot be written.
     """
+    steering = rig_map.steering
     store.write_json(path, {"name": name, "bones": {r: list(c) for r, c in rig_map.bones.items()},
-                            "twist": {r: list(c) for r, c in rig_map.twist.items()}})
+                            "twist": {r: list(c) for r, c in rig_map.twist.items()}}
+                     | ({"steering": {part: {k: v if isinstance(v, str) else dict(v) for k, v in getattr(steering, part).items()}
+                                      for part in ("follows", "properties", "skin")}} if steering is not None else {}))
 
 
 def apply_preset(rig: Rig, preset: Preset) -> RigMap:
@@ -100,7 +131,7 @@ def apply_preset(rig: Rig, preset: Preset) -> RigMap:
         raise InputError(f"None of the bones of the mapping “{preset.name}” are in this rig; choose another or let it be found.")
     missing = tuple(f"{role}: no bone “{preset.bones[role][0]}”" for role in preset.bones if role not in bones)
     return RigMap(bones=bones, twist={role: chain for role, chain in twist.items() if chain and role in bones}, missing=missing,
-                  origin=f"mapping “{preset.name}”")
+                  origin=f"mapping “{preset.name}”", steering=preset.steering)
 
 
 def fit_of(rig: Rig, preset: Preset) -> float:
@@ -119,7 +150,8 @@ def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
 
     best = max(presets, key=lambda preset: fit_of(rig, preset), default=None)
     if best is not None and fit_of(rig, best) > 0.9:
-        return _completed(rig, apply_preset(rig, best))
+        found = apply_preset(rig, best)
+        return found if found.steering is not None else _completed(rig, found)
     named = by_names(rig)
     if all(role in named.bones for role in NEEDED) or _is_limb(named):
         return named
