@@ -19,6 +19,7 @@ from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
 from .correcting import corrected_cloud, corrected_tracks
 from .errors import InputError
+from .fit_sources import fit_input
 from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
 from .fitting.settings import FitSettings
@@ -271,24 +272,14 @@ def fit(run: Run, monitor: Monitor) -> None:
         track(run, monitor)
     began, take = time.perf_counter(), run.footage.take
     run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
-    missing = "no [body] model" if take.body_model is None else "no clicked joints" if not take.seeds.joints else ""
+    missing = "no [body] model" if take.body_model is None else "no clicked joints" if not (take.seeds.joints or take.keyframes) else ""
     if missing:
         run.warn(f"No body was fitted: take.toml has {missing}.")
         run.finish_stage("fit", began, not_done=missing)
         return
-    time_s = np.array([m.frame for m in run.measured]) / take.fps
     try:
-        body = fit_sequence(
-            run.footage.rig,
-            str(take.body_model),
-            run.clouds,
-            {name: {view: xy.tolist() for view, xy in at.items()} for name, at in take.seeds.joints.items()},
-            take.seeds.frame,
-            time_s,
-            run.trajectories,  # type: ignore[arg-type]
-            run.settings["fitting"],
-            monitor,
-        )
+        given = fit_input(run.footage, run.clouds, run.trajectories, run.results)
+        body = fit_sequence(given, run.settings["fitting"], monitor)
         run.body = body
         _write_body(run, body, monitor)
     except Cancelled as stop:

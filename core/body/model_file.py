@@ -6,7 +6,7 @@ file the bones of the right side stand for both. A file with `part_of` is anothe
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, radians
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from .skeleton import Bone, Dof, Skeleton
 
 MODELS = Path(__file__).with_name("models")
 MIRROR = np.array([-1.0, 1.0, 1.0])
+LOCKED = radians(0.1)  # sigma of what is not free to turn
 OTHER_SIDE = {".R": ".L", ".L": ".R"}
 
 
@@ -88,6 +89,28 @@ def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
     rows = [i for i, left in enumerate(names) if left not in gone]
     skeleton = Skeleton(name=name, bones=tuple(model.skeleton.bones[i] for i in rows), base_dofs=model.skeleton.base_dofs)
     return BodyModel(name=name, skeleton=skeleton, visible_radii_m=model.visible_radii_m[rows], surface=model.surface[rows])
+
+
+def with_limits(model: BodyModel, limits: Mapping[str, tuple[float, float]], locked: Sequence[str]) -> BodyModel:
+    """A model with other limits [rad], by the names of its DOFs; those that are `locked` keep their rest value (0, or the nearest limit).
+
+    Raises:
+        InputError: the model has no such degree of freedom, or it is the base's.
+    """
+    turning = [dof.name for bone in model.skeleton.bones for dof in bone.dofs]
+    for name in (*limits, *locked):
+        if name not in turning:
+            raise InputError(f"The model “{model.name}” has no joint angle “{name}” to limit or lock.{nearest_name(name, turning)}")
+
+    def changed(dof: Dof) -> Dof:
+        low, high = limits.get(dof.name, dof.limits)
+        rest = min(max(0.0, low), high)
+        if dof.name in locked:
+            return replace(dof, limits=(rest, rest), prior_mean=rest, prior_sigma=LOCKED)
+        return replace(dof, limits=(low, high), prior_mean=min(max(dof.prior_mean, low), high))
+
+    bones = tuple(replace(bone, dofs=tuple(changed(dof) for dof in bone.dofs)) for bone in model.skeleton.bones)
+    return replace(model, skeleton=Skeleton(name=model.skeleton.name, bones=bones, base_dofs=model.skeleton.base_dofs))
 
 
 def mirrored(model: BodyModel, name: str) -> BodyModel:

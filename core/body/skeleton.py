@@ -131,6 +131,11 @@ class Skeleton:
         return Layout(self.dof_names, sets)
 
     @cached_property
+    def held(self) -> np.ndarray:
+        """The DOFs that keep one value, because their limits are equal."""
+        return np.flatnonzero([dof.limits[0] == dof.limits[1] for dof in self.dofs])
+
+    @cached_property
     def parents(self) -> np.ndarray:
         """Index of each bone's parent (B,), −1 for the first."""
         names = [bone.name for bone in self.bones]

@@ -32,6 +32,17 @@ class NormalEquations:
                                next2=np.zeros((max(frames - 2, 0), D, D)), border=np.zeros((frames, D, S)), corner=np.zeros((S, S)),
                                g=np.zeros((frames, D)), h=np.zeros(S))
 
+    def hold(self, motion: np.ndarray) -> None:
+        """Take some of the D unknowns (K,) out of every frame: they keep their values. Their variance in the inverse is 1."""
+        if not len(motion):
+            return
+        for blocks in (self.diagonal, self.next1, self.next2):
+            blocks[:, motion, :] = 0.0
+            blocks[:, :, motion] = 0.0
+        self.diagonal[:, motion, motion] = 1.0
+        self.border[:, motion] = 0.0
+        self.g[:, motion] = 0.0
+
     def solve(self, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """x (T, D) and s (S,), with the diagonal multiplied by 1 + damping (Marquardt).
 

@@ -87,7 +87,7 @@ def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np
         support = [fit.support(points, other, vector) for other in others]
         others = [others[i] for i in np.argsort(support)[::-1][:MOST_OTHERS]]
     starts = [motion, *others]
-    view = np.mean([camera.R_cam_world[2] for camera in fit.clicks.observation.cameras], axis=0)
+    view = np.mean([camera.R_cam_world[2] for camera in fit.cameras], axis=0)
     for shift in (-DEPTH_SHIFT_M, DEPTH_SHIFT_M):
         moved = motion.copy()
         moved[fit.model.skeleton.layout.set("base")] += shift * view
@@ -96,4 +96,4 @@ def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np
 
 
 def _observe(fit: Conditions, points: CloudPoints, wide: float) -> Callable[[int, BodyState], list[Observation]]:
-    return lambda t, state: [fit.surface(points, state, wide), fit.clicks.observation, *fit.priors]
+    return lambda t, state: [fit.surface(points, state, wide), *fit.joints(fit.click), *fit.priors]

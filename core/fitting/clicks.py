@@ -1,6 +1,6 @@
 """Clicked joints: which there are, where they lie in space, and whether the views agree."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +8,8 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig
-from .observations import ClickedJoints
+from .fit_input import ClickedAt
+from .observations import ClickedJoints, Observation
 
 CONTRADICTION = 6.0  # sigmas between a click and the projection of the joint that the views agree on
 STEPS = 10
@@ -16,10 +17,10 @@ STEPS = 10
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Clicks:
-    """The usable clicks, and the joints' places in space by forward intersection."""
+    """What is known of the joints where the fit begins, and their places in space."""
 
-    observation: ClickedJoints
-    xyz_m: np.ndarray  # (J, 3) NaN: not clicked in two views
+    observations: tuple[Observation, ...]
+    xyz_m: np.ndarray  # (J, 3) NaN: not known in two views
 
     @property
     def located(self) -> np.ndarray:
@@ -27,11 +28,13 @@ class Clicks:
         return np.isfinite(self.xyz_m).all(axis=1)
 
 
-def read_clicks(rig: Rig, joint_names: Sequence[str], joints: Mapping[str, Mapping[str, Sequence[float]]], sigma_px: float) -> Clicks:
-    """Clicks of the model's joints; `joints[name][view] = (x, y)` in full-frame pixels. Joints of other limbs are passed over.
+def read_clicks(rig: Rig, joint_names: Sequence[str], joints: ClickedAt, sigma_px: float) -> tuple[ClickedJoints, np.ndarray]:
+    """Clicks of the model's joints in one frame, and the joints' places (J, 3) by forward intersection, NaN without two views.
+
+    `joints[name][view] = (x, y)` in full-frame pixels. Joints of other limbs are passed over.
 
     Raises:
-        InputError: fewer than two of the model's joints are clicked in two views, or the views contradict each other.
+        InputError: the views contradict each other, or the rig has no such view.
     """
     cameras: list[Camera] = []
     index: list[int] = []
@@ -46,12 +49,22 @@ def read_clicks(rig: Rig, joint_names: Sequence[str], joints: Mapping[str, Mappi
         cameras += seen
         index += [j] * len(seen)
         xy += list(views.values())
-    located = [name for name, place in zip(joint_names, places) if np.isfinite(place).all()]
+    found = ClickedJoints(cameras=tuple(cameras), joint=np.array(index, dtype=np.intp), xy_px=np.array(xy).reshape(-1, 2),
+                          sigma_px=sigma_px)
+    return found, places
+
+
+def enough(xyz_m: np.ndarray, joint_names: Sequence[str], observations: Sequence[Observation]) -> Clicks:
+    """What the fit begins with, when two of the joints (J, 3) have places.
+
+    Raises:
+        InputError: they have not.
+    """
+    located = [name for name, place in zip(joint_names, xyz_m) if np.isfinite(place).all()]
     if len(located) < 2:
         raise InputError(f"The body needs at least two of the joints {', '.join(joint_names)} clicked in two views each, "
                          f"but has {', '.join(located) or 'none'}; click more of them under [seeds.joints].")
-    observation = ClickedJoints(cameras=tuple(cameras), joint=np.array(index), xy_px=np.array(xy), sigma_px=sigma_px)
-    return Clicks(observation=observation, xyz_m=places)
+    return Clicks(observations=tuple(observations), xyz_m=xyz_m)
 
 
 def intersection(cameras: Sequence[Camera], xy_px: np.ndarray) -> np.ndarray:

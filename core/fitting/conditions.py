@@ -1,20 +1,23 @@
 """What stays the same throughout one fit: the model, the clicks, what is believed beforehand, and how points become observations."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from ..body.model_file import BodyModel
+from ..geometry.camera import Camera
 from .acceleration import Acceleration
 from .clicks import Clicks
 from .cloud_points import CloudPoints
-from .observations import EqualRadii, Observation, ShapePrior, SurfacePoints, Symmetry
+from .joint_tracks import JointTracks
+from .observations import ClickedJoints, EqualRadii, Observation, ShapePrior, SurfacePoints, Symmetry
 from .problem import Problem
 from .robust import robust_weights
 from .segmentation import HeldSegments, segment
 from .settings import FitSettings
+from .silhouettes import Silhouettes
 from .state import BodyState, ShapeParameters
 
 SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
@@ -25,12 +28,20 @@ NO_SHAPE = np.zeros(0, dtype=np.intp)
 class Conditions:
     """Model, settings and clicks of one fit."""
 
+    cameras: tuple[Camera, ...]
     model: BodyModel
     parameters: ShapeParameters
     settings: FitSettings
     clicks: Clicks
-    click: int  # index of the click frame
+    click: int  # index of the frame where the fit begins
     priors: list[Observation]  # of every frame's motion
+    clicked: Mapping[int, ClickedJoints]  # by frame index
+    tracks: JointTracks
+    silhouettes: Silhouettes
+
+    def joints(self, t: int) -> list[Observation]:
+        """What is known of the joints in frame index `t`: clicks and keypoints."""
+        return [*([self.clicked[t]] if t in self.clicked else []), *self.tracks.observe(t)]
 
     def surface(self, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0, held: HeldSegments | None = None,
                 ) -> SurfacePoints:
@@ -64,7 +75,7 @@ class Conditions:
         """An adjustment in which the shape parameters of the set `free` may change."""
         shape = self.parameters.layout.set(free) if free else NO_SHAPE
         return Problem(parameters=self.parameters, observe=observe, of_shape=self.of_shape(), free_shape=shape, smoothness=smoothness,
-                       robust=self.settings.robust, robust_width=self.settings.robust_width)
+                       held=self.model.skeleton.held, robust=self.settings.robust, robust_width=self.settings.robust_width)
 
     def support(self, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
         """How many points a body explains: the sum of their weights at a fixed width."""

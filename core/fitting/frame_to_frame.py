@@ -38,10 +38,11 @@ def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first
         for t in range(fit.click + direction, T if direction > 0 else -1, direction):
             monitor.step("fit frame after frame", done, T)
             before = fit.parameters.state(motion[t - direction], first.vector)
-            moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else None
+            moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else []
             near = _some(crop(points[t], before, REACH_M))
             predictions = _predictions(motion, time_s, seen, t, _slowing(fit, unseen))
-            motion[t], found = _next_posture(fit, near, moved, predictions, first, support, 1 + np.minimum(WIDENING * unseen, WIDEST - 1))
+            wide = 1 + np.minimum(WIDENING * unseen, WIDEST - 1)
+            motion[t], found = _next_posture(fit, t, near, moved, predictions, first, support, wide)
             known[t] = False
             if found is not None:
                 support = found
@@ -80,17 +81,17 @@ def _predictions(motion: np.ndarray, time_s: np.ndarray, seen: list[int], t: int
     return [last + rate * (time_s[t] - time_s[seen[-1]]), last]
 
 
-def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, direction: int) -> StepsFromFixed | None:
+def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, direction: int) -> list[StepsFromFixed]:
     """What tracked points say about frame t, when the neighbour's body is held."""
     if tracks is None:
-        return None
+        return []
     steps = tracks.steps(t - 1, before, None) if direction > 0 else tracks.steps(t, None, before)
-    return None if steps is None else StepsFromFixed(steps=steps, other=before, backwards=direction < 0)
+    return [] if steps is None else [StepsFromFixed(steps=steps, other=before, backwards=direction < 0)]
 
 
-def _next_posture(fit: Conditions, points: CloudPoints, moved: StepsFromFixed | None, predictions: list[np.ndarray], first: Solution,
+def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[StepsFromFixed], predictions: list[np.ndarray], first: Solution,
                   last_support: float | None, wide: np.ndarray) -> tuple[np.ndarray, float | None]:
-    """The posture (D,) and its support; None if the frame has too few points, and the posture is the prediction."""
+    """The posture (D,) of frame index `i` and its support; None if the frame has too few points, and the posture is the prediction."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
     sigma[skeleton.layout.set("base")] = s.prediction_sigma_m
@@ -99,7 +100,7 @@ def _next_posture(fit: Conditions, points: CloudPoints, moved: StepsFromFixed | 
         prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
-            return [fit.surface(points, state, wide, held), *([moved] if moved is not None else []), prior, *fit.priors]
+            return [fit.surface(points, state, wide, held), *fit.joints(i), *moved, prior, *fit.priors]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
         support = fit.support(points, solution.motion[0], first.vector)

@@ -32,8 +32,9 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
     vector = parameters.vector()
     start = coarse_posture(parameters, clicks)
     sigma = np.full(len(vector), length_sigma)
-    problem = Problem(parameters=parameters, observe=lambda t, state: [clicks.observation, *priors],
-                      of_shape=[ShapePrior(mean=vector, sigma=sigma)], free_shape=parameters.layout.set("lengths"))
+    problem = Problem(parameters=parameters, observe=lambda t, state: [*clicks.observations, *priors],
+                      of_shape=[ShapePrior(mean=vector, sigma=sigma)], free_shape=parameters.layout.set("lengths"),
+                      held=parameters.skeleton.held)
     return solve(problem, start[None], vector, steps=STEPS)
 
 
@@ -110,7 +111,7 @@ def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, plac
     order = bone.rotation_mode[::-1]
     angles = dict(zip(order.lower(), Rotation.from_matrix(R.T @ turn @ R).as_euler(order)))
     for dof in bone.dofs:
-        motion[skeleton.layout[dof.name]] = angles[dof.axis]
+        motion[skeleton.layout[dof.name]] = np.clip(angles[dof.axis], *dof.limits)
 
 
 def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarray) -> list[np.ndarray]:

@@ -3,12 +3,12 @@
     Σ_t Σ_i w_i (r_i(θ_t, s) / σ0)² + Σ_t Σ_i w_i (r_i(θ_t, θ_{t+1}, s) / σ1)² + Σ_j r_j(s)² + Σ_t |θ̈_t / σ_a|²  →  min          (1)
 
 r are residuals of unit weight (D'Apuzzo et al. 1999, Eqs. 9–12). Measured points and tracked points carry robust weights w and scales
-σ0, σ1 that are estimated from them. Which limb a point belongs to is decided anew at every linearisation. Holding the shape while the
-pose is solved is choosing an empty set of free shape parameters.
+σ0, σ1 that are estimated from them, and so do contours and keypoints. Which limb a point belongs to is decided anew at every
+linearisation. Holding the shape while the pose is solved is choosing an empty set of free shape parameters.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,10 +22,21 @@ from .state import BodyState, ShapeParameters
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
-    """Robust standard deviations of unit-weight residuals: of measured points (sigma0) and of tracked points."""
+    """Robust standard deviations of unit-weight residuals, kind by kind: measured points (sigma0), tracked points, contours, keypoints."""
 
     points: float = 1.0
     steps: float = 1.0
+    contours: float = 1.0
+    keypoints: float = 1.0
+
+    def of(self, kind: str) -> float:
+        """The scale of a kind."""
+        return float(getattr(self, kind))
+
+    def renewed(self, residuals: Mapping[str, list[np.ndarray]]) -> "Scales":
+        """With the scales of these residuals; what has none keeps its own."""
+        found = {kind: robust_scale(np.concatenate(r), self.of(kind)) for kind, r in residuals.items() if r}
+        return replace(self, **found)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,6 +50,7 @@ class Problem:
     of_shape_weight: float = 1.0
     free_shape: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     smoothness: Acceleration | None = None
+    held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))  # DOFs that keep their values
     robust: str = "geman-mcclure"
     robust_width: float = 3.0
 
@@ -62,12 +74,11 @@ class Linearised:
     steps: list[tuple[MaterialSteps, np.ndarray] | None]
     equations: NormalEquations
     cost: float = 0.0
-    point_residuals: list[np.ndarray] = field(default_factory=list)
-    step_residuals: list[np.ndarray] = field(default_factory=list)
+    residuals: dict[str, list[np.ndarray]] = field(default_factory=dict)  # of robust observations, by kind
 
     def scales(self, before: Scales) -> Scales:
         """The scales of the residuals here."""
-        return Scales(points=_scale(self.point_residuals, before.points), steps=_scale(self.step_residuals, before.steps))
+        return before.renewed(self.residuals)
 
 
 def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: Scales, understated: Scales | None = None) -> Linearised:
@@ -80,7 +91,7 @@ def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: 
     lin = Linearised(observations=[], steps=[], equations=NormalEquations.empty(T, D, len(problem.free_shape)))
     states = problem.parameters.states(motion, vector)
     for t, state in enumerate(states):
-        _add_frame(problem, lin, t, state, scales.points, factor.points)
+        _add_frame(problem, lin, t, state, scales, factor)
     for t in range(T - 1):
         _add_step(problem, lin, t, states[t], states[t + 1], scales.steps, factor.steps)
     for o in problem.of_shape if len(problem.free_shape) else ():
@@ -91,6 +102,7 @@ def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: 
     if problem.smoothness is not None:
         problem.smoothness.add_to(lin.equations, motion)
         lin.cost += problem.smoothness.cost(motion)
+    lin.equations.hold(problem.held)
     return lin
 
 
@@ -106,24 +118,22 @@ def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarr
 
 def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scales:
     """By how much the weights understate variances (`robust.variance_factor`)."""
-    both = [variance_factor(np.concatenate(r) / scale, problem.robust, problem.robust_width) if r else 1.0
-            for r, scale in ((lin.point_residuals, scales.points), (lin.step_residuals, scales.steps))]
-    return Scales(points=both[0], steps=both[1])
+    return Scales(**{kind: variance_factor(np.concatenate(r) / scales.of(kind), problem.robust, problem.robust_width)
+                     for kind, r in lin.residuals.items() if r})
 
 
 def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, before: Scales) -> Scales:
     """The scales of the residuals before the first step."""
-    states = problem.parameters.states(motion, vector)
-    points = [o.residual(state) for t, state in enumerate(states) for o in problem.observe(t, state) if o.robust]
-    steps = []
-    if problem.observe_step is not None:
-        pairs = [(problem.observe_step(t, a, b), a, b) for t, (a, b) in enumerate(zip(states, states[1:]))]
-        steps = [s.residual(a, b) for s, a, b in pairs if s is not None]
-    return Scales(points=_scale(points, before.points), steps=_scale(steps, before.steps))
-
-
-def _scale(residuals: list[np.ndarray], before: float) -> float:
-    return robust_scale(np.concatenate(residuals), before) if residuals else before
+    states, residuals = problem.parameters.states(motion, vector), dict[str, list[np.ndarray]]()
+    for t, state in enumerate(states):
+        for o in problem.observe(t, state):
+            if o.kind:
+                residuals.setdefault(o.kind, []).append(o.residual(state))
+    for t, (a, b) in enumerate(zip(states, states[1:])):
+        step = problem.observe_step(t, a, b) if problem.observe_step is not None else None
+        if step is not None:
+            residuals.setdefault("steps", []).append(step.residual(a, b))
+    return before.renewed(residuals)
 
 
 def blocks_of(observation: Observation, state: BodyState, shape: bool) -> Iterable[Block]:
@@ -134,14 +144,14 @@ def blocks_of(observation: Observation, state: BodyState, shape: bool) -> Iterab
     return [(np.arange(len(J)), np.arange(J.shape[1]), J)]
 
 
-def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scale: float, factor: float) -> None:
+def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scales: Scales, factor: Scales) -> None:
     e, free, D, frame = lin.equations, problem.free_shape, state.n_motion, []
     for o in problem.observe(t, state):
         r = o.residual(state)
         w: np.ndarray | float = 1.0
-        if o.robust:
-            lin.point_residuals.append(r)
-            w = problem.weights(r, scale, o.crowding) / factor
+        if o.kind:
+            lin.residuals.setdefault(o.kind, []).append(r)
+            w = problem.weights(r, scales.of(o.kind), o.crowding) / factor.of(o.kind)
         frame.append((o, w))
         lin.cost += float(np.sum(w * r * r))
         for rows, columns, J in blocks_of(o, state, len(free) > 0):
@@ -167,7 +177,7 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
     r = step.residual(a, b)
     w = problem.weights(r, scale, step.crowding) / factor
     lin.steps.append((step, w))
-    lin.step_residuals.append(r)
+    lin.residuals.setdefault("steps", []).append(r)
     lin.cost += float(np.sum(w * r * r))
     for rows, columns, J in step.blocks(a, b, len(problem.free_shape) > 0):
         weighted, columns, J = _free_columns(problem, 2 * D, w, rows, columns, J)

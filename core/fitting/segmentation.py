@@ -30,7 +30,7 @@ def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: 
     nearest, owner = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
     own = np.zeros(n, dtype=bool)
     for b, rows in _candidates(points.xyz_m, state, gate):
-        gap, along, facing = _from_bone(points.xyz_m[rows], points.normals[rows], state, b)
+        gap, along, facing = from_bone(points.xyz_m[rows], points.normals[rows], state, b)
         closer = gap < nearest[rows]
         rows = rows[closer]
         nearest[rows], owner[rows] = gap[closer], b
@@ -58,7 +58,7 @@ def crop(points: CloudPoints, state: BodyState, reach_m: float) -> CloudPoints:
     """The points within `reach_m` of the bones: what a fit near this posture can ever need."""
     near = np.zeros(len(points.xyz_m), dtype=bool)
     for b, rows in _candidates(points.xyz_m, state, np.full(len(state.lengths_m), reach_m)):
-        near[rows] |= _from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] < reach_m
+        near[rows] |= from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] < reach_m
     return points.take(np.flatnonzero(near))
 
 
@@ -75,7 +75,7 @@ def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> lis
     return [(int(b), np.flatnonzero(column)) for b, column in zip(bones, near.T)]
 
 
-def _from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance from the limb's surface (N,) [m], fraction along the bone (N,), and whether the normal points outwards (N,)."""
     local = (xyz_m - state.head_m[bone]) @ state.R[bone]
     length = state.lengths_m[bone]

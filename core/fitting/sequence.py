@@ -10,87 +10,92 @@ step 4 what is known of the shape beforehand (radii from the model, bone lengths
 as it would in a single frame (`shared_frames`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from ..body.model_file import read_model
+from ..body.model_file import read_model, with_limits
 from ..body.shape import default_shape, scaled_shape
-from ..errors import InputError
-from ..geometry.rig import Rig
 from ..progress import Monitor
 from .acceleration import Acceleration, typical_acceleration
 from .body_motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from .click_frame import clicked_lengths, fit_click_frame
-from .clicks import read_clicks
-from .cloud_points import Cloud, CloudPoints, thinned
+from .clicks import enough, read_clicks
+from .cloud_points import CloudPoints, thinned
 from .conditions import Conditions
+from .fit_input import FitInput
 from .frame_to_frame import follow
 from .inverse_kinematics import clicked_stature, dof_priors, lasting
-from .material_tracks import MaterialTracks, Trajectories
+from .joint_tracks import JointTracks
+from .material_tracks import MaterialTracks
 from .observations import Observation
 from .problem import Problem, linearise, variance_factors
 from .robust import robust_scale
 from .segmentation import HeldSegments
 from .settings import FitSettings
+from .silhouettes import Silhouettes
 from .solver import Solution, solve
 from .state import BodyState, ShapeParameters, free_bones
 
-__all__ = ["BodyFit", "BodyMotion", "FitSettings", "fit_sequence"]
+__all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
 
 SUSPICIOUS = 3.0  # times the usual sigma0
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
-def fit_sequence(rig: Rig, model_name: str, clouds: Sequence[Cloud], joints: Mapping[str, Mapping[str, Sequence[float]]],
-                 click_frame: int, time_s: np.ndarray, trajectories: Trajectories | None = None, settings: FitSettings | None = None,
-                 monitor: Monitor | None = None) -> BodyFit:
-    """Shape and motion of the person from the clouds of a sequence and the joints clicked in one of its frames.
-
-    `clouds` in the order of time, `time_s` (T,) their times, `joints[name][view] = (x, y)` full-frame pixels at frame `click_frame`.
-    Frames without points are bridged and say so in their status. Time is linear in frames.
+def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None) -> BodyFit:
+    """Shape and motion of the person. Frames without points are bridged and say so in their status. Time is linear in frames.
 
     Raises:
-        InputError: the model is unknown, clicks are missing or contradict each other, or the limb has no points at the click frame.
+        InputError: the model or a degree of freedom is unknown, clicks are missing or contradict each other, or the limb has no points
+            where the fit begins.
         Cancelled: the user asked to stop.
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
-    time_s = _checked_times(time_s, len(clouds))
-    fit = _conditions(rig, model_name, [int(cloud.frame) for cloud in clouds], joints, click_frame, settings)
+    fit = conditions(given, settings)
     points = []
-    for i, cloud in enumerate(clouds):
-        monitor.step("thin the clouds", i, len(clouds))
+    for i, cloud in enumerate(given.clouds):
+        monitor.step("thin the clouds", i, len(given.clouds))
         points.append(thinned(cloud, settings.voxel_m))
     first = fit_click_frame(fit, points[fit.click], monitor)
     tracks = None
-    if trajectories is not None and settings.use_trajectories:
-        tracks = MaterialTracks(trajectories, [p.frame for p in points], fit.model.surface, settings)
-    motion, points, known = follow(fit, points, time_s, first, tracks, monitor)
-    sigma = typical_acceleration(motion, known, time_s, _loosest(fit))
-    problem = _whole_sequence(fit, points, time_s, sigma, tracks, clicked_lengths(fit, points[fit.click], first))
+    if given.trajectories is not None and settings.use_trajectories:
+        tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
+    motion, points, known = follow(fit, points, given.time_s, first, tracks, monitor)
+    sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
+    problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, clicked_lengths(fit, points[fit.click], first))
     solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
-    return _result(fit, points, time_s, solution, problem)
+    return _result(fit, points, given.time_s, solution, problem)
 
 
-def _checked_times(time_s: np.ndarray, frames: int) -> np.ndarray:
-    times = np.asarray(time_s, dtype=np.float64)
-    if times.shape != (frames,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise InputError(f"The fit needs a growing time for each of the {frames} frames; check the frame rate and the frames of the take.")
-    return times
+def conditions(given: FitInput, settings: FitSettings) -> Conditions:
+    """What stays the same throughout the fit.
 
-
-def _conditions(rig: Rig, model_name: str, frames: list[int], joints: Mapping[str, Mapping[str, Sequence[float]]], click_frame: int,
-                settings: FitSettings) -> Conditions:
-    if click_frame not in frames:
-        raise InputError(f"The joints are clicked in frame {click_frame}, which was not measured; measure it, or click in another frame.")
-    model = read_model(model_name)
-    clicks = read_clicks(rig, model.skeleton.joint_names, joints, settings.click_sigma_px)
+    Raises:
+        InputError: see `fit_sequence`.
+    """
+    model = with_limits(read_model(given.model), given.limits, given.locked)
+    names, frames = model.skeleton.joint_names, given.frames
+    tracks, clicked, places = JointTracks(given, names), {}, {}
+    for frame, joints in given.clicks.items():
+        clicked[frames.index(frame)], places[frames.index(frame)] = read_clicks(given.rig, names, joints, settings.click_sigma_px)
+    wanted = given.click_frame if given.click_frame in given.clicks else None
+    begin = _best_known(places, tracks) if wanted is None else frames.index(wanted)
+    known = tracks.located(begin)
+    known = np.where(np.isfinite(places[begin]), places[begin], known) if begin in places else known
+    clicks = enough(known, names, [*([clicked[begin]] if begin in clicked else []), *tracks.observe(begin)])
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
     shape = default_shape(model)
     shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
-    return Conditions(model=model, parameters=ShapeParameters(shape), settings=settings, clicks=clicks,
-                      click=frames.index(click_frame), priors=priors)
+    return Conditions(cameras=given.rig.cameras, model=model, parameters=ShapeParameters(shape), settings=settings, clicks=clicks,
+                      click=begin, priors=priors, clicked=clicked, tracks=tracks,
+                      silhouettes=Silhouettes(given, model.surface, settings))
+
+
+def _best_known(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
+    """The frame index with most clicked joints; without clicks, the one with most keypoints."""
+    return max(places, key=lambda t: int(np.isfinite(places[t]).sum())) if places else tracks.best_frame()
 
 
 def _loosest(fit: Conditions) -> np.ndarray:
@@ -109,7 +114,8 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
     held = HeldSegments()
 
     def observe(t: int, state: BodyState) -> list[Observation]:
-        return [fit.surface(points[t], state, held=held), *([fit.clicks.observation] if t == fit.click else []), *priors]
+        return [fit.surface(points[t], state, held=held), *fit.joints(t), *fit.silhouettes.observe(t, state, held),
+                *priors]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
     return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),
@@ -149,7 +155,9 @@ def _covariance(problem: Problem, solution: Solution) -> tuple[np.ndarray, np.nd
     """Blocks of the covariance: pose (T, D, D), pose with shape (T, D, S), shape (S, S)."""
     lin = linearise(problem, solution.motion, solution.vector, solution.scales)
     understated = variance_factors(problem, lin, solution.scales)
-    return linearise(problem, solution.motion, solution.vector, solution.scales, understated).equations.covariance()
+    pose, mixed, shape = linearise(problem, solution.motion, solution.vector, solution.scales, understated).equations.covariance()
+    pose[:, problem.held] = pose[:, :, problem.held] = mixed[:, problem.held] = 0.0
+    return pose, mixed, shape
 
 
 def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:

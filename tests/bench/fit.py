@@ -21,6 +21,7 @@ from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.fitting import sequence
 from tricap.core.fitting.conditions import Conditions
+from tricap.core.fitting.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solver import solve
 from tricap.core.geometry.camera import Camera
@@ -92,7 +93,8 @@ def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
     try:
         for name in real:
             setattr(sequence, name, timed(name))
-        fit = sequence.fit_sequence(cameras, "full", clouds, clicks, 0, np.arange(frames) / FPS, None, settings)
+        given = FitInput(rig=cameras, model="full", clouds=clouds, clicks={0: clicks}, time_s=np.arange(frames) / FPS)
+        fit = sequence.fit_sequence(given, settings)
     finally:
         for name, function in real.items():
             setattr(sequence, name, function)
@@ -106,15 +108,17 @@ def beside_scipy(settings: FitSettings) -> dict[str, float]:
     """One frame's posture from 0.05 rad off: our solver, and scipy's with 2-point differences and with our Jacobian, on the same points."""
     shape, random, cameras = default_shape(read_model("full")), np.random.default_rng(1), rig()
     motion = walk(shape, 1)
-    points = sequence.thinned(cloud(shape, motion[0], 0, random), settings.voxel_m)
+    seen = cloud(shape, motion[0], 0, random)
+    points = sequence.thinned(seen, settings.voxel_m)
     clicks = {name: {c.name: c.project(X) for c in cameras.cameras}
               for name, X in joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()}
-    fit: Conditions = sequence._conditions(cameras, "full", [0], clicks, 0, settings)
+    given = FitInput(rig=cameras, model="full", clouds=[seen], clicks={0: clicks}, time_s=np.zeros(1))
+    fit: Conditions = sequence.conditions(given, settings)
     vector = fit.parameters.vector()
     start = motion[0] + random.normal(0, 0.05, motion.shape[1])
     there = fit.parameters.state(motion[0], vector)
     surface = fit.surface(points, there)
-    surface = replace(surface, robust=False, sigma_m=surface.sigma_m * np.sqrt(surface.crowding), crowding=1.0).scaled(there)
+    surface = replace(surface, kind="", sigma_m=surface.sigma_m * np.sqrt(surface.crowding), crowding=1.0).scaled(there)
     held = [surface, *fit.priors]
 
     def residual(x: np.ndarray) -> np.ndarray:

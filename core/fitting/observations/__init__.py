@@ -28,8 +28,8 @@ class Observation(Protocol):
     """One kind of observation of one body state."""
 
     @property
-    def robust(self) -> bool:
-        """Whether the residuals may hold gross errors, and are to be weighted down by their size."""
+    def kind(self) -> str:
+        """Empty, or the kind (problem.Scales) of residuals of which some may be gross errors, and are weighted down."""
 
     @property
     def crowding(self) -> np.ndarray | float:

@@ -16,7 +16,7 @@ class EqualRadii:
 
     sigma: float
     log_ratio: np.ndarray | float = 0.0  # (M,) the model's ln l_x − ln l_z
-    robust: bool = False
+    kind: str = ""
     crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:

@@ -16,7 +16,7 @@ class FootOnFloor:
     floor_m: float
     sigma_m: float
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    robust: bool = False
+    kind: str = ""
     crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:

@@ -16,7 +16,7 @@ class MotionPrior(FromBlocks):
 
     mean: np.ndarray
     sigma: np.ndarray
-    robust: bool = False
+    kind: str = ""
     crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
@@ -40,7 +40,7 @@ class ShapePrior:
 
     mean: np.ndarray
     sigma: np.ndarray
-    robust: bool = False
+    kind: str = ""
     crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:

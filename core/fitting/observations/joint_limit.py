@@ -16,7 +16,7 @@ class JointLimits(FromBlocks):
     low: np.ndarray
     high: np.ndarray
     sigma: float
-    robust: bool = False
+    kind: str = ""
     crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:

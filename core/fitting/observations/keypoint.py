@@ -14,8 +14,8 @@ class Keypoints:
     joint: np.ndarray  # (K,) index in Skeleton.joint_names
     xyz_m: np.ndarray  # (K, 3)
     sigma_m: np.ndarray  # (K,)
-    robust: bool = False
-    crowding: float = 1.0
+    kind: str = ""
+    crowding: np.ndarray | float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(3K,)"""

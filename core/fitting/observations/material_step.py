@@ -59,7 +59,7 @@ class StepsFromFixed(FromBlocks):
     steps: MaterialSteps
     other: BodyState
     backwards: bool = False  # the held body is frame b, the observed one frame a
-    robust: bool = True
+    kind: str = "steps"
 
     @property
     def crowding(self) -> np.ndarray | float:

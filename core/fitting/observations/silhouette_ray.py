@@ -3,7 +3,7 @@
     t* = argmax_t F(o + t u) ,   √(−½ ln F(o + t* u)) − √(½ ln 2) = ε                                    (1)
 
 Because ∂F/∂t = 0 at t*, derivatives of F(o + t* u) need none of t* (envelope theorem): they are those of a surface point held there.
-t* is the best of the closest approaches to the single balls, t = −(M o)·(M u)/|M u|² with M = diag(1/l) Rᵀ, made exact by Newton steps.
+t* starts at the best of the closest approaches to the single balls, t = −(M o)·(M u)/|M u|² with M = diag(1/l) Rᵀ.
 A ray belongs to one bone's part, whose field is meant. The sigma is that of the contour in the image, carried to the ray's depth.
 """
 
@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..part_field import PartField
 from ..state import BodyState
 from .blocks import Block, FromBlocks
 from .surface_point import SurfacePoints
 
-NEWTON_STEPS = 8
+MEAN_STEPS, NEWTON_STEPS, LONGEST_M = 4, 5, 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -30,7 +29,7 @@ class SilhouetteRays(FromBlocks):
     sigma_m: np.ndarray  # (N,) Z/f · σ_px
     crowding: np.ndarray | float = 1.0
     held: SurfacePoints | None = None  # the touching points with their weights, at the state of `scaled`
-    robust: bool = True
+    kind: str = "contours"
 
     def scaled(self, state: BodyState) -> "SilhouetteRays":
         """The same rays with weights for this state."""
@@ -66,28 +65,28 @@ class SilhouetteRays(FromBlocks):
 
 
 def _largest_field(state: BodyState, bone: int, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Along a ray the field is Σ w exp(−2 (a t² + 2 b t + c)): its shares p_i give t = −Σ p b / Σ p a, then Newton's steps on ln F."""
     part, balls = state.parts[bone], state.balls
-    approaches = []
-    for ball in part.balls:
-        b = balls.bone_index[ball]
-        centre = state.head_m[b] + state.R[b] @ (balls.centre[ball] * state.lengths_m[b])
-        M = state.R[b].T / balls.radii_m[ball][:, None]
-        o, u = (origin - centre) @ M.T, direction @ M.T
-        approaches.append(-np.einsum("ni,ni->n", o, u) / np.einsum("ni,ni->n", u, u))
-    t = np.stack(approaches, axis=1)
-    X = origin[:, None] + t[..., None] * direction[:, None]
-    F = PartField(part, state, X.reshape(-1, 3)).F.reshape(t.shape)
-    best = t[np.arange(len(t)), np.argmax(F, axis=1)]
+    own, of = part.balls, balls.bone_index[part.balls]
+    centre = state.head_m[of] + np.einsum("mij,mj->mi", state.R[of], balls.centre[own] * state.lengths_m[of, None])
+    M = state.R[of].transpose(0, 2, 1) / balls.radii_m[own][:, :, None]
+    o, u = origin @ M.transpose(0, 2, 1) - np.einsum("mij,mj->mi", M, centre)[:, None], direction @ M.transpose(0, 2, 1)  # (m, N, 3)
+    a, b = np.einsum("mni,mni->nm", u, u), np.einsum("mni,mni->nm", o, u)
+    least = np.einsum("mni,mni->nm", o, o) - b * b / a  # d where the ball is nearest, at t = −b/a
+    nearest, log_weight = -b / a, np.log(balls.weight[own])
+
+    def shares(t: np.ndarray) -> np.ndarray:
+        log_terms = log_weight - 2 * (least + a * (t[:, None] - nearest) ** 2)
+        terms = np.exp(log_terms - log_terms.max(axis=1, keepdims=True))
+        return np.asarray(terms / terms.sum(axis=1, keepdims=True))
+
+    t = nearest[np.arange(len(origin)), np.argmax(log_weight - 2 * least, axis=1)]
+    for _ in range(MEAN_STEPS):
+        p = shares(t)
+        t = -(p * b).sum(axis=1) / (p * a).sum(axis=1)
     for _ in range(NEWTON_STEPS):
-        best = best + _newton(state, bone, origin, direction, best)
-    return origin + best[:, None] * direction
-
-
-def _newton(state: BodyState, bone: int, origin: np.ndarray, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Steps (N,) [m] towards the largest F along the rays, from differences of the slope; at most a centimetre."""
-    h = 1e-4
-    slopes = [np.einsum("ni,ni->n", PartField(state.parts[bone], state, origin + (t + d)[:, None] * direction).gradient, direction)
-              for d in (0.0, h)]
-    slope, curve = slopes[0], (slopes[1] - slopes[0]) / h
-    step = np.where(curve < 0, -slope / np.where(curve < 0, curve, 1.0), np.sign(slope) * 0.005)
-    return np.clip(step, -0.01, 0.01)
+        p, slopes = shares(t), -4 * (a * t[:, None] + b)
+        slope = (p * slopes).sum(axis=1)
+        curve = (p * (slopes**2 - 4 * a)).sum(axis=1) - slope**2
+        t = t + np.clip(np.where(curve < 0, -slope / np.where(curve < 0, curve, 1.0), 0.0), -LONGEST_M, LONGEST_M)
+    return np.asarray(origin + t[:, None] * direction)

@@ -47,7 +47,7 @@ class SurfacePoints(FromBlocks):
     form: str = "metric"  # or "paper"
     parts: tuple[_Scaled, ...] | None = None
     moved: bool = False  # since `scaled`
-    robust: bool = True
+    kind: str = "points"
 
     def scaled(self, state: BodyState) -> "SurfacePoints":
         """The same points with weights for this state.  (12)"""

@@ -14,7 +14,7 @@ class Symmetry:
     left: np.ndarray  # (K,) indices in the shape vector
     right: np.ndarray  # (K,)
     sigma: float
-    robust: bool = False
+    kind: str = ""
     crowding: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:

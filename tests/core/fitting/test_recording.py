@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tricap.core.fitting.sequence import fit_sequence
+from tricap.core.fitting.sequence import FitInput, fit_sequence
 from tricap.core.geometry.rig import read_rig
 
 TAKE = Path(__file__).resolve().parents[4] / "shared" / "takes" / "dev_arm"
@@ -62,7 +62,9 @@ def test_arm_of_a_whole_person() -> None:
     rng = np.random.default_rng(0)
     clouds = [_cloud(t, v, triangles[seen[triangles].all(axis=1)], centre, rng) for t, (v, seen) in enumerate(zip(V, visible))]
     tracks = _tracks(V, visible & truth["textured"], rng)
-    fit = fit_sequence(rig, "arm.R", clouds, take["seeds"]["joints"], take["seeds"]["frame"], truth["time_s"], trajectories=tracks)
+    seeds = take["seeds"]
+    fit = fit_sequence(FitInput(rig=rig, model="arm.R", clouds=clouds, clicks={seeds["frame"]: seeds["joints"]}, click_frame=seeds["frame"],
+                                time_s=truth["time_s"], trajectories=tracks))
     names = truth["joint_names"].tolist()
     true = np.stack([truth["joints_m"][:, names.index(JOINTS[joint])] for joint in fit.motion.joint_names], axis=1)
     error = fit.motion.joints_m - true

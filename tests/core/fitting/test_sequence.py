@@ -12,7 +12,7 @@ from tricap.core.errors import InputError
 from tricap.core.fitting.click_frame import fit_posture_and_shape
 from tricap.core.fitting.cloud_points import thinned
 from tricap.core.fitting.inverse_kinematics import inverse_kinematics
-from tricap.core.fitting.sequence import FitSettings, _conditions, fit_sequence
+from tricap.core.fitting.sequence import FitInput, FitSettings, conditions, fit_sequence
 from tricap.core.progress import Cancelled, Monitor
 
 KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
@@ -20,9 +20,13 @@ UNKNOWN = FitSettings(model_sigma_m=0.0, voxel_m=0.002)
 
 
 def _fit(scene, settings=KNOWN, click=0, **changes):
-    values = dict(rig=scene.rig, model_name=scene.model, clouds=scene.clouds, joints=scene.clicks, click_frame=click, time_s=scene.time_s,
-                  settings=settings)
-    return fit_sequence(**{**values, **changes})
+    return fit_sequence(_given(scene, click, **changes), settings)
+
+
+def _given(scene, click=0, joints=None, **changes) -> FitInput:
+    values = dict(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={click: scene.clicks if joints is None else joints},
+                  click_frame=click, time_s=scene.time_s)
+    return FitInput(**{**values, **changes})
 
 
 def _joint_errors(scene, fit) -> np.ndarray:
@@ -84,7 +88,7 @@ def test_sigmas_are_honest(make_scene) -> None:
 @pytest.mark.slow
 def test_starts_thirty_degrees_off_all_converge(make_scene) -> None:
     scene = make_scene(seed=1)
-    fit = _conditions(scene.rig, scene.model, [0], scene.clicks, 0, KNOWN)
+    fit = conditions(_given(scene), KNOWN)
     points = thinned(scene.clouds[0], KNOWN.voxel_m)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, KNOWN.length_sigma)
     rng, good = np.random.default_rng(0), 0
@@ -109,7 +113,7 @@ def test_mirrored_scene_gives_the_mirrored_fit(make_scene) -> None:
     # voxels are cut from 0 upwards and are not their own mirror images: leave the points alone
     settings = FitSettings(model_sigma_m=0.0, voxel_m=0.001)
     right = _fit(scene, settings)
-    left = _fit(scene, settings, model_name="arm.L", clouds=clouds, joints=clicks)
+    left = _fit(scene, settings, model="arm.L", clouds=clouds, joints=clicks)
     assert np.allclose(left.motion.joints_m * flip, right.motion.joints_m, atol=2e-4)
     assert np.allclose(left.shape.lengths_m, right.shape.lengths_m, atol=2e-4)
     signs = np.array([-1, 1, 1, 1, -1, -1, 1, -1.0])
@@ -188,7 +192,7 @@ def test_bad_input_is_refused_in_a_sentence(make_scene) -> None:
     with pytest.raises(InputError, match="no measured points"):
         _fit(scene, clouds=[_empty(0), scene.clouds[1]])
     with pytest.raises(InputError, match="no body model.*arm.R"):
-        _fit(scene, model_name="arm.r")
+        _fit(scene, model="arm.r")
     with pytest.raises(InputError, match="growing time"):
         _fit(scene, time_s=np.zeros(2))
 
@@ -198,7 +202,7 @@ def test_cancelling_stops_the_fit(make_scene) -> None:
     monitor = Monitor()
     monitor.cancel()
     with pytest.raises(Cancelled):
-        _fit(scene, monitor=monitor)
+        fit_sequence(_given(scene), KNOWN, monitor)
 
 
 def test_paper_mode_fits_too(make_scene) -> None:

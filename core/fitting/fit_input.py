@@ -1,0 +1,82 @@
+"""What a fit is made from, in one value: clouds, trajectories, contours, clicks, keypoints, and what the user knows about the joints."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.rig import Rig
+from ..values import frozen
+from .cloud_points import Cloud
+from .material_tracks import Trajectories
+
+ClickedAt = Mapping[str, Mapping[str, Sequence[float]]]  # joint -> view -> (x, y) full-frame pixels
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ViewContours:
+    """The outline of the person in one view, over frames: V vertices."""
+
+    view: str
+    frame: np.ndarray  # (V,) the take's frame numbers
+    xy_px: np.ndarray  # (V, 2) full frame
+    normal: np.ndarray  # (V, 2) unit, outwards
+    sigma_px: np.ndarray  # (V,) along the normal
+
+    def __post_init__(self) -> None:
+        v = len(self.frame)
+        object.__setattr__(self, "frame", frozen(self.frame, (v,), np.int64, "frame"))
+        for name, shape in dict(xy_px=(v, 2), normal=(v, 2), sigma_px=(v,)).items():
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class JointPlaces:
+    """K places of joints that another system found: in the pixels of a view (K, 2), or in space (K, 3) [m] where `view` is empty."""
+
+    view: str
+    frame: np.ndarray  # (K,) the take's frame numbers
+    joint: tuple[str, ...]  # K
+    place: np.ndarray  # (K, 2) or (K, 3)
+    sigma: np.ndarray  # (K,) px or m
+
+    def __post_init__(self) -> None:
+        k = len(self.frame)
+        object.__setattr__(self, "frame", frozen(self.frame, (k,), np.int64, "frame"))
+        object.__setattr__(self, "place", frozen(self.place, (k, 2 if self.view else 3), name="place"))
+        object.__setattr__(self, "sigma", frozen(self.sigma, (k,), name="sigma"))
+        if len(self.joint) != k:
+            raise ValueError("every place needs its joint")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FitInput:
+    """A recording as the fit takes it: `clouds` in the order of time, `time_s` (T,) their times, clicks by frame number."""
+
+    rig: Rig
+    model: str
+    clouds: Sequence[Cloud]
+    time_s: np.ndarray
+    clicks: Mapping[int, ClickedAt] = field(default_factory=dict)
+    click_frame: int | None = None  # where the fit begins; None: where most joints are known
+    trajectories: Trajectories | None = None
+    contours: Sequence[ViewContours] = ()
+    keypoints: Sequence[JointPlaces] = ()
+    locked: Sequence[str] = ()  # degrees of freedom that are held at their rest value
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # rad, by degree of freedom
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.time_s, dtype=np.float64)
+        if times.shape != (len(self.clouds),) or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise InputError(f"The fit needs a growing time for each of the {len(self.clouds)} frames; "
+                             "check the frame rate and the frames of the take.")
+        object.__setattr__(self, "time_s", frozen(times, times.shape))
+        for frame in self.clicks:
+            if frame not in self.frames:
+                raise InputError(f"The joints are clicked in frame {frame}, which was not measured; measure it, or click in another frame.")
+
+    @property
+    def frames(self) -> list[int]:
+        """The take's frame numbers (T)."""
+        return [int(cloud.frame) for cloud in self.clouds]

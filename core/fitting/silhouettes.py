@@ -1,0 +1,108 @@
+"""Contours of the views as rays that touch the body, frame by frame, and the limb that each touches.
+
+A ray of the outline touches the limb that it enters deepest, or passes nearest: a ray inside any limb would be inside the outline. It is
+nobody's when it is further from every limb than the gate, when it meets the limb where the surface is another part's, or when the outline
+faces the other way than the limb.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from .fit_input import FitInput
+from .observations import SilhouetteRays
+from .segmentation import HeldSegments, from_bone
+from .settings import FitSettings
+from .state import BodyState
+
+SPACING_M = 0.012  # of the rays, at the body
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rays:
+    """N rays through the outlines of one frame."""
+
+    origin_m: np.ndarray  # (N, 3)
+    direction: np.ndarray  # (N, 3) unit
+    outward: np.ndarray  # (N, 3) unit, away from the person and across the ray
+    angle: np.ndarray  # (N,) sigma across the ray, rad
+
+
+class Silhouettes:
+    """The rays of all frames, as observations of a body."""
+
+    def __init__(self, given: FitInput, surface: np.ndarray, settings: FitSettings) -> None:
+        self._surface, self._settings = surface, settings
+        used = given.contours if settings.use_contours else ()
+        self._tables = [(given.rig[c.view], c) for c in used]
+        self._frames = given.frames
+        self._rays: dict[int, Rays | None] = {}
+
+    def observe(self, t: int, state: BodyState, held: HeldSegments | None = None) -> list[SilhouetteRays]:
+        """The rays of frame index `t` that touch a limb of the body near its state; none without contours."""
+        if t not in self._rays:
+            self._rays[t] = self._of_frame(t, state)
+        rays = self._rays[t]
+        if rays is None:
+            return []
+
+        def find() -> tuple[np.ndarray, np.ndarray]:
+            return touched(rays, state, self._surface, self._settings.gate_m)
+
+        rows, bone = find() if held is None else held.get(("rays", t), state, find)
+        if not len(rows):
+            return []
+        away = np.linalg.norm(state.head_m[bone] - rays.origin_m[rows], axis=1)
+        own, model = (rays.angle[rows] * away) ** 2 + 1e-12, self._settings.model_sigma_m**2
+        share = max(1.0, len(self._tables) * self._settings.model_patch_m / SPACING_M)
+        found = SilhouetteRays(origin_m=rays.origin_m[rows], direction=rays.direction[rows], bone=bone, sigma_m=np.sqrt(own + model),
+                               crowding=(own + share * model) / (own + model))
+        return [found.scaled(state)]
+
+    def _of_frame(self, t: int, state: BodyState) -> Rays | None:
+        parts = [_view_rays(camera, table.xy_px[rows], table.normal[rows], table.sigma_px[rows], state.head_m.mean(axis=0))
+                 for camera, table in self._tables if len(rows := np.flatnonzero(table.frame == self._frames[t]))]
+        if not parts:
+            return None
+        columns: Mapping[str, np.ndarray] = {name: np.concatenate([getattr(p, name) for p in parts])
+                                             for name in ("origin_m", "direction", "outward", "angle")}
+        return Rays(**columns)
+
+
+def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: np.ndarray, about_m: np.ndarray) -> Rays:
+    """The rays of one view, thinned to `SPACING_M` at a place (3,) of the body."""
+    pixel_m = np.linalg.norm(about_m - camera.centre_m) / camera.focal_px
+    gap = np.median(np.linalg.norm(np.diff(xy_px, axis=0), axis=1)) * pixel_m if len(xy_px) > 1 else SPACING_M
+    keep = np.arange(0, len(xy_px), max(1, round(SPACING_M / max(gap, 1e-9))))
+    direction, beside = (_unit(camera.rays(xy)) for xy in (xy_px[keep], xy_px[keep] + normal[keep]))
+    outward = _unit(beside - np.einsum("ni,ni->n", beside, direction)[:, None] * direction)
+    return Rays(origin_m=np.broadcast_to(camera.centre_m, direction.shape), direction=direction, outward=outward,
+                angle=sigma_px[keep] / camera.focal_px)
+
+
+def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (K,) of the rays that touch a limb, and its bone (K,). `surface` (B, 2) as in `segmentation.segment`."""
+    n = len(rays.direction)
+    nearest, owner, own = np.full(n, np.inf), np.zeros(n, dtype=np.intp), np.zeros(n, dtype=bool)
+    for b in np.unique(state.balls.bone_index).tolist():
+        X = nearest_to_segment(rays.origin_m, rays.direction, state.head_m[b], state.R[b][:, 1], state.lengths_m[b])
+        gap, along, facing = from_bone(X, rays.outward, state, b)
+        closer = gap < nearest
+        nearest[closer], owner[closer] = gap[closer], b
+        own[closer] = ((along >= surface[b, 0]) & (along <= surface[b, 1]) & facing)[closer]
+    rows = np.flatnonzero(own & (np.abs(nearest) < gate_m))
+    return rows, owner[rows]
+
+
+def nearest_to_segment(origin: np.ndarray, direction: np.ndarray, head: np.ndarray, axis: np.ndarray, length: float) -> np.ndarray:
+    """The points (N, 3) of rays that come nearest to a segment from `head` (3,) along the unit vector `axis` (3,)."""
+    w = origin - head
+    b, d, e = direction @ axis, np.einsum("ni,ni->n", direction, w), w @ axis
+    along = np.clip((e - b * d) / np.maximum(1 - b * b, 1e-9), 0.0, length)
+    return origin + (along * b - d)[:, None] * direction
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

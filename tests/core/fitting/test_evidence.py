@@ -1,0 +1,99 @@
+"""What the fit uses besides points: outlines, clicks in further frames, keypoints, limits and locks."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tricap.core.body.skin import limb_skin
+from tricap.core.errors import InputError
+from tricap.core.fitting.fit_input import FitInput, JointPlaces, ViewContours
+from tricap.core.fitting.sequence import fit_sequence
+from tricap.core.fitting.settings import FitSettings
+from tricap.core.geometry.raster import rasterize
+from tricap.core.tracking.contour import contour_of_mask, outward_normals
+
+SETTINGS = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
+
+
+def _given(scene, **changes) -> FitInput:
+    values = dict(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={0: scene.clicks}, time_s=scene.time_s)
+    return FitInput(**{**values, **changes})
+
+
+def _outlines(scene) -> list[ViewContours]:
+    """The true outlines of every frame and view, found in a mask of four samples a pixel."""
+    found = []
+    for camera in scene.rig.cameras:
+        parts = []
+        for frame, motion in enumerate(scene.motion):
+            skin = limb_skin(scene.shape, motion)
+            raster = rasterize(camera, skin.vertices_m, skin.triangles, factor=4)
+            xy = contour_of_mask(raster.image(np.ones(len(raster.sample)), 0.0) > 0, 16.0)
+            normal = outward_normals(xy)
+            parts.append(np.column_stack([np.full(len(xy), frame), (xy + 0.5) / 4 - 0.5, normal]))
+        table = np.concatenate(parts)
+        found.append(ViewContours(view=camera.name, frame=table[:, 0], xy_px=table[:, 1:3], normal=table[:, 3:],
+                                  sigma_px=np.full(len(table), 0.5)))
+    return found
+
+
+def test_outlines_tell_the_thickness_that_points_from_one_side_do_not(make_scene, other_person) -> None:
+    before, after = [], []
+    for seed in range(4):
+        scene = make_scene(seed=seed, shape=other_person("arm.R", np.random.default_rng(seed)))
+        for contours, errors in (((), before), (_outlines(scene), after)):
+            fit = fit_sequence(_given(scene, contours=contours), SETTINGS)
+            errors.append(fit.motion.joints_m - scene.joints_m)
+    depth = [np.sqrt(np.mean(np.array(e)[..., 1] ** 2)) for e in (before, after)]
+    across = [np.sqrt(np.mean(np.array(e)[..., [0, 2]] ** 2)) for e in (before, after)]
+    assert depth[1] < 0.4 * depth[0]  # measured 6.4 mm and 0.5 mm
+    assert across[1] < across[0]
+
+
+def test_a_click_in_a_further_frame_finds_the_limb_again(make_scene) -> None:
+    scene = make_scene(frames=8, seed=1)
+    flexion = scene.shape.skeleton.layout["elbow.R flexion"]
+    for t in range(3, 8):  # from frame 3 on the forearm has no points, and bends otherwise than before
+        scene.motion[t, flexion] -= np.radians(8.0 * (t - 2))
+        shoulder, elbow = scene.joints_m[t, :2]
+        c = scene.clouds[t]
+        upper = np.linalg.norm(c.xyz_m - shoulder, axis=1) < np.linalg.norm(elbow - shoulder) * 0.9
+        scene.clouds[t] = SimpleNamespace(frame=t, xyz_m=c.xyz_m[upper], normals=c.normals[upper], covariance_m2=c.covariance_m2[upper])
+    wrist = {camera.name: camera.project(scene.joints_m[7, 2]) for camera in scene.rig.cameras}
+    errors = []
+    for clicks in ({0: scene.clicks}, {0: scene.clicks, 7: {"wrist.R": wrist}}):
+        fit = fit_sequence(_given(scene, clicks=clicks, click_frame=0), SETTINGS)
+        errors.append(np.linalg.norm(fit.motion.joints_m[:, 2] - scene.joints_m[:, 2], axis=1))
+    assert errors[1][7] < 0.02 < errors[0][7]
+    assert errors[1][3:].mean() < 0.5 * errors[0][3:].mean()
+
+
+def test_locked_and_limited_angles_stay_so(make_scene) -> None:
+    scene = make_scene(frames=3, seed=2)
+    layout = scene.shape.skeleton.layout
+    fit = fit_sequence(_given(scene, locked=["elbow.R twist"], limits={"elbow.R flexion": (0.0, np.radians(50))}), SETTINGS)
+    assert (fit.motion.values[:, layout["elbow.R twist"]] == 0).all()
+    assert (fit.motion.sigma[:, layout["elbow.R twist"]] == 0).all()
+    free = fit_sequence(_given(scene), SETTINGS)
+    flexion = np.degrees([f.motion.values[-1, layout["elbow.R flexion"]] for f in (fit, free)])
+    assert flexion[1] > 65 and flexion[0] < 60  # softly: truth is 75°
+    with pytest.raises(InputError, match="elbow.R twist"):
+        fit_sequence(_given(scene, locked=["elbow.R twst"]), SETTINGS)
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_keypoints_begin_the_fit_and_carry_it_without_clicks(make_scene, space) -> None:
+    scene = make_scene(frames=6, seed=3)
+    rng = np.random.default_rng(3)
+    names, frame = scene.shape.skeleton.joint_names, np.repeat(np.arange(6), 3)
+    X = scene.joints_m.reshape(-1, 3)
+    views = [("", X + rng.normal(0, 0.008, X.shape), 0.01)] if space else [
+        (c.name, c.project(X) + rng.normal(0, 3.0, (len(X), 2)), 4.0) for c in scene.rig.cameras]
+    keypoints = [JointPlaces(view=view, frame=frame, joint=names * 6, place=place, sigma=np.full(18, sigma))
+                 for view, place, sigma in views]
+    fit = fit_sequence(_given(scene, clicks={}, keypoints=keypoints), SETTINGS)
+    assert set(fit.motion.status) == {"fitted"}
+    assert np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2).mean() < 8e-3  # measured 6.3 mm
+    with pytest.raises(InputError, match="at least two of the joints"):
+        fit_sequence(_given(scene, clicks={}), SETTINGS)
