@@ -8,9 +8,11 @@ from typing import Any
 from .calibrating import calibrate_rig, measure_bar, open_bar, write_report
 from .calibration import account
 from .calibration.rig_files import FORMATS, read_any, write_as
+from .calibration.world_choice import WorldChoice, frame_of_clicks
 from .errors import InputError
-from .geometry.rig import write_rig
+from .geometry.rig import Rig, write_rig
 from .progress import Monitor
+from .tracking.point_tables import read_points
 
 
 def add_command(commands: Any) -> None:
@@ -23,6 +25,9 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--interlaced", choices=("none", "odd", "even"), default="none", help="which lines to keep of interlaced video")
     parser.add_argument("--mask", type=Path, metavar="FILE", help="image that is black where no target can be")
     parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar lies on the floor, which becomes z = 0")
+    parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar is held level")
+    parser.add_argument("--points", type=Path, metavar="FILE",
+                        help="CSV of point,view,x,y: the pixels of “origin”, “x” and “y”, which become the world's origin and axes")
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for the report: text, JSON, pictures")
     parser.add_argument("--import", dest="source", type=Path, metavar="FILE", help="read another tool's calibration instead of images")
     parser.add_argument("--export", dest="format", choices=sorted(FORMATS), help="write the rig in another tool's format")
@@ -43,6 +48,12 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def _convert(args: argparse.Namespace) -> list[str]:
     rig = read_any(args.source)
+    world = _world(args)
+    if world.floor_frames or world.level_frames:
+        raise InputError("--floor and --level need the bar's images; with --import give --points.")
+    if world.points:
+        frame = frame_of_clicks(rig.cameras, world.points)
+        rig = Rig(cameras=tuple(map(frame.camera, rig.cameras)), metadata={**rig.metadata, "floor": True})
     written = write_as(args.out, rig, args.format) if args.format else [args.out]
     if not args.format:
         write_rig(args.out, rig)
@@ -54,10 +65,10 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError("The bar's length is missing; give --bar-length with the distance between its two targets in metres.")
     if args.focal_px is not None and not 10 < args.focal_px < 1e6:
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
-    floor = _frames(args.floor)
+    world = _world(args)
     footage = open_bar(args.bar, args.interlaced, args.mask)
     measured = measure_bar(footage, args.bar_length, monitor)
-    result = calibrate_rig(measured.observations, monitor, focal_px=args.focal_px, floor_frames=floor)
+    result = calibrate_rig(measured.observations, monitor, focal_px=args.focal_px, world=world)
     written = [args.out]
     if args.report:
         written += write_report(args.report, result)[:1]
@@ -70,10 +81,19 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     return [result.verdict.sentence, f"To do better: {result.verdict.advice}.", f"Written: {', '.join(map(str, written))}"]
 
 
-def _frames(text: str | None) -> tuple[int, ...]:
+def _world(args: argparse.Namespace) -> WorldChoice:
+    points: dict[str, dict[str, list[float]]] = {}
+    if args.points is not None:
+        table = read_points(args.points, with_views=True)
+        for name, view, xy in zip(table.names, table.views, table.xy_px.tolist()):
+            points.setdefault(name, {})[view] = xy
+    return WorldChoice(floor_frames=_frames(args.floor, "--floor"), level_frames=_frames(args.level, "--level"), points=points)
+
+
+def _frames(text: str | None, flag: str) -> tuple[int, ...]:
     if not text:
         return ()
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError as error:
-        raise InputError(f"--floor {text} cannot be read; write frame numbers, such as 0,40,80.") from error
+        raise InputError(f"{flag} {text} cannot be read; write frame numbers, such as 0,40,80.") from error

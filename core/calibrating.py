@@ -19,7 +19,7 @@ from .calibration.quality import Quality, assess
 from .calibration.self_calibration import Calibration, calibrate
 from .calibration.target_tracks import BarTrack, track_bar
 from .calibration.targets import Targets, TargetStatus, find_targets
-from .calibration.world_frame import WorldFrame, frame_of_cameras, frame_on_floor
+from .calibration.world_choice import WorldChoice, frame_of_bar
 from .errors import InputError
 from .geometry.rig import Rig
 from .images.fields import row_grid
@@ -191,18 +191,17 @@ class CalibratedRig:
 
 
 def calibrate_rig(
-    observations: BarObservations, monitor: Monitor, *, focal_px: float | None = None, floor_frames: tuple[int, ...] = ()
+    observations: BarObservations, monitor: Monitor, *, focal_px: float | None = None, world: WorldChoice | None = None
 ) -> CalibratedRig:
     """Calibrate from what was seen of the bar, judge the result, and put it into the world's frame.
 
-    `floor_frames` are frames in which the bar lies on the floor; without them up is where the cameras' tops are.
-
     Raises:
-        InputError: the data cannot determine the rig; the sentence says what is missing.
+        InputError: the data cannot determine the rig, or not the world's frame; the sentence says what is missing.
     """
+    world = world or WorldChoice()
     calibration = calibrate(observations, monitor, focal_px)
     verdict.refuse_if_useless(calibration)
-    calibration = in_world(calibration, floor_frames)
+    calibration = in_world(calibration, world)
     quality = assess(calibration, monitor)
     verdict.refuse_if_undetermined(calibration, quality)
     judged = verdict.judge(calibration, quality)
@@ -214,31 +213,22 @@ def calibrate_rig(
         "predicted_error_m": quality.predicted.rms_m,
         "held_out_length_rms_m": quality.held_out.rms_m,
         "verdict": judged.sentence,
-        "floor": bool(floor_frames),
+        "floor": world.on_floor,
     }
     cameras = calibration.network.cameras(observations.names, observations.size_px)
     return CalibratedRig(rig=Rig(cameras=cameras, metadata=metadata), calibration=calibration, quality=quality, verdict=judged)
 
 
-def in_world(calibration: Calibration, floor_frames: tuple[int, ...]) -> Calibration:
+def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
     """The calibration turned and shifted into the world's frame. Its covariance stays: the cameras' unknowns are in their own frames.
 
     Raises:
-        InputError: the floor frames do not show the bar, or make no plane.
+        InputError: what the frame is to be made of was not seen, or makes none.
     """
     observations, network = calibration.observations, calibration.network
     cameras = network.cameras(observations.names, observations.size_px)
     known = (calibration.used.sum(axis=1) >= 2).all(axis=1)
-    frame: WorldFrame
-    if floor_frames:
-        unseen = [f for f in floor_frames if f not in set(observations.frames[known].tolist())]
-        if unseen:
-            raise InputError(
-                f"Frame {unseen[0]}, in which the bar is said to lie on the floor, does not show both of its ends; choose another."
-            )
-        frame = frame_on_floor(network.ends_m[np.isin(observations.frames, floor_frames)].reshape(-1, 3), cameras)
-    else:
-        frame = frame_of_cameras(cameras, network.ends_m[known])
+    frame = frame_of_bar(world, cameras, observations.frames[known], network.ends_m[known])
     moved = network.with_cameras([frame.camera(c) for c in cameras])
     moved = replace(moved, middle=frame.points(network.middle), direction=network.direction @ frame.R.T)
     return replace(calibration, network=moved)

@@ -9,6 +9,7 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ...core.calibrating import BarFootage, CalibratedRig, MeasuredBar, calibrate_rig, measure_bar, open_bar, write_report
 from ...core.calibration.rig_files import FORMATS, read_any, write_as
+from ...core.calibration.world_choice import WorldChoice
 from ...core.errors import InputError
 from ...core.geometry.rig import write_rig
 from ...core.progress import Monitor
@@ -56,8 +57,9 @@ class Calibrate(JobOperator, bpy.types.Operator):
         # Blender keeps single precision; what was typed is the shortest decimal that is stored alike.
         length, interlaced = float(f"{self.length_m or props.length_m:.7g}"), props.interlaced
         focal = props.focal_px if props.focal_px > 0 else None
+        world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level))
         live.begin()
-        return lambda monitor: compute(folder, length, interlaced, focal, out, monitor)
+        return lambda monitor: compute(folder, length, interlaced, focal, world, out, monitor)
 
     def finish(self, context: bpy.types.Context, result: Done) -> set[str]:
         """Build the cameras and tell the verdict."""
@@ -70,11 +72,24 @@ class Calibrate(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def compute(folder: Path, length_m: float, interlaced: str, focal_px: float | None, out: Path, monitor: Monitor) -> Done:
+def frame_numbers(text: str) -> tuple[int, ...]:
+    """The frames that a text such as "0, 40, 80" names.
+
+    Raises:
+        InputError: it names something else.
+    """
+    try:
+        return tuple(int(part) for part in text.replace(",", " ").split())
+    except ValueError as error:
+        raise InputError(f"“{text}” is no list of frames; write frame numbers, such as 0, 40, 80.") from error
+
+
+def compute(folder: Path, length_m: float, interlaced: str, focal_px: float | None, world: WorldChoice, out: Path, monitor: Monitor
+            ) -> Done:
     """The computation, free of bpy: from footage to rig.toml and its report beside it."""
     footage = open_bar(folder, interlaced)
     measured = measure_bar(footage, length_m, monitor, live.note)
-    result = calibrate_rig(measured.observations, monitor, focal_px=focal_px)
+    result = calibrate_rig(measured.observations, monitor, focal_px=focal_px, world=world)
     write_report(out.parent / f"{out.stem}_report", result)
     write_rig(out, result.rig)
     return Done(footage=footage, measured=measured, result=result, written=out)

@@ -25,6 +25,8 @@ class TRICAP_PT_calibrate(TricapPanel, bpy.types.Panel):
         column.prop(props, "length_m")
         column.prop(props, "interlaced")
         column.prop(props, "focal_px")
+        column.prop(props, "floor", placeholder="frames: 0, 40, 80")
+        column.prop(props, "level", placeholder="frames: 12, 57")
         row = column.row()
         row.scale_y = 1.3
         row.enabled = bool(props.bar)

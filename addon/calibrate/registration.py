@@ -20,6 +20,9 @@ class TricapCalibrate(bpy.types.PropertyGroup):
                                               ("even", "Even", "Keep the 2nd, 4th, … line")])
     focal_px: bpy.props.FloatProperty(name="Rough Focal Length [px]", default=0.0, min=0.0,  # type: ignore[valid-type]
                                       description="In pixels, if it is known; 0: it is found")
+    floor: bpy.props.StringProperty(name="Bar on Floor", description="Frames in which the bar lies on the floor, such as 0, 40, 80; "  # type: ignore[valid-type]
+                                    "the floor becomes z = 0. Empty: up is where the cameras' tops are")
+    level: bpy.props.StringProperty(name="Bar Level", description="Frames in which the bar is held level, such as 12, 57")  # type: ignore[valid-type]
     light: bpy.props.StringProperty(name="Light")  # type: ignore[valid-type]
     verdict: bpy.props.StringProperty(name="Verdict")  # type: ignore[valid-type]
     advice: bpy.props.StringProperty(name="Advice")  # type: ignore[valid-type]

@@ -31,6 +31,9 @@ def test_footage_becomes_cameras(blender, empty, bar: Path) -> None:
     clip = empty.data.movieclips["Bar C"]
     first = clip.tracking.tracks[0].markers
     assert len(clip.tracking.tracks) == 2 and len(first) > 20
+    waved = empty.data.objects["Reference bar"].data
+    ends = np.array([v.co for v in waved.vertices]).reshape(-1, 2, 3)
+    np.testing.assert_allclose(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), 0.5, atol=1e-3)
     assert rig["C"].size_px == tuple(clip.size)
 
 
@@ -39,6 +42,9 @@ def test_a_mistake_is_told_and_changes_nothing(blender, empty, tmp_path: Path) -
         empty.ops.tricap.calibrate(bar=str(tmp_path / "none"), length_m=0.5)
     with pytest.raises(RuntimeError, match="footage first"):
         empty.ops.tricap.calibrate()
+    empty.context.scene.tricap_calibrate.floor = "0, forty"
+    with pytest.raises(RuntimeError, match="“0, forty” is no list of frames"):
+        empty.ops.tricap.calibrate(bar=str(tmp_path), length_m=0.5)
     assert not [o for o in empty.context.scene.objects if o.type == "CAMERA"]
 
 

@@ -1,13 +1,17 @@
 """The world's frame: rigid, Z up, and where the user says it is."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tricap.__main__ import main
 from tricap.core.calibrating import calibrate_rig
+from tricap.core.calibration.world_choice import WorldChoice, frame_of_clicks
 from tricap.core.calibration.world_frame import WorldFrame, frame_of_cameras, frame_of_level_bar, frame_of_points, frame_on_floor
 from tricap.core.errors import InputError
+from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.progress import Monitor
 from tricap.core.synthetic.bar import BarNoise, bar_ends, benchmark_cameras, waved_bar
@@ -71,8 +75,56 @@ def test_floor_frames_of_a_calibration() -> None:
     ends[5], ends[40] = [[-0.25, 0.6, 2.4], [0.25, 0.6, 2.4]], [[0.0, 0.6, 2.3], [0.0, 0.6, 2.8]]
     xy = np.stack([c.project(ends) for c in CAMERAS], axis=1) + np.random.default_rng(1).normal(0, 0.02, waved.xy_px.shape)
     laid = replace(waved, ends_m=ends, xy_px=xy)
-    done = calibrate_rig(observed(laid), Monitor(), floor_frames=(5, 40))
+    done = calibrate_rig(observed(laid), Monitor(), world=WorldChoice(floor_frames=(5, 40)))
     assert np.abs(done.calibration.network.ends_m[[5, 40]][..., 2]).max() < 2e-3
     assert all(c.centre_m[2] == pytest.approx(0.6, abs=0.05) for c in done.rig.cameras)
+    level = calibrate_rig(observed(laid), Monitor(), world=WorldChoice(level_frames=(5, 40)))
+    assert np.abs(np.diff(level.calibration.network.ends_m[[5, 40]][..., 2])).max() < 2e-3
+    assert done.rig.metadata["floor"] is True and level.rig.metadata["floor"] is False
     with pytest.raises(InputError, match="Frame 999"):
-        calibrate_rig(observed(laid), Monitor(), floor_frames=(999, 5))
+        calibrate_rig(observed(laid), Monitor(), world=WorldChoice(floor_frames=(999, 5)))
+
+
+CLICKED = {"origin": [0.2, 0.5, 2.5], "x": [0.9, 0.5, 2.6], "y": [0.1, 0.5, 3.2]}
+
+
+def clicks(error_px: float = 0.0) -> dict[str, dict[str, list[float]]]:
+    pixels = {name: {c.name: c.project(np.array([at]))[0].tolist() for c in CAMERAS} for name, at in CLICKED.items()}
+    pixels["y"][CAMERAS[0].name][0] += error_px
+    return pixels
+
+
+def test_three_clicked_points_are_the_frame() -> None:
+    frame = frame_of_clicks(CAMERAS, clicks())
+    check_rigid(frame)
+    origin, x, y = (frame.points(np.array(at)) for at in CLICKED.values())
+    assert np.abs(origin).max() < 1e-6 and np.abs(x[1:]).max() < 1e-6 < x[0] and abs(y[2]) < 1e-6 < y[1]
+
+
+@pytest.mark.parametrize("points, said", [
+    ({k: v for k, v in clicks().items() if k != "x"}, "“x” of the world's frame is clicked in 0 view"),
+    (clicks() | {"x": {CAMERAS[0].name: [1.0, 2.0]}}, "“x” of the world's frame is clicked in 1 view"),
+    (clicks() | {"x": {"none": [1.0, 2.0]}}, "view “none”, which the rig does not have"),
+    (clicks(80.0), "clicks of the point “y” of the world's frame miss each other by"),
+    (clicks() | {"y": clicks()["x"]}, "lie on one line"),
+])
+def test_clicked_points_that_make_no_frame(points: dict[str, dict[str, list[float]]], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        frame_of_clicks(CAMERAS, points)
+    with pytest.raises(InputError, match="given twice"):
+        WorldChoice(points=points, floor_frames=(1, 2))
+
+
+def test_an_imported_rig_gets_the_clicked_frame(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    write_rig(rig, Rig(cameras=tuple(CAMERAS)))
+    rows = [f"{name},{view},{x},{y}" for name, at in clicks().items() for view, (x, y) in at.items()]
+    (tmp_path / "world é.csv").write_text("\n".join(["point,view,x,y", *rows]), encoding="utf-8")
+    out, points = tmp_path / "out.toml", str(tmp_path / "world é.csv")
+    assert main(["calibrate", "--import", str(rig), "--points", points, "--out", str(out), "--quiet"]) == 0
+    moved = read_rig(out)
+    assert moved.metadata["floor"] is True
+    for camera in CAMERAS:
+        expected = frame_of_clicks(CAMERAS, clicks()).camera(camera)
+        np.testing.assert_allclose(moved[camera.name].centre_m, expected.centre_m, atol=1e-9)
+    assert main(["calibrate", "--import", str(rig), "--floor", "1,2", "--out", str(out), "--quiet"]) == 2
