@@ -4,16 +4,29 @@ import csv
 import io
 from collections.abc import Sequence
 from math import radians
+from pathlib import Path
 
 import numpy as np
 
 from .errors import InputError
-from .fitting.fit_input import ClickedAt, FitInput, ViewContours
+from .fitting.fit_input import ClickedAt, FitInput, JointPlaces, ViewContours
+from .keypoint_sources import KeypointSource
+from .motion.c3d import read_c3d
+from .motion.keypoints_json import natural_order, read_keypoints
+from .motion.markers import Markers
+from .motion.points_csv import read_points_csv
+from .motion.retarget.points import joint_of
+from .motion.trc import read_trc
 from .results import Results
+from .settings import nearest_name
 from .surface.cloud import PointCloud
-from .take import Footage, Seeds
+from .take import JOINTS, Footage, Seeds
 from .tracking.trajectories import Trajectories
 
+OURS = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist", "thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "toe",
+        "clavicle": "clavicle", "hips": "pelvis", "neck": "neck"}  # of the roles that retargeting reads in names
+LOOSE = {"toe.L": 2.0, "toe.R": 2.0, "neck": 2.0, "pelvis": 2.0}  # where detectors mean another place than we do: times the sigma
+LEAST_CONFIDENCE = 0.2
 COLUMNS = ("frame", "x", "y", "normal_x", "normal_y", "sigma", "on_edge")
 
 
@@ -33,6 +46,7 @@ def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Traj
         click_frame=take.seeds.frame,
         trajectories=trajectories,  # type: ignore[arg-type]
         contours=read_contours(results, [v.name for v in take.views]),
+        keypoints=[read_source(footage, source) for source in take.keypoints],
         locked=take.locked,
         limits={name: (radians(low), radians(high)) for name, (low, high) in take.limits.items()},
     )
@@ -57,6 +71,59 @@ def read_contours(results: Results, views: Sequence[str]) -> list[ViewContours]:
         table = table[(table[:, 6] > 0) & np.isfinite(table).all(axis=1)]
         found.append(ViewContours(view=view, frame=table[:, 0], xy_px=table[:, 1:3], normal=table[:, 3:5], sigma_px=table[:, 5]))
     return found
+
+
+def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
+    """The keypoints of one [[keypoints]] entry, in the take's frames.
+
+    Raises:
+        InputError: there are no such files, they cannot be read, or none of their names is a joint.
+    """
+    folder = footage.take.folder
+    paths = sorted((p for p in folder.glob(source.files) if p.is_file()), key=lambda p: natural_order(p.name))
+    if not paths:
+        raise InputError(f"There are no keypoints “{source.files}” in {folder}; mend `files` under [[keypoints]].")
+    if source.view:
+        points = read_keypoints(paths)
+        view = next(v for v in footage.take.views if v.name == source.view)
+        frames = points.number - source.offset_frames - view.offset_frames
+        return _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
+    if len(paths) > 1:
+        raise InputError(f"“{source.files}” in {folder} are {len(paths)} files; keypoints in space are one file.")
+    markers = _markers(paths[0], source.axes)
+    return _places(source, markers.names, markers.frames - source.offset_frames, markers.xyz_m, np.ones(markers.sigma_m.shape), paths[0])
+
+
+def _markers(path: Path, axes: str | None) -> Markers:
+    if path.suffix.lower() == ".csv":
+        return read_points_csv(path)
+    read = read_trc if path.suffix.lower() == ".trc" else read_c3d
+    return read(path) if axes is None else read(path, axes=axes)
+
+
+def _places(source: KeypointSource, names: Sequence[str], frames: np.ndarray, places: np.ndarray, confidence: np.ndarray,
+            path: Path) -> JointPlaces:
+    """What a file says of joints, one row per place; a point of confidence c has the sigma over √c."""
+    for name in source.names:
+        if name not in names:
+            raise InputError(f"{path} has no point “{name}”.{nearest_name(name, list(names))} Mend `names` under [[keypoints]].")
+    joints = [source.names.get(name, joint_named(name)) for name in names]
+    rows = [(t, n) for t in range(len(frames)) for n, joint in enumerate(joints)
+            if joint and confidence[t, n] >= LEAST_CONFIDENCE and np.isfinite(places[t, n]).all()]
+    if not rows:
+        raise InputError(f"None of the points in {path} ({', '.join(names[:6])} …) is a joint of ours; say which under `names`.")
+    t, n = np.array(rows).T
+    loose = np.array([LOOSE.get(joint, 1.0) for joint in joints])
+    return JointPlaces(view=source.view, frame=frames[t], joint=tuple(joints[i] for i in n), place=places[t, n],
+                       sigma=source.sigma * loose[n] / np.sqrt(confidence[t, n]))
+
+
+def joint_named(name: str) -> str:
+    """Our joint of another system's name: "RKnee", "left_hip" -> "knee.R", "hip.L"; "" for what is no joint of ours."""
+    if name in JOINTS:
+        return name
+    part, dot, side = joint_of(name).partition(".")
+    return OURS.get(part, "") + (dot + side if part in OURS else "")
 
 
 def _clicked(seeds: Seeds) -> ClickedAt:

@@ -272,7 +272,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         track(run, monitor)
     began, take = time.perf_counter(), run.footage.take
     run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
-    missing = "no [body] model" if take.body_model is None else "no clicked joints" if not (take.seeds.joints or take.keyframes) else ""
+    joints = take.seeds.joints or take.keyframes or take.keypoints
+    missing = "no [body] model" if take.body_model is None else "no clicked joints" if not joints else ""
     if missing:
         run.warn(f"No body was fitted: take.toml has {missing}.")
         run.finish_stage("fit", began, not_done=missing)

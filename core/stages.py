@@ -43,7 +43,7 @@ def _fitted(footage: Footage) -> Any:
     take = footage.take
     model = take.body_model
     own = store.digest(Path(model)) if model and Path(model).is_file() else ""
-    return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes]
+    return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take)
 
 
 CONCERNS: dict[str, Concern] = {
@@ -88,6 +88,10 @@ def still_good(run: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any
 
 def _name_and_size(path: Path) -> tuple[str, int]:
     return path.name, path.stat().st_size
+
+
+def _keypoints(take: Take) -> Any:
+    return [(repr(s), [_name_and_size(path) for path in sorted(take.folder.glob(s.files))]) for s in take.keypoints]
 
 
 def _clicked(seeds: Seeds) -> Any:

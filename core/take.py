@@ -17,6 +17,7 @@ from .errors import InputError
 from .geometry.rig import Rig, read_rig
 from .images.fields import INTERLACE, RowGrid, row_grid
 from .images.sequence import Sequence, open_sequence
+from .keypoint_sources import KeypointSource, keypoint_sources
 from .settings import nearest_name
 from .values import frozen
 
@@ -24,7 +25,7 @@ FORMAT, VERSION = "tricap-take", 1
 SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
 KEYS = ("format", "version", "fps", "interlaced", "rig", "reference_view", "frames", "views", "body", "seeds", "keyframes", "corrections",
-        "settings")
+        "keypoints", "settings")
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
@@ -84,6 +85,7 @@ class Take:
     seeds: Seeds = field(default_factory=Seeds)
     keyframes: tuple[Seeds, ...] = ()  # clicked joints of further frames, one entry per frame
     corrections: tuple[Correction, ...] = ()
+    keypoints: tuple[KeypointSource, ...] = ()
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -252,6 +254,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         seeds=_seeds(_table(table, "seeds", where), names, where),
         keyframes=_keyframes(_list_of_tables(table, "keyframes", where), names, where),
         corrections=tuple(_correction(c, names, where) for c in _list_of_tables(table, "corrections", where)),
+        keypoints=keypoint_sources(_list_of_tables(table, "keypoints", where), names, JOINTS, where),
         settings=_settings(_table(table, "settings", where), where),
     )
 

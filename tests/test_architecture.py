@@ -15,7 +15,8 @@ ROOT = Path(__file__).resolve().parent.parent
 # Lowest first: a module of core imports only from its left. Sub-packages count as one.
 LAYERS = (
     "errors progress settings values store lock geometry images matching calibration surface tracking "
-    "body fitting motion take take_file results fit_sources measuring following frame_table correcting calibrating report stages pipeline "
+    "body fitting motion keypoint_sources take take_file results fit_sources measuring following "
+    "frame_table correcting calibrating report stages pipeline "
     "arguments calibrate_command track2d_command contour_command points_command commands"
 ).split()
 SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}
