@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from . import calibrate_command, contour_command, pipeline, points_command, track2d_command
+from . import calibrate_command, check_command, contour_command, pipeline, points_command, track2d_command
 from .arguments import frame_range, overrides
 from .errors import InputError
 from .geometry.rig import read_rig
@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     if not args.quiet or getattr(args, "json", False):
         for line in lines:
             _say(line, sys.stdout)
-    return 0
+    return int(getattr(args, "exit_code", 0))
 
 
 def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
@@ -62,7 +62,8 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
     demo.set_defaults(run=_demo, json=False)
-    for add in (calibrate_command.add_command, track2d_command.add_command, contour_command.add_command, *adders):
+    of_core = (check_command, calibrate_command, track2d_command, contour_command)
+    for add in (*(module.add_command for module in of_core), *adders):
         add(commands)
     for sub in commands.choices.values():
         sub.add_argument("--quiet", action="store_true", help="say nothing but errors")

@@ -33,6 +33,10 @@ CLICK_MISS_PX = 25.0
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
 
+class NothingMeasured(InputError):
+    """The first frame of a take gave no surface. The footage shows the cause; `checking` can find it."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FrameImages:
     """The rows of one frame that are measured, of all views, ready for matching."""
@@ -75,7 +79,8 @@ def measure_frames(
     """Measure all frames: from the frame of the clicks to the end, then from it to the beginning.
 
     Raises:
-        InputError: the images cannot be read, or nothing of a person can be measured in the first frame.
+        InputError: the images cannot be read.
+        NothingMeasured: nothing of a person can be measured in the first frame.
     """
     take = footage.take
     first = take.seeds.frame if take.seeds.frame in footage.frames else footage.frames.start
@@ -156,7 +161,7 @@ def _measure(
     field = clean_field(_single(field), cameras[ref], ref, surface)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):
-        raise InputError(
+        raise NothingMeasured(
             f"No surface could be measured in frame {frame} of {take.folder.name}: no texture is found alike in all views. "
             "Check that rig.toml belongs to this footage and that the views are not swapped, or click surface seeds."
         )

@@ -17,6 +17,7 @@ from . import store
 from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
+from .checking.take_check import causes_of_failure, first_look
 from .correcting import corrected_cloud, corrected_tracks
 from .errors import InputError
 from .fit_sources import fit_input
@@ -28,7 +29,7 @@ from .frame_table import frame_table, write_frame_table
 from .images.enhance import EnhanceSettings
 from .matching.growing import GrowingSettings
 from .matching.least_squares import MatchingSettings
-from .measuring import MeasuredFrame, clicked_depth, measure_frames
+from .measuring import MeasuredFrame, NothingMeasured, clicked_depth, measure_frames
 from .motion.ply import write_mesh
 from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
@@ -199,16 +200,14 @@ def measure(run: Run, monitor: Monitor) -> None:
         raise Cancelled(
             f"Stopped: the surface of {len(done)} of {len(run.footage.frames)} frames is kept; the same command goes on from there."
         ) from stop
+    except NothingMeasured as error:
+        cause = next(iter(causes_of_failure(run.footage, monitor)), None)
+        if cause is None:
+            raise
+        raise InputError(f"Nothing could be measured in the first frame. {cause.sentence} {cause.advice}".strip()) from error
     run.measured = sorted(done, key=lambda m: m.frame)
     points, residual = [len(m.cloud.xyz_m) for m in run.measured], _median([m.cloud.residual_px for m in run.measured])
-    empty = [m.frame for m in run.measured if not len(m.cloud.xyz_m)]
-    if empty:
-        run.warn(f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}.")
-    if residual > DOUBTFUL_RESIDUAL_PX:
-        run.warn(
-            f"The rays of matched points miss each other by {residual:.1f} px: "
-            "does rig.toml belong to this recording, and were the views in step?"
-        )
+    _warn_of_doubts(run, residual, monitor)
     run.finish_stage(
         "measure",
         began,
@@ -219,6 +218,21 @@ def measure(run: Run, monitor: Monitor) -> None:
         foreground=done[0].foreground.method,
         background_planes=len(done[0].foreground.planes),
     )
+
+
+def _warn_of_doubts(run: Run, residual_px: float, monitor: Monitor) -> None:
+    """What is odd about the clouds, and what is wrong with the take if anything is."""
+    empty = [m.frame for m in run.measured if not len(m.cloud.xyz_m)]
+    if empty:
+        run.warn(f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}.")
+    if residual_px > DOUBTFUL_RESIDUAL_PX:
+        run.warn(
+            f"The rays of matched points miss each other by {residual_px:.1f} px: "
+            "does rig.toml belong to this recording, and were the views in step?"
+        )
+    thorough = empty or residual_px > DOUBTFUL_RESIDUAL_PX
+    for cause in causes_of_failure(run.footage, monitor) if thorough else first_look(run.footage, run.measured[0].frame):
+        run.warn(f"{cause.sentence} {cause.advice}".strip())
 
 
 def track(run: Run, monitor: Monitor) -> None:

@@ -41,7 +41,7 @@ SEEN_RADII_M = np.array([[[0.053, 0.050], [0.047, 0.045], [0.043, 0.041]], [[0.0
 TARGET_M = np.array([-0.34, -0.06, 1.35])  # where the cameras look
 WALL_Y_M = 1.20
 SWING_S = 1.36  # there and back
-VIEWS = ("L", "C", "R")
+VIEWS, LATE = ("L", "C", "R"), "R"
 JOINTS = ("shoulder.R", "elbow.R", "wrist.R")
 MARK = "synthetic arm"  # in rig.toml's metadata
 SENSORS = dict(L=Sensor(gain=1.06, offset=-4.0), C=Sensor(), R=Sensor(gain=0.94, offset=7.0))
@@ -57,6 +57,7 @@ class ArmTakeSettings:
     interlaced: str = knob("odd", "Lines that take.toml keeps; the others are exposed half a frame later.", choices=("none", "odd", "even"))
     noise: float = knob(1.0, "Multiplies the sensors' noise.", low=0.0, high=20.0)
     click_error_px: float = knob(4.0, "Clicks on the joints are wrong by up to this much, in x and in y.", unit="px", low=0.0, high=100.0)
+    late_frames: float = knob(0.0, "View R is exposed this much later than the others.", unit="frames", low=-100.0, high=100.0)
     seed: int = knob(1, "Another seed: other textures, noise and clicks.", low=0, high=2**31 - 1)
 
 
@@ -175,12 +176,13 @@ def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> 
     settings, kept = studio.settings, row_grid(studio.settings.interlaced)
     instants = [frame / settings.fps] + ([(frame + 0.5) / settings.fps] if kept.step == 2 else [])
     bodies = [studio.body(time) for time in instants]
+    late = [studio.body(time + settings.late_frames / settings.fps) for time in instants] if settings.late_frames else bodies
     scene = joined(bodies[0])
     seen = np.ones(len(scene.vertices_m), dtype=bool)
     for i, camera in enumerate(studio.rig.cameras):
         monitor.step(STAGE, frame * len(VIEWS) + i, settings.frames * len(VIEWS))
         sensor = SENSORS[camera.name]
-        layers = [paint(camera, parts, studio.noise, studio.backdrops[i]) for parts in bodies]
+        layers = [paint(camera, parts, studio.noise, studio.backdrops[i]) for parts in (late if camera.name == LATE else bodies)]
         seen &= seen_vertices(camera, scene.vertices_m, scene.normals, layers[0])
         picture = expose(layers[0], sensor)
         if kept.step == 2:

@@ -1,0 +1,121 @@
+"""`tricap check TAKE`: the footage, its timing, its texture, and whether the rig belongs to it."""
+
+import math
+from pathlib import Path
+
+from ..errors import InputError
+from ..matching.least_squares import MatchingSettings
+from ..progress import Monitor
+from ..settings import from_table
+from ..take import Footage, open_take, read_take
+from .clicks import seed_findings
+from .findings import Checked, Finding, doubtful, wrong
+from .rig_check import geometry_findings
+from .rig_fit import ENOUGH, rig_findings, same_views, share, stale_finding
+from .survey import picture_findings, survey
+from .texture import texture_findings
+from .timing import Film, Offset, estimate_offsets
+from .view_matches import match_views
+
+SPARE = 0.25  # frames: an offset beyond it spoils a measurement
+UNUSABLE = ("blank view", "identical views", "swapped views", "foreign rig", "no texture")  # after them, timing says nothing
+
+
+def check_take(folder: Path, monitor: Monitor) -> Checked:
+    """Everything that can be said of a take before it is measured; seconds for a short clip.
+
+    What cannot even be opened is a finding too.
+    """
+    try:
+        footage = open_take(read_take(folder))
+        findings, figures = check_footage(footage, monitor)
+    except InputError as error:
+        findings, figures = [wrong("input", str(error))], {}
+    return Checked(subject=str(folder), kind="take", findings=tuple(findings), figures=figures)
+
+
+def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], dict[str, object]]:
+    """The findings about an opened take, and the figures behind them.
+
+    Raises:
+        InputError: an image cannot be read.
+    """
+    names = tuple(v.name for v in footage.take.views)
+    matching = from_table(MatchingSettings, footage.take.settings.get("matching", {}), "[matching]")
+    film = Film(footage, survey(footage, monitor))
+    found = [*geometry_findings(footage.rig), *picture_findings(film.seen, names)]
+    pairs = film.matches()
+    alike = same_views(pairs, names)
+    weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
+    found += alike or rig_findings(pairs, footage.rig.cameras, names)
+    found += [*weak, *seed_findings(footage)]
+    figures: dict[str, object] = {
+        "frames": len(footage.frames),
+        "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},
+        "agreeing_share": round(share(pairs, footage.rig.cameras), 4),
+        "texture_bound_px": bounds,
+    }
+    if not any(f.cause in UNUSABLE for f in found):
+        offsets = estimate_offsets(footage, monitor, film)
+        lonely = [n for k, n in enumerate(names) if max(len(p.xi_px) for p in pairs if k in (p.i, p.j)) < ENOUGH]
+        found += [_lonely(name) for name in lonely]
+        found += [timing_finding(o) for o in offsets if o.significant or (o.method == "energy" and o.late_frames)]
+        found += stale_finding({o.view: o.miss_px for o in offsets if math.isfinite(o.miss_px)})
+        figures["offsets"] = {o.view: offset_table(o) for o in offsets}
+    return found, figures
+
+
+def causes_of_failure(footage: Footage, monitor: Monitor) -> list[Finding]:
+    """Why a take could not be measured, or only badly, what is certain first.
+
+    Raises:
+        InputError: an image cannot be read.
+    """
+    return sorted(check_footage(footage, monitor)[0], key=lambda finding: not finding.certain)
+
+
+def first_look(footage: Footage, frame: int) -> list[Finding]:
+    """Views that are identical or swapped, or a rig of another recording, from one frame: a second's work in every run.
+
+    Raises:
+        InputError: an image cannot be read.
+    """
+    names = tuple(v.name for v in footage.take.views)
+    pairs = match_views([[footage.take.rows.rows(image) for image in footage.read(frame)]], footage.take.rows)
+    return same_views(pairs, names) or rig_findings(pairs, footage.rig.cameras, names)
+
+
+def timing_finding(offset: Offset) -> Finding:
+    """What to do about a view that is early or late."""
+    late, sigma = offset.late_frames, offset.sigma_frames
+    word = "later" if late > 0 else "earlier"
+    whole = f"Add {-round(late):+d} to `offset_frames` of view {offset.view} in take.toml" if round(late) else ""
+    advice = f"{whole or 'Synchronize the cameras'}."
+    costs = f"; the rays of moving points miss by up to {offset.effect_px:.1f} px" if offset.method == "rays" else ""
+    return (wrong if abs(late) > SPARE else doubtful)(
+        "out of step",
+        f"View {offset.view} is {abs(late):.2f} ± {sigma:.2g} frames {word} than the reference view{costs}.",
+        advice,
+        **offset_table(offset),
+    )
+
+
+def offset_table(offset: Offset) -> dict[str, object]:
+    """The figures of an offset, for JSON."""
+    late = round(offset.late_frames, 4) if math.isfinite(offset.late_frames) else None
+    sigma = round(offset.sigma_frames, 4) if math.isfinite(offset.sigma_frames) else None
+    return {
+        "late_frames": late,
+        "sigma_frames": sigma,
+        "from": offset.method,
+        "moving_matches": offset.moving,
+        "miss_px": round(offset.miss_px, 3) if math.isfinite(offset.miss_px) else None,
+    }
+
+
+def _lonely(name: str) -> Finding:
+    return doubtful(
+        "nothing in common",
+        f"View {name} has almost nothing in common with any other view.",
+        "Neighbouring cameras should stand at most 30° apart, look at the same place and show it in like size.",
+    )

@@ -1,0 +1,238 @@
+"""How late each view is: whole frames from when things move, parts of a frame from where moving points miss the epipolar lines.
+
+    c(L) = corr(E_r(t), E_k(t + L))                                                      (1)   E: motion energy; candidates of L
+    e(s) = e_0 + s (e_+ − e_−) / 2 + s² (e_+ − 2 e_0 + e_−) / 2                          (2)   miss of a point followed in view k
+    Σ ρ(e_i(s) − b) → min over s, b ,   late = −(L + s)                                  (3)   ρ: Cauchy's; b: the rig's own miss
+
+A point seen in the reference at t and in view k at t + L is followed in view k to the frames before and after; (2) is its signed distance
+from the epipolar line as if view k had been exposed s frames later. Points that rest, or move along the line, say nothing of s and much
+of b. The sigma of `late` comes from the adjustment (3).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..progress import Monitor
+from ..take import Footage
+from .survey import Survey, survey
+from .view_matches import Features, PairMatches, alike, eight_bits, epipolar_miss_px, find_features, match_features
+
+FRAMES = 6  # looked at for the part of a frame
+MOST_LAG = 50
+FEWEST = 10  # moving matches
+LEAST = 0.3  # part of the moving matches that must fit
+CLEAR = 0.7  # frames within which whole frames need not be looked for
+GOES_TOGETHER = 0.7  # correlation of the motion energies
+SCALE_PX, MOVES_PX, FITS_PX = 0.5, 0.3, 0.5
+ROUND_TRIP_PX = 0.5
+STEPS = 12
+FLOW_WINDOW, FLOW_LEVELS = 21, 4
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Offset:
+    """A view's offset in time: its image that should show a moment shows `late_frames` later. NaN where that cannot be told."""
+
+    view: str
+    late_frames: float
+    sigma_frames: float
+    method: str  # reference, rays, energy (whole frames only) or nothing
+    moving: int = 0  # matches that move across the epipolar lines and fit
+    speed_px: float = 0.0  # the speed across them that a tenth exceeds, per frame
+    miss_px: float = np.nan  # median miss once the offset is allowed for
+
+    @property
+    def significant(self) -> bool:
+        """Larger than its noise, and than what matters to a measurement."""
+        return self.method == "rays" and abs(self.late_frames) > max(0.05, 4 * self.sigma_frames) and self.effect_px > 0.1
+
+    @property
+    def effect_px(self) -> float:
+        """By how much it makes the rays of moving points miss each other."""
+        return abs(self.late_frames) * self.speed_px
+
+
+def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = None) -> tuple[Offset, ...]:
+    """The offset of every view against the reference view, in the order of the views; about a second per view.
+
+    Views that have nothing in common with the reference are compared with a view that has. `offset_frames` of take.toml is in force: what
+    is found comes on top of it.
+
+    Raises:
+        InputError: see `Footage.read`.
+    """
+    film = film or Film(footage, survey(footage, monitor))
+    names = [v.name for v in footage.take.views]
+    found = {footage.take.reference: Offset(view=names[footage.take.reference], late_frames=0.0, sigma_frames=0.0, method="reference")}
+    while len(found) < len(names):
+        base, k = film.best_link(set(found))
+        monitor.step("synchronization", len(found) - 1, len(names) - 1)
+        link = _between(film, base, k, names[k], monitor)
+        late, sigma = link.late_frames + found[base].late_frames, float(np.hypot(link.sigma_frames, found[base].sigma_frames))
+        found[k] = Offset(
+            view=names[k],
+            late_frames=late,
+            sigma_frames=sigma,
+            method=link.method,
+            moving=link.moving,
+            speed_px=link.speed_px,
+            miss_px=link.miss_px,
+        )
+    return tuple(found[k] for k in range(len(names)))
+
+
+class Film:
+    """Pictures and their features, read once."""
+
+    def __init__(self, footage: Footage, seen: Survey) -> None:
+        self.footage, self.seen = footage, seen
+        self.rows, self.cameras = footage.take.rows, footage.rig.cameras
+        self._pictures: dict[tuple[int, int], np.ndarray] = {}
+        self._features: dict[tuple[int, int], Features] = {}
+
+    def holds(self, k: int, frame: int) -> bool:
+        """Whether view k has an image of that frame of the take."""
+        return 0 <= frame + self.footage.take.views[k].offset_frames < self.footage.sequences[k].count
+
+    def picture(self, k: int, frame: int) -> np.ndarray:
+        """The measured rows (h, w) uint8 of view k."""
+        if (k, frame) not in self._pictures:
+            image = self.footage.sequences[k].read(frame + self.footage.take.views[k].offset_frames)
+            self._pictures[k, frame] = eight_bits(self.rows.rows(image))
+        return self._pictures[k, frame]
+
+    def features(self, k: int, frame: int) -> Features:
+        """The keypoints of view k."""
+        if (k, frame) not in self._features:
+            self._features[k, frame] = find_features(self.picture(k, frame))
+        return self._features[k, frame]
+
+    def frames(self) -> list[int]:
+        """Frames in which most moves, apart from each other, in the order of time."""
+        energy = np.nan_to_num(self.seen.energy / np.maximum(np.nanmedian(self.seen.energy, axis=1, keepdims=True), 1e-6)).min(axis=0)
+        apart, chosen = max(1, len(energy) // (2 * FRAMES)), list[int]()
+        for t in np.argsort(-energy):
+            if 0 < t < len(energy) - 1 and all(abs(t - c) >= apart for c in chosen) and len(chosen) < FRAMES:
+                chosen.append(int(t))
+        return sorted(self.seen.frames[t] for t in chosen)
+
+    def best_link(self, known: set[int]) -> tuple[int, int]:
+        """A view that is known and one that is not, with most in common in the middle frame."""
+        frame = self.seen.frames[len(self.seen.frames) // 2]
+        links = [(i, k) for i in sorted(known) for k in range(len(self.cameras)) if k not in known]
+        return max(links, key=lambda link: len(alike(self.features(link[0], frame), self.features(link[1], frame))[0]))
+
+    def matches(self) -> list[PairMatches]:
+        """What looks alike in every pair of views, in the first, a middle and the last frame that `frames` chose."""
+        chosen = self.frames() or [self.seen.frames[0]]
+        chosen = sorted({chosen[0], chosen[len(chosen) // 2], chosen[-1]})
+        return match_features([[self.features(k, f) for k in range(len(self.cameras))] for f in chosen], self.rows)
+
+
+def _between(film: Film, base: int, k: int, name: str, monitor: Monitor) -> Offset:
+    """How late view k is against view `base`: the whole frames at which most moving matches fit, and the rest by (3)."""
+    lags, correlation = energy_lags(film.seen.energy[base], film.seen.energy[k])
+    best: Offset | None = None
+    for n, lag in enumerate(dict.fromkeys([0, *lags])):
+        monitor.step("synchronization", n, len(lags) + 1)
+        misses = [m for f in film.frames() if (m := _misses(film, base, k, f, lag)) is not None]
+        offset = _fit(misses, lag, name) if misses else None
+        if offset is not None and (best is None or offset.moving > 1.1 * best.moving):
+            best = offset
+        if lag == 0 and best is not None and abs(best.late_frames) < CLEAR:
+            break
+    if best is not None:
+        return best
+    if correlation > GOES_TOGETHER:
+        return Offset(view=name, late_frames=float(-lags[0]), sigma_frames=0.5, method="energy")
+    return Offset(view=name, late_frames=np.nan, sigma_frames=np.inf, method="nothing")
+
+
+def energy_lags(a: np.ndarray, b: np.ndarray) -> tuple[list[int], float]:
+    """Whole-frame lags L (best first, then its neighbours) at which the motion energies a(t) and b(t + L) (T,) go together, and how
+    well the best of them does.  (1)"""
+    most = min(MOST_LAG, len(a) // 3)
+    scores = {}
+    for lag in range(-most, most + 1):
+        x, y = a[max(0, -lag) : len(a) - max(0, lag)], b[max(0, lag) : len(b) - max(0, -lag)]
+        known = np.isfinite(x) & np.isfinite(y)
+        x, y = x[known] - x[known].mean() if known.any() else x[known], y[known] - y[known].mean() if known.any() else y[known]
+        length = float(np.sqrt((x @ x) * (y @ y)))
+        scores[lag] = float(x @ y) / length if len(x) > 4 and length > 1e-9 else 0.0
+    best = max(scores, key=lambda lag: (scores[lag], -abs(lag)))
+    return [best, best - 1, best + 1], scores[best]
+
+
+def _misses(film: Film, base: int, k: int, frame: int, lag: int) -> np.ndarray | None:
+    """e_−, e_0, e_+ (m, 3) of the matches of one frame, in full-frame pixels."""
+    if not film.holds(base, frame) or not all(film.holds(k, frame + lag + step) for step in (-1, 0, 1)):
+        return None
+    a, b = film.features(base, frame), film.features(k, frame + lag)
+    i, j = alike(a, b)
+    if not len(i):
+        return None
+    here = film.picture(k, frame + lag)
+    places = [_followed(here, film.picture(k, frame + lag + step), b.xy[j]) if step else b.xy[j] for step in (-1, 0, 1)]
+    good = np.isfinite(np.stack(places)).all(axis=(0, 2))
+    xa = film.rows.to_frame(a.xy[i[good]])
+    ca, cb = film.cameras[base], film.cameras[k]
+    return np.stack([epipolar_miss_px(ca, cb, xa, film.rows.to_frame(place[good])) for place in places], axis=1)
+
+
+def _followed(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Points (m, 2) in the next picture by the method of Lucas and Kanade, NaN where the way back does not end where it began."""
+    start = np.ascontiguousarray(xy, dtype=np.float32).reshape(-1, 1, 2)
+    options = dict(winSize=(FLOW_WINDOW, FLOW_WINDOW), maxLevel=FLOW_LEVELS)
+    end, found, _ = cv2.calcOpticalFlowPyrLK(here, there, start, None, **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(there, here, end, None, **options)
+    good = (found.ravel() == 1) & (returned.ravel() == 1) & (np.linalg.norm((back - start).reshape(-1, 2), axis=1) < ROUND_TRIP_PX)
+    return np.where(good[:, None], end.reshape(-1, 2).astype(np.float64), np.nan)
+
+
+def _fit(misses: list[np.ndarray], lag: int, name: str) -> Offset | None:
+    """The offset from the misses (m, 3) of some frames at one whole-frame lag, or None where too few moving matches fit.  (3)"""
+    e = np.concatenate(misses)
+    rate, bend = (e[:, 2] - e[:, 0]) / 2, (e[:, 2] - 2 * e[:, 1] + e[:, 0]) / 2
+
+    def miss(s: float) -> np.ndarray:
+        return np.asarray(e[:, 1] + s * rate + s * s * bend)  # (2)
+
+    moving = np.abs(rate) > MOVES_PX
+    if moving.sum() < FEWEST:
+        return None
+    grid = np.linspace(-1, 1, 81)
+    s, b = float(grid[np.argmin([np.log1p((miss(g) / SCALE_PX) ** 2).sum() for g in grid])]), 0.0
+    for _ in range(STEPS):
+        v = miss(s) - b
+        w = 1 / (1 + (v / SCALE_PX) ** 2)
+        A = np.stack([rate + 2 * s * bend, -np.ones_like(rate)], axis=1)
+        normal = (A * w[:, None]).T @ A
+        if np.linalg.cond(normal) > 1e9:
+            return None
+        ds, db = np.linalg.solve(normal, -(A * w[:, None]).T @ v)
+        s, b = float(np.clip(s + ds, -1, 1)), b + float(db)
+    good = moving & (np.abs(miss(s) - b) < FITS_PX)
+    if good.sum() < max(FEWEST, LEAST * moving.sum()):
+        return None
+    frame = np.repeat(np.arange(len(misses)), [len(m) for m in misses])
+    return Offset(
+        view=name,
+        late_frames=-(lag + s),
+        sigma_frames=_sigma(A, w, miss(s) - b, frame),
+        method="rays",
+        moving=int(good.sum()),
+        speed_px=float(np.percentile(np.abs(rate[good]), 90)),
+        miss_px=float(np.median(np.abs(miss(s)))),
+    )
+
+
+def _sigma(A: np.ndarray, w: np.ndarray, v: np.ndarray, frame: np.ndarray) -> float:
+    """Sigma of the first unknown: the larger one of the adjustment's and of the scatter between frames, whose matches err alike."""
+    inverse = np.linalg.inv((A * w[:, None]).T @ A)
+    gradient = A * (w * v)[:, None]
+    each = np.stack([gradient[frame == f].sum(axis=0) for f in np.unique(frame)])
+    between = inverse @ (each.T @ each) @ inverse * len(each) / max(len(each) - 1, 1)
+    within = inverse * float((w * v**2).sum() / max(w.sum() - 2, 1))
+    return float(np.sqrt(max(between[0, 0], within[0, 0])))

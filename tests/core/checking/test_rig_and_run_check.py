@@ -1,0 +1,165 @@
+"""`tricap check` of rigs and of results: every fault is made and must be named; the demo's rig and a finished run pass."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core import commands, pipeline
+from tricap.core.checking.rig_check import check_rig
+from tricap.core.checking.run_check import check_run
+from tricap.core.geometry.rig import Rig, write_rig
+from tricap.core.motion.ply import read_ply, write_cloud
+from tricap.core.progress import Monitor
+from tricap.core.synthetic.arm import arm_rig
+
+CAMERAS = arm_rig(768).cameras
+
+
+def scaled(matrix: np.ndarray, focal: float = 1.0, shift_px: float = 0.0) -> np.ndarray:
+    changed = matrix.copy()
+    changed[0, 0], changed[1, 1], changed[0, 2] = matrix[0, 0] * focal, matrix[1, 1] * focal, matrix[0, 2] + shift_px
+    return changed
+
+
+def same_place() -> Rig:
+    return Rig(cameras=(CAMERAS[0], replace(CAMERAS[1], R_cam_world=CAMERAS[0].R_cam_world, t_cam_world_m=CAMERAS[0].t_cam_world_m),
+                        CAMERAS[2]))  # fmt: skip
+
+
+def looking_away() -> Rig:
+    turn = np.diag([-1.0, 1.0, -1.0])
+    b = CAMERAS[2]
+    return Rig(cameras=(CAMERAS[0], replace(b, R_cam_world=turn @ b.R_cam_world, t_cam_world_m=turn @ b.t_cam_world_m)))
+
+
+def with_first(**changes: Any) -> Rig:
+    return Rig(cameras=(replace(CAMERAS[0], **changes), *CAMERAS[1:]))
+
+
+RIGS: dict[str, tuple[Rig, str]] = {
+    "same place": (same_place(), "same place"),
+    "looking away": (looking_away(), "no common view"),
+    "one camera": (Rig(cameras=CAMERAS[:1]), "one camera"),
+    "focal length of another size": (with_first(matrix=scaled(CAMERAS[0].matrix, focal=0.1)), "odd camera"),
+    "principal point of a crop": (with_first(matrix=scaled(CAMERAS[0].matrix, shift_px=300)), "odd camera"),
+    "distortion that folds": (with_first(distortions=np.array([-6.0, 0.0, 0.0, 0.0, 0.0])), "odd camera"),
+    "poor by its own word": (Rig(cameras=CAMERAS, metadata={"verdict": "Poor: points within 20 mm."}), "poor calibration"),
+    "large residuals": (Rig(cameras=CAMERAS, metadata={"sigma0_px": 2.5}), "poor calibration"),
+}
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_fault_of_a_rig_is_named(name: str, tmp_path: Path) -> None:
+    rig, cause = RIGS[name]
+    write_rig(tmp_path / "rig.toml", rig)
+    checked = check_rig(tmp_path / "rig.toml")
+    assert cause in {f.cause for f in checked.findings}, checked.lines()
+    assert json.dumps(checked.to_table(), allow_nan=False)
+
+
+def test_a_sound_rig_passes_and_a_broken_one_says_why(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.toml", arm_rig(768))
+    assert commands.main(["check", str(tmp_path / "rig.toml")]) == 0
+    (tmp_path / "rig.toml").write_text("[cam_0]\nname = 3")
+    assert commands.main(["check", str(tmp_path / "rig.toml")]) == 1
+
+
+@pytest.fixture(scope="module")
+def finished(arm_recording: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of five frames, and the take that it was made of beside it."""
+    folder = tmp_path_factory.mktemp("run")
+    shutil.copytree(arm_recording(), folder / "take")
+    pipeline.run(folder / "take", folder / "out", {"growing": {"spacing_px": 6}}, frames=(0, 5))
+    return folder
+
+
+def stopped(folder: Path) -> None:
+    edit(folder, lambda run: run["stages"].clear())
+
+
+def cloud_gone(folder: Path) -> None:
+    (folder / "out" / "clouds" / "0002.ply").unlink()
+
+
+def file_gone(folder: Path) -> None:
+    (folder / "out" / "motion.csv").unlink()
+
+
+def take_changed(folder: Path) -> None:
+    with open(folder / "take" / "take.toml", "a") as file:
+        file.write("# another thought\n")
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    run = json.loads((folder / "out" / "run.json").read_text())
+    change(run)
+    (folder / "out" / "run.json").write_text(json.dumps(run))
+
+
+def clouds(folder: Path, change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]], frames: str = "*") -> None:
+    for path in (folder / "out" / "clouds").glob(f"{frames}.ply"):
+        v = change(dict(read_ply(path).vertex))
+        write_cloud(path, xyz_m=np.stack([v[a] for a in "xyz"], 1), sigma_m=v["sigma"],
+                    normals=np.stack([v[a] for a in ("nx", "ny", "nz")], 1), intensity=v["intensity"])  # fmt: skip
+
+
+def thin(folder: Path) -> None:
+    clouds(folder, lambda v: {name: a[::5] for name, a in v.items()}, "0003")
+
+
+def unsure(folder: Path) -> None:
+    clouds(folder, lambda v: v | {"sigma": v["sigma"] * 0 + 0.02})
+
+
+def bare_forearm(folder: Path) -> None:
+    def without(v: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        far = v["x"] > -0.33
+        return {name: a[far] for name, a in v.items()}
+
+    clouds(folder, without)
+
+
+def unsure_angle(folder: Path) -> None:
+    path = folder / "out" / "motion.csv"
+    header, *rows = [line.split(",") for line in path.read_text().splitlines()]
+    column = header.index("sigma elbow.R flexion")
+    path.write_text("\n".join(",".join([*row[:column], "25.0", *row[column + 1 :]]) for row in rows).join([",".join(header) + "\n", "\n"]))
+
+
+def warned(folder: Path) -> None:
+    edit(folder, lambda run: run["warnings"].append("The rays of matched points miss each other by 2.0 px."))
+
+
+def rays(folder: Path) -> None:
+    edit(folder, lambda run: run["stages"]["measure"].update(residual_px=2.0))
+
+
+def damaged(folder: Path) -> None:
+    (folder / "out" / "run.json").write_text('{"format": "tricap-run", "stages": 3}')
+
+
+RESULTS = {stopped: "not finished", cloud_gone: "frames missing", file_gone: "files missing", take_changed: "stale result",
+           thin: "coverage", unsure: "large sigma", bare_forearm: "coverage", unsure_angle: "large sigma", warned: "warning",
+           rays: "rays miss", damaged: "input"}  # fmt: skip
+
+
+def test_a_finished_run_passes(finished: Path) -> None:
+    checked = check_run(finished / "out", Monitor())
+    assert [f for f in checked.findings if f.cause != "large sigma"] == [], checked.lines()  # the twist of 384 px may be unsure
+    assert checked.figures["points_per_frame"] > 100 and "elbow.R flexion" in checked.figures["angle_sigma_deg"]
+
+
+@pytest.mark.parametrize("fault", RESULTS, ids=lambda fault: fault.__name__)
+def test_a_fault_of_a_result_is_named(fault: Callable[[Path], None], finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    edit(tmp_path / "run", lambda run: run.update(take=str(tmp_path / "run" / "take")))
+    fault(tmp_path / "run")
+    sound = {f.sentence for f in check_run(finished / "out", Monitor()).findings}
+    new = [f for f in check_run(tmp_path / "run" / "out", Monitor()).findings if f.sentence not in sound]
+    assert RESULTS[fault] in {f.cause for f in new}, new

@@ -1,0 +1,229 @@
+"""`tricap check TAKE`: every fault is made and must be named, and sound recordings pass without a complaint."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core import commands, pipeline
+from tricap.core.checking.findings import Checked
+from tricap.core.checking.take_check import check_take
+from tricap.core.checking.timing import energy_lags, estimate_offsets
+from tricap.core.errors import InputError
+from tricap.core.geometry.rig import Rig, read_rig, write_rig
+from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.progress import Monitor
+from tricap.core.take import open_take, read_take
+
+SHARED = Path(__file__).parents[4] / "shared" / "takes"
+Record = Callable[..., Path]
+
+
+def pictures(take: Path, view: str) -> list[Path]:
+    return sorted((take / view).glob("*.png"))
+
+
+def change(path: Path, edit: Callable[[np.ndarray], np.ndarray]) -> None:
+    picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    path.write_bytes(cv2.imencode(".png", np.clip(np.rint(edit(picture.astype(float))), 0, 255).astype(np.uint8))[1].tobytes())
+
+
+def black(take: Path) -> None:
+    for path in pictures(take, "L"):
+        change(path, lambda p: p * 0 + 3)
+
+
+def black_for_a_while(take: Path) -> None:
+    for path in pictures(take, "R")[3:5]:
+        change(path, lambda p: p * 0)
+
+
+def identical(take: Path) -> None:
+    shutil.rmtree(take / "R")
+    shutil.copytree(take / "C", take / "R")
+
+
+def identical_but_encoded_again(take: Path) -> None:
+    identical(take)
+    for i, path in enumerate(pictures(take, "R")):
+        noise = np.random.default_rng(i).normal(0, 1.5, (240, 320))
+        change(path, lambda p, noise=noise: 0.9 * p + 8 + noise)  # type: ignore[misc]
+
+
+def swapped(take: Path) -> None:
+    (take / "L").rename(take / "x")
+    (take / "R").rename(take / "L")
+    (take / "x").rename(take / "R")
+
+
+def edit_rig(take: Path, **turn: np.ndarray) -> None:
+    rig = read_rig(take / "rig.toml")
+    cameras = []
+    for c in rig.cameras:
+        R = rotation_from_vector(turn.get(c.name, np.zeros(3)))  # about the camera's own centre
+        cameras.append(replace(c, R_cam_world=R @ c.R_cam_world, t_cam_world_m=R @ c.t_cam_world_m))
+    write_rig(take / "rig.toml", Rig(cameras=tuple(cameras), metadata=rig.metadata))
+
+
+def foreign_rig(take: Path) -> None:
+    edit_rig(take, L=np.array([0.04, 0.0, 0.02]), C=np.array([-0.03, 0.01, 0.0]))
+
+
+def knocked_camera(take: Path) -> None:
+    edit_rig(take, R=np.array([0.0026, 0.0, 0.0]))  # 1.6 px across the lines
+
+
+def flat(take: Path, box: float) -> None:
+    for view in "LCR":
+        for i, path in enumerate(pictures(take, view)):
+            noise, x = np.random.default_rng([i, ord(view)]).normal(0, 2, (240, 320)), np.arange(320)
+            change(path, lambda p, i=i, x=x, noise=noise: 100 + box * ((x > 120 + 5 * i) & (x < 200 + 5 * i)) + noise)  # type: ignore[misc]
+
+
+def no_texture(take: Path) -> None:
+    flat(take, 0.0)
+
+
+def plain_clothes(take: Path) -> None:
+    flat(take, 60.0)
+
+
+def smooth_sleeve(take: Path) -> None:
+    for view in "LCR":
+        for i, path in enumerate(pictures(take, view)):
+            noise = np.random.default_rng([i, ord(view)]).normal(0, 2, (240, 320))
+            change(path, lambda p, noise=noise: cv2.GaussianBlur(p, (0, 0), 7) + noise)  # type: ignore[misc]
+
+
+def dark(take: Path) -> None:
+    for path in pictures(take, "C"):
+        change(path, lambda p: p * 0.08)
+
+
+def overexposed(take: Path) -> None:
+    for path in pictures(take, "L"):
+        change(path, lambda p: p * 2.2)
+
+
+def repeated(take: Path) -> None:
+    files = pictures(take, "R")
+    for i in (3, 5):
+        shutil.copy(files[i - 1], files[i])
+
+
+def a_frame_late(take: Path) -> None:
+    text = (take / "take.toml").read_text().replace('images = "R/*.png"', 'images = "R/*.png"\noffset_frames = -1')
+    (take / "take.toml").write_text(text.replace("fps", "frames = [1, 7]\nfps").replace("frame = 0", "frame = 1"))
+
+
+def seed_on_the_wall(take: Path) -> None:
+    wall = np.array([-0.6, 1.2, 1.8])
+    at = {c.name: c.project(wall) for c in read_rig(take / "rig.toml").cameras}
+    said = ", ".join(f"{name} = [{x:.1f}, {y:.1f}]" for name, (x, y) in at.items())
+    text = (take / "take.toml").read_text()
+    (take / "take.toml").write_text(text[: text.index("[seeds.joints]")] + f"surface = [{{ {said} }}]\n")
+
+
+def contradicting_click(take: Path) -> None:
+    text = (take / "take.toml").read_text()
+    (take / "take.toml").write_text(text[: text.index('"wrist.R"')] + '"wrist.R" = { L = [20.0, 20.0], C = [290.0, 210.0] }\n')
+
+
+def image_gone(take: Path) -> None:
+    pictures(take, "C")[5].unlink()
+
+
+def other_size(take: Path) -> None:
+    for path in pictures(take, "L"):
+        change(path, lambda p: p[:-8])
+
+
+FAULTS = {
+    black: "blank view", black_for_a_while: "blank view", identical: "identical views", identical_but_encoded_again: "identical views",
+    swapped: "swapped views", foreign_rig: "foreign rig", knocked_camera: "stale calibration", no_texture: "no texture",
+    plain_clothes: "no texture",
+    smooth_sleeve: "weak texture", dark: "dark", overexposed: "overexposed", repeated: "repeated frames", a_frame_late: "out of step",
+    seed_on_the_wall: "seed on the background", contradicting_click: "clicks", image_gone: "input", other_size: "input",
+}  # fmt: skip
+
+
+@pytest.fixture
+def fault(request: pytest.FixtureRequest, arm_recording: Record, tmp_path: Path) -> tuple[Checked, str]:
+    make: Callable[[Path], None] = request.param
+    shutil.copytree(arm_recording(), tmp_path / "take")
+    make(tmp_path / "take")
+    return check_take(tmp_path / "take", Monitor()), FAULTS[make]
+
+
+@pytest.mark.parametrize("fault", FAULTS, indirect=True, ids=lambda make: make.__name__)
+def test_the_fault_is_named(fault: tuple[Checked, str]) -> None:
+    checked, cause = fault
+    assert cause in {f.cause for f in checked.findings}, checked.lines()
+    named = next(f for f in checked.findings if f.cause == cause)
+    assert named.sentence.endswith(".") and str(checked.to_table())
+    json.dumps(checked.to_table(), allow_nan=False)
+    if cause in ("blank view", "identical views", "swapped views", "foreign rig", "no texture"):
+        assert named.certain and named.advice
+
+
+def test_a_sound_recording_passes(arm_recording: Record) -> None:
+    assert check_take(arm_recording(), Monitor()).lines()[0].endswith("nothing to complain about.")
+
+
+@pytest.mark.parametrize("take", [pytest.param(p, id=p.name) for p in (SHARED / "dev_arm", SHARED / "dev_walk")])
+@pytest.mark.slow
+def test_the_development_recordings_pass(take: Path) -> None:
+    if not take.exists():
+        pytest.skip(f"{take} is not on this machine")
+    checked = check_take(take, Monitor())
+    assert not checked.findings, checked.lines()
+
+
+@pytest.mark.parametrize("late", [0.5, 0.25, -1.3])
+def test_a_late_view_is_found_to_a_twentieth_of_a_frame(arm_recording: Record, late: float) -> None:
+    """Measured: 0.010 frames at worst at 480 and 384 px."""
+    offsets = {o.view: o for o in estimate_offsets(open_take(read_take(arm_recording(late_frames=late))), Monitor())}
+    assert abs(offsets["R"].late_frames - late) < 0.05 and offsets["R"].significant
+    assert abs(offsets["L"].late_frames) < 0.02 and not offsets["L"].significant
+    assert (offsets["C"].method, offsets["C"].late_frames) == ("reference", 0.0)
+
+
+def test_whole_frames_from_the_motion_alone() -> None:
+    motion = np.abs(np.sin(np.arange(60) ** 1.3)) + 0.1
+    for lag in (-7, 0, 4):
+        lags, correlation = energy_lags(motion[10:50], 3 * motion[10 - lag : 50 - lag] + 2)
+        assert lags[0] == lag and correlation > 0.99
+    assert energy_lags(motion[:40], np.ones(40))[1] == 0
+
+
+def test_exit_codes_and_json(arm_recording: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(arm_recording(), tmp_path / "take")
+    assert commands.main(["check", str(tmp_path / "take"), "--json"]) == 0
+    table = json.loads(capsys.readouterr().out)
+    assert table["good"] and table["kind"] == "take" and table["figures"]["offsets"]["R"]["from"] == "rays"
+    image_gone(tmp_path / "take")
+    assert commands.main(["check", str(tmp_path / "take"), "--quiet"]) == 1
+    assert commands.main(["check", str(tmp_path / "nothing")]) == 2
+
+
+MEASURED = {black: "View L is black", identical: "show the same picture", swapped: "L and R are swapped",
+            foreign_rig: "px off the epipolar", no_texture: "is blank", seed_on_the_wall: "Surface seed 1"}  # fmt: skip
+
+
+@pytest.mark.parametrize("make", MEASURED, ids=lambda make: make.__name__)
+def test_measuring_it_all_the_same_names_the_cause(make: Callable[[Path], None], arm_recording: Record, tmp_path: Path) -> None:
+    """An error where nothing can be measured, a warning in run.json where something can."""
+    shutil.copytree(arm_recording(), tmp_path / "take")
+    make(tmp_path / "take")
+    with pipeline.open_run(tmp_path / "take", tmp_path / "out", {"growing": {"spacing_px": 8}}, frames=(0, 3)) as run:
+        try:
+            pipeline.measure(run, Monitor())
+        except InputError as error:
+            assert MEASURED[make] in str(error)
+        else:
+            assert any(MEASURED[make] in sentence for sentence in run.account["warnings"]), run.account["warnings"]
