@@ -34,7 +34,12 @@ FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual
 
 
 class NothingMeasured(InputError):
-    """The first frame of a take gave no surface. The footage shows the cause; `checking` can find it."""
+    """The first frame of a take gave no surface. `why` is what the footage says about it, if it was asked."""
+
+    def __init__(self, frame: int, why: str = "") -> None:
+        self.frame = frame
+        guess = "no texture is found alike in all views. Check that rig.toml belongs to this footage and that the views are not swapped, "
+        super().__init__(f"No surface could be measured in frame {frame}: {why or guess + 'or click surface seeds.'}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -161,10 +166,7 @@ def _measure(
     field = clean_field(_single(field), cameras[ref], ref, surface)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):
-        raise NothingMeasured(
-            f"No surface could be measured in frame {frame} of {take.folder.name}: no texture is found alike in all views. "
-            "Check that rig.toml belongs to this footage and that the views are not swapped, or click surface seeds."
-        )
+        raise NothingMeasured(frame)
     return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key)
 
 

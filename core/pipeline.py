@@ -204,7 +204,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         cause = next(iter(causes_of_failure(run.footage, monitor)), None)
         if cause is None:
             raise
-        raise InputError(f"Nothing could be measured in the first frame. {cause.sentence} {cause.advice}".strip()) from error
+        raise NothingMeasured(error.frame, f"{cause.sentence} {cause.advice}".strip()) from error
     run.measured = sorted(done, key=lambda m: m.frame)
     points, residual = [len(m.cloud.xyz_m) for m in run.measured], _median([m.cloud.residual_px for m in run.measured])
     _warn_of_doubts(run, residual, monitor)
