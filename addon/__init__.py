@@ -7,9 +7,10 @@ def _modules() -> tuple[ModuleType, ...]:
     from . import command, jobs, operators, panels, properties
     from .calibrate import registration as calibrate
     from .clicking import registration as clicking
+    from .overlay import registration as overlay
     from .retarget import registration
 
-    return jobs, properties, operators, panels, calibrate, registration, clicking, command
+    return jobs, properties, operators, panels, calibrate, registration, clicking, overlay, command
 
 
 def register() -> None:

@@ -88,7 +88,7 @@ class ClickOperator:
         canvas.redraw_clips(context)
 
     def _act(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        area = area_under(context.window, event.mouse_x, event.mouse_y)
+        area = canvas.area_under(context.window, event.mouse_x, event.mouse_y)
         view = self._view(area) if area is not None else None
         undo = event.type == "Z" and (event.ctrl or event.oskey)
         if undo and event.value == "PRESS":
@@ -300,15 +300,6 @@ def note_first_frame(scene: bpy.types.Scene, clips: dict[str, bpy.types.MovieCli
     """The first clicks of all say which frame is that of the seeds."""
     if not any(seeds.frames_of(clip) for clip in clips.values()):
         scene.tricap.seed_frame = frame
-
-
-def area_under(window: bpy.types.Window, x: int, y: int) -> bpy.types.Area | None:
-    """The Clip Editor whose picture lies under a place of the window; None over its sidebar, header or tools."""
-    for area in window.screen.areas:
-        if area.x <= x < area.x + area.width and area.y <= y < area.y + area.height:
-            inside = {r.type for r in area.regions if r.width > 1 and r.x <= x < r.x + r.width and r.y <= y < r.y + r.height}
-            return area if canvas.clip_of(area) is not None and inside == {"WINDOW"} else None
-    return None
 
 
 def show_view(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:

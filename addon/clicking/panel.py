@@ -44,9 +44,8 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         if scene.frame_current == first:
             layout.label(text=f"Frame {first}: the first clicks", icon="KEYTYPE_KEYFRAME_VEC")
         else:
-            row = layout.row()
-            row.label(text=f"Frame {scene.frame_current}: a keyframe", icon="KEYTYPE_EXTREME_VEC")
-            row.operator("tricap.go_to_frame", text=f"Go to {first}").frame = first
+            layout.label(text=f"Frame {scene.frame_current}: clicks are a keyframe", icon="KEYTYPE_EXTREME_VEC")
+            layout.operator("tricap.go_to_frame", text=f"Go to the first clicks, frame {first}").frame = first
 
     def _draw_joints(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         try:

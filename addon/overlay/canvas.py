@@ -68,6 +68,15 @@ def clip_areas(window: bpy.types.Window) -> list[bpy.types.Area]:
     return [area for area in window.screen.areas if clip_of(area) is not None]
 
 
+def area_under(window: bpy.types.Window, x: int, y: int) -> bpy.types.Area | None:
+    """The Clip Editor whose picture lies under a place of the window; None over its sidebar, header or tools."""
+    for area in window.screen.areas:
+        if area.x <= x < area.x + area.width and area.y <= y < area.y + area.height:
+            inside = {r.type for r in area.regions if r.width > 1 and r.x <= x < r.x + r.width and r.y <= y < r.y + r.height}
+            return area if clip_of(area) is not None and inside == {"WINDOW"} else None
+    return None
+
+
 def redraw_clips(context: bpy.types.Context) -> None:
     """Have all Clip Editors drawn again."""
     for window in context.window_manager.windows:
@@ -108,14 +117,14 @@ def point_batch(points: np.ndarray, colours: np.ndarray) -> gpu.types.GPUBatch:
     """A batch of points (N, 2) with colours (N, 4)."""
     position = np.zeros((len(points), 3), dtype=np.float32)
     position[:, :2] = points
-    shader = gpu.shader.from_builtin("FLAT_COLOR")
+    shader = gpu.shader.from_builtin("POINT_FLAT_COLOR")
     return batch_for_shader(shader, "POINTS", {"pos": position, "color": np.asarray(colours, dtype=np.float32)})
 
 
 def draw_points(batch: gpu.types.GPUBatch, size: float) -> None:
     """Draw a batch of `point_batch`."""
     gpu.state.point_size_set(size)
-    batch.draw(gpu.shader.from_builtin("FLAT_COLOR"))
+    batch.draw(gpu.shader.from_builtin("POINT_FLAT_COLOR"))
 
 
 def fill(triangles: np.ndarray, colour: Colour) -> None:

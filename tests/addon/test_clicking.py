@@ -294,8 +294,8 @@ def _holds(t: np.ndarray, p: np.ndarray) -> bool:
     return min(sides) >= 0 or max(sides) <= 0
 
 
-def test_the_order_of_the_joints() -> None:
-    from tricap.addon.clicking.session import joints_of
+def test_the_order_of_the_joints(blender: ModuleType) -> None:
+    joints_of = module("clicking.session").joints_of
     from tricap.core.body.model_file import read_model
 
     every = read_model("full").skeleton.joint_names

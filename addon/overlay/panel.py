@@ -1,0 +1,75 @@
+"""The sections “Overlays” and “Frames” in the Clip Editor's sidebar."""
+
+import bpy
+import numpy as np
+
+from ..clicking.panel import ClipPanel
+from . import recording
+
+WORST = 12
+
+
+class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
+    """What is shown over the footage."""
+
+    bl_label = "Overlays"
+    bl_order = 1
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """The switches."""
+        layout, shown = self.layout, context.scene.tricap_overlay
+        if recording.current(context.scene) is None:
+            layout.label(text=recording.problem() or "Nothing was measured yet.", icon="INFO")
+            return
+        column = layout.column()
+        row = column.row()
+        row.prop(shown, "points")
+        if shown.points:
+            column.prop(shown, "most_sigma_mm")
+        column.prop(shown, "tracks")
+        if shown.tracks:
+            column.row(align=True).prop(shown, "which", expand=True)
+            column.prop(shown, "tail")
+        column.prop(shown, "body")
+        column.prop(shown, "contour")
+        column.prop(shown, "graph")
+        layout.operator("tricap.look_closer", icon="VIEWZOOM")
+        if recording.problem():
+            layout.label(text=recording.problem(), icon="ERROR")
+
+
+class TRICAP_PT_frames(ClipPanel, bpy.types.Panel):
+    """The worst frames: press one to go there."""
+
+    bl_label = "Worst Frames"
+    bl_order = 2
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only after a run."""
+        run = recording.current(context.scene)
+        return run is not None and run.table() is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """A row per frame: number, what is wrong, residual and sigma."""
+        run = recording.current(context.scene)
+        table = run.table() if run is not None else None
+        if table is None:
+            return
+        much, why = table.badness()
+        layout = self.layout
+        if not any(why):
+            layout.label(text="No frame stands out.", icon="CHECKMARK")
+        column = layout.column(align=True)
+        for i in np.argsort(-much, kind="stable")[:WORST]:
+            frame = int(table.frames[i])
+            row = column.row(align=True)
+            residual, sigma = (table.values[name][i] for name in ("residual_px", "sigma_mm"))
+            text = f"{frame}: {why[i] or 'fine'}"
+            row.operator("tricap.go_to_frame", text=text, depress=frame == context.scene.frame_current,
+                         icon="ERROR" if why[i] else "CHECKMARK").frame = frame
+            row.label(text=f"{residual:.2f} px  {sigma:.2f} mm" if np.isfinite(residual) else "no points")
+
+
+CLASSES = (TRICAP_PT_overlays, TRICAP_PT_frames)

@@ -1,0 +1,212 @@
+"""What is shown over the footage: which run, what each layer holds, where it is drawn, and the table of frames."""
+
+import importlib
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core import store
+from tricap.core.frame_table import COLUMNS, FrameTable, write_frame_table
+from tricap.core.matching.proposals import Proposal
+from tricap.core.motion.ply import write_mesh
+from tricap.core.tracking.settings import TrackStatus
+
+from .conftest import FRAMES, SIZE, SmallRun
+
+ADDON = "bl_ext.user_default.tricap.addon"
+
+
+def module(name: str) -> ModuleType:
+    return importlib.import_module(f"{ADDON}.{name}")
+
+
+@pytest.fixture
+def scene(blender: ModuleType, empty: ModuleType, small_run: SmallRun) -> Any:
+    """The small run in the scene, with trajectories before the filters, a table of frames, a contour and a skin."""
+    out, joints = small_run.out, small_run.joints_m
+    xyz = np.stack([joints["elbow.R"], joints["wrist.R"]], axis=1)
+    status = np.full(xyz.shape[:2], TrackStatus.MEASURED, dtype=np.int8)
+    status[:, 1] = TrackStatus.NOT_RIGID
+    store.save(out / "trajectories_raw.npz", dict(frames=np.array(FRAMES), xyz_m=xyz, status=status,
+                                                  reason=np.array([1, 13], dtype=np.int8)), {})  # fmt: skip
+    values = {name: np.ones(len(FRAMES)) for name in COLUMNS}
+    values["residual_px"] = np.array([0.1, 0.1, 0.5, 0.1, 0.1, 0.1])
+    write_frame_table(out / "frames.csv", FrameTable(frames=np.array(FRAMES), values=values, fit=("fitted",) * len(FRAMES)))
+    square_px = "".join(f"3,{i},{x},{y},0,1,0.2,1\n" for i, (x, y) in enumerate([(20, 20), (60, 20), (60, 60), (20, 60)]))
+    store.write_text(out / "contours" / "C.csv", "frame,vertex,x,y,normal_x,normal_y,sigma,on_edge\n" + square_px)
+    a = joints["elbow.R"][1]
+    square = a + 0.1 * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+    write_mesh(out / "skin" / "0003.ply", square, np.array([[0, 1, 2, 3]]))
+    scene = empty.context.scene
+    module("project").open_take(scene, small_run.take)
+    scene.tricap.out = str(out)
+    scene.frame_set(3)
+    module("overlay.recording").forget()
+    return scene
+
+
+@pytest.fixture
+def run(scene: Any) -> Any:
+    found = module("overlay.recording").current(scene)
+    assert found is not None, module("overlay.recording").problem()
+    return found
+
+
+def test_the_run_is_read_once_and_again_when_it_changed(run: Any, scene: Any, small_run: SmallRun) -> None:
+    recording = module("overlay.recording")
+    assert list(run.cameras) == ["L", "C", "R"] and run.reference == 1 and run.rows.step == 2
+    assert run.points(3) is run.points(3) and recording.current(scene) is run
+    write_frame_table(small_run.out / "frames.csv", run.table())
+    assert recording.current(scene) is not run
+
+
+def test_nothing_was_measured_yet(scene: Any, small_run: SmallRun) -> None:
+    recording = module("overlay.recording")
+    (small_run.out / "run.json").unlink()
+    assert recording.current(scene) is None and recording.problem() == "Nothing was measured yet."
+    scene.tricap.take = scene.tricap.out = ""
+    scene.tricap.views.clear()
+    assert recording.current(scene) is None and "Save the Blender file" in recording.problem()
+
+
+def test_a_damaged_file_is_told_and_the_rest_is_shown(run: Any, small_run: SmallRun) -> None:
+    (small_run.out / "trajectories_raw.npz").write_bytes(b"PK nonsense")
+    (small_run.out / "clouds" / "0003.ply").write_bytes(b"ply\nnonsense")
+    assert run.tracks() is None and "damaged" in run.problem
+    assert run.points(3) is None and run.points(4) is not None
+
+
+def test_points_are_coloured_by_sigma(run: Any, small_run: SmallRun) -> None:
+    layers = module("overlay.layers")
+    found = layers.sigmas(run, "L", 3, 2.0)
+    points = run.points(3)
+    assert np.allclose(found.xy_px, small_run.rig["L"].project(points.xyz_m), atol=1e-3) and found.most_mm == 2.0
+    assert np.allclose(found.colours, layers.ramp(np.array([0.5]))), "1 mm of 2 mm"
+    assert layers.sigmas(run, "L", 3, 0.0).most_mm == pytest.approx(1.0, rel=1e-5)
+    blue, red = layers.ramp(np.array([0.0, 7.0]))
+    assert blue[2] == 1.0 and red[0] == 1.0 and red[2] < 0.2
+    assert layers.sigmas(run, "L", 99, 0.0) is None
+
+
+def test_tails_before_and_after_the_filters(run: Any, small_run: SmallRun) -> None:
+    layers = module("overlay.layers")
+    counts = {which: len(layers.tails(run, "C", 7, 3, which)[0]) for which in ("before", "kept", "removed", "both")}
+    assert counts == {"before": 6, "kept": 3, "removed": 3, "both": 6}
+    segments, colours = layers.tails(run, "C", 7, 3, "kept")
+    elbow = small_run.rig["C"].project(small_run.joints_m["elbow.R"][-4:])
+    assert np.allclose(segments[:, 1], elbow[1:], atol=1e-3) and (np.diff(colours[:, 3]) > 0).all(), "the older the paler"
+    assert layers.removed_here(run.tracks(), 7) == [("not rigid", 1)] and layers.removed_here(run.tracks(), 70) == []
+
+
+def test_looking_closer_tells_why(run: Any, small_run: SmallRun) -> None:
+    layers = module("overlay.layers")
+    wrist = small_run.rig["C"].project(small_run.joints_m["wrist.R"][1])
+    assert layers.look(run, "C", 3, wrist, 3.0).words == ("trajectory 1: removed here (not rigid)",)
+    elbow = small_run.rig["C"].project(small_run.joints_m["elbow.R"][1])
+    found = layers.look(run, "C", 3, elbow, 8.0)
+    assert found.words[0] == "point: sigma 1.00 mm" and found.words[-1] == "trajectory 0: kept" and set(found.xy_px) == {"L", "C", "R"}
+    assert not found.found and "cache" in found.words[1]
+    assert layers.look(run, "C", 3, np.array([2.0, 2.0]), 3.0) is None and layers.look(run, "C", 99, elbow, 3.0) is None
+
+
+def test_the_curve_of_a_graph() -> None:
+    from tricap.addon.overlay.layers import curve
+
+    height, usual = curve(np.array([1.0, 2.0, np.nan, 2.0, 9.0]))
+    assert usual == 2.0 and np.allclose(height, [0.25, 0.5, np.nan, 0.5, 1.0], equal_nan=True)
+    assert curve(np.array([np.nan]))[1] == 0.0 and curve(np.zeros(2))[0].tolist() == [0.5, 0.5]
+
+
+def test_switches_are_saved_and_off_at_first(blender: ModuleType, scene: Any, tmp_path: Path) -> None:
+    shown = scene.tricap_overlay
+    assert not (shown.points or shown.tracks or shown.contour or shown.body or shown.graph)
+    shown.tracks, shown.which, shown.tail = True, "removed", 5
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a é.blend"))
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "a é.blend"))
+    shown = blender.context.scene.tricap_overlay
+    assert shown.tracks and shown.which == "removed" and shown.tail == 5
+
+
+def test_going_to_a_frame(blender: ModuleType, scene: Any) -> None:
+    assert blender.ops.tricap.go_to_frame(frame=5) == {"FINISHED"} and scene.frame_current == 5
+    assert not blender.ops.tricap.look_closer.poll()
+
+
+@pytest.fixture
+def drawn(blender: ModuleType, run: Any, scene: Any) -> Any:
+    """Draws overlays of view C into a picture, 3 region pixels per image pixel; gives its RGB (H, W, 3), top row first."""
+    if blender.app.version < (5, 0, 0):
+        pytest.skip("Blender 4.5 draws only in a window")
+    import gpu
+    from mathutils import Matrix
+
+    gpu.init()
+    zoom, width, height = 3, 3 * SIZE[0], 3 * SIZE[1]
+    view2d = SimpleNamespace(region_to_view=lambda x, y: (x / width, y / height))
+    sheet = module("overlay.canvas").Canvas(SimpleNamespace(view2d=view2d, width=width, height=height, x=0, y=0), SIZE)
+    assert sheet.zoom == zoom
+
+    def draw(**switches: Any) -> np.ndarray:
+        for name, value in switches.items():
+            setattr(scene.tricap_overlay, name, value)
+        target = gpu.types.GPUOffScreen(width, height)
+        with target.bind():
+            gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 1.0))
+            with gpu.matrix.push_pop(), gpu.matrix.push_pop_projection():
+                gpu.matrix.load_matrix(Matrix.Identity(4))
+                to_clip = Matrix.Translation((-1, -1, 0)) @ Matrix.Diagonal((2 / width, 2 / height, 1, 1))
+                gpu.matrix.load_projection_matrix(to_clip)
+                module("overlay.draw").draw_overlays(run, scene.tricap_overlay, "C", 3, sheet)
+            picture = np.array(gpu.state.active_framebuffer_get().read_color(0, 0, width, height, 3, 0, "FLOAT").to_list())
+        target.free()
+        return picture[::-1]
+
+    return draw
+
+
+def lit(picture: np.ndarray, xy_px: np.ndarray) -> np.ndarray:
+    """The brightest colour within a region pixel or two of an image pixel."""
+    column, row = np.rint(3 * (np.asarray(xy_px) + 0.5)).astype(int)
+    return picture[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].reshape(-1, 3).max(axis=0)
+
+
+def test_it_is_drawn_where_it_is(drawn: Any, run: Any, small_run: SmallRun) -> None:
+    assert drawn().max() == 0.0, "everything is off"
+    picture = drawn(points=True, most_sigma_mm=2.0)
+    for xy in small_run.rig["C"].project(run.points(3).xyz_m)[:10]:
+        assert lit(picture, xy)[1] > 0.8
+    picture = drawn(points=False, body=True)
+    corners = small_run.rig["C"].project(small_run.joints_m["elbow.R"][1] + 0.1 * np.array([[-1, 0, 0], [1, 0, 0]]))
+    for xy in corners:
+        assert lit(picture, xy)[0] > 0.8 and lit(picture, xy)[2] < 0.4
+    picture = drawn(body=False, contour=True)
+    assert lit(picture, [40, 20])[2] > 0.8 and lit(picture, [20, 40])[0] > 0.8 and lit(picture, [40, 40]).max() < 0.2
+    picture = drawn(contour=False, tracks=True, which="both")
+    way = small_run.rig["C"].project(small_run.joints_m["elbow.R"][:2]).mean(axis=0)
+    assert lit(picture, way)[2] > 0.6
+    module("overlay.draw").show_looked(3, module("overlay.layers").look(run, "C", 3, corners.mean(axis=0), 9.0))
+    assert drawn(tracks=False, graph=True).max() > 0.5
+    module("overlay.draw").show_looked(-1, None)
+
+
+def test_the_clicks_are_drawn_where_they_are(blender: ModuleType, drawn: Any, scene: Any, run: Any) -> None:
+    draw, sessions = module("clicking.draw"), module("clicking.session")
+    finder = SimpleNamespace(cameras=list(run.cameras.values()), ask=id)
+    session = sessions.ClickSession(module("project").clips_of(scene), ["elbow.R"], 3, finder)
+    session.click("L", np.array([60.0, 70.0]))
+    session.proposals = {"C": Proposal(xy_px=np.array([100.0, 50.0]), sigma_px=0.5, correlation=0.9)}
+    curve = session.curves("C")["L"]
+    overlays = module("overlay.draw")
+    before = overlays.draw_overlays
+    overlays.draw_overlays = lambda run, shown, view, frame, sheet: draw.draw_session(session, view, sheet, (30, 30))
+    try:
+        picture = drawn()
+    finally:
+        overlays.draw_overlays = before
+    inside = curve[(curve > 8).all(axis=1) & (curve < np.array(SIZE) - 8).all(axis=1)]
+    assert len(inside) > 5 and all(lit(picture, xy)[2] > 0.5 for xy in inside)
+    assert lit(picture, np.array([100.0 + 11 / 3, 50.0]))[1] > 0.8, "the ring of the proposal"
+
