@@ -4,13 +4,14 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import command, jobs, operators, panels, properties
+    from . import command, jobs, operators, properties
     from .calibrate import registration as calibrate
     from .clicking import registration as clicking
     from .overlay import registration as overlay
-    from .retarget import registration
+    from .retarget import registration as retarget
+    from .steps import registration as steps
 
-    return jobs, properties, operators, panels, calibrate, registration, clicking, overlay, command
+    return jobs, properties, operators, calibrate, retarget, clicking, overlay, steps, command
 
 
 def register() -> None:

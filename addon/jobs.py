@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -25,6 +26,7 @@ from ..core.progress import Cancelled, Monitor
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
+PACE_S, PACE_PARTS = 20.0, 200  # the time left is told from the pace of the last seconds
 SWITCH_S = 0.0005  # how soon the worker hands the interpreter to the window: redrawn after 30…90 ms at worst; Python's 5 ms: 130 ms
 BUG = "Tricap made a mistake ({error}); the console shows where. Please report it with that text."
 
@@ -37,7 +39,7 @@ class Job:
         self._thread: threading.Thread | None = None
         self.monitor = Monitor(self._note)
         self.stage, self.done, self.total = "", 0.0, 0.0
-        self.began = time.monotonic()
+        self._pace: deque[tuple[float, float]] = deque(maxlen=PACE_PARTS)  # when, and which fraction of the present stage was done
         self.result: Any = None
         self.error: BaseException | None = None
         self.trace = ""
@@ -78,8 +80,33 @@ class Job:
         if self._thread is not None:
             self._thread.join()
 
+    @property
+    def seconds_left(self) -> float | None:
+        """Until the end of the present stage, at its pace; None as long as that cannot be told."""
+        pace = list(self._pace)
+        if len(pace) < 2 or pace[-1][1] <= pace[0][1]:
+            return None
+        (since, before), (_, now) = pace[0], pace[-1]
+        return (time.monotonic() - since) / (now - before) * (1.0 - before) - (time.monotonic() - since)
+
     def _note(self, stage: str, done: float, total: float) -> None:
+        if stage != self.stage:
+            self._pace.clear()
         self.stage, self.done, self.total = stage, done, total
+        now = time.monotonic()
+        if not self._pace or self.fraction > self._pace[-1][1]:
+            self._pace.append((now, self.fraction))
+        while len(self._pace) > 2 and self._pace[0][0] < now - PACE_S:
+            self._pace.popleft()
+
+
+def time_words(seconds: float) -> str:
+    """A time left in words: "40 s", "3 min", "1 h 20 min"."""
+    whole = max(0, round(seconds))
+    if whole < 90:
+        return f"{whole} s"
+    minutes = round(whole / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
 class JobState(bpy.types.PropertyGroup):
@@ -88,10 +115,13 @@ class JobState(bpy.types.PropertyGroup):
     running: bpy.props.BoolProperty(name="Running", options={"SKIP_SAVE"})  # type: ignore[valid-type]
     progress: bpy.props.FloatProperty(name="Progress", min=0.0, max=1.0, options={"SKIP_SAVE"})  # type: ignore[valid-type]
     stage: bpy.props.StringProperty(name="Stage", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    left: bpy.props.StringProperty(name="Time Left", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    step: bpy.props.StringProperty(name="Step", options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
 
 _current: list[Job] = []  # the one job that runs, or nothing
 _watching: list["JobOperator"] = []  # the modal operator that watches it
+ENDED: list[Callable[[bpy.types.Context, str, str], None]] = []  # told of the end of every job: its step, and what went wrong or ""
 
 
 def current() -> Job | None:
@@ -122,11 +152,16 @@ class JobOperator:
 
     job: Job
     timer: Any = None
+    step: ClassVar[str] = ""  # of the workflow, in which the job is at its beginning
     last_words: ClassVar[str] = "What was finished is kept."
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
         """Main thread: read everything from Blender and return the computation."""
         raise NotImplementedError
+
+    def step_at(self, stage: str) -> str:
+        """The step of the workflow to which a stage of the computation belongs."""
+        return self.step
 
     def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
         """Main thread: write the result into the scene; returns the operator's result."""
@@ -152,6 +187,7 @@ class JobOperator:
         _current[:], _watching[:] = [job], [self]
         wm = context.window_manager
         wm.tricap.running, wm.tricap.progress, wm.tricap.stage = True, 0.0, "Starting"
+        wm.tricap.step, wm.tricap.left = self.step, ""
         self.timer = wm.event_timer_add(TICK_S, window=context.window)
         wm.modal_handler_add(self)
         job.start()
@@ -182,12 +218,20 @@ class JobOperator:
             return None
 
     def _conclude(self, context: bpy.types.Context, job: Job) -> set[str]:
-        error = job.error
+        error, ended = job.error, {"CANCELLED"}
         if error is None:
             try:
-                return self.finish(context, job.result)
+                ended = self.finish(context, job.result)
             except InputError as mistake:
                 error = mistake
+        if error is not None:
+            self._tell(job, error)
+        failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else str(error)
+        for listener in ENDED:
+            listener(context, self.step_at(job.stage), failed)
+        return ended
+
+    def _tell(self, job: Job, error: BaseException) -> None:
         if isinstance(error, InputError):
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
         elif isinstance(error, (Cancelled, KeyboardInterrupt)):
@@ -195,16 +239,17 @@ class JobOperator:
         else:
             log.error("A Tricap job failed.\n%s", job.trace)
             self.report({"ERROR"}, BUG.format(error=f"{type(error).__name__}: {error}"))  # type: ignore[attr-defined]
-        return {"CANCELLED"}
 
     def _show(self, context: bpy.types.Context) -> None:
         state = context.window_manager.tricap
         stopping = self.job.monitor.cancelled
         state.progress, state.stage = self.job.fraction, "Stopping" if stopping else self.job.stage
+        state.step, left = self.step_at(self.job.stage), self.job.seconds_left
+        state.left = "" if left is None or stopping else f"{time_words(left)} left"
         if context.workspace is not None:
-            words = "stopping…" if stopping else f"{self.job.stage} {self.job.fraction:.0%}  (Esc stops)"
+            words = "stopping…" if stopping else f"{self.job.stage} {self.job.fraction:.0%}  {state.left}  (Esc stops)"
             context.workspace.status_text_set(f"Tricap: {words}")
-        _redraw(context)
+        redraw(context)
 
     def clear(self, context: bpy.types.Context) -> None:
         """The watching is over: no timer, no progress."""
@@ -215,18 +260,19 @@ class JobOperator:
             self.timer = None
         if self.job in _current:
             _current.remove(self.job)
-        wm.tricap.running, wm.tricap.progress, wm.tricap.stage = False, 0.0, ""
+        wm.tricap.running, wm.tricap.progress, wm.tricap.stage, wm.tricap.step, wm.tricap.left = False, 0.0, "", "", ""
         if context.workspace is not None:
             context.workspace.status_text_set(None)
-        _redraw(context)
+        redraw(context)
 
 
-def _redraw(context: bpy.types.Context) -> None:
+def redraw(context: bpy.types.Context) -> None:
+    """Draw the sidebars again, where our panels are; not the views themselves: a heavy scene would be drawn ten times a second."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type == "VIEW_3D":
+            if area.type in ("VIEW_3D", "CLIP_EDITOR"):
                 for region in area.regions:
-                    if region.type == "UI":  # not the view itself: a heavy scene would be drawn ten times a second
+                    if region.type == "UI":
                         region.tag_redraw()
 
 

@@ -1,10 +1,10 @@
-"""The panel “Tricap” in the sidebar of the 3-D view. draw() only draws."""
+"""What all panels share: where they live, and sentences that are wrapped to the sidebar's width. draw() only draws."""
 
-import dataclasses
+import textwrap
 
 import bpy
 
-from . import properties
+CHARACTER_PX, MARGIN_PX, NARROW = 6.6, 40, 20
 
 
 class TricapPanel:
@@ -15,69 +15,16 @@ class TricapPanel:
     bl_category = "Tricap"
 
 
-class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
-    """From a take to a moving armature."""
-
-    bl_label = "Tricap"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Take, output, buttons or progress, and the last result."""
-        layout, props, state = self.layout, context.scene.tricap, context.window_manager.tricap
-        column = layout.column()
-        column.enabled = not state.running
-        column.prop(props, "take")
-        column.prop(props, "out", placeholder="beside this file or the take")
-        if state.running:
-            layout.progress(factor=state.progress, text=f"{state.stage}  {state.progress:.0%}", type="BAR")
-            layout.operator("tricap.cancel", icon="X", text="Cancel (Esc)")
-        else:
-            buttons = layout.column(align=True)
-            run = buttons.row(align=True)
-            run.scale_y = 1.4
-            run.enabled = bool(props.take)
-            run.operator("tricap.run", icon="PLAY")
-            build = buttons.row(align=True)
-            build.enabled = bool(props.take or props.out)
-            build.operator("tricap.build_scene", icon="ARMATURE_DATA")
-        if not props.take and not props.out:
-            layout.label(text="Choose the folder of a recording, or see how it works:", icon="INFO")
-            layout.operator("tricap.load_sample", icon="PLAY")
-        found = layout.column(align=True)
-        for part in props.last.split(", ") if props.last else ():
-            found.label(text=part)
+def sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
+    """A sentence in as many lines as the sidebar's width needs, the icon before the first."""
+    region = context.region
+    width = region.width / context.preferences.system.ui_scale if region is not None else 0
+    column = layout.column(align=True)
+    column.scale_y = 0.85
+    for n, line in enumerate(wrapped(text, max(NARROW, int((width - MARGIN_PX) / CHARACTER_PX)))):
+        column.label(text=line, icon=icon if n == 0 else "NONE" if icon == "NONE" else "BLANK1")
 
 
-class TRICAP_PT_advanced(TricapPanel, bpy.types.Panel):
-    """The knobs of every stage."""
-
-    bl_label = "Advanced"
-    bl_parent_id = "TRICAP_PT_main"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """One box per stage."""
-        layout = self.layout
-        layout.use_property_split, layout.use_property_decorate = True, False
-        layout.enabled = not context.window_manager.tricap.running
-        for name, settings in properties.stages().items():
-            header, body = layout.panel(f"tricap_{name}", default_closed=True)
-            header.label(text=name.capitalize())
-            if body is not None:
-                group = getattr(context.scene.tricap, name)
-                for field in dataclasses.fields(settings):
-                    body.prop(group, field.name)
-
-
-CLASSES = (TRICAP_PT_main, TRICAP_PT_advanced)
-
-
-def register() -> None:
-    """Register the panels."""
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    """Unregister the panels."""
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+def wrapped(text: str, width: int) -> list[str]:
+    """The lines of a text."""
+    return [line for part in text.splitlines() for line in textwrap.wrap(part, width)]

@@ -8,7 +8,7 @@ A scene is bound to a take once it has views of its own. Without views, a take t
 Other parts of the add-on that keep something of take.toml in the scene add a function to `WRITERS` (scene → table) and `READERS`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -165,8 +165,8 @@ def table(scene: bpy.types.Scene) -> Table:
     """
     props, old = scene.tricap, read_table(folder_of(scene))
     made = dict(old) or new_table([])
-    made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": [_view_entry(view) for view in props.views]}
-    _put(made, "reference_view", props.reference_view)
+    made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": [view_entry(view) for view in props.views]}
+    _put(made, "reference_view", props.reference_view if props.reference_view in [view.name for view in props.views] else "")
     _put(made, "frames", None if props.all_frames else [props.first_frame, props.last_frame + 1])
     _put(made, "body", {**old.get("body", {}), "model": model_of(scene)} if model_of(scene) else None)
     _put_clicks(scene, made)
@@ -196,7 +196,8 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
     if opened.frames:
         props.first_frame, props.last_frame = opened.frames[0], opened.frames[1] - 1
     _show_model(scene, said.get("body", {}).get("model", ""))
-    _show_clicks(scene, opened)
+    props.seed_frame = opened.seeds.frame
+    show_clicks(scene, said, [view.name for view in opened.views])
     properties.show_settings(scene, opened.settings)
     for reader in READERS:
         reader(scene, said)
@@ -204,20 +205,28 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def show_views(scene: bpy.types.Scene, entries: list[Table], files: dict[str, Path]) -> None:
-    """Make the scene's views those of `entries` ([[views]]), with a clip each; a clip that shows the file already is kept."""
+    """Make the scene's views those of `entries` ([[views]]), with a clip each; a clip that shows the file already is kept.
+
+    Raises:
+        InputError: Blender cannot read a file; the views are as they were.
+    """
     props = scene.tricap
     kept = {view.name: view.clip for view in props.views if view.clip is not None}
+    shown = {name: _clip_of(kept.get(name), name, path) for name, path in files.items()}
     props.views.clear()
     for entry in entries:
-        name, path = entry["name"], files[entry["name"]]
-        clip = kept.get(name)
-        if clip is None or Path(bpy.path.abspath(clip.filepath)).resolve() != path.resolve():
-            clip = clips.open_clip(f"Footage {name}", path)
         view = props.views.add()
-        view.clip = clip
-        view.name = name
+        view.clip = shown[entry["name"]]
+        view.name = entry["name"]
         view.images, view.movie = entry.get("images", ""), entry.get("movie", "")
         view.offset_frames = entry.get("offset_frames", 0)
+
+
+def _clip_of(known: bpy.types.MovieClip | None, name: str, path: Path) -> bpy.types.MovieClip:
+    """The clip that is there, if it shows the file, else a new one."""
+    if known is not None and Path(bpy.path.abspath(known.filepath)).resolve() == path.resolve():
+        return known
+    return clips.open_clip(f"Footage {name}", path)
 
 
 def model_of(scene: bpy.types.Scene) -> str:
@@ -233,7 +242,8 @@ def _show_model(scene: bpy.types.Scene, name: str) -> None:
     props.model_file = name if props.model == "own" else ""
 
 
-def _view_entry(view: Any) -> Table:
+def view_entry(view: Any) -> Table:
+    """What [[views]] says of a view."""
     entry = {"name": view.name, "images": view.images, "movie": view.movie, "offset_frames": view.offset_frames}
     return {key: value for key, value in entry.items() if value or key == "name"}
 
@@ -270,16 +280,16 @@ def _same_pixels(new: dict[Any, Any], old: dict[Any, Any], sizes: dict[str, tupl
     return {name: {view: same(name, view, xy) for view, xy in at.items()} for name, at in new.items()}
 
 
-def _show_clicks(scene: bpy.types.Scene, opened: Take) -> None:
-    shown = clips_of(scene)
-    scene.tricap.seed_frame = opened.seeds.frame
+def show_clicks(scene: bpy.types.Scene, said: Table, views: Collection[str]) -> None:
+    """Show the clicks of a take.toml's table in the clips of these views, in the place of those that are there."""
+    shown = {view: clip for view, clip in clips_of(scene).items() if view in views}
     for clip in shown.values():
         seeds.clear(clip)
-    for group in (opened.seeds, *opened.keyframes):
-        numbered = {f"seed {i + 1}": at for i, at in enumerate(group.surface)}
-        for name, at in {**group.joints, **numbered}.items():
-            for view, xy in at.items():
-                seeds.set_click(shown[view], name, group.frame, (float(xy[0]), float(xy[1])))
+    for group in (said.get("seeds", {}), *said.get("keyframes", [])):
+        numbered = {f"seed {i + 1}": at for i, at in enumerate(group.get("surface", []))}
+        for name, at in {**group.get("joints", {}), **numbered}.items():
+            for view in at.keys() & shown.keys():
+                seeds.set_click(shown[view], name, group.get("frame", 0), at[view])
 
 
 def _kept_alike(new: Any, old: Any) -> Any:
@@ -288,3 +298,18 @@ def _kept_alike(new: Any, old: Any) -> Any:
         return {key: _kept_alike(value, old.get(key)) for key, value in new.items()}
     numbers = isinstance(new, float) and isinstance(old, (int, float)) and not isinstance(old, bool)
     return old if numbers and np.float32(new) == np.float32(old) else new
+
+
+def chosen(scene: bpy.types.Scene, take: str, out: str) -> tuple[Path, Path, dict[str, dict[str, Any]]]:
+    """What an operator is to run: the take's folder, that for the results, and the knobs to put over the take's own.
+
+    The scene's project is written to take.toml first, its knobs with it; another take is run as its file stands, with the panel's knobs.
+
+    Raises:
+        InputError: no take is chosen, it cannot be, or a folder cannot be written to.
+    """
+    ours = bound(scene) and (not take or folders.absolute(take) == folder_of(scene))
+    folder = write(scene) if ours else folders.take_folder(take, scene)
+    results = folders.output_folder(out, scene, str(folder))
+    folders.check_writable(results)
+    return folder, results, {} if ours else properties.overrides(scene)

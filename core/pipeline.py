@@ -36,7 +36,7 @@ from .progress import Cancelled, Monitor
 from .report.pages import write_report
 from .results import Results
 from .settings import from_table, nearest_name, to_table
-from .stages import CONCERNS, DERIVED, stage_keys, still_good
+from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
 from .take import Footage, open_take, read_take
 from .tracking.settings import TrackingSettings, TrackStatus
@@ -93,7 +93,7 @@ class Run:
     def __str__(self) -> str:
         """One line for a panel."""
         stages = self.account["stages"]
-        parts = [f"{len(self.measured)} frames"]
+        parts = [f"{stages.get('measure', {}).get('frames', 0)} frames"]
         if "measure" in stages:
             parts.append(f"{stages['measure']['points_per_frame']:.0f} points a frame (sigma {stages['measure']['sigma_mm']:.2f} mm)")
         if "track" in stages:
@@ -350,6 +350,14 @@ def all_stages(run: Run, monitor: Monitor) -> None:
     """Measure, track, fit and report, as `run` does, of an opened take."""
     for stage in (measure, track, fit, report):
         stage(run, monitor)
+
+
+def is_complete(run: Run) -> bool:
+    """Whether everything was done with the same input before, and still lies in the folder."""
+    done = run.account["stages"]
+    body = () if "not_done" in done.get("fit", {}) else ("body.toml", "joints.csv", "motion.csv")
+    files = ("clouds", "trajectories.npz", "report", *body)
+    return {*STAGES, "report"} <= set(done) and all(run.results.path(name).exists() for name in files)
 
 
 def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:

@@ -170,12 +170,18 @@ def open_take(take: Take, sequences: tuple[Sequence, ...] | None = None) -> Foot
     rig = read_rig(take.rig_path)
     cameras = tuple(rig[v.name] for v in take.views)
     sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
-    footage = Footage(take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=_frames(take, sequences))
+    frames = footage_frames(take, sequences)
+    footage = Footage(take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=frames)
     _check_seeds(footage)
     return footage
 
 
-def _frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
+def footage_frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
+    """The frames of a take that are measured, by its own numbers.
+
+    Raises:
+        InputError: the views have no frames in common, or not those that the take names.
+    """
     counts = [s.count - v.offset_frames for s, v in zip(sequences, take.views)]
     first = max(0, *(-v.offset_frames for v in take.views))
     if take.frames is None:

@@ -102,7 +102,7 @@ def make_take(folder: Path, table: Table, links: Sequence[Link], rig: Path | Non
             store.write_bytes(folder / "rig.toml", rig.read_bytes())
         store.write_text(folder / "take.toml", toml_text(table))
     except (OSError, InputError) as error:
-        _remove(made)
+        unlink_footage(made)
         raise error if isinstance(error, InputError) else _cannot_make(folder, error) from error
 
 
@@ -120,7 +120,7 @@ def link_footage(folder: Path, links: Sequence[Link]) -> list[Path]:
                 made.append(target)
                 _link(target, source)
     except OSError as error:
-        _remove(made)
+        unlink_footage(made)
         raise _cannot_make(folder, error) from error
     return made
 
@@ -189,7 +189,8 @@ def _link(target: Path, source: Path) -> None:
         (shutil.copytree if source.is_dir() else shutil.copy2)(source, target)
 
 
-def _remove(made: Sequence[Path]) -> None:
+def unlink_footage(made: Sequence[Path]) -> None:
+    """Remove what `link_footage` made; what the links stand for stays."""
     for target in made:
         if target.is_dir() and not target.is_symlink():
             shutil.rmtree(target, ignore_errors=True)

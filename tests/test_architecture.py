@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS = (
     "errors progress settings values store lock geometry images matching calibration surface tracking "
     "body fitting motion keypoint_sources take take_file results fit_sources measuring following "
-    "frame_table inspection correcting calibrating checking report stages pipeline "
+    "frame_table inspection correcting calibrating footage_files checking report stages pipeline "
     "arguments calibrate_command track2d_command contour_command points_command check_command commands"
 ).split()
 SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}

@@ -13,8 +13,9 @@ from ...core.calibration.world_choice import WorldChoice
 from ...core.errors import InputError
 from ...core.geometry.rig import write_rig
 from ...core.progress import Monitor
-from .. import folders
+from .. import folders, project
 from ..jobs import JobOperator
+from ..steps.cameras import use_rig
 from . import live
 from .cameras import build_cameras, rig_of_scene
 
@@ -37,6 +38,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
     bl_idname = "tricap.calibrate"
     bl_label = "Calibrate"
     bl_options = {"UNDO"}
+    step = "cameras"
     last_words = "No camera was changed."
 
     bar: bpy.props.StringProperty(name="Bar Footage", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
@@ -69,6 +71,8 @@ class Calibrate(JobOperator, bpy.types.Operator):
         verdict, props = result.result.verdict, context.scene.tricap_calibrate
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)
+        if project.bound(context.scene):
+            use_rig(context.scene, result.result.rig)
         return {"FINISHED"}
 
 

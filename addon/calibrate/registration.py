@@ -1,9 +1,9 @@
-"""What Blender is told of calibration: properties, operators, and a section of the panel."""
+"""What Blender is told of calibration: properties and operators."""
 
 import bpy
 
 from .. import jobs
-from . import operators, panel
+from . import operators
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -29,7 +29,7 @@ class TricapCalibrate(bpy.types.PropertyGroup):
     rig: bpy.props.StringProperty(name="Rig", subtype="FILE_PATH")  # type: ignore[valid-type]
 
 
-CLASSES = (TricapCalibrate, *operators.CLASSES, *panel.CLASSES)
+CLASSES = (TricapCalibrate, *operators.CLASSES)
 
 
 def register() -> None:

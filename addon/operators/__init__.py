@@ -3,9 +3,9 @@
 import bpy
 
 from .. import jobs
-from . import build_scene, cancel, load_sample, run
+from . import build_scene, cancel, load_sample, run, stages
 
-CLASSES = (load_sample.LoadSample, run.Run, build_scene.BuildScene, cancel.Cancel)
+CLASSES = (load_sample.LoadSample, stages.Measure, stages.Track, stages.Fit, run.Run, build_scene.BuildScene, cancel.Cancel)
 
 
 def register() -> None:

@@ -24,7 +24,8 @@ class BuildScene(JobOperator, bpy.types.Operator):
 
     bl_idname = "tricap.build_scene"
     bl_label = "Build Scene"
-    bl_options = {"UNDO"}
+    bl_options = {"REGISTER", "UNDO"}
+    step = "rig"
 
     out: bpy.props.StringProperty(name="Contents", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                   description="Folder of a run; empty: the panel's output folder")

@@ -8,7 +8,7 @@ import bpy
 
 from ...core.progress import Monitor
 from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
-from .. import folders
+from .. import folders, project
 from ..jobs import JobOperator
 from ..scene.contents import Contents
 from .build_scene import put_into_scene
@@ -33,10 +33,11 @@ class LoadSample(JobOperator, bpy.types.Operator):
         return lambda monitor: make_and_measure(base / NAME, monitor)
 
     def finish(self, context: bpy.types.Context, result: tuple[Path, Any, Contents | None]) -> set[str]:
-        """Choose the sample as the scene's take, and build the scene."""
+        """Open the sample as the scene's take, and build the scene."""
         take, report, results = result
         props = context.scene.tricap
-        props.take, props.out, props.last = str(take), "", str(report)
+        props.out, props.last = folders.for_user(take.with_name(f"{take.name}_tricap")), str(report)
+        project.open_take(context.scene, take)
         if results is not None:
             put_into_scene(self, context, results)
         self.report({"INFO"}, str(report))

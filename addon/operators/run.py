@@ -8,18 +8,19 @@ import bpy
 
 from ...core import pipeline
 from ...core.progress import Monitor
-from .. import folders, properties
-from ..jobs import JobOperator
+from .. import project
 from ..scene.contents import Contents, read_contents
 from .build_scene import RELATIVE, put_into_scene
+from .stages import StageOperator
 
 
-class Run(JobOperator, bpy.types.Operator):
-    """Measure the take from the first image to the body's motion; a run that was stopped goes on where it was"""
+class Run(StageOperator, bpy.types.Operator):
+    """Do everything that is missing, from the first image to the rig; what is done already is kept, a stopped run goes on where it was"""
 
     bl_idname = "tricap.run"
     bl_label = "Run"
     bl_options = {"UNDO"}
+    step, stages = "surface", ("measure", "track", "fit", "report")
 
     take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                    description="Folder with take.toml; empty: the panel's")
@@ -30,10 +31,8 @@ class Run(JobOperator, bpy.types.Operator):
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Any, Contents | None]]:
         """Folders and settings as they are now."""
-        take = folders.take_folder(self.take, context.scene)
-        out = folders.output_folder(self.out, context.scene, str(take))
-        folders.check_writable(out)
-        overrides, build = properties.overrides(context.scene), self.build
+        take, out, overrides = project.chosen(context.scene, self.take, self.out)
+        build = self.build
         return lambda monitor: measure(take, out, overrides, build, monitor)
 
     def finish(self, context: bpy.types.Context, result: tuple[Any, Contents | None]) -> set[str]:
@@ -47,6 +46,8 @@ class Run(JobOperator, bpy.types.Operator):
 
 
 def measure(take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor) -> tuple[Any, Contents | None]:
-    """The computation, free of bpy: the whole run, and its results read back for the scene."""
-    report = pipeline.run(take, out, overrides, monitor)
+    """The computation, free of bpy: all that is not done yet, and its results read back for the scene."""
+    with pipeline.open_run(take, out, overrides) as report:
+        if not pipeline.is_complete(report):
+            pipeline.all_stages(report, monitor)
     return report, read_contents(out, monitor) if build else None

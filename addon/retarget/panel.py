@@ -1,4 +1,4 @@
-"""The section “Retarget” of the panel. draw() only draws."""
+"""The section “Onto a Character” of the panel. draw() only draws."""
 
 import dataclasses
 
@@ -6,7 +6,6 @@ import bpy
 
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.retarget import RetargetSettings
-from ..panels import TricapPanel
 
 
 class TRICAP_UL_map(bpy.types.UIList):
@@ -19,46 +18,39 @@ class TRICAP_UL_map(bpy.types.UIList):
         row.prop(item, "bones", text="", emboss=False)
 
 
-class TRICAP_PT_retarget(TricapPanel, bpy.types.Panel):
-    """A motion onto any rig."""
-
-    bl_label = "Retarget"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Source, target, mapping, settings, buttons."""
-        layout, props = self.layout, context.scene.tricap_retarget
-        layout.enabled = not context.window_manager.tricap.running
-        column = layout.column()
-        column.prop(props, "source")
-        if props.source is None:
-            column.prop(props, "file")
-        column.prop(props, "target")
-        header, body = layout.panel("tricap_retarget_map", default_closed=True)
-        header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (found by itself)")
+def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Source, target, mapping, settings, buttons."""
+    props = context.scene.tricap_retarget
+    column = layout.column()
+    column.prop(props, "source")
+    if props.source is None:
+        column.prop(props, "file")
+    column.prop(props, "target")
+    header, body = layout.panel("tricap_retarget_map", default_closed=True)
+    header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (found by itself)")
+    if body is not None:
+        body.template_list("TRICAP_UL_map", "", props, "rows", props, "row", rows=6)
+        buttons = body.row(align=True)
+        buttons.operator("tricap.retarget_find_map", icon="VIEWZOOM")
+        buttons.operator("tricap.retarget_save_map", icon="FILE_TICK", text="Save")
+        for line in props.missing.splitlines():
+            body.label(text=line, icon="INFO")
+    for title, group, settings in (("Motion", props.settings, RetargetSettings), ("Feet", props.feet, FeetSettings)):
+        header, body = layout.panel(f"tricap_retarget_{title}", default_closed=True)
+        header.label(text=title)
         if body is not None:
-            body.template_list("TRICAP_UL_map", "", props, "rows", props, "row", rows=6)
-            buttons = body.row(align=True)
-            buttons.operator("tricap.retarget_find_map", icon="VIEWZOOM")
-            buttons.operator("tricap.retarget_save_map", icon="FILE_TICK", text="Save")
-            for line in props.missing.splitlines():
-                body.label(text=line, icon="INFO")
-        for title, group, settings in (("Motion", props.settings, RetargetSettings), ("Feet", props.feet, FeetSettings)):
-            header, body = layout.panel(f"tricap_retarget_{title}", default_closed=True)
-            header.label(text=title)
-            if body is not None:
-                body.use_property_split = True
-                for field in dataclasses.fields(settings):
-                    body.prop(group, field.name)
-        layout.prop(props, "tolerance_deg")
-        layout.prop(props, "strip")
-        buttons = layout.row(align=True)
-        buttons.scale_y = 1.3
-        buttons.operator("tricap.retarget", icon="ARMATURE_DATA")
-        buttons.operator("tricap.retarget_preview", text="Preview", icon="HIDE_OFF")
-        buttons.operator("tricap.retarget_end_preview", text="", icon="X")
-        for line in props.last.splitlines():
-            layout.label(text=line)
+            body.use_property_split = True
+            for field in dataclasses.fields(settings):
+                body.prop(group, field.name)
+    layout.prop(props, "tolerance_deg")
+    layout.prop(props, "strip")
+    buttons = layout.row(align=True)
+    buttons.scale_y = 1.3
+    buttons.operator("tricap.retarget", icon="ARMATURE_DATA")
+    buttons.operator("tricap.retarget_preview", text="Preview", icon="HIDE_OFF")
+    buttons.operator("tricap.retarget_end_preview", text="", icon="X")
+    for line in props.last.splitlines():
+        layout.label(text=line)
 
 
-CLASSES = (TRICAP_UL_map, TRICAP_PT_retarget)
+CLASSES = (TRICAP_UL_map,)

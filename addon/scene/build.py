@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
+from ...core.stages import STAGES
 from . import action, armature, cameras, clips, implicit, metaballs, skin, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
@@ -26,6 +27,7 @@ from .trajectories import add_arrows, add_trajectories
 COLLECTION = "Tricap"
 NEAR_M = 0.03  # a cloud's point has the speed of a tracked point within this distance
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder it was built from
+KEYS_KEY = "tricap_keys"  # and the keys of the stages that had been done (core/stages.py)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +81,7 @@ def write_scene(contents: Contents, blend: Path | None = None, options: SceneOpt
     remove_earlier()
     collection = bpy.data.collections.new(COLLECTION)
     collection[OUT_KEY] = str(contents.out)
+    collection[KEYS_KEY] = {stage: e["key"] for stage, e in contents.run.get("stages", {}).items() if e.get("key") and stage in STAGES}
     scene.collection.children.link(collection)
     set_time(scene, contents)
     warnings, counts = list(contents.warnings), {}

@@ -142,7 +142,7 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
             raise InputError(f"The movie {path} of view {view} is missing; mend `movie` in take.toml.")
         return Movie(path)
     try:
-        paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS), key=_natural))
+        paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS), key=natural))
     except (ValueError, IndexError, NotImplementedError):  # what pathlib raises for a pattern that is none
         paths = ()
     if not paths:
@@ -200,7 +200,8 @@ def _check_signature(path: Path) -> None:
         raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
 
 
-def _natural(path: Path) -> list[tuple[int, int, str]]:
+def natural(path: Path) -> list[tuple[int, int, str]]:
+    """A key to sort paths by, 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in re.split(r"(\d+)", str(path)) if part]
 
 

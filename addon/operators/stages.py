@@ -1,0 +1,89 @@
+"""bpy.ops.tricap.measure(take="…", out="…"), bpy.ops.tricap.track(…), bpy.ops.tricap.fit(…)"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+
+from ...core import pipeline
+from ...core.progress import Monitor
+from .. import project
+from ..jobs import JobOperator
+from .build_scene import RELATIVE
+
+STEP_WORDS = {"surface": "surface", "seeds": "surface", "matching": "surface", "tracks": "tracks", "filters": "tracks", "fit": "body",
+              "thin": "body", "skin": "body", "report": "body", "pictures": "body"}  # a stage's first word -> its step
+
+
+class StageOperator(JobOperator):
+    """Mix-in: one stage of the run, and those before it as far as they are not done."""
+
+    stages: ClassVar[tuple[str, ...]] = ()
+
+    def step_at(self, stage: str) -> str:
+        """Measuring comes first wherever it is not done."""
+        return STEP_WORDS.get(stage.split()[0] if stage else "", self.step)
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], pipeline.Run]:
+        """Folders and settings as they are now; the project's take.toml is written."""
+        take, out, overrides = project.chosen(context.scene, self.take, self.out)  # type: ignore[attr-defined]
+        return lambda monitor: run_stages(take, out, overrides, self.stages, monitor)
+
+    def finish(self, context: bpy.types.Context, result: pipeline.Run) -> set[str]:
+        """Tell what was found."""
+        context.scene.tricap.last = str(result)
+        for sentence in result.account["warnings"]:
+            self.report({"WARNING"}, sentence)  # type: ignore[attr-defined]
+        self.report({"INFO"}, str(result))  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+
+def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> pipeline.Run:
+    """The computation, free of bpy. What is checkpointed is not computed again."""
+    with pipeline.open_run(take, out, overrides) as run:
+        for name in names:
+            getattr(pipeline, name)(run, monitor)
+    return run
+
+
+class Measure(StageOperator, bpy.types.Operator):
+    """Measure the surface of the body in every frame; what was measured before with the same input is kept"""
+
+    bl_idname = "tricap.measure"
+    bl_label = "Measure Surface"
+    bl_options = {"UNDO"}
+    step, stages = "surface", ("measure",)
+
+    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                   description="Folder with take.toml; empty: this file's project")
+    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="Folder for the results; empty: the project's")
+
+
+class Track(StageOperator, bpy.types.Operator):
+    """Follow the surface's points from frame to frame; the surface is measured first where that is needed"""
+
+    bl_idname = "tricap.track"
+    bl_label = "Follow Points"
+    bl_options = {"UNDO"}
+    step, stages = "tracks", ("measure", "track")
+
+    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                   description="Folder with take.toml; empty: this file's project")
+    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="Folder for the results; empty: the project's")
+
+
+class Fit(StageOperator, bpy.types.Operator):
+    """Fit the body to surface and tracks, and write the report; both are made first where that is needed"""
+
+    bl_idname = "tricap.fit"
+    bl_label = "Fit Body"
+    bl_options = {"UNDO"}
+    step, stages = "body", ("measure", "track", "fit", "report")
+
+    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                   description="Folder with take.toml; empty: this file's project")
+    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="Folder for the results; empty: the project's")

@@ -1,0 +1,202 @@
+"""What each step offers when it is unfolded: the knobs that a person touches, the buttons, and all other knobs under Advanced."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.stages import CONCERNS
+from .. import project, properties, seeds
+from ..calibrate.panel import draw_calibrate
+from ..panels import sentence
+from ..retarget.panel import draw_retarget
+from . import states, watch
+
+KNOBS = {  # what a person touches; the others are under Advanced
+    "surface": (("matching", "patch_px"), ("growing", "spacing_px")),
+    "tracks": (("tracking", "smooth_frames"), ("tracking", "min_length")),
+    "body": (("fitting", "gate_m"),),
+}
+
+
+def primary(layout: bpy.types.UILayout, operator: str, is_next: bool, **words: Any) -> Any:
+    """The step's own button; large and lit as long as it is the next thing to do."""
+    row = layout.row()
+    row.scale_y = 1.5 if is_next else 1.0
+    return row.operator(operator, depress=is_next, **words)
+
+
+def offer(layout: bpy.types.UILayout, operator: str, **words: Any) -> None:
+    """A button of another part of the add-on, where that part is there."""
+    if hasattr(bpy.types, "TRICAP_OT_" + operator.removeprefix("tricap.")):
+        layout.operator(operator, **words)
+
+
+def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Add or open; the list of views; how they were recorded."""
+    props = context.scene.tricap
+    if not project.bound(context.scene):
+        _begin(layout, context)
+        return
+    row = layout.row()
+    row.template_list("TRICAP_UL_views", "", props, "views", props, "view_index", rows=3)
+    side = row.column(align=True)
+    side.operator("tricap.add_footage", text="", icon="ADD")
+    side.operator("tricap.remove_view", text="", icon="REMOVE")
+    side.operator("tricap.move_view", text="", icon="TRIA_UP").up = True
+    side.operator("tricap.move_view", text="", icon="TRIA_DOWN").up = False
+    _mend_footage(layout, context, is_next)
+    layout.prop(props, "fps")
+    layout.prop(props, "interlaced")
+    layout.prop(props, "all_frames")
+    if not props.all_frames:
+        pair = layout.column(align=True)
+        pair.prop(props, "first_frame")
+        pair.prop(props, "last_frame")
+
+
+def _begin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Nothing is there: save, add footage, or open a take."""
+    props = context.scene.tricap
+    if not bpy.data.filepath and not props.take:
+        sentence(layout, context, "Save this file first: the project lies in a folder beside it.", "INFO")
+        primary(layout, "wm.save_mainfile", True, text="Save the File", icon="FILE_TICK")
+    else:
+        primary(layout, "tricap.add_footage", not props.take, icon="FILE_MOVIE")
+    named = bool(props.take) and (Path(bpy.path.abspath(props.take)) / "take.toml").exists()
+    primary(layout, "tricap.open_take", named, icon="FILE_FOLDER")
+    layout.prop(props, "take", text="Folder", placeholder="beside this file")
+
+
+def _mend_footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Buttons for what can have happened to the footage."""
+    state, scene = watch.look(context.scene).states["footage"], context.scene
+    if any(view.clip is None for view in scene.tricap.views):
+        primary(layout, "tricap.reload_footage", True, icon="FILE_REFRESH")
+    elif "changed outside" in state.why:
+        row = layout.row()
+        row.operator("tricap.reload_take", icon="FILE_REFRESH")
+        row.operator("tricap.keep_mine", icon="FILE_TICK")
+    elif state.word == "failed" and "frame" in state.why:
+        layout.operator("tricap.common_frames", icon="PREVIEW_RANGE")
+    elif len(scene.tricap.views) < 2:
+        primary(layout, "tricap.add_footage", is_next, icon="FILE_MOVIE")
+
+
+def cameras(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Three ways to cameras."""
+    column = layout.column()
+    column.enabled = project.bound(context.scene)
+    primary(column, "tricap.cameras_from_file", is_next, icon="FILE_CACHE", text="From a Calibration File")
+    column.operator("tricap.cameras_from_scene", icon="OUTLINER_OB_CAMERA", text="From This Scene's Cameras")
+
+
+def seeds_of(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
+    """Every joint to click, with the views in which it is clicked.
+
+    Raises:
+        InputError: a clip was deleted, or there is no such model.
+    """
+    scene = context.scene
+    clips = project.clips_of(scene)
+    frame = scene.tricap.seed_frame
+    wanted = states.joints_of(project.model_of(scene)) if project.model_of(scene) else ()
+    return [(name, [view for view, clip in clips.items() if seeds.click(clip, name, frame) is not None]) for name in wanted]
+
+
+def _seeds(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Which body, in which frame; the views to click in; what is clicked."""
+    props = context.scene.tricap
+    layout.prop(props, "model")
+    if props.model == "own":
+        layout.prop(props, "model_file")
+    layout.prop(props, "seed_frame")
+    buttons = layout.column()
+    buttons.enabled = project.bound(context.scene)
+    if hasattr(bpy.types, "TRICAP_OT_open_views"):
+        primary(buttons, "tricap.open_views", is_next, icon="WINDOW", text="Open the Views and Click")
+    try:
+        clicked = seeds_of(context)
+    except InputError:
+        return  # the step's sentence says it
+    grid = layout.grid_flow(columns=2, even_columns=True, align=True)
+    for name, views in clicked:
+        icon = "CHECKMARK" if len(views) > 1 else "LAYER_USED" if views else "BLANK1"
+        grid.label(text=f"{name}  {' '.join(views)}", icon=icon)
+
+
+def surface(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Measure."""
+    _stage(layout, context, "surface", "tricap.measure", is_next, icon="POINTCLOUD_DATA")
+
+
+def tracks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Follow."""
+    _stage(layout, context, "tracks", "tricap.track", is_next, icon="CURVE_PATH")
+
+
+def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Fit."""
+    _stage(layout, context, "body", "tricap.fit", is_next, icon="ARMATURE_DATA")
+
+
+def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, operator: str, is_next: bool, icon: str) -> None:
+    now = watch.look(context.scene).states
+    for group, name in KNOBS[step]:
+        layout.prop(getattr(context.scene.tricap, group), name)
+    row = layout.column()
+    row.enabled = now["cameras"].word == "done"
+    primary(row, operator, is_next, icon=icon)
+
+
+def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Build; options are offered after it (F9)."""
+    column = layout.column()
+    column.enabled = watch.look(context.scene).states["surface"].word != "empty" or bool(context.scene.tricap.out)
+    primary(column, "tricap.build_scene", is_next, icon="OUTLINER_OB_ARMATURE", text="Build Rig and Scene")
+
+
+def retarget(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Onto another rig, or into a file."""
+    row = layout.row()
+    row.operator_menu_enum("tricap.export", "kind", text="Export the Motion", icon="EXPORT")
+
+
+DRAW = {"footage": footage, "cameras": cameras, "seeds": _seeds, "surface": surface, "tracks": tracks, "body": body, "rig": rig,
+        "retarget": retarget}
+
+
+def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
+    """The further sections of a step: other ways, and all the knobs that a person seldom touches."""
+    if step == "cameras":
+        _section(layout, context, "bar", "From a Waved Bar", draw_calibrate)
+    if step == "retarget":
+        _section(layout, context, "onto", "Onto a Character", draw_retarget)
+    if step == "footage":
+        _section(layout, context, "where", "Advanced", _where)
+    for group in CONCERNS[states.STAGE[step]].settings if step in states.STAGE else ():
+        _section(layout, context, group, f"Advanced: {group}", lambda inside, _, group=group: _knobs(inside, context, step, group))
+
+
+def _section(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, title: str, draw: Any) -> None:
+    header, inside = layout.panel(f"tricap_{name}", default_closed=True)
+    header.label(text=title)
+    if inside is not None:
+        inside.enabled = not context.window_manager.tricap.running
+        inside.use_property_split, inside.use_property_decorate = True, False
+        draw(inside, context)
+
+
+def _where(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    props = context.scene.tricap
+    layout.prop(props, "take", text="Project")
+    layout.prop(props, "out", placeholder="beside this file or the take")
+    layout.prop_search(props, "reference_view", props, "views", icon="CAMERA_DATA")
+
+
+def _knobs(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, group: str) -> None:
+    for field in dataclasses.fields(properties.stages()[group]):
+        if (group, field.name) not in KNOBS[step]:
+            layout.prop(getattr(context.scene.tricap, group), field.name)

@@ -1,0 +1,58 @@
+"""bpy.ops.tricap.export(filepath="…", kind="bvh", preset="plain", out="")"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.progress import Monitor
+from .. import folders
+from ..jobs import JobOperator
+from ..retarget.export import PROGRAMS, export_file
+
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+KINDS = (("bvh", "BVH", "The skeleton's motion, for nearly every animation program"),
+         ("trc", "TRC", "The joints as points, for OpenSim"),
+         ("c3d", "C3D", "The joints as points, for biomechanics"),
+         ("csv", "CSV", "The joints as a table with their sigmas"),
+         ("ply", "PLY", "The skin of every frame, into a folder"))
+
+
+class Export(JobOperator, bpy.types.Operator):
+    """Write the motion for another program. For FBX, glTF, USD and Alembic use Blender's own File > Export on the rig"""
+
+    bl_idname = "tricap.export"
+    bl_label = "Export"
+    step = "retarget"
+    last_words = "No file was written."
+
+    kind: bpy.props.EnumProperty(name="Format", items=KINDS, default="bvh")  # type: ignore[valid-type]
+    preset: bpy.props.EnumProperty(name="For", items=[(name, name.capitalize(), "") for name in PROGRAMS],  # type: ignore[valid-type]
+                                   description="Names, units and axes as a program wants them")
+    filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH")  # type: ignore[valid-type]
+    out: bpy.props.StringProperty(name="Results", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                  description="Folder of a run; empty: the project's")
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the file; what follows is quick enough to wait for."""
+        name = "skin" if self.kind == "ply" else f"motion.{self.kind}"
+        self.filepath = self.filepath or str(Path(bpy.data.filepath).parent / name if bpy.data.filepath else name)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], str]:
+        """Which results, and which file."""
+        if not self.filepath:
+            raise InputError("Choose the file to write.")
+        out, file, kind, preset = folders.output_folder(self.out, context.scene), folders.absolute(self.filepath), self.kind, self.preset
+        return lambda monitor: f"{file}: {export_file(out, kind, file, preset, monitor)}"
+
+    def finish(self, context: bpy.types.Context, result: str) -> set[str]:
+        """Tell what was written."""
+        context.scene.tricap_retarget.last = f"Exported {result}"
+        self.report({"INFO"}, result)
+        return {"FINISHED"}
+
+
+CLASSES = (Export,)

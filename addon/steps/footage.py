@@ -1,0 +1,248 @@
+"""bpy.ops.tricap.add_footage(directory="…", files=[…]), .open_take(directory="…"), .reload_take(), .keep_mine(), .move_view(up=True),
+.remove_view(), .reload_footage(), .common_frames()"""
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.footage_files import find_footage, name_views
+from ...core.images.sequence import open_sequence
+from ...core.take_file import footage_entry, link_footage, read_table, unlink_footage
+from .. import folders, project
+from ..scene import clips
+from . import watch
+
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+
+class Told:
+    """Mix-in: `do` is the work; what is wrong is told in its one sentence, and the panel looks again."""
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Do it."""
+        try:
+            said = self.do(context)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        finally:
+            watch.refresh(context.scene)
+        if said:
+            self.report({"INFO"}, said)  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """The work; gives a sentence to show, or "".
+
+        Raises:
+            InputError: it cannot be done; nothing was changed.
+        """
+        raise NotImplementedError
+
+
+class AddFootage(Told, bpy.types.Operator):
+    """Choose the movies of all cameras at once, or the folder that has a folder of images for every camera"""
+
+    bl_idname = "tricap.add_footage"
+    bl_label = "Add Footage"
+    bl_options = {"UNDO"}
+
+    directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=RELATIVE)  # type: ignore[valid-type]
+    files: bpy.props.CollectionProperty(type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the files; where no project can be, say so first."""
+        try:
+            folders.check_writable(project.folder_of(context.scene))
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Link the footage into the project and show it as clips."""
+        scene = context.scene
+        sources = find_footage(folders.absolute(self.directory), [f.name for f in self.files])
+        folder, first = project.make_folder(scene), not project.bound(scene)
+        old = [project.view_entry(view) for view in scene.tricap.views]
+        made = [footage_entry(folder, name, path) for name, path in name_views(sources, [entry["name"] for entry in old])]
+        linked = link_footage(folder, [link for _, link in made])
+        entries = [*old, *(entry for entry, _ in made)]
+        try:
+            files = {e["name"]: clips.first_file(folder, e.get("images"), e.get("movie"), e["name"]) for e in entries}
+            project.show_views(scene, entries, files)
+        except InputError:
+            unlink_footage(linked)
+            raise
+        if first:
+            use_rate_of(scene)
+        if lengths_differ(scene, folder):
+            use_common_frames(scene, folder)
+        if len(entries) > 1:
+            project.write(scene)
+        return f"{len(made)} views added: {', '.join(entry['name'] for entry, _ in made)}. Check names and order."
+
+
+class OpenTake(Told, bpy.types.Operator):
+    """Open a recording that has a take.toml: its footage, cameras, clicks and settings"""
+
+    bl_idname = "tricap.open_take"
+    bl_label = "Open Take"
+    bl_options = {"UNDO"}
+
+    directory: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                        description="Folder with take.toml; empty: the panel's")
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the folder, unless the panel names one that is not open yet."""
+        if context.scene.tricap.take and not project.bound(context.scene):
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Show it."""
+        scene = context.scene
+        folder = folders.take_folder(self.directory, scene)
+        if self.directory and scene.tricap.take and folder != folders.absolute(scene.tricap.take):
+            scene.tricap.out = ""  # the results of another take
+        project.open_take(scene, folder)
+        return f"{folder.name}: {len(scene.tricap.views)} views."
+
+
+class ReloadTake(Told, bpy.types.Operator):
+    """Read take.toml again; what it says takes the place of what this file has"""
+
+    bl_idname = "tricap.reload_take"
+    bl_label = "Reload Take"
+    bl_options = {"UNDO"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Read it."""
+        project.open_take(context.scene, project.existing_folder(context.scene))
+        return "take.toml was read again."
+
+
+class KeepMine(Told, bpy.types.Operator):
+    """Write take.toml as this file has it, over what was changed in it outside"""
+
+    bl_idname = "tricap.keep_mine"
+    bl_label = "Keep Mine"
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Write it."""
+        project.write(context.scene, overwrite=True)
+        return "take.toml says what this file says."
+
+
+class MoveView(bpy.types.Operator):
+    """Move the view in the order in which the cameras stand, from left to right"""
+
+    bl_idname = "tricap.move_view"
+    bl_label = "Move View"
+    bl_options = {"UNDO"}
+
+    up: bpy.props.BoolProperty(name="Up", default=True)  # type: ignore[valid-type]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Move it."""
+        props = context.scene.tricap
+        to = props.view_index + (-1 if self.up else 1)
+        if not (0 <= to < len(props.views) and 0 <= props.view_index < len(props.views)):
+            return {"CANCELLED"}
+        props.views.move(props.view_index, to)
+        props.view_index = to
+        watch.refresh(context.scene)
+        return {"FINISHED"}
+
+
+class RemoveView(bpy.types.Operator):
+    """Take the view out of the recording; its files stay where they are"""
+
+    bl_idname = "tricap.remove_view"
+    bl_label = "Remove View"
+    bl_options = {"UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Take it out."""
+        props = context.scene.tricap
+        if not 0 <= props.view_index < len(props.views):
+            return {"CANCELLED"}
+        props.views.remove(props.view_index)
+        props.view_index = max(0, props.view_index - 1)
+        watch.refresh(context.scene)
+        return {"FINISHED"}
+
+
+class ReloadFootage(Told, bpy.types.Operator):
+    """Make the movie clips again that were deleted, with the clicks that take.toml has of them"""
+
+    bl_idname = "tricap.reload_footage"
+    bl_label = "Reload Footage"
+    bl_options = {"UNDO"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Make them again."""
+        scene, folder = context.scene, project.existing_folder(context.scene)
+        lost = [view.name for view in scene.tricap.views if view.clip is None]
+        entries = [project.view_entry(view) for view in scene.tricap.views]
+        files = {e["name"]: clips.first_file(folder, e.get("images"), e.get("movie"), e["name"]) for e in entries}
+        project.show_views(scene, entries, files)
+        project.show_clicks(scene, read_table(folder), lost)
+        return f"{len(lost)} clips were made again."
+
+
+class CommonFrames(Told, bpy.types.Operator):
+    """Measure the frames that all views have"""
+
+    bl_idname = "tricap.common_frames"
+    bl_label = "Use Common Frames"
+    bl_options = {"UNDO"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Set first and last."""
+        use_common_frames(context.scene, project.existing_folder(context.scene))
+        return ""
+
+
+def use_rate_of(scene: bpy.types.Scene) -> None:
+    """The frame rate of the first movie; images have none."""
+    rate = next((view.clip.fps for view in scene.tricap.views if view.clip.source == "MOVIE" and view.clip.fps > 0), None)
+    if rate:
+        scene.tricap.fps = rate
+
+
+def lengths_differ(scene: bpy.types.Scene, folder: Path) -> bool:
+    """Whether the views end or begin at different frames."""
+    return len({span for span in _spans(scene, folder)}) > 1
+
+
+def use_common_frames(scene: bpy.types.Scene, folder: Path) -> None:
+    """Measure the frames that all views have.
+
+    Raises:
+        InputError: they have none in common.
+    """
+    spans = _spans(scene, folder)
+    first, stop = max(0, *(a for a, _ in spans)), min(b for _, b in spans)
+    if stop <= first:
+        raise InputError("With these offsets the views have no frame in common; mend the offsets.")
+    props = scene.tricap
+    props.all_frames, props.first_frame, props.last_frame = False, first, stop - 1
+
+
+def _spans(scene: bpy.types.Scene, folder: Path) -> list[tuple[int, int]]:
+    def count(view: Any) -> int:
+        return open_sequence(folder, images=view.images or None, movie=view.movie or None, view=view.name).count
+
+    return [(-view.offset_frames, count(view) - view.offset_frames) for view in scene.tricap.views]
+
+
+CLASSES = (AddFootage, OpenTake, ReloadTake, KeepMine, MoveView, RemoveView, ReloadFootage, CommonFrames)

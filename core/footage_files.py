@@ -1,0 +1,85 @@
+"""Which files are a camera's footage, and what the views are called: guessed from the names that cameras and people give."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from .calibrating import MOVIE_ENDINGS
+from .errors import InputError
+from .images.sequence import IMAGE_ENDINGS, natural
+
+SIDES = {  # words for the sides, in the order in which the cameras stand
+    "L": ("l", "left", "links", "gauche", "izquierda", "sinistra"),
+    "C": ("c", "centre", "center", "middle", "mid", "m", "mitte", "centro", "milieu"),
+    "R": ("r", "right", "rechts", "droite", "derecha", "destra"),
+}
+SIDE_OF = {word: side for side, words in SIDES.items() for word in words}
+
+
+def find_footage(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The movies and image folders that a user means who chose files `names` in `folder`; none chosen: all that the folder holds.
+
+    An image stands for the folder in which it lies.
+
+    Raises:
+        InputError: there is no footage, or a file is none.
+    """
+    folder = Path(folder)
+    chosen = [folder / name for name in names if name]
+    if not chosen:
+        try:
+            inside = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=natural)
+        except OSError as error:
+            raise InputError(f"Cannot read the folder {folder}: {error.strerror or error}.") from error
+        chosen = [p for p in inside if _is_movie(p) or p.is_dir() and any(map(_is_image, p.iterdir()))]
+        chosen = chosen or [p for p in inside if _is_image(p)][:1]
+    if not chosen:
+        raise InputError(f"{folder} holds no footage; choose the movies, or the folder that has a folder of images for every camera.")
+    found: dict[Path, None] = {}
+    for path in chosen:
+        if not path.exists():
+            raise InputError(f"The footage {path} is missing; check the path.")
+        if not (path.is_dir() or _is_movie(path) or _is_image(path)):
+            raise InputError(f"{path.name} is neither a movie nor an image; choose the footage of the cameras.")
+        found[path.parent if _is_image(path) else path] = None
+    return list(found)
+
+
+def name_views(sources: Sequence[Path], taken: Sequence[str] = ()) -> list[tuple[str, Path]]:
+    """Names for footage, in the order in which the cameras stand: L, C, R where the files tell the side, else what tells them apart."""
+    sides = [_side(path.stem if path.is_file() else path.name) for path in sources]
+    if all(sides) and len({*sides, *taken}) == len(sides) + len(taken):
+        named = list(zip([str(side) for side in sides], sources))
+        return sorted(named, key=lambda pair: list(SIDES).index(pair[0]))
+    ordered = sorted(sources, key=natural)
+    named = []
+    for path, short in zip(ordered, _different_parts([p.stem if p.is_file() else p.name for p in ordered])):
+        name, known = short, {*taken, *(n for n, _ in named)}
+        number = 2
+        while name in known:
+            name, number = f"{short} {number}", number + 1
+        named.append((name, path))
+    return named
+
+
+def _side(stem: str) -> str | None:
+    """L, C or R if exactly one side is said in a file's name."""
+    words = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", stem).lower())
+    found = {SIDE_OF[word] for word in words if word in SIDE_OF}
+    return found.pop() if len(found) == 1 else None
+
+
+def _different_parts(stems: Sequence[str]) -> list[str]:
+    """The names without the whole words that all of them have in common; as they are where nothing remains."""
+    words = [re.findall(r"[^\W_]+", stem) for stem in stems]
+    common = set(words[0]).intersection(*words[1:]) if len(words) > 1 else set()
+    short = ["_".join(w for w in each if w not in common) for each in words]
+    return short if all(short) and len(set(short)) == len(short) else list(stems)
+
+
+def _is_movie(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in MOVIE_ENDINGS
+
+
+def _is_image(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in IMAGE_ENDINGS

@@ -1,0 +1,322 @@
+"""The eight steps: the state of each at every point of the way, what a change makes stale, and what each wrong move is told."""
+
+import importlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from tricap.core import pipeline
+from tricap.core.geometry.rig import read_rig, write_rig
+from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
+from tricap.core.take_file import read_table
+
+NAME = "bl_ext.user_default.tricap.addon"
+QUICK = {"growing": {"spacing_px": 6}}
+Words = Callable[[], str]
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Footage, cameras and clicks of an arm."""
+    folder = tmp_path_factory.mktemp("recordings") / "arm"
+    make_arm_take(folder, ArmTakeSettings(frames=4, width_px=512, interlaced="none"))
+    return folder
+
+
+@pytest.fixture
+def states(blender: ModuleType) -> ModuleType:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    return importlib.import_module(f"{NAME}.steps.states")
+
+
+@pytest.fixture
+def words(states: ModuleType, blender: ModuleType) -> Words:
+    """The states' words in a line, after a look."""
+    watch = importlib.import_module(f"{NAME}.steps.watch")
+    return lambda: " ".join(watch.refresh(blender.context.scene).states[step].word for step in states.STEPS)
+
+
+@pytest.fixture
+def why(states: ModuleType, blender: ModuleType) -> Callable[[str], str]:
+    """The sentence of a step."""
+    watch = importlib.import_module(f"{NAME}.steps.watch")
+    return lambda step: watch.refresh(blender.context.scene).states[step].why
+
+
+def new_project(blender: ModuleType, sample: Path, folder: Path) -> Any:
+    """A saved file with the sample's footage added, as a user would."""
+    shutil.copytree(sample, folder / "film")
+    for name in ("take.toml", "truth.npz"):
+        (folder / "film" / name).unlink()
+    blender.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(folder / "film")) == {"FINISHED"}
+    return blender.context.scene
+
+
+def opened(blender: ModuleType, sample: Path, folder: Path) -> Any:
+    """The sample's take opened, with results to be in folder/out."""
+    shutil.copytree(sample, folder / "take")
+    assert blender.ops.tricap.open_take(directory=str(folder / "take")) == {"FINISHED"}
+    scene = blender.context.scene
+    scene.tricap.out = str(folder / "out")
+    scene.tricap.growing.spacing_px = 6
+    return scene
+
+
+@pytest.mark.slow
+def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
+    assert words() == "empty empty empty empty empty empty empty empty"
+    scene = new_project(blender, sample, tmp_path)
+    assert [(v.name, v.images) for v in scene.tricap.views] == [("L", "L/*.png"), ("C", "C/*.png"), ("R", "R/*.png")]
+    assert words() == "done ready ready empty empty empty empty empty" and why("footage") == "3 views, 4 frames of 512×384 pixels."
+    assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "film" / "rig.toml")) == {"FINISHED"}
+    scene.tricap.model = "arm.R"
+    assert words() == "done done ready ready empty empty empty empty"
+    click(blender, read_table(sample)["seeds"]["joints"])
+    assert words() == "done done done ready empty empty empty empty" and why("seeds") == "All 3 joints are clicked."
+    scene.tricap.growing.spacing_px = 6
+    assert blender.ops.tricap.measure() == {"FINISHED"}
+    assert words() == "done done done done ready empty empty empty"
+    assert blender.ops.tricap.track() == {"FINISHED"}
+    assert words() == "done done done done done ready empty empty"
+    assert blender.ops.tricap.fit() == {"FINISHED"}
+    assert words() == "done done done done done done ready empty"
+    assert blender.ops.tricap.build_scene() == {"FINISHED"}
+    assert words() == "done done done done done done done ready"
+    assert blender.ops.tricap.export(kind="bvh", filepath=str(tmp_path / "motion.bvh")) == {"FINISHED"}
+    assert words() == "done done done done done done done done" and (tmp_path / "motion.bvh").stat().st_size > 0
+    assert (tmp_path / "shot_tricap" / "results" / "report" / "report.html").exists()
+    same_numbers_as_the_command(tmp_path)
+    assert len([c for c in blender.data.movieclips]) == 3, "the scene shows the project's own clips"
+
+
+def click(blender: ModuleType, joints: dict[str, dict[str, list[float]]]) -> None:
+    project, seeds = (importlib.import_module(f"{NAME}.{name}") for name in ("project", "seeds"))
+    clips = project.clips_of(blender.context.scene)
+    for name, at in joints.items():
+        for view, xy in at.items():
+            seeds.set_click(clips[view], name, 0, xy)
+
+
+def same_numbers_as_the_command(folder: Path) -> None:
+    pipeline.run(folder / "shot_tricap", folder / "command")
+    for name in ("motion.csv", "body.toml", "trajectories.npz", "clouds/0003.ply"):
+        assert (folder / "command" / name).read_bytes() == (folder / "shot_tricap" / "results" / name).read_bytes(), name
+
+
+@pytest.fixture(scope="module")
+def results(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command makes of the sample."""
+    out = tmp_path_factory.mktemp("results") / "out"
+    pipeline.run(sample, out, QUICK)
+    return out
+
+
+@pytest.fixture
+def done(blender: ModuleType, words: Words, sample: Path, results: Path, tmp_path: Path) -> Any:
+    """The scene, with everything done."""
+    shutil.copytree(results, tmp_path / "out")
+    scene = opened(blender, sample, tmp_path)
+    assert words() == "done done done done done done ready empty", "what the command did counts here too"
+    assert blender.ops.tricap.run() == {"FINISHED"}
+    assert words() == "done done done done done done done ready"
+    return scene
+
+
+def test_changes_make_the_right_steps_stale_and_only_those(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
+    scene = done
+    scene.tricap.fitting.gate_m = 0.04
+    assert words() == "done done done done done stale stale ready"
+    scene.tricap.fitting.gate_m = 0.035
+    assert words() == "done done done done done done done ready"
+    scene.tricap.fps = 50.0
+    assert words().split()[3:7] == ["done", "stale", "stale", "stale"]
+    scene.tricap.fps = 25.0
+    clip = scene.tricap.views[0].clip
+    marker = clip.tracking.tracks["elbow.R"].markers[0]
+    before = marker.co[:]
+    marker.co[0] += 0.01
+    assert words().split()[2:7] == ["done", "stale", "stale", "stale", "stale"]
+    marker.co = before
+    assert words() == "done done done done done done done ready"
+    clip.tracking.tracks["elbow.R"].markers.insert_frame(3, co=before)  # a keyframe in another frame
+    assert words().split()[3:7] == ["done", "done", "stale", "stale"]
+    assert blender.ops.tricap.fit() == {"FINISHED"}
+    assert words().split()[3:7] == ["done", "done", "done", "stale"]
+    assert blender.ops.tricap.run() == {"FINISHED"}
+    assert words().split()[3:7] == ["done", "done", "done", "done"]
+
+
+def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any, tmp_path: Path, words: Words) -> None:
+    run = (tmp_path / "out" / "run.json").stat().st_mtime_ns
+    assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "run.json").stat().st_mtime_ns == run
+    (tmp_path / "out" / "motion.csv").unlink()
+    assert words().split()[5] == "ready"
+    assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "motion.csv").exists()
+
+
+def test_objects_and_clips_that_the_user_deleted_or_renamed(blender: ModuleType, done: Any, words: Words, why: Any) -> None:
+    scene = done
+    body = next(o for o in scene.objects if o.type == "ARMATURE")
+    body.name = "Anna"
+    scene.tricap.views[1].clip.name = "my film"
+    assert words() == "done done done done done done done ready"
+    blender.data.objects.remove(body)
+    assert words().split()[6] == "stale" and "not in the scene" in why("rig")
+    assert blender.ops.tricap.build_scene() == {"FINISHED"} and words().split()[6] == "done"
+    blender.data.movieclips.remove(scene.tricap.views[0].clip)
+    assert words().split()[0] == "failed" and "press Reload Footage" in why("footage")
+    with pytest.raises(RuntimeError, match="clip of view L was deleted; press Reload Footage"):
+        blender.ops.tricap.fit()
+    assert blender.ops.tricap.reload_footage() == {"FINISHED"}
+    assert words() == "done done done done done done done ready"
+
+
+def test_a_saved_file_opens_with_its_states_and_undo_goes_back(blender: ModuleType, done: Any, words: Words, tmp_path: Path) -> None:
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "again.blend"))
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    assert words().startswith("empty")
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "again.blend"))
+    assert words() == "done done done done done done done ready"
+    shutil.move(tmp_path / "take", tmp_path / "hidden")
+    assert words().split()[0] == "failed"
+    with pytest.raises(RuntimeError, match="is not there; move it back, or choose where it is now"):
+        blender.ops.tricap.run()
+
+
+def test_a_step_that_failed_stays_failed_until_its_input_changes(blender: ModuleType, words: Words, why: Any, sample: Path,
+                                                                 tmp_path: Path) -> None:  # fmt: skip
+    scene = opened(blender, sample, tmp_path)
+    blank(tmp_path / "take" / "R")
+    with pytest.raises(RuntimeError, match="No surface could be measured"):
+        blender.ops.tricap.measure()
+    assert words().split()[3] == "failed" and "No surface could be measured in frame 0" in why("surface")
+    scene.tricap.matching.patch_px = 17
+    assert words().split()[3] == "ready"
+
+
+def blank(folder: Path) -> None:
+    import cv2
+
+    for path in folder.glob("*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path)) * 0 + 90)
+
+
+WRONG = {
+    "another size": "was calibrated with pictures of 640×480 pixels, its footage has 512×384",
+    "no camera for a view": "no camera “R”",
+    "no rig at all": "Cannot read the rig",
+    "damaged rig": "rig.toml",
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_wrong_cameras(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path, kind: str) -> None:
+    opened(blender, sample, tmp_path)
+    path = tmp_path / "take" / "rig.toml"
+    rig = read_rig(path)
+    if kind == "another size":
+        path.write_text(path.read_text(encoding="utf-8").replace("size = [512, 384]", "size = [640, 480]"), encoding="utf-8")
+    elif kind == "no camera for a view":
+        write_rig(path, type(rig)(cameras=rig.cameras[:2], metadata={}))
+    elif kind == "no rig at all":
+        path.unlink()
+    else:
+        path.write_text("[cam_0", encoding="utf-8")
+    assert words().split()[1] == ("ready" if kind == "no rig at all" else "failed") and words().split()[3] == "empty"
+    if kind != "no rig at all":
+        assert WRONG[kind] in why("cameras")
+    with pytest.raises(RuntimeError, match="rig|pixels") as told:
+        blender.ops.tricap.run()
+    assert "Traceback" not in str(told.value)
+
+
+def test_wrong_moves_with_footage(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="Save the Blender file first"):
+        blender.ops.tricap.add_footage(directory=str(sample))
+    (tmp_path / "notes").mkdir()
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "x.blend"))
+    with pytest.raises(RuntimeError, match="holds no footage"):
+        blender.ops.tricap.add_footage(directory=str(tmp_path / "notes"))
+    (tmp_path / "notes" / "film.mp4").write_bytes(b"no movie")
+    with pytest.raises(RuntimeError, match="not a movie that can be decoded"):
+        blender.ops.tricap.add_footage(directory=str(tmp_path / "notes"))
+    assert not blender.context.scene.tricap.views and not any((tmp_path / "x_tricap").iterdir()), "nothing half made"
+    scene = new_project(blender, sample, tmp_path)
+    scene.tricap.views[0].offset_frames = 2
+    assert words().split()[0] == "failed" and "not equally long" in why("footage")
+    assert blender.ops.tricap.common_frames() == {"FINISHED"}
+    assert words().split()[0] == "done" and why("footage").startswith("3 views, 2 frames")
+    scene.tricap.views[1].name = "L"
+    assert words().split()[0] == "failed" and "same name" in why("footage")
+    scene.tricap.views[1].name = "C"
+    scene.tricap.view_index = 2
+    assert blender.ops.tricap.remove_view() == {"FINISHED"} and blender.ops.tricap.move_view(up=True) == {"FINISHED"}
+    assert [v.name for v in scene.tricap.views] == ["C", "L"]
+    (tmp_path / "film" / "C").rename(tmp_path / "film" / "gone")
+    assert words().split()[0] == "failed" and "is not at" in why("footage")
+
+
+def test_a_read_only_folder_is_told(blender: ModuleType, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(sample, tmp_path / "film")
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "x.blend"))
+    monkeypatch.setattr(os, "access", lambda *_: False)  # the tests may be run by root, whom no mode stops
+    with pytest.raises(RuntimeError, match="Cannot write into"):
+        blender.ops.tricap.add_footage(directory=str(tmp_path / "film"))
+    assert not (tmp_path / "x_tricap").exists()
+
+
+def test_a_click_that_contradicts_itself_is_told_at_its_step(blender: ModuleType, words: Words, why: Any, sample: Path,
+                                                             tmp_path: Path) -> None:  # fmt: skip
+    scene = opened(blender, sample, tmp_path)
+    marker = scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers[0]
+    marker.co = (0.1, 0.1)
+    assert words().split()[2] == "failed" and "“wrist.R”" in why("seeds") and "click the same spot in every view" in why("seeds")
+
+
+def test_swapped_views_are_told(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
+    scene = opened(blender, sample, tmp_path)
+    views = scene.tricap.views
+    views[0].images, views[2].images = views[2].images, views[0].images
+    views[0].clip, views[2].clip = views[2].clip, views[0].clip
+    assert blender.ops.tricap.measure() == {"FINISHED"}
+    assert words().split()[3] == "done" and "whether views are swapped" in why("surface")
+
+
+def test_what_changed_in_take_toml_outside_is_a_choice(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
+    scene = opened(blender, sample, tmp_path)
+    path = tmp_path / "take" / "take.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("fps = 25.0", "fps = 60.0"), encoding="utf-8")
+    assert words().split()[0] == "failed" and "changed outside" in why("footage")
+    assert blender.ops.tricap.reload_take() == {"FINISHED"} and scene.tricap.fps == 60.0 and words().split()[0] == "done"
+    path.write_text(path.read_text(encoding="utf-8").replace("fps = 60.0", "fps = 70.0"), encoding="utf-8")
+    assert blender.ops.tricap.keep_mine() == {"FINISHED"} and read_table(path.parent)["fps"] == 60.0
+
+
+@pytest.fixture
+def layout() -> Iterator[Any]:
+    from .layout import Layout
+
+    yield Layout()
+
+
+@pytest.mark.parametrize("point", ["empty", "opened", "done"])
+def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleType, layout: Any, sample: Path, tmp_path: Path,
+                                           point: str, request: pytest.FixtureRequest) -> None:  # fmt: skip
+    if point == "done":
+        request.getfixturevalue("done")
+    elif point == "opened":
+        opened(blender, sample, tmp_path)
+    panel = importlib.import_module(f"{NAME}.steps.panel")
+    importlib.import_module(f"{NAME}.steps.watch").refresh(blender.context.scene)
+    drawn = layout.draw(panel.TRICAP_PT_main, blender.context)
+    for n, title in enumerate(states.TITLES, 1):
+        assert f"{n}  {title}" in drawn.texts
+    assert {"empty": "tricap.open_take", "opened": "tricap.measure", "done": "tricap.export"}[point] in drawn.operators
+    if point == "done":
+        assert "Next: 8 Retarget and Export" in " ".join(drawn.texts)
