@@ -138,7 +138,7 @@ def open_run(
         clicked_depth(footage, name, at)
     if take.body_model is not None:
         read_model(take.body_model)
-    keys = stage_keys(footage, settings)
+    keys = stage_keys(footage, settings, Path(out))
     with Results(out).opened() as results:
         if restart:
             results.remove("clouds", *DERIVED, "cache")  # the cache last: it marks the folder as ours

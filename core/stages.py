@@ -58,8 +58,8 @@ CONCERNS: dict[str, Concern] = {
 DERIVED = tuple(name for concern in CONCERNS.values() for name in concern.files)
 
 
-def stage_keys(footage: Footage, settings: Mapping[str, Any]) -> dict[str, str]:
-    """The key of every stage, for opened footage and the settings of a run.
+def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict[str, str]:
+    """The key of every stage, for opened footage, the settings of a run, and the contours that were put into its folder OUT.
 
     Raises:
         InputError: footage, rig or model have gone.
@@ -67,7 +67,8 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any]) -> dict[str, str]:
     keys, before = {}, ""
     try:
         for stage, concern in CONCERNS.items():
-            before = store.digest(before, repr([settings[name] for name in concern.settings]), repr(concern.take(footage)))
+            said = [settings[name] for name in concern.settings], concern.take(footage)
+            before = store.digest(before, repr(said), *(sorted((out / "contours").glob("*.csv")) if stage == "fit" else ()))
             keys[stage] = before
     except OSError as error:
         raise InputError(f"Cannot read {error.filename}: {error.strerror or error}.") from error

@@ -141,9 +141,8 @@ def read_take(folder: Path) -> Take:
     try:
         return take_of_text(path.read_text(encoding="utf-8"), path)
     except OSError as error:
-        raise InputError(
-            f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
-        ) from error
+        said = f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
+        raise InputError(said) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a TOML file: {error}.") from error
 
@@ -220,9 +219,8 @@ def _check_inside(footage: Footage, label: str, at: Clicks) -> None:
     for view, xy in at.items():
         if not footage.rig[view].sees(xy):
             w, h = footage.rig[view].size_px
-            raise InputError(
-                f"The {label} in view {view} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels; click it again."
-            )
+            where = f"at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels"
+            raise InputError(f"The {label} in view {view} lies {where}; click it again.")
 
 
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:

@@ -5,7 +5,7 @@ A step is *empty* (something before it is missing), *ready* (it can be done now)
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +75,8 @@ def compute(scene: bpy.types.Scene) -> Look:
     states: dict[str, State] = {}
     for step, look in (("footage", _footage), ("cameras", _cameras), ("seeds", _seeds)):
         states[step] = _or_failed(look, scene, found)
-    found.keys = _or_none(lambda: _keys(found))
     found.out = _or_none(lambda: folders.output_folder("", scene))
+    found.keys = _or_none(lambda: _keys(found))
     found.run = _run_json(found.out)
     for step in STAGE:
         states[step] = _stage(step, states, found)
@@ -236,10 +236,9 @@ def joints_of(model: str) -> tuple[str, ...]:
 
 
 def _keys(found: _Found) -> Mapping[str, str] | None:
-    if found.footage is None or found.take is None:
+    if found.footage is None or found.take is None or found.out is None:
         return None
-    footage = replace(found.footage, frames=found.frames)
-    return stage_keys(footage, settings_of(found.take.settings, {}, "The panel"))
+    return stage_keys(found.footage, settings_of(found.take.settings, {}, "The panel"), found.out)
 
 
 def _run_json(out: Path | None) -> Mapping[str, Any] | None:

@@ -31,7 +31,7 @@ def test_beside_the_file_with_the_commands_numbers(blender: ModuleType, small: M
     pipeline.run(tmp_path / "sample", tmp_path / "out")
     assert (out / "motion.csv").read_bytes() == (tmp_path / "out" / "motion.csv").read_bytes()
     scene = blender.context.scene
-    assert Path(scene.tricap.take) == folder / "tricap_sample" and "body fitted" in scene.tricap.last
+    assert Path(blender.path.abspath(scene.tricap.take)) == folder / "tricap_sample" and "body fitted" in scene.tricap.last
     assert blender.data.objects["Body"].animation_data.action is not None
     (folder / "tricap_sample" / "take.toml").write_text((folder / "tricap_sample" / "take.toml").read_text() + "# mine\n")
     assert blender.ops.tricap.load_sample() == {"FINISHED"}

@@ -25,7 +25,7 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def keys(folder: Path, overrides: dict[str, Any] | None = None, **changes: Any) -> dict[str, str]:
     table = read_table(folder) | {"seeds": {"frame": 1, "joints": JOINTS}, "body": {"model": "arm.R"}} | changes
     take = take_of_table(folder, table)
-    return stage_keys(open_take(take), pipeline.settings_of(take.settings, overrides or {}, "the test"))
+    return stage_keys(open_take(take), pipeline.settings_of(take.settings, overrides or {}, "the test"), folder / "out")
 
 
 def stale(folder: Path, overrides: dict[str, Any] | None = None, **changes: Any) -> list[str]:
@@ -86,6 +86,13 @@ def test_other_cameras_and_other_footage_concern_everything(take: Path, tmp_path
     with open(moved / "L" / "0002.png", "ab") as file:
         file.write(b"more")
     assert all(a != b for a, b in zip(keys(take).values(), keys(moved).values()))
+
+
+def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
+    shutil.copytree(take, tmp_path / "take")
+    before = keys(tmp_path / "take")
+    store.write_text(tmp_path / "take" / "out" / "contours" / "L.csv", "frame,x,y\n")
+    assert [stage for stage in STAGES if keys(tmp_path / "take")[stage] != before[stage]] == ["fit"]
 
 
 def test_every_group_of_knobs_concerns_one_stage() -> None:
