@@ -186,19 +186,15 @@ def footage_frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
     if take.frames is None:
         if len(set(counts)) > 1:
             said = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
-            raise InputError(
-                f"The views of {take.folder.name} are not equally long: {said} frames. "
-                "Trim them, or set `offset_frames` or `frames` in take.toml."
-            )
+            mend = "Trim them, or set `offset_frames` or `frames` in take.toml."
+            raise InputError(f"The views of {take.folder.name} are not equally long: {said} frames. {mend}")
         if counts[0] <= first:
             raise InputError(f"With these `offset_frames` the views of {take.folder.name} have no frame in common; mend them in take.toml.")
         return range(first, counts[0])
     start, stop = take.frames
     if start < first or stop > min(counts):
-        raise InputError(
-            f"`frames` of {take.folder.name} is [{start}, {stop}], but the footage has frames {first} to {min(counts)} (half-open); "
-            "mend it in take.toml."
-        )
+        has = f"the footage has frames {first} to {min(counts)} (half-open)"
+        raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but {has}; mend it in take.toml.")
     return range(start, stop)
 
 
@@ -226,9 +222,8 @@ def _check_inside(footage: Footage, label: str, at: Clicks) -> None:
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     _known(table, KEYS, where)
     if table.get("format") != FORMAT or table.get("version") != VERSION:
-        raise InputError(
-            f'{where} must say format = "{FORMAT}" and version = {VERSION}; it says {table.get("format")!r} and {table.get("version")!r}.'
-        )
+        says = f"it says {table.get('format')!r} and {table.get('version')!r}"
+        raise InputError(f'{where} must say format = "{FORMAT}" and version = {VERSION}; {says}.')
     views = _views(table.get("views"), where)
     names = tuple(v.name for v in views)
     reference = table.get("reference_view", names[len(names) // 2])
