@@ -18,6 +18,7 @@ THRESHOLD = 0.5
 VISIBLE = float(np.sqrt(0.5 * np.log(1 / THRESHOLD)))  # r / l of an isolated ball
 STATIONS = (1 / 6, 1 / 2, 5 / 6)  # centres of a segment's three balls, as fractions of the bone
 ALONG = 0.30  # l along the bone, as a fraction of its length
+PER_STOUTNESS, FURTHEST_ALONG = 0.85, 0.42  # for bones that are thick for their length
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -79,22 +80,39 @@ def active_balls(balls: Metaballs, neighbours: np.ndarray, bone: int) -> np.ndar
     return neighbours[bone, balls.bone_index]
 
 
-def three_balls(bone_index: np.ndarray, lengths_m: np.ndarray, visible_radii_m: np.ndarray) -> Metaballs:
+def three_balls(bone_index: np.ndarray, lengths_m: np.ndarray, visible_radii_m: np.ndarray,
+                stations: np.ndarray | None = None) -> Metaballs:
     """Three balls for each of the bones (K,) whose surface has the wanted cross radii (K, 3 stations, 2) [m] in x and z at the stations.
 
-    Fixed point of l_k = R_k / √(½ ln(1/(T − Σ_{j≠k} F_j))) at the stations (50 steps; SCIENCE of ripple: 1.8 mm for R = 40, L = 260).
+    `stations` (K, 3) are fractions of the bones, as a rule `STATIONS`. Balls of bones that are short for their thickness reach further
+    along the bone and are weaker (`_reach`): else each shows as a band. Fixed point of l_k = R_k / √(½ ln(w/(T − Σ_{j≠k} F_j))) at the
+    stations (50 steps; SCIENCE of ripple: 1.8 mm for R = 40, L = 260).
     """
     bone_index, wanted = np.asarray(bone_index), np.asarray(visible_radii_m, dtype=np.float64)
     k = len(bone_index)
-    stations = np.array(STATIONS)
-    along = np.exp(-2 * ((stations[:, None] - stations) / ALONG) ** 2)
+    own = np.asarray(lengths_m, dtype=np.float64)[bone_index]
+    at = np.broadcast_to(STATIONS, (k, 3)) if stations is None else np.asarray(stations, dtype=np.float64)
+    reach, spread = _reach(wanted.mean(axis=(1, 2)) / own), (at[:, 2] - at[:, 0]) / (STATIONS[2] - STATIONS[0])
+    weight = _at_middle(ALONG) / _at_middle(reach)
+    reach = reach * spread
+    along = weight[:, None, None] * np.exp(-2 * ((at[:, :, None] - at[:, None]) / reach[:, None, None]) ** 2)
     cross = 1.534 * wanted
     for _ in range(50):
-        others = along * np.exp(-2 * (wanted[:, :, None, :] / cross[:, None, :, :]) ** 2).transpose(0, 3, 1, 2)
+        others = along[:, None] * np.exp(-2 * (wanted[:, :, None, :] / cross[:, None, :, :]) ** 2).transpose(0, 3, 1, 2)
         rest = others.sum(-1) - np.diagonal(others, axis1=-2, axis2=-1)
-        cross = wanted / np.sqrt(0.5 * np.log(1 / np.maximum(THRESHOLD - rest.transpose(0, 2, 1), 0.05)))
-    own = np.repeat(np.asarray(lengths_m, dtype=np.float64)[bone_index], 3)
-    radii = np.stack([cross[..., 0].ravel(), ALONG * own, cross[..., 1].ravel()], axis=-1)
+        room = np.maximum(THRESHOLD - rest.transpose(0, 2, 1), 0.05)
+        cross = wanted / np.sqrt(0.5 * np.log(np.maximum(weight[:, None, None] / room, 1.01)))
+    radii = np.stack([cross[..., 0].ravel(), np.repeat(reach * own, 3), cross[..., 1].ravel()], axis=-1)
     centre = np.zeros((3 * k, 3))
-    centre[:, 1] = np.tile(stations, k)
-    return Metaballs(bone_index=np.repeat(bone_index, 3), centre=centre, radii_m=radii, weight=np.ones(3 * k))
+    centre[:, 1] = at.ravel()
+    return Metaballs(bone_index=np.repeat(bone_index, 3), centre=centre, radii_m=radii, weight=np.repeat(weight, 3))
+
+
+def _reach(stoutness: np.ndarray) -> np.ndarray:
+    """l along the bone as a fraction of its length, for bones of a mean radius of so many lengths."""
+    return np.clip(PER_STOUTNESS * stoutness, ALONG, FURTHEST_ALONG)
+
+
+def _at_middle(reach: np.ndarray | float) -> np.ndarray:
+    """Σ exp(−2 d) of three balls at the middle of their bone's axis."""
+    return np.asarray(np.exp(-2 * np.subtract.outer(0.5, np.array(STATIONS)) ** 2 / np.asarray(reach)[..., None] ** 2).sum(axis=-1))

@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import InputError
 from ..settings import nearest_name
 from ..values import frozen
+from .metaballs import STATIONS
 from .skeleton import Bone, Dof, Skeleton
 
 MODELS = Path(__file__).with_name("models")
@@ -32,11 +33,13 @@ class BodyModel:
     skeleton: Skeleton
     visible_radii_m: np.ndarray  # (B, 3, 2) seen cross radii at the stations in x and z; NaN for bones without balls
     surface: np.ndarray  # (B, 2) fractions of the bone between which a measured surface is the bone's own
+    stations: np.ndarray  # (B, 3) fractions of the bone where its balls are
 
     def __post_init__(self) -> None:
         b = len(self.skeleton.bones)
         object.__setattr__(self, "visible_radii_m", frozen(self.visible_radii_m, (b, 3, 2), name="visible_radii_m"))
         object.__setattr__(self, "surface", frozen(self.surface, (b, 2), name="surface"))
+        object.__setattr__(self, "stations", frozen(self.stations, (b, 3), name="stations"))
 
 
 def model_names() -> tuple[str, ...]:
@@ -88,7 +91,8 @@ def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
             gone.add(bone.name)
     rows = [i for i, left in enumerate(names) if left not in gone]
     skeleton = Skeleton(name=name, bones=tuple(model.skeleton.bones[i] for i in rows), base_dofs=model.skeleton.base_dofs)
-    return BodyModel(name=name, skeleton=skeleton, visible_radii_m=model.visible_radii_m[rows], surface=model.surface[rows])
+    return BodyModel(name=name, skeleton=skeleton, visible_radii_m=model.visible_radii_m[rows], surface=model.surface[rows],
+                     stations=model.stations[rows])
 
 
 def with_limits(model: BodyModel, limits: Mapping[str, tuple[float, float]], locked: Sequence[str]) -> BodyModel:
@@ -119,7 +123,7 @@ def mirrored(model: BodyModel, name: str) -> BodyModel:
     bones = tuple(_mirrored_bone(bone) for bone in old.bones)
     base = tuple(Dof(name=other_side(d.name), axis=d.axis, limits=d.limits, prior_sigma=d.prior_sigma) for d in old.base_dofs)
     return BodyModel(name=name, skeleton=Skeleton(name=name, bones=bones, base_dofs=base),
-                     visible_radii_m=model.visible_radii_m, surface=model.surface)
+                     visible_radii_m=model.visible_radii_m, surface=model.surface, stations=model.stations)
 
 
 def other_side(name: str) -> str:
@@ -171,13 +175,14 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
         rows = list(table["bones"])
         bones = [_bone(t, stature) for t in rows]
         radii = [np.broadcast_to(np.array(t.get("radii_m", [np.nan] * 3), dtype=float).reshape(3, -1), (3, 2)) for t in rows]
-        surface = [t.get("surface", (0.0, 1.0)) for t in rows]
+        surface, stations = [t.get("surface", (0.0, 1.0)) for t in rows], [t.get("stations", STATIONS) for t in rows]
         if table.get("symmetric", False):
             right = [i for i, bone in enumerate(bones) if bone.name.endswith(".R")]
             bones += [_mirrored_bone(bones[i]) for i in right]
-            radii, surface = radii + [radii[i] for i in right], surface + [surface[i] for i in right]
+            radii, surface, stations = ([*column, *(column[i] for i in right)] for column in (radii, surface, stations))
         skeleton = Skeleton(name=str(table["name"]), bones=tuple(bones), base_dofs=base_dofs(str(table["base"])))
-        return BodyModel(name=skeleton.name, skeleton=skeleton, visible_radii_m=np.array(radii), surface=np.array(surface))
+        return BodyModel(name=skeleton.name, skeleton=skeleton, visible_radii_m=np.array(radii), surface=np.array(surface),
+                         stations=np.array(stations))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The body model {path} lacks something or holds a wrong value: {error}.") from error
 

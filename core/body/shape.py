@@ -14,6 +14,7 @@ from ..values import frozen
 from .metaballs import Metaballs, three_balls
 from .model_file import BodyModel, base_dofs, dof_from_table
 from .skeleton import Bone, Skeleton
+from .trunk_profile import smoothed, stout_chain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -37,7 +38,10 @@ def default_shape(model: BodyModel) -> BodyShape:
     """The model's nominal lengths and default radii, before any measurement."""
     lengths = np.array([bone.nominal_length_m for bone in model.skeleton.bones])
     has_balls = np.flatnonzero(np.isfinite(model.visible_radii_m).all(axis=(1, 2)))
-    balls = three_balls(has_balls, lengths, model.visible_radii_m[has_balls])
+    balls = three_balls(has_balls, lengths, model.visible_radii_m[has_balls], model.stations[has_balls])
+    chain = stout_chain(model.skeleton, lengths, model.visible_radii_m)
+    if chain:
+        balls = smoothed(balls, model.skeleton, lengths, chain, model.visible_radii_m, model.stations)
     return BodyShape(model=model.name, skeleton=model.skeleton, lengths_m=lengths, metaballs=balls,
                      length_sigma_m=np.full(len(lengths), np.nan), radius_sigma_m=np.full((len(balls.weight), 3), np.nan))
 
