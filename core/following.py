@@ -49,13 +49,13 @@ class _State:
 def track_frames(
     footage: Footage,
     measured: Sequence[MeasuredFrame],
+    limit_px: float,
     matching: MatchingSettings,
     tracking: TrackingSettings,
     results: Results,
     monitor: Monitor,
 ) -> Iterator[TrackedFrame]:
-    """Follow the surface through the frames (in the order of time)."""
-    limit_px = float(np.median([m.field.limit_px for m in measured]))
+    """Follow the surface through the frames (in the order of time), in which rays were allowed to miss by `limit_px`."""
     view = tracking_view(footage, matching, tracking, limit_px)
     state = _State(before=None, current=None, templates=no_templates(view.matching, view.rows.step), born=0)
     key = store.digest(ALGORITHM, repr((matching, tracking, limit_px)))

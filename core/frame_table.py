@@ -57,23 +57,23 @@ class FrameTable:
 
 def frame_table(clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
     """The table of a run, as far as it is."""
-    frames = np.array([c.frame for c in clouds], dtype=np.int64)
+    frames = np.zeros(len(clouds), dtype=np.int64)
     values = {name: np.full(len(frames), np.nan) for name in COLUMNS}
-    values["points"] = np.array([float(len(c.xyz_m)) for c in clouds])
-    values["sigma_mm"] = 1e3 * _medians([c.sigma_m for c in clouds])
-    values["residual_px"] = _medians([c.residual_px for c in clouds])
+    for i, c in enumerate(clouds):  # once: each may be read from the disk
+        frames[i], values["points"][i] = c.frame, len(c.xyz_m)
+        values["sigma_mm"][i], values["residual_px"][i] = 1e3 * _median(c.sigma_m), _median(c.residual_px)
     if trajectories is not None:
         for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
             at = np.searchsorted(frames, trajectories.frames[t])
             values["tracks"][at] = trajectories.seen[t].sum()
-            values["track_sigma_mm"][at] = 1e3 * _medians([trajectories.sigma_m[t][trajectories.seen[t]]])[0]
+            values["track_sigma_mm"][at] = 1e3 * _median(trajectories.sigma_m[t][trajectories.seen[t]])
     fit = [""] * len(frames)
     if body is not None:
         motion = body.motion
         for t in np.flatnonzero(np.isin(motion.frames, frames)):
             at = int(np.searchsorted(frames, motion.frames[t]))
             fit[at] = motion.status[t]
-            values["fit_sigma0"][at], values["joint_sigma_mm"][at] = motion.sigma0[t], 1e3 * _medians([motion.joint_sigma_m[t]])[0]
+            values["fit_sigma0"][at], values["joint_sigma_mm"][at] = motion.sigma0[t], 1e3 * _median(motion.joint_sigma_m[t])
     return FrameTable(frames=frames, values=values, fit=tuple(fit))
 
 
@@ -105,5 +105,5 @@ def read_frame_table(path: Path) -> FrameTable:
         raise InputError(f"{path} is damaged; run the take again.") from error
 
 
-def _medians(parts: Sequence[np.ndarray]) -> np.ndarray:
-    return np.array([float(np.median(p)) if len(p) else np.nan for p in parts])
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else np.nan

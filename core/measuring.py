@@ -105,7 +105,7 @@ def measure_frames(
             before = start
         known = [before.key] if before else _image_digests(footage, _furthest_frame(footage, frame))  # the room is found with that frame
         key = store.digest(base, *known, str(frame), *_image_digests(footage, frame))
-        measured = _from_checkpoint(footage, results, frame, key)
+        measured = read_checkpoint(footage, results, frame, key)
         if measured is None:
             measured = _measure(footage, matching, growing, surface, frame, before, key, part, enhance)
             _checkpoint(results, measured)
@@ -283,7 +283,8 @@ def _checkpoint(results: Results, m: MeasuredFrame) -> None:
     results.save_checkpoint("surface", f"{m.frame:04d}", m.key, arrays)
 
 
-def _from_checkpoint(footage: Footage, results: Results, frame: int, key: str) -> MeasuredFrame | None:
+def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) -> MeasuredFrame | None:
+    """A frame that was measured before, from the same input; None where there is none, or it is damaged."""
     a = results.load_checkpoint("surface", f"{frame:04d}", key)
     if a is None:
         return None

@@ -5,7 +5,7 @@ Every stage asks the stages before it for their results; what is checkpointed is
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +29,8 @@ from .frame_table import frame_table, write_frame_table
 from .images.enhance import EnhanceSettings
 from .matching.growing import GrowingSettings
 from .matching.least_squares import MatchingSettings
-from .measuring import MeasuredFrame, NothingMeasured, clicked_depth, measure_frames
+from .measured import Clouds, MeasuredFrames, note_of
+from .measuring import NothingMeasured, clicked_depth, measure_frames
 from .motion.ply import write_mesh
 from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
@@ -40,7 +41,6 @@ from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
 from .take import Footage, open_take, read_take
 from .tracking.settings import TrackingSettings, TrackStatus
-from .tracking.tracked import TrackedFrame
 from .tracking.trajectories import Trajectories, assemble
 
 SETTINGS: dict[str, type] = {
@@ -65,14 +65,17 @@ class Run:
     results: Results
     keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
     account: dict[str, Any] = field(default_factory=dict)
-    measured: list[MeasuredFrame] = field(default_factory=list)
+    measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
 
+    def __post_init__(self) -> None:
+        self.measured = MeasuredFrames(footage=self.footage, results=self.results)
+
     @property
-    def clouds(self) -> list[PointCloud]:
+    def clouds(self) -> Clouds:
         """The clouds in the order of time, as the user corrected them."""
-        return [self.corrected(m.cloud) for m in self.measured]
+        return Clouds(measured=self.measured, corrected=self.corrected)
 
     def corrected(self, cloud: PointCloud) -> PointCloud:
         """A cloud without what the user took out."""
@@ -191,11 +194,12 @@ def measure(run: Run, monitor: Monitor) -> None:
     """
     began, s = time.perf_counter(), run.settings
     _forget_other_clouds(run)
-    done = []
+    done, room = [], None
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
             run.results.write_cloud(run.corrected(m.cloud))
-            done.append(m)
+            done.append(note_of(m))
+            room = room or m.foreground
     except Cancelled as stop:
         raise Cancelled(
             f"Stopped: the surface of {len(done)} of {len(run.footage.frames)} frames is kept; the same command goes on from there."
@@ -205,24 +209,25 @@ def measure(run: Run, monitor: Monitor) -> None:
         if cause is None:
             raise
         raise NothingMeasured(error.frame, f"{cause.sentence} {cause.advice}".strip()) from error
-    run.measured = sorted(done, key=lambda m: m.frame)
-    points, residual = [len(m.cloud.xyz_m) for m in run.measured], _median([m.cloud.residual_px for m in run.measured])
+    notes = tuple(sorted(done, key=lambda n: n.frame))
+    run.measured = MeasuredFrames(footage=run.footage, results=run.results, notes=notes)
+    residual = _median([n.residual_px for n in notes])
     _warn_of_doubts(run, residual, monitor)
     run.finish_stage(
         "measure",
         began,
-        frames=len(points),
-        points_per_frame=float(np.mean(points)),
+        frames=len(notes),
+        points_per_frame=float(np.mean([n.points for n in notes])),
         residual_px=residual,
-        sigma_mm=1e3 * _median([m.cloud.sigma_m for m in run.measured]),
-        foreground=done[0].foreground.method,
-        background_planes=len(done[0].foreground.planes),
+        sigma_mm=1e3 * _median([n.sigma_m for n in notes]),
+        foreground=room.method if room else "",
+        background_planes=len(room.planes) if room else 0,
     )
 
 
 def _warn_of_doubts(run: Run, residual_px: float, monitor: Monitor) -> None:
     """What is odd about the clouds, and what is wrong with the take if anything is."""
-    empty = [m.frame for m in run.measured if not len(m.cloud.xyz_m)]
+    empty = [n.frame for n in run.measured.notes if not n.points]
     if empty:
         run.warn(f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}.")
     if residual_px > DOUBTFUL_RESIDUAL_PX:
@@ -231,7 +236,7 @@ def _warn_of_doubts(run: Run, residual_px: float, monitor: Monitor) -> None:
             "does rig.toml belong to this recording, and were the views in step?"
         )
     thorough = empty or residual_px > DOUBTFUL_RESIDUAL_PX
-    for cause in causes_of_failure(run.footage, monitor) if thorough else first_look(run.footage, run.measured[0].frame):
+    for cause in causes_of_failure(run.footage, monitor) if thorough else first_look(run.footage, run.measured.notes[0].frame):
         run.warn(f"{cause.sentence} {cause.advice}".strip())
 
 
@@ -245,14 +250,18 @@ def track(run: Run, monitor: Monitor) -> None:
     if not run.measured:
         measure(run, monitor)
     began, s = time.perf_counter(), run.settings
-    steps: list[TrackedFrame] = []
     try:
-        steps.extend(track_frames(run.footage, run.measured, s["matching"], s["tracking"], run.results, monitor))
+        steps = track_frames(run.footage, run.measured, run.measured.limit_px, s["matching"], s["tracking"], run.results, monitor)
+        raw = assemble(steps, run.footage.take.fps)
     except Cancelled as stop:
         raise Cancelled(
             "Stopped: the surface of all frames is kept, and the tracks as far as they are; the same command goes on from there."
         ) from stop
-    raw = assemble(steps, run.footage.take.fps)
+    if raw.omitted:
+        run.warn(
+            f"Only the {raw.seen.shape[1]} longest of {raw.seen.shape[1] + raw.omitted} trajectories are kept: "
+            "more have no room in one table of so many frames; run the take in pieces (--frames) to have all."
+        )
     filtered, missed = corrected_tracks(raw, run.footage.take.corrections, run.footage.rig, s["tracking"], monitor)
     run.trajectories = filtered.kept
     run.results.write_trajectories(filtered, run.footage.take.fps)
@@ -264,12 +273,12 @@ def track(run: Run, monitor: Monitor) -> None:
     run.finish_stage(
         "track",
         began,
-        started=int(raw.seen.shape[1]),
+        started=int(raw.seen.shape[1] + raw.omitted),
         trajectories=int(seen.shape[1]),
         points_per_frame=float(seen.sum(axis=1).mean()),
         mean_length_frames=float(seen.sum(axis=0).mean()) if seen.shape[1] else 0.0,
         reasons=dict(why.most_common()),
-        sigma_mm=1e3 * _median([run.trajectories.sigma_m[seen]]),
+        sigma_mm=1e3 * _median(run.trajectories.sigma_m[seen]),
     )
 
 
@@ -313,8 +322,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         frames=states,
         iterations=body.iterations,
         converged=body.converged,
-        sigma0=_median([body.motion.sigma0]),
-        joint_sigma_mm=1e3 * _median([body.motion.joint_sigma_m.ravel()]),
+        sigma0=_median(body.motion.sigma0),
+        joint_sigma_mm=1e3 * _median(body.motion.joint_sigma_m),
     )
 
 
@@ -361,16 +370,14 @@ def is_complete(run: Run) -> bool:
 
 
 def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
-    skins = []
     for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
         monitor.step("skin", i, len(body.motion.frames))
         try:
-            skins.append((int(frame), body_skin(body.shape, values, run.settings["skin"])))
+            skin = body_skin(body.shape, values, run.settings["skin"])
         except InputError as no_skin:
             run.warn(f"No skin was made: {no_skin}")
-            skins.clear()
+            run.results.remove("skin")
             break
-    for frame, skin in skins:
         write_mesh(run.results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)
     write_joints(run.results.path("joints.csv"), body.motion)
     write_motion(run.results.path("motion.csv"), body.motion, body.shape.skeleton)
@@ -384,7 +391,7 @@ def _forget_other_clouds(run: Run) -> None:
             path.unlink()
 
 
-def _median(parts: list[np.ndarray]) -> float:
-    values = np.concatenate([np.asarray(p, dtype=np.float64).ravel() for p in parts]) if parts else np.zeros(0)
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if len(values) else 0.0
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    return float(np.median(finite)) if len(finite) else 0.0

@@ -95,11 +95,12 @@ def _pictures(
 
 
 def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None) -> list[str]:
-    frames = np.array([c.frame for c in clouds])
+    rows = [(c.frame, len(c.xyz_m), _median(c.residual_px), 1e3 * _median(c.sigma_m)) for c in clouds]
+    frames, points, residual, sigma = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     graphs = [
-        curve_graph("Measured points", "", frames, {"points": np.array([float(len(c.xyz_m)) for c in clouds])}),
-        curve_graph("Residual of the rays (median)", "px", frames, {"residual": _medians([c.residual_px for c in clouds])}),
-        curve_graph("Sigma of the points (median)", "mm", frames, {"sigma": 1e3 * _medians([c.sigma_m for c in clouds])}),
+        curve_graph("Measured points", "", frames, {"points": points}),
+        curve_graph("Residual of the rays (median)", "px", frames, {"residual": residual}),
+        curve_graph("Sigma of the points (median)", "mm", frames, {"sigma": sigma}),
     ]
     if trajectories is not None:
         graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.seen.sum(axis=1).astype(float)}))
@@ -146,5 +147,5 @@ def _figures(figures: Mapping[str, Any]) -> str:
     return "; ".join(said)
 
 
-def _medians(parts: Sequence[np.ndarray]) -> np.ndarray:
-    return np.array([float(np.median(p)) if len(p) else np.nan for p in parts])
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else np.nan

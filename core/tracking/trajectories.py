@@ -1,6 +1,6 @@
 """Trajectories: position, velocity and acceleration of every tracked point, raw and smoothed (kinematics.py), and why it ended."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from .settings import TrackingSettings, TrackStatus
 from .tracked import TrackedFrame
 
 SMOOTH_FRAMES = 7
+MOST_CELLS = 4_000_000  # frames times trajectories of one table: filtering it takes about 2 GB
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -29,6 +30,7 @@ class Trajectories:
     status: np.ndarray  # (T, N)
     raw: Kinematics | None = None  # the same velocities and accelerations with their sigmas
     smooth: Kinematics | None = None  # smoothed ones with theirs
+    omitted: int = 0  # shorter ones that found no room in the table
 
     def __post_init__(self) -> None:
         t, n = self.sigma_m.shape
@@ -51,18 +53,25 @@ class Trajectories:
         return np.isfinite(self.xyz_m[..., 0])
 
 
-def assemble(steps: Sequence[TrackedFrame], fps: float, smooth_frames: int = SMOOTH_FRAMES) -> Trajectories:
-    """The trajectories of consecutive tracked frames, in the order of their identities; derivatives smoothed over so many frames (or 0)."""
-    T, N = len(steps), 1 + max((int(s.identity.max()) for s in steps if len(s.identity)), default=-1)
+def assemble(steps: Iterable[TrackedFrame], fps: float, smooth_frames: int = SMOOTH_FRAMES, most_cells: int = MOST_CELLS) -> Trajectories:
+    """The trajectories of consecutive tracked frames, in the order of their identities; derivatives smoothed over so many frames (or 0).
+
+    Of a long recording only the longest trajectories are taken, as many as a table of `most_cells` frames times trajectories can hold.
+    """
+    seen = [(s.frame, s.identity, s.xyz_m, np.sqrt(np.trace(s.covariance_m2, axis1=1, axis2=2)), s.ended, s.reason) for s in steps]
+    length = np.bincount(np.concatenate([identity for _, identity, *_ in seen])) if seen else np.zeros(0, dtype=np.int64)
+    T, N = len(seen), min(len(length), max(1, most_cells // max(1, len(seen))))
+    column = np.full(len(length), -1)
+    column[np.sort(np.argsort(-length, kind="stable")[:N])] = np.arange(N)
     xyz, sigma = np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
     status = np.zeros((T, N), dtype=np.int8)
-    for t, s in enumerate(steps):
-        xyz[t, s.identity] = s.xyz_m
-        sigma[t, s.identity] = np.sqrt(np.trace(s.covariance_m2, axis1=1, axis2=2))
-        status[t, s.identity] = TrackStatus.MEASURED
-        status[t, s.ended] = s.reason
-    frames = np.array([s.frame for s in steps], dtype=np.int32)
-    return with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames)
+    for t, (_, identity, place, uncertainty, ended, reason) in enumerate(seen):
+        here, gone = column[identity], column[ended]
+        xyz[t, here[here >= 0]], sigma[t, here[here >= 0]] = place[here >= 0], uncertainty[here >= 0]
+        status[t, here[here >= 0]] = TrackStatus.MEASURED
+        status[t, gone[gone >= 0]] = reason[gone >= 0]
+    frames = np.array([frame for frame, *_ in seen], dtype=np.int32)
+    return replace(with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames), omitted=len(length) - N)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -135,7 +135,8 @@ def track(
     """The tracked points of a take that was measured."""
     footage = open_take(read_take(folder))
     s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
-    return list(track_frames(footage, measured, s["matching"], s["tracking"], Results(out), monitor or Monitor()))
+    limit_px = float(np.median([m.field.limit_px for m in measured]))
+    return list(track_frames(footage, measured, limit_px, s["matching"], s["tracking"], Results(out), monitor or Monitor()))
 
 
 @dataclass(frozen=True)

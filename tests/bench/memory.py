@@ -1,0 +1,86 @@
+"""Peak memory against the length of a clip: three cameras, 25 frames a second, so that 20 minutes are 30,000 frames.
+
+    python tests/bench/memory.py [--frames 100 400] [--json FILE]
+
+The clip is 40 pictures a camera shown to and fro, each a hard link, so that a long one takes no more room than a short one. Each length is
+run in a process of its own; what grows is told per frame and for 30,000 frames.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E402
+
+CLIP_FRAMES = 30_000
+COARSE = ("growing.spacing_px=12", "growing.seed_spacing_px=16", "tracking.spacing_px=16", "matching.patch_px=9", "growing.bigger_patches=0")
+STAGES = ("measure", "track", "run")
+CHILD = """
+import resource, sys
+from tricap.core import commands
+code = commands.main(sys.argv[1:])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10))
+sys.exit(code)
+"""
+
+
+def long_take(pictures: Path, folder: Path, frames: int) -> Path:
+    """A take of so many frames that shows the pictures of another to and fro."""
+    for view in sorted(p for p in pictures.iterdir() if p.is_dir()):
+        shown = sorted(view.iterdir())
+        (folder / view.name).mkdir(parents=True)
+        for i in range(frames):
+            turn = i % (2 * len(shown) - 2)
+            os.link(shown[min(turn, 2 * len(shown) - 2 - turn)], folder / view.name / f"{i:06d}.png")
+    for name in ("take.toml", "rig.toml"):
+        (folder / name).write_bytes((pictures / name).read_bytes())
+    return folder
+
+
+def peak_mb(stage: str, take: Path, out: Path) -> float:
+    """Peak resident memory [MB] of one command in a process of its own."""
+    argv = [stage, str(take), "--out", str(out), "--quiet", *(f"--set={s}" for s in COARSE)]
+    done = subprocess.run([sys.executable, "-c", CHILD, *argv], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"tricap {stage} ended with {done.returncode}: {done.stderr}")
+    return float(done.stdout.split()[-1])
+
+
+def growth(stages: tuple[str, ...], lengths: list[int], width_px: int = 128, pictures: int = 40) -> list[dict[str, object]]:
+    """A row per stage: peak memory at each length, what a frame adds between the last two, and what 30,000 frames would need."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        make_arm_take(folder / "pictures", ArmTakeSettings(frames=pictures, width_px=width_px, interlaced="none"))
+        takes = {n: long_take(folder / "pictures", folder / f"take{n}", n) for n in lengths}
+        rows = []
+        for stage in stages:
+            peaks = {n: peak_mb(stage, take, folder / f"out{n}") for n, take in takes.items()}
+            added = 1024 * (peaks[lengths[-1]] - peaks[lengths[-2]]) / (lengths[-1] - lengths[-2])
+            whole = peaks[lengths[-1]] + max(0.0, added) * (CLIP_FRAMES - lengths[-1]) / 1024
+            rows.append({"stage": stage, "peak_mb": {str(n): round(p, 1) for n, p in peaks.items()}, "kb_per_frame": round(added, 1),
+                         "mb_20_minutes": round(whole)})
+    return rows
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, nargs="+", default=[100, 400])
+    parser.add_argument("--stages", nargs="+", default=list(STAGES), choices=STAGES)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    rows = growth(tuple(args.stages), sorted(args.frames))
+    for row in rows:
+        print(f"{row['stage']:<8} peak {row['peak_mb']} MB, {row['kb_per_frame']} KB a frame, 20 minutes: {row['mb_20_minutes']} MB")
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
