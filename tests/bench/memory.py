@@ -19,13 +19,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E402
 
 CLIP_FRAMES = 30_000
-COARSE = ("growing.spacing_px=12", "growing.seed_spacing_px=16", "tracking.spacing_px=16", "matching.patch_px=9", "growing.bigger_patches=0")
+COARSE = ("growing.spacing_px=6", "tracking.spacing_px=12")
 STAGES = ("measure", "track", "run")
 CHILD = """
-import resource, sys
+import pathlib, resource, sys
 from tricap.core import commands
 code = commands.main(sys.argv[1:])
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10))
+status = pathlib.Path("/proc/self/status")
+if status.exists():  # what getrusage says on Linux contains the process that started this one
+    print(next(int(line.split()[1]) / 1024 for line in status.read_text().splitlines() if line.startswith("VmHWM")))
+else:
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20))
 sys.exit(code)
 """
 
@@ -52,7 +56,7 @@ def peak_mb(stage: str, take: Path, out: Path) -> float:
     return float(done.stdout.split()[-1])
 
 
-def growth(stages: tuple[str, ...], lengths: list[int], width_px: int = 128, pictures: int = 40) -> list[dict[str, object]]:
+def growth(stages: tuple[str, ...], lengths: list[int], width_px: int = 192, pictures: int = 40) -> list[dict[str, object]]:
     """A row per stage: peak memory at each length, what a frame adds between the last two, and what 30,000 frames would need."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
