@@ -77,7 +77,8 @@ def test_the_disk_is_full(
         assert run(take, tmp_path / "out") == 2
     assert "No space left on device. Choose another folder or free some space." in said(capfd)
     kept = files(tmp_path / "out")
-    assert after - 2 <= len(kept) <= after and all(whole[name] == data for name, data in kept.items())
+    kept.pop("frames.csv", None)  # it grows with every stage
+    assert after - 3 <= len(kept) <= after and all(whole[name] == data for name, data in kept.items())
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole
 
 
