@@ -8,7 +8,7 @@ A ray belongs to one bone's part, whose field is meant. The sigma is that of the
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ..state import BodyState
 from .blocks import Block, FromBlocks
 from .surface_point import SurfacePoints
 
-MEAN_STEPS, NEWTON_STEPS, LONGEST_M = 4, 5, 0.01
+MEAN_STEPS, NEWTON_STEPS, LONGEST_M = 10, 5, 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,20 +29,22 @@ class SilhouetteRays(FromBlocks):
     sigma_m: np.ndarray  # (N,) Z/f · σ_px
     crowding: np.ndarray | float = 1.0
     held: SurfacePoints | None = None  # the touching points with their weights, at the state of `scaled`
+    along_m: np.ndarray | None = None  # (N,) where they lie on their rays: at other states they are looked for from there
     kind: str = "contours"
 
     def scaled(self, state: BodyState) -> "SilhouetteRays":
         """The same rays with weights for this state."""
-        touching = SurfacePoints(xyz_m=self.touching(state), bone=self.bone, sigma_m=self.sigma_m).scaled(state)
-        return SilhouetteRays(origin_m=self.origin_m, direction=self.direction, bone=self.bone, sigma_m=self.sigma_m,
-                              crowding=self.crowding, held=touching)
+        X = replace(self, along_m=None).touching(state)
+        along = np.einsum("ni,ni->n", X - self.origin_m, self.direction)
+        return replace(self, held=SurfacePoints(xyz_m=X, bone=self.bone, sigma_m=self.sigma_m).scaled(state), along_m=along)
 
     def touching(self, state: BodyState) -> np.ndarray:
         """The points (N, 3) where the field along each ray is largest.  (1)"""
         X = np.empty_like(self.origin_m)
         for b in np.unique(self.bone):
             rows = np.flatnonzero(self.bone == b)
-            X[rows] = _largest_field(state, int(b), self.origin_m[rows], self.direction[rows])
+            start = None if self.along_m is None else self.along_m[rows]
+            X[rows] = _largest_field(state, int(b), self.origin_m[rows], self.direction[rows], start)
         return X
 
     def residual(self, state: BodyState) -> np.ndarray:
@@ -64,7 +66,7 @@ class SilhouetteRays(FromBlocks):
         return self.held.at(self.touching(state))
 
 
-def _largest_field(state: BodyState, bone: int, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _largest_field(state: BodyState, bone: int, origin: np.ndarray, direction: np.ndarray, start: np.ndarray | None) -> np.ndarray:
     """Along a ray the field is Σ w exp(−2 (a t² + 2 b t + c)): its shares p_i give t = −Σ p b / Σ p a, then Newton's steps on ln F."""
     part, balls = state.parts[bone], state.balls
     own, of = part.balls, balls.bone_index[part.balls]
@@ -80,13 +82,14 @@ def _largest_field(state: BodyState, bone: int, origin: np.ndarray, direction: n
         terms = np.exp(log_terms - log_terms.max(axis=1, keepdims=True))
         return np.asarray(terms / terms.sum(axis=1, keepdims=True))
 
-    t = nearest[np.arange(len(origin)), np.argmax(log_weight - 2 * least, axis=1)]
-    for _ in range(MEAN_STEPS):
+    t = nearest[np.arange(len(origin)), np.argmax(log_weight - 2 * least, axis=1)] if start is None else start
+    for _ in range(MEAN_STEPS if start is None else 1):
         p = shares(t)
         t = -(p * b).sum(axis=1) / (p * a).sum(axis=1)
     for _ in range(NEWTON_STEPS):
         p, slopes = shares(t), -4 * (a * t[:, None] + b)
         slope = (p * slopes).sum(axis=1)
         curve = (p * (slopes**2 - 4 * a)).sum(axis=1) - slope**2
-        t = t + np.clip(np.where(curve < 0, -slope / np.where(curve < 0, curve, 1.0), 0.0), -LONGEST_M, LONGEST_M)
+        mean = -(p * b).sum(axis=1) / (p * a).sum(axis=1)
+        t = np.where(curve < 0, t + np.clip(-slope / np.where(curve < 0, curve, 1.0), -LONGEST_M, LONGEST_M), mean)
     return np.asarray(origin + t[:, None] * direction)
