@@ -7,11 +7,12 @@ def _modules() -> tuple[ModuleType, ...]:
     from . import command, jobs, operators, properties
     from .calibrate import registration as calibrate
     from .clicking import registration as clicking
+    from .correcting import registration as correcting
     from .overlay import registration as overlay
     from .retarget import registration as retarget
     from .steps import registration as steps
 
-    return jobs, properties, operators, calibrate, retarget, clicking, overlay, steps, command
+    return jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, command
 
 
 def register() -> None:

@@ -137,6 +137,12 @@ def nearest_track(recording: "Recording", view: str, frame: int, xy_px: np.ndarr
     return None
 
 
+def track_place(recording: "Recording", view: str, frame: int, xy_px: np.ndarray, reach_px: float) -> np.ndarray | None:
+    """Where (2,) the view sees the trajectory nearest to a pixel; None where none is within reach."""
+    found, history = nearest_track(recording, view, frame, xy_px, reach_px), recording.tracks()
+    return history.at(recording.cameras[view], frame)[0][found[0]] if found is not None and history is not None else None
+
+
 def _nearest(away: np.ndarray, reach: float) -> int | None:
     if not len(away) or not np.isfinite(away).any():
         return None

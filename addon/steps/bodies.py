@@ -10,6 +10,7 @@ from ...core.errors import InputError
 from ...core.stages import CONCERNS
 from .. import project, properties, seeds
 from ..calibrate.panel import draw_calibrate
+from ..correcting.panel import draw_dofs
 from ..panels import sentence
 from ..retarget.panel import draw_retarget
 from . import states, watch
@@ -138,8 +139,9 @@ def tracks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
 
 
 def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Fit."""
+    """Fit; what is locked or limited."""
     _stage(layout, context, "body", "tricap.fit", is_next, icon="ARMATURE_DATA")
+    draw_dofs(layout, context.scene)
 
 
 def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, operator: str, is_next: bool, icon: str) -> None:
