@@ -27,7 +27,7 @@ from .results import Results
 from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 from .take import Clicks, Footage
 
-ALGORITHM = "surface 3"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 4"  # part of every key: raise it when the same input gives other numbers
 CLICK_SIGMA_PX = 4.0
 CLICK_MISS_PX = 25.0
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")

@@ -16,10 +16,12 @@ LONGEST_LOOK_UP = 32_000  # OpenCV looks up at most 32,766 rows at once
 
 
 class SplineImage:
-    """An image ready to be sampled between its pixels. `shape` is (h, w)."""
+    """An image ready to be sampled between its pixels. `shape` is (h, w), `smoothing` (2,) what `smoothed` did to its columns and rows."""
 
-    def __init__(self, image: np.ndarray) -> None:
+    def __init__(self, image: np.ndarray, *, smoothing: tuple[float, float] = (0.0, 0.0)) -> None:
         grey = np.ascontiguousarray(image, dtype=np.float32)
+        self.smoothing = smoothing
+        self._grey, self._smoothed = grey, dict[tuple[float, float], SplineImage]()
         self.shape: tuple[int, int] = (grey.shape[0], grey.shape[1])
         self.noise = noise_sigma(grey)
         self._fine = _refine(_refine(grey, axis=1), axis=0)
@@ -46,12 +48,48 @@ class SplineImage:
         warp = (FINENESS * np.concatenate([centre[:, :, None], shape], axis=2)).astype(np.float32)
         return cv2.remap(self._fine, warp[:, 0] @ basis, warp[:, 1] @ basis, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
 
+    def smoothed(self, sigma_px: float, row_step: int) -> "SplineImage":
+        """The image after a Gaussian of `sigma_px` full-frame pixels (a field's rows are `row_step` of them); kept for the next call."""
+        sigma = (sigma_px, sigma_px / row_step)
+        if sigma not in self._smoothed:
+            size = (_width(sigma[0]), _width(sigma[1]))
+            grey = cv2.GaussianBlur(self._grey, size, sigmaX=sigma[0], sigmaY=sigma[1], borderType=cv2.BORDER_REFLECT_101)
+            self._smoothed[sigma] = SplineImage(grey, smoothing=sigma)
+        return self._smoothed[sigma]
+
     def inside(self, xy: np.ndarray, margin: np.ndarray | float) -> np.ndarray:
         """Whether points (…, 2) lie inside the image by at least `margin` pixels; NaN does not."""
         h, w = self.shape
         m = np.broadcast_to(np.asarray(margin, dtype=np.float64), (2,))
         with np.errstate(invalid="ignore"):
             return (xy[..., 0] >= m[0]) & (xy[..., 1] >= m[1]) & (xy[..., 0] <= w - 1 - m[0]) & (xy[..., 1] <= h - 1 - m[1])
+
+
+def correlated_noise(fx: np.ndarray, fy: np.ndarray, smoothing: tuple[float, float]) -> np.ndarray:
+    """(N,) how many times larger the variance of a match with gradients fx, fy (N, h, w) is for smoothed noise than for white noise.
+
+    Smoothed noise has the autocorrelation R of the Gaussian's kernel, about exp(−|Δ|²/(4 σ²)): the sandwich (AᵀA)⁻¹ AᵀRA (AᵀA)⁻¹ (SCIENCE
+    §4), by the trace of its middle.
+    """
+    if not any(smoothing):
+        return np.ones(len(fx))
+    R_columns, R_rows = (_autocorrelation(n, s) for n, s in zip((fx.shape[2], fx.shape[1]), smoothing))
+    spread = sum(np.einsum("nij,nij->n", f, R_rows @ (f @ R_columns)) for f in (fx, fy))
+    power = sum(np.einsum("nij,nij->n", f, f) for f in (fx, fy))
+    return np.maximum(1.0, spread.astype(np.float64) / np.maximum(power, 1e-9))
+
+
+def _autocorrelation(n: int, sigma_px: float) -> np.ndarray:
+    """Correlations (n, n) of n neighbouring pixels of white noise after the Gaussian."""
+    kernel = cv2.getGaussianKernel(_width(sigma_px), sigma_px).ravel()
+    shifts = np.zeros(n + len(kernel))
+    shifts[: len(kernel)] = np.correlate(kernel, kernel, "full")[len(kernel) - 1 :] / np.sum(kernel**2)
+    return shifts[np.abs(np.arange(n)[:, None] - np.arange(n))].astype(np.float32)
+
+
+def _width(sigma_px: float) -> int:
+    """Taps of a Gaussian that reaches four sigmas to either side."""
+    return 2 * round(4 * sigma_px) + 1
 
 
 def noise_sigma(grey: np.ndarray) -> float:

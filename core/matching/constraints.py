@@ -20,7 +20,7 @@ from ..geometry.camera import Camera
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from .foreground import Foreground
-from .growing import TEMPLATE_SIGMA_PX, TripletField
+from .growing import LESS_SURE, RETRY_SMOOTHING_PX, TEMPLATE_SIGMA_PX, TripletField
 from .least_squares import MatchingSettings, MatchStatus, patch_offsets
 from .multi_image import MultiImageMatches, match_multi_image
 from .neighbourhood import RADIUS_CELLS, NeighbourFit, fit_neighbours, neighbours_of
@@ -29,6 +29,8 @@ from .template_patches import monomials
 
 WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
 SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SHARE = 0.1, 0.001, 1.0  # px/px and px/px² in the search view that moves fastest; of itself
+SAME_PLACE, SAME_PLACE_M = 0.15, 0.003  # of the patch's width; and never less
+SMOOTH_EXTRA_PX = 4  # wider where texture is weak
 STIFF = 0.1  # of these sigmas in the second try
 FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
 MAX_RIG_SIGMA_PX = 0.3  # a rig that is worse knows less of a point's place than its own patch does
@@ -38,7 +40,7 @@ MEDIAN_OF_CHI2 = 0.4549
 SCATTER_SHARE = 0.3  # of the neighbours' scatter about their quadric: what the model does not follow
 # Limits of a piece of surface: held by all views and its neighbours, it may look less alike in each; and its sigma is honest,
 # on skin up to four times the naive one.
-LESS_SURE, LOOSER, LESS_ALIKE = 4.0, 2.0, 0.15
+LOOSER, LESS_ALIKE = 2.0, 0.15
 MAX_STEEPNESS = 5.0  # change of depth per distance across
 OUTLINE_SIGMA_PX = 1.3  # across the ray where no neighbour supports a point: at an outline the patch hangs over the edge
 
@@ -105,17 +107,19 @@ def _object_space(
         max_sigma0=LOOSER * settings.max_sigma0,
         min_correlation=max(0.0, settings.min_correlation - LESS_ALIKE),
     )
-    weight = _window(wide.patch_px, rows.step)
 
-    def match(which: np.ndarray, prior: SurfacePrior, sigma_c: float) -> SurfacePatch:
+    def match(
+        which: np.ndarray, prior: SurfacePrior, sigma_c: float, views: Sequence[SplineImage] = images, extra_px: int = 0
+    ) -> SurfacePatch:
+        weight = _window(wide.patch_px + extra_px, rows.step)
         return match_surface(
-            images,
+            views,
             cameras,
             reference,
             rows,
             xy[which],
             start[which],
-            wide,
+            replace(wide, patch_px=wide.patch_px + extra_px),
             sigma_across_px=sigma_c,
             prior=SurfacePrior(value=prior.value[which], sigma=prior.sigma[which]),
             weight=np.broadcast_to(weight, (len(which), len(weight))),
@@ -127,12 +131,31 @@ def _object_space(
     rig_sigma_px = _rig_sigma(sample.across_px[sample.ok], sample.across_sigma_px[sample.ok])
     if rig_sigma_px > MAX_RIG_SIGMA_PX:
         return field
-    found = match(every, prior, max(MIN_SIGMA_C_PX, rig_sigma_px))
-    again = np.flatnonzero(~found.ok)
-    if neighbours and len(again):
+    sigma_c = max(MIN_SIGMA_C_PX, rig_sigma_px)
+    found = match(every, prior, sigma_c)
+    if neighbours:
         stiff = SurfacePrior(value=prior.value, sigma=prior.sigma * np.array([1, STIFF, STIFF, STIFF, STIFF, STIFF]))
-        _replace(found, again, match(again, stiff, max(MIN_SIGMA_C_PX, rig_sigma_px)))
-    return _kept(_from_surface(field, found, around, cameras, reference, rig_sigma_px), found.ok, foreground, cameras[reference])
+        again = np.flatnonzero(~found.ok)
+        _replace(found, again, match(again, stiff, sigma_c))
+        again = np.flatnonzero(~found.ok & field.smoothed)
+        if len(again):
+            smooth = [image.smoothed(RETRY_SMOOTHING_PX, rows.step) for image in images]
+            _replace(found, again, match(again, stiff, sigma_c, smooth, SMOOTH_EXTRA_PX))
+    agrees = _agrees(field, found, cameras[reference], reference, settings.patch_px)
+    result = _from_surface(field, found, around, cameras, reference, rig_sigma_px)
+    return _kept(result, found.ok & agrees, foreground, cameras[reference])
+
+
+def _agrees(field: TripletField, found: SurfacePatch, base: Camera, reference: int, patch_px: int) -> np.ndarray:
+    """(N,) where the piece of surface runs through the point that was matched without constraint.
+
+    Over one surface both ways measure the same; where a patch holds two (an outline before a background, a border of occlusion), each
+    settles on a mixture of its own.
+    """
+    u, v = (field.xy[:, reference] - field.grid.xy(field.cell)).T
+    w = np.einsum("ni,ni->n", monomials(u, v, 2 if found.theta.shape[1] == 6 else 1), found.theta)
+    depth = base.to_camera(field.xyz_m)[:, 2]
+    return np.abs(1 / np.maximum(w, 1e-6) - depth) < np.maximum(SAME_PLACE * patch_px * depth / base.focal_px, SAME_PLACE_M)
 
 
 def _prior(start: np.ndarray, speed: float) -> SurfacePrior:

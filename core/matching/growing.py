@@ -27,6 +27,10 @@ TEMPLATE_SIGMA_PX = 0.02  # of the template point itself, so that it may move al
 NOISE_SIGMAS = 4.0
 EQUAL_SIGMA_PX = 1.0  # far above matching's own: all rays weigh alike
 PATCH_STEP_PX = 4
+SMOOTH_FROM = 2
+RETRY_SMOOTHING_PX = 1.0  # what fails is weak texture: noise that is finer than its details is kept out
+LESS_SURE = 4.0  # the sigma of smoothed patches is honest: on skin up to four times the naive one
+LARGEST_PATCH_M = 0.03
 SEED_MEDIANS, MAX_LIMIT_PX = 3.0, 2.5
 
 
@@ -47,7 +51,12 @@ class GrowingSettings:
     spacing_px: int = knob(4, "Distance between measured points in the reference image.", unit="px", low=1, high=32)
     seed_spacing_px: int = knob(24, "Distance between the points at which seeds are looked for.", unit="px", low=4, high=128)
     attempts: int = knob(3, "How often a point is tried from different neighbours.", low=1, high=8)
-    bigger_patches: int = knob(1, "Rounds in which what failed is tried again with a patch 4 px larger each time.", low=0, high=5)
+    bigger_patches: int = knob(
+        3,
+        "Rounds in which what failed is tried again with a patch 4 px larger, from the second on smoothed; one where pixels are large.",
+        low=0,
+        high=5,
+    )
     max_residual_px: float = knob(
         0.7,
         "Largest distance by which rays may miss; if half of the seeds miss by more, three times their median.",
@@ -75,6 +84,7 @@ class TripletField:
     residual_px: np.ndarray  # (N,) rms distance of the image points to the meeting point's projections
     sigma0: np.ndarray  # (N,) of the intersection
     spread: np.ndarray  # (N, 2) variance of the texture's energy in the patch of the reference view
+    smoothed: np.ndarray  # (N,) found in the smoothed images only
     tried: int  # how many cells were tried
     limit_px: float  # the residual that was allowed
 
@@ -99,6 +109,7 @@ class _State:
         self.covariance = np.zeros((cells, views, 2, 2))
         self.correlation, self.residual, self.sigma0 = np.zeros(cells), np.zeros(cells), np.zeros(cells)
         self.spread = np.zeros((cells, 2))
+        self.smoothed = np.zeros(cells, dtype=bool)
         self.xyz, self.covariance_m2 = np.zeros((cells, 3)), np.zeros((cells, 3, 3))
         self.accepted, self.attempts = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=np.int16)
 
@@ -126,20 +137,37 @@ def grow(
     cells, start, shape, parent_depth = _seed_front(grid, seeds, reference)
     matched, point, _ = _measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching, EQUAL_SIGMA_PX, pairs=False)
     limit_px, rig_sigma_px = _rig_quality(matched, point, growing)
-    for enlarged in range(growing.bigger_patches + 1):
-        settings = replace(matching, patch_px=matching.patch_px + PATCH_STEP_PX * enlarged)
-        if enlarged:
+    depths = camera.to_camera(point.xyz_m)[:, 2]
+    views = images
+    for level in range(rounds_of_larger_patches(matching, growing, depths, camera) + 1):
+        settings = replace(matching, patch_px=matching.patch_px + PATCH_STEP_PX * level)
+        if level:
             state.attempts[:] = 0
             cells, start, shape, parent_depth = _front_from(state, np.flatnonzero(state.accepted), grid, growing.attempts, camera)
+        if level >= SMOOTH_FROM:
+            settings = replace(settings, max_sigma_px=LESS_SURE * matching.max_sigma_px)
+            views = [image.smoothed(RETRY_SMOOTHING_PX, grid.rows.step) for image in images]
         while len(cells):
             monitor.step("surface", int(state.accepted.sum()), n_cells)
             state.attempts[cells] += 1
             xy = grid.xy(cells)
-            matched, point, depth = _measure(images, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px, growing.pairs)
+            matched, point, depth = _measure(views, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px, growing.pairs)
             good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, foreground)
             _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], grid, cameras, reference)
+            state.smoothed[cells[good]] = level >= SMOOTH_FROM
             cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
     return _field(state, grid, limit_px)
+
+
+def rounds_of_larger_patches(matching: MatchingSettings, growing: GrowingSettings, depth_m: np.ndarray, camera: Camera) -> int:
+    """How many rounds of larger patches follow: as many as are asked for, but from the second on none wider than LARGEST_PATCH_M there.
+
+    A limb is round; over a wider patch it turns away.
+    """
+    if not np.isfinite(depth_m).any():
+        return 0
+    across_px = LARGEST_PATCH_M * camera.focal_px / float(np.nanmedian(depth_m))
+    return int(np.clip((across_px - matching.patch_px) // PATCH_STEP_PX, min(1, growing.bigger_patches), growing.bigger_patches))
 
 
 def _rig_quality(matched: Sequence[Matches], seeds: Intersection, growing: GrowingSettings) -> tuple[float, float]:
@@ -307,6 +335,7 @@ def _field(state: _State, grid: TemplateGrid, limit_px: float) -> TripletField:
         residual_px=state.residual[cell],
         sigma0=state.sigma0[cell],
         spread=state.spread[cell],
+        smoothed=state.smoothed[cell],
         limit_px=limit_px,
         tried=int((state.attempts > 0).sum()),
     )

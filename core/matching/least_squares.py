@@ -28,7 +28,7 @@ from enum import IntEnum
 import numpy as np
 
 from ..geometry.small_matrices import invert_spd
-from ..images.sampling import SplineImage
+from ..images.sampling import SplineImage, correlated_noise
 from ..progress import Monitor
 from ..settings import knob
 
@@ -192,6 +192,8 @@ class PatchTemplates:
         eye = np.eye(6) * MIN_CONDITION
         self.inverse = invert_spd(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
         self.offset, self.spread = self._centre_of_gravity()
+        patch = (-1, 2 * self._half[1] + 1, 2 * self._half[0] + 1)
+        self.noise_factor = correlated_noise(fx.reshape(patch), fy.reshape(patch), image.smoothing)
         self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
 
     def select(self, rows: np.ndarray) -> "PatchTemplates":
@@ -291,7 +293,7 @@ class PatchTemplates:
         s = self._settings
         dof = max(1, self.n_pixels - PARAMETERS)
         lost = np.clip(1 - correlation**2, 0, 1)
-        variance = self.contrast.astype(np.float64) ** 2 * lost / dof  # (4)
+        variance = self.noise_factor * self.contrast.astype(np.float64) ** 2 * lost / dof  # (4)
         K = variance[:, None, None] * (A @ self.inverse[:, ::3, ::3] @ A.transpose(0, 2, 1))
         E = np.concatenate([np.ones((len(c), 1)), self.offset], axis=1)
         transferred = np.einsum("ni,naibj,nj->nab", E, self.inverse.reshape(-1, 2, 3, 2, 3), E)  # (5)

@@ -26,7 +26,7 @@ from ..images.sampling import SplineImage
 from ..progress import Monitor
 from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
 from .object_space import MIN_NOISE, inverse_normals, solve_normals, without_noise
-from .template_patches import GRADIENT_NOISE, TemplatePatches
+from .template_patches import TemplatePatches
 
 NEIGHBOUR_SHIFT_PX, NEIGHBOUR_SHAPE = 1.0, 0.1
 CONVERGED_SIGMAS, MAX_STEP_PX, MAX_SHAPE_STEP = 0.05, 1.5, 0.3
@@ -226,7 +226,8 @@ class _Adjustment:
             if self._neighbours:
                 for N in (texture, middle):
                     _add_neighbours(N[:, at, at], np.zeros((len(c), 6)), c[:, k], A[:, k], c[:, k], A[:, k])
-            texture[:, at, at] += P[:, k, None, None] * without_noise(self._H, 0.5 * GRADIENT_NOISE * self._noise / P[:, k, None, None])
+            noise = 0.5 * (self._patches.gradient_noise / P[:, k])[:, None, None] * self._noise
+            texture[:, at, at] += P[:, k, None, None] * without_noise(self._H, noise)
             for j in range(S):
                 share = (1.0 if j == k else 0.5) * np.sqrt(P[:, k] * P[:, j])
                 middle[:, at, 6 * j : 6 * j + 6] += share[:, None, None] * self._H

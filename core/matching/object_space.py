@@ -32,7 +32,7 @@ from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
-from .template_patches import GRADIENT_NOISE, TemplatePatches, monomials
+from .template_patches import TemplatePatches, monomials
 
 MIN_NOISE = 1.0  # grey values: no image is better than its quantisation and interpolation
 CONVERGED_SIGMAS = 0.05
@@ -272,7 +272,7 @@ class _Adjustment:
                 common[:, P + k, P + j] = patches.normal_of_shift(a.weight[:, k, None] * t, a.weight[:, j, None] * a.side[:, j])
         middle = 0.5 * N + 0.5 * common / np.maximum(a.weight.max(axis=1), 1e-12)[:, None, None]
         diagonal = np.arange(P + self._S)
-        texture = without_noise(N, 0.5 * GRADIENT_NOISE * noise)
+        texture = without_noise(N, 0.5 * patches.gradient_noise[:, None, None] * noise)
         for M in (middle, texture):
             M[:, diagonal, diagonal] += pseudo
         half = inverse_normals(texture)

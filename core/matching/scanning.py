@@ -273,6 +273,7 @@ def _merged(
         residual_px=point.rms_residual_px,
         sigma0=point.sigma0,
         spread=scans[0].spread[cell],
+        smoothed=np.zeros(n, dtype=bool),
         tried=int(np.any([s.tried for s in scans], axis=0).sum()),
         limit_px=limit_px,
     )

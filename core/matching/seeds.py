@@ -26,6 +26,7 @@ SWEEP_STEP_PX = 1.0
 MIN_SCORE, MIN_LEAD = 0.80, 0.04
 MIN_CONTRAST, CONTRAST_OVER_NOISE = 0.5, 1.4
 PATCH_STRIDE = 2
+SWEEP_SMOOTHING_PX = 1.0  # a patch is compared at every other pixel: what is finer is noise to it
 MAX_SAMPLES = 1200
 LOOK_UP = 30_000_000
 
@@ -43,12 +44,22 @@ def approximations_at_depth(
     cameras: Sequence[Camera], reference: int, rows: RowGrid, xy: np.ndarray, depth_m: np.ndarray
 ) -> Approximations:
     """The starts of points `xy` (M, 2) (rows' pixels of the reference) at depth (M,), induced by planes that face the reference camera."""
-    base = cameras[reference]
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    X = base.points_at_depth(rows.to_frame(xy[:, None, :] + corners), np.asarray(depth_m)[:, None])  # (M, 3, 3)
-    image = np.stack([rows.from_frame(camera.project(X)) for camera in cameras], axis=1)  # (M, K, 3, 2)
-    shape = np.stack([image[:, :, 1] - image[:, :, 0], image[:, :, 2] - image[:, :, 0]], axis=-1)
-    return Approximations(xy=image[:, :, 0], shape=shape, depth_m=np.asarray(depth_m, dtype=np.float64))
+    depth = np.asarray(depth_m, dtype=np.float64)
+    corners = _corners(cameras[reference], rows, xy, depth[:, None])[:, 0]
+    at = [_image_of(camera, rows, corners) for camera in cameras]
+    return Approximations(xy=np.stack([c for c, _ in at], axis=1), shape=np.stack([A for _, A in at], axis=1), depth_m=depth)
+
+
+def _corners(base: Camera, rows: RowGrid, xy: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+    """World points (M, D, 3, 3) of the reference's rows' pixels (M, 2), of the next column and of the next row, at depths (M or 1, D)."""
+    ray = base.rays(rows.to_frame(xy[:, None, :] + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])))
+    return base.centre_m + ray[:, None] * depth_m[..., None, None]
+
+
+def _image_of(camera: Camera, rows: RowGrid, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position (…, 2) and shape (…, 2, 2) in one view of the patches with corners (…, 3, 3)."""
+    image = rows.from_frame(camera.project(corners))
+    return image[..., 0, :], np.stack([image[..., 1, :] - image[..., 0, :], image[..., 2, :] - image[..., 0, :]], axis=-1)
 
 
 def sweep_seeds(
@@ -68,6 +79,7 @@ def sweep_seeds(
     """
     rows = grid.rows
     xy = _textured(images[reference], settings, rows, grid.every(max(1, round(spacing_px / grid.spacing_px))))
+    smooth = [image.smoothed(SWEEP_SMOOTHING_PX, rows.step) for image in images]
     near, far = depth_range_m or _default_range(cameras)
     inverse = _inverse_depths(cameras, reference, near, far)
     block = max(1, LOOK_UP // max(1, len(inverse) * settings.patch_px**2 * len(cameras)))
@@ -75,7 +87,7 @@ def sweep_seeds(
     for i in range(0, len(xy), block):
         monitor.step("seeds", i, len(xy))
         part = slice(i, i + block)
-        score = _sweep_scores(images, cameras, reference, rows, settings, xy[part], inverse)
+        score = _sweep_scores(smooth, cameras, reference, rows, settings, xy[part], inverse)
         depth[part], good[part] = _peaks(score, inverse)
     return approximations_at_depth(cameras, reference, rows, xy[good], depth[good])
 
@@ -133,15 +145,16 @@ def _sweep_scores(
     keep = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > 9 else np.ones(len(u), dtype=bool)
     u, v = u[keep], v[keep]
     f = _normalised(images[reference].sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
-    at = approximations_at_depth(cameras, reference, rows, np.repeat(xy, D, axis=0), np.tile(1 / inverse, m))
+    corners = _corners(cameras[reference], rows, xy, 1 / inverse[None])
     total, views = np.zeros((m, D)), 0
     seen_by_all = np.ones((m, D), dtype=bool)
     for k in range(len(cameras)):
         if k == reference:
             continue
-        inside = images[k].inside(at.xy[:, k], np.array(half))
+        c, A = (a.reshape(m * D, *a.shape[2:]) for a in _image_of(cameras[k], rows, corners))
+        inside = images[k].inside(c, np.array(half))
         rho = np.full(m * D, -1.0)
-        rho[inside] = _correlations(images[k], at.xy[inside, k], at.shape[inside, k], f, np.repeat(np.arange(m), D)[inside], u, v)
+        rho[inside] = _correlations(images[k], c[inside], A[inside], f, np.repeat(np.arange(m), D)[inside], u, v)
         total += rho.reshape(m, D)
         seen_by_all &= inside.reshape(m, D)
         views += 1

@@ -13,10 +13,10 @@ belong to the template, so that normal matrices of any number of search images, 
 
 import numpy as np
 
-from ..images.sampling import SplineImage
+from ..images.sampling import SplineImage, correlated_noise
 from .least_squares import patch_offsets
 
-GRADIENT_NOISE = 130 / 144  # variance of the fourth-order central difference, for noise of variance 1
+GRADIENT_NOISE = 130 / 144  # variance of the fourth-order central difference, for white noise of variance 1; 1 / 2σ² after smoothing
 MIN_CONTRAST = 0.5  # grey values
 
 
@@ -39,6 +39,10 @@ class TemplatePatches:
         self.textured = self.inside & (self.contrast > MIN_CONTRAST * np.sqrt(np.maximum(self.pixels, 1.0)))
         self.weighted_f = self.f * self._weight
         self._wfx, self._wfy = fx * self._weight, fy * self._weight
+        patch = (-1, 2 * self.half[1] + 1, 2 * self.half[0] + 1)
+        self.noise_factor = correlated_noise(self._wfx.reshape(patch), self._wfy.reshape(patch), image.smoothing)  # (N,)
+        smooth = image.smoothing[0]
+        self.gradient_noise = min(GRADIENT_NOISE, 0.5 / smooth**2 if smooth else GRADIENT_NOISE) / self.noise_factor  # (N,)
         self._centre(fx, fy)
         self._moments(fx, fy)
 
@@ -103,8 +107,9 @@ class TemplatePatches:
         return along / np.sqrt(power), (gain * (px - q[:, 0] * along[:, None]), gain * (py - q[:, 1] * along[:, None]))
 
     def residual_variance(self, rho: np.ndarray, parameters: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Variance [grey values²] of a pixel after the adjustment, at correlation rho (m,)."""
-        return self.contrast[rows] ** 2 * np.clip(1 - rho**2, 0, 1) / np.maximum(self.pixels[rows] - parameters, 1.0)
+        """Variance [grey values²] of a pixel after the adjustment, at correlation rho (m,), as white noise that would do as much."""
+        lost = self.noise_factor[rows] * self.contrast[rows] ** 2 * np.clip(1 - rho**2, 0, 1)
+        return lost / np.maximum(self.pixels[rows] - parameters, 1.0)
 
 
 def monomials(u: np.ndarray, v: np.ndarray, degree: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tricap.core.images.sampling import SplineImage
+from tricap.core.images.sampling import SplineImage, correlated_noise
 
 PHASES = (0.0, 0.003, 0.1, 0.123, 0.25, 0.3701, 0.5, 0.77)
 
@@ -85,3 +85,19 @@ def test_mirrored_image_gives_mirrored_samples() -> None:
     at = np.random.default_rng(4).uniform(5, 74, (2, 50, 9)).astype(np.float32)
     a, b = SplineImage(image).sample(at[0], at[1]), SplineImage(image[:, ::-1]).sample(np.float32(79) - at[0], at[1])
     assert np.abs(a - b).max() < 0.35  # OpenCV 4: 1/128 px times a gradient of 20 grey values a pixel
+
+
+@pytest.mark.parametrize("row_step", [1, 2])
+def test_correlated_noise_is_what_smoothing_does(row_step: int) -> None:
+    """The variance of Σ f n over a patch, for gradients f and smoothed noise n, over what white noise of the same strength gives."""
+    random = np.random.default_rng(3)
+    field = SplineImage(random.standard_normal((400, 400)).astype(np.float32)).smoothed(1.0, row_step)
+    assert field.smoothing == (1.0, 1.0 / row_step)
+    y, x = np.mgrid[0:400, 0:400].astype(np.float32)
+    noise = field.sample(x, y)
+    f = cv2.GaussianBlur(random.standard_normal((13, 13)).astype(np.float32), (0, 0), 1.5)
+    sums = cv2.filter2D(noise, cv2.CV_32F, f)[20:-20, 20:-20]
+    factor = correlated_noise(f[None], np.zeros_like(f)[None], field.smoothing)[0]
+    assert factor > 2
+    assert np.var(sums) / (np.var(noise) * np.sum(f * f)) == pytest.approx(factor, rel=0.1)
+    assert correlated_noise(f[None], f[None], (0.0, 0.0)).tolist() == [1.0]

@@ -12,7 +12,7 @@ from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
-from tricap.core.matching.growing import GrowingSettings, TripletField, grow
+from tricap.core.matching.growing import GrowingSettings, TripletField, grow, rounds_of_larger_patches
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
 from tricap.core.matching.multi_image import match_multi_image
 from tricap.core.matching.object_space import Epipolar, SurfacePrior, match_surface
@@ -188,6 +188,26 @@ def test_constraints_earn_their_place(surfaces: ModuleType, kind: str) -> None:
         assert np.isfinite(found.covariance_m2).all()
     assert rms["object"] < 0.9 * rms["none"]
     assert rms["epipolar"] < rms["none"]
+
+
+def test_points_on_which_two_ways_of_matching_disagree_are_rejected(surfaces: ModuleType) -> None:
+    """At an outline the unconstrained patch settles on a mixture of two surfaces; here such points are made."""
+    scene = Scene(surfaces, surfaces.cylinder(0.06), "strong")
+    field = scene.grown()
+    kept = constrain(field, scene.images, scene.rig, 1, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
+    chosen = np.searchsorted(field.cell, kept.cell[::25])
+    mixed = field.xyz_m.copy()
+    mixed[chosen] += 0.015 * scene.rig[1].rays(field.xy[chosen, 1])
+    found = constrain(replace(field, xyz_m=mixed), scene.images, scene.rig, 1, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
+    assert not np.isin(field.cell[chosen], found.cell).any()
+    assert np.isin(np.delete(kept.cell, np.arange(0, len(kept.cell), 25)), found.cell).mean() > 0.97
+
+
+def test_larger_patches_only_where_pixels_are_small(plane: Scene) -> None:
+    growing, depth = GrowingSettings(), np.array([1.4, 1.5, np.nan])
+    assert rounds_of_larger_patches(SETTINGS, growing, depth, plane.rig[1]) == 1  # 2 mm per pixel
+    assert rounds_of_larger_patches(SETTINGS, growing, depth / 8, plane.rig[1]) == growing.bigger_patches
+    assert rounds_of_larger_patches(SETTINGS, replace(growing, bigger_patches=0), depth, plane.rig[1]) == 0
 
 
 def test_failures_are_statuses(plane: Scene) -> None:

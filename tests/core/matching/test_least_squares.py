@@ -257,3 +257,21 @@ def test_cancelling_stops_within_a_chunk() -> None:
         for _ in range(50):
             match_patches(template, xy, [search], [xy], [eye], OPEN, monitor=monitor)
     assert time.perf_counter() - began < 1.1
+
+
+def test_smoothing_helps_weak_texture_and_its_sigma_allows_for_it() -> None:
+    """Skin-like: texture of 3 px, contrast 10, noise 2. Raw 0.24 px, smoothed 0.13 px by simulation (SCIENCE §4)."""
+    errors, z = {0.0: [], 1.0: []}, []
+    for seed in range(3):
+        spectrum, random = speckle(3.0, seed) / 2, np.random.default_rng(50 + seed)
+        a, b = (SplineImage(g + 2 * random.standard_normal(g.shape)) for g in (shifted(spectrum, 0, 0), shifted(spectrum, 0.3, -0.2)))
+        xy, eye = points(), np.tile(np.eye(2), (len(points()), 1, 1))
+        for sigma, found in errors.items():
+            f, g = (a.smoothed(sigma, 1), b.smoothed(sigma, 1)) if sigma else (a, b)
+            m = match_patches(f, xy, [g], [xy], [eye], OPEN)[0]
+            e = (m.transfer_xy - xy - m.offset - (0.3, -0.2))[m.ok]
+            found.extend(np.abs(e).ravel())
+            if sigma:
+                z.extend((e / np.sqrt(m.transfer_covariance[m.ok][:, [0, 1], [0, 1]])).ravel())
+    assert np.median(errors[1.0]) < 0.8 * np.median(errors[0.0])
+    assert 0.6 < np.median(np.abs(z)) / 0.6745 < 1.25
