@@ -153,7 +153,7 @@ class JobOperator:
     job: Job
     timer: Any = None
     step: ClassVar[str] = ""  # of the workflow, in which the job is at its beginning
-    last_words: ClassVar[str] = "What was finished is kept."
+    last_words: ClassVar[str] = ""
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
         """Main thread: read everything from Blender and return the computation."""

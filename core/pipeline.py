@@ -309,6 +309,11 @@ def fit(run: Run, monitor: Monitor) -> None:
     except Cancelled as stop:
         run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
         raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop
+    except InputError as error:
+        cause = next((finding for finding in first_look(run.footage, run.measured[0].frame) if finding.certain), None)
+        if cause is None:
+            raise
+        raise InputError(f"{cause.sentence} {cause.advice}".strip()) from error
     states = {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
     if set(states) - {"fitted"}:
         run.warn(

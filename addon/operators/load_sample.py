@@ -6,6 +6,7 @@ from typing import Any
 
 import bpy
 
+from ...core.errors import InputError
 from ...core.progress import Monitor
 from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
 from .. import folders, project
@@ -29,15 +30,17 @@ class LoadSample(JobOperator, bpy.types.Operator):
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, Any, Contents | None]]:
         """Where the recording and its results go: beside the .blend, or among the extension's own files while there is none."""
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
+        take = base / NAME
+        if project.bound(context.scene) and project.folder_of(context.scene) != take.resolve():
+            raise InputError("This file has footage of its own; make an empty one (File > New > General) and press this there.")
         folders.check_writable(base)
-        return lambda monitor: make_and_measure(base / NAME, monitor)
+        return lambda monitor: make_and_measure(take, monitor)
 
     def finish(self, context: bpy.types.Context, result: tuple[Path, Any, Contents | None]) -> set[str]:
-        """Open the sample as the scene's take, and build the scene."""
+        """The sample becomes the scene's project; build the scene."""
         take, report, results = result
-        props = context.scene.tricap
-        props.out, props.last = folders.for_user(take.with_name(f"{take.name}_tricap")), str(report)
         project.open_take(context.scene, take)
+        context.scene.tricap.out, context.scene.tricap.last = folders.for_user(take / project.RESULTS), str(report)
         if results is not None:
             put_into_scene(self, context, results)
         self.report({"INFO"}, str(report))
@@ -48,4 +51,4 @@ def make_and_measure(take: Path, monitor: Monitor) -> tuple[Path, Any, Contents 
     """The computation, free of bpy. A sample that is there already, with whatever was changed in it, is measured as it is."""
     if not is_arm_take(take):
         make_arm_take(take, SAMPLE, monitor)
-    return take, *measure(take, take.with_name(f"{take.name}_tricap"), {}, True, monitor)
+    return take, *measure(take, take / project.RESULTS, {}, True, monitor)

@@ -26,12 +26,12 @@ def test_beside_the_file_with_the_commands_numbers(blender: ModuleType, small: M
     folder.mkdir()
     blender.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
-    out = folder / "tricap_sample_tricap"
+    out = folder / "tricap_sample" / "results"
     make_arm_take(tmp_path / "sample", small.SAMPLE)
     pipeline.run(tmp_path / "sample", tmp_path / "out")
     assert (out / "motion.csv").read_bytes() == (tmp_path / "out" / "motion.csv").read_bytes()
     scene = blender.context.scene
-    assert Path(blender.path.abspath(scene.tricap.take)) == folder / "tricap_sample" and "body fitted" in scene.tricap.last
+    assert scene.tricap.take == "//tricap_sample" and len(scene.tricap.views) == 3 and "body fitted" in scene.tricap.last
     assert blender.data.objects["Body"].animation_data.action is not None
     (folder / "tricap_sample" / "take.toml").write_text((folder / "tricap_sample" / "take.toml").read_text() + "# mine\n")
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
@@ -42,7 +42,7 @@ def test_without_a_file_it_lies_among_the_extensions_own(blender: ModuleType, sm
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
     place = Path(blender.utils.extension_path_user("bl_ext.user_default.tricap"))
     assert Path(blender.context.scene.tricap.take) == place / "tricap_sample"
-    assert (place / "tricap_sample_tricap" / "motion.csv").is_file()
+    assert (place / "tricap_sample" / "results" / "motion.csv").is_file()
 
 
 def test_a_folder_of_the_users_is_left_alone(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:
@@ -54,10 +54,20 @@ def test_a_folder_of_the_users_is_left_alone(blender: ModuleType, small: ModuleT
     assert [path.name for path in (tmp_path / "tricap_sample").iterdir()] == ["precious.txt"]
 
 
+def test_a_file_with_footage_is_left_alone(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:
+    make_arm_take(tmp_path / "mine", small.SAMPLE)
+    from bl_ext.user_default.tricap.addon import project
+
+    project.open_take(blender.context.scene, tmp_path / "mine")
+    with pytest.raises(RuntimeError, match="footage of its own"):
+        blender.ops.tricap.load_sample()
+    assert Path(blender.context.scene.tricap.take) == tmp_path / "mine"
+
+
 @pytest.mark.slow
 def test_the_whole_sample_is_close_to_its_truth(blender: ModuleType, tmp_path: Path) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
-    score = score_run(tmp_path / "tricap_sample", tmp_path / "tricap_sample_tricap")
+    score = score_run(tmp_path / "tricap_sample", tmp_path / "tricap_sample" / "results")
     assert score.joints is not None and score.joints.mpjpe_mm < 10, str(score)
