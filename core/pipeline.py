@@ -17,7 +17,7 @@ from . import store
 from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
-from .checking.take_check import causes_of_failure, first_look
+from .checking.take_check import causes_of_failure, first_look, with_cause
 from .correcting import corrected_cloud, corrected_tracks
 from .errors import InputError
 from .fit_sources import fit_input
@@ -310,10 +310,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
         raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop
     except InputError as error:
-        cause = next((finding for finding in first_look(run.footage, run.measured[0].frame) if finding.certain), None)
-        if cause is None:
-            raise
-        raise InputError(f"{cause.sentence} {cause.advice}".strip()) from error
+        raise with_cause(error, run.footage, run.measured[0].frame) from error
     states = {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
     if set(states) - {"fitted"}:
         run.warn(

@@ -85,6 +85,12 @@ def first_look(footage: Footage, frame: int) -> list[Finding]:
     return same_views(pairs, names) or rig_findings(pairs, footage.rig.cameras, names)
 
 
+def with_cause(error: InputError, footage: Footage, frame: int) -> InputError:
+    """What is certainly wrong with the footage instead of what came of it, where there is such a thing."""
+    cause = next((finding for finding in first_look(footage, frame) if finding.certain), None)
+    return error if cause is None else InputError(f"{cause.sentence} {cause.advice}".strip())
+
+
 def timing_finding(offset: Offset) -> Finding:
     """What to do about a view that is early or late."""
     late, sigma = offset.late_frames, offset.sigma_frames
