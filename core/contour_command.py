@@ -45,17 +45,29 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: the arguments or the take need mending.
     """
     with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
-        names = [v.name for v in job.footage.take.views]
-        if args.view not in names:
-            raise InputError(f"{args.take} has no view “{args.view}”.{nearest_name(args.view, names)}")
         polygon = read_polygon(args.polygon) if args.polygon else None
         background = read_image(args.background) if args.background else None
+        return [write_contour(job, args.view, monitor, polygon, background)]
+
+
+def write_contour(
+    job: pipeline.Run, name: str, monitor: Monitor, polygon: np.ndarray | None = None, background: np.ndarray | None = None
+) -> str:
+    """Track the contour in the view of that name (measures and tracks first where that is needed): contours/NAME.csv; says what was found.
+
+    Raises:
+        InputError: there is no such view, or nothing to start from.
+    """
+    names = [v.name for v in job.footage.take.views]
+    if name not in names:
+        raise InputError(f"{job.footage.take.folder} has no view “{name}”.{nearest_name(name, names)}")
+    if job.trajectories is None:
         pipeline.track(job, monitor)
-        contours = dict(track_contour(job, names.index(args.view), ContourSettings(), polygon, background, monitor))
-        path = job.results.path("contours", f"{args.view}.csv")
-        store.write_text(path, _table(contours))
+    contours = dict(track_contour(job, names.index(name), ContourSettings(), polygon, background, monitor))
+    path = job.results.path("contours", f"{name}.csv")
+    store.write_text(path, _table(contours))
     seen = float(np.mean([c.seen.mean() for c in contours.values()]))
-    return [f"{path}: the outline in {len(contours)} frames, {100 * seen:.0f} % of its vertices on an edge."]
+    return f"{path}: the outline in {len(contours)} frames, {100 * seen:.0f} % of its vertices on an edge."
 
 
 def track_contour(

@@ -93,10 +93,10 @@ class ClickOperator:
         undo = event.type == "Z" and (event.ctrl or event.oskey)
         if undo and event.value == "PRESS":
             self.session.back()
-        elif view is None or area is None:
-            return {"PASS_THROUGH"}
         elif event.type == "ESC" and event.value == "PRESS":
             return self._end(context)
+        elif view is None or area is None:
+            return {"PASS_THROUGH"}
         elif not self._act_in(area, view, event):
             return {"PASS_THROUGH"}
         if not self.session.name:

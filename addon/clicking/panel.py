@@ -4,6 +4,7 @@ import bpy
 
 from ...core.errors import InputError
 from .. import project, seeds
+from ..panels import sentence
 from .operators import model_joints
 from .session import joints_of
 
@@ -26,7 +27,7 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         """Buttons, and which joints are clicked in how many views."""
         layout, scene = self.layout, context.scene
         if not scene.tricap.views:
-            layout.label(text="Add footage first: 3-D view, sidebar, tab Tricap.", icon="INFO")
+            sentence(layout, context, "Add footage first: in the 3-D view's sidebar, tab Tricap.", "INFO")
             return
         view = project.view_of(scene, context.space_data.clip)
         if view is not None:
@@ -44,14 +45,14 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         if scene.frame_current == first:
             layout.label(text=f"Frame {first}: the first clicks", icon="KEYTYPE_KEYFRAME_VEC")
         else:
-            layout.label(text=f"Frame {scene.frame_current}: clicks are a keyframe", icon="KEYTYPE_EXTREME_VEC")
-            layout.operator("tricap.go_to_frame", text=f"Go to the first clicks, frame {first}").frame = first
+            layout.label(text=f"Frame {scene.frame_current}: a keyframe", icon="KEYTYPE_EXTREME_VEC")
+            layout.operator("tricap.go_to_frame", text=f"To the First Clicks ({first})").frame = first
 
     def _draw_joints(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         try:
             clips, names = project.clips_of(scene), joints_of(model_joints(scene))
         except InputError as error:
-            layout.label(text=str(error), icon="ERROR")
+            sentence(layout, bpy.context, str(error), "ERROR")
             return
         grid = layout.column(align=True)
         for name in names:

@@ -4,6 +4,8 @@ import bpy
 
 from .. import project
 from ..clicking.panel import ClipPanel
+from ..panels import sentence
+from .properties import TricapCorrecting
 
 
 class TRICAP_UL_corrections(bpy.types.UIList):
@@ -11,12 +13,9 @@ class TRICAP_UL_corrections(bpy.types.UIList):
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
         """Kind, view and frames."""
-        row = layout.row(align=True)
         region = item.kind == "region"
-        row.label(text=f"{item.kind} {item.view}", icon="MESH_PLANE" if region else "TRACKER")
-        row.prop(item, "first", text="", emboss=False)
-        if region:
-            row.prop(item, "last", text="", emboss=False)
+        frames = f"{item.first} to {max(item.first, item.last)}" if region else str(item.first)
+        layout.label(text=f"{item.view}  {item.kind}  {frames}", icon="MESH_PLANE" if region else "TRACKER")
 
 
 class TRICAP_UL_dofs(bpy.types.UIList):
@@ -28,9 +27,9 @@ class TRICAP_UL_dofs(bpy.types.UIList):
         row.prop(item, "locked", text="", icon="LOCKED" if item.locked else "UNLOCKED", emboss=False)
         row.label(text=item.name)
         limits = row.row(align=True)
-        limits.enabled = not item.locked
-        limits.prop(item, "low", text="")
-        limits.prop(item, "high", text="")
+        limits.alignment = "RIGHT"
+        limits.active = not item.locked
+        limits.label(text=f"{item.low:g}…{item.high:g}°")
 
 
 class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
@@ -50,14 +49,20 @@ class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
         layout.operator_context = "INVOKE_DEFAULT"
         column = layout.column(align=True)
         column.operator("tricap.remove_trajectory", icon="TRACKER")
-        row = column.row(align=True)
-        row.operator("tricap.remove_region", icon="MESH_PLANE")
-        row.prop(said, "region_frames", text="")
+        column.operator("tricap.remove_region", icon="MESH_PLANE")
+        column.prop(said, "region_frames")
         if said.corrections:
             row = layout.row()
             row.template_list("TRICAP_UL_corrections", "", said, "corrections", said, "active", rows=3)
             row.operator("tricap.remove_correction", text="", icon="REMOVE").index = -1
-            layout.label(text="They count when the step is run again.", icon="INFO")
+            self._draw_chosen(layout, said)
+            sentence(layout, context, "They take effect when the steps that are now stale are run again.", "INFO")
+
+    def _draw_chosen(self, layout: bpy.types.UILayout, said: TricapCorrecting) -> None:
+        if 0 <= said.active < len(said.corrections) and said.corrections[said.active].kind == "region":
+            row = layout.row(align=True)
+            row.prop(said.corrections[said.active], "first")
+            row.prop(said.corrections[said.active], "last")
 
 
 def draw_dofs(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
@@ -66,8 +71,13 @@ def draw_dofs(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     if not said.dofs or said.dofs_model != project.model_of(scene):
         layout.operator("tricap.list_dofs", icon="LOCKED")
         return
-    layout.label(text="Lock, lowest and highest angle [°]")
     layout.template_list("TRICAP_UL_dofs", "", said, "dofs", said, "active_dof", rows=5)
+    if 0 <= said.active_dof < len(said.dofs):
+        row = layout.row(align=True)
+        row.use_property_split = False
+        row.active = not said.dofs[said.active_dof].locked
+        row.prop(said.dofs[said.active_dof], "low")
+        row.prop(said.dofs[said.active_dof], "high")
 
 
 CLASSES = (TRICAP_UL_corrections, TRICAP_UL_dofs, TRICAP_PT_corrections)

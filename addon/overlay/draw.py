@@ -122,7 +122,7 @@ def _draw_tracks(run: Recording, view: str, frame: int, length: int, which: str)
 def _draw_contour(run: Recording, view: str, frame: int) -> list[tuple[str, Colour]]:
     found = run.contour(view).get(frame)
     if found is None:
-        return [("no contour here (tricap contour makes it)", BAD)]
+        return [("no contour here", BAD)]
     xy, on_edge = found
     segments = canvas.chain(xy, closed=True)
     for mine, colour in ((on_edge, CONTOUR), (~on_edge, NO_EDGE)):

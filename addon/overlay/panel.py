@@ -4,6 +4,7 @@ import bpy
 import numpy as np
 
 from ..clicking.panel import ClipPanel
+from ..panels import sentence
 from . import recording
 
 WORST = 12
@@ -18,8 +19,9 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """The switches."""
         layout, shown = self.layout, context.scene.tricap_overlay
-        if recording.current(context.scene) is None:
-            layout.label(text=recording.problem() or "Nothing was measured yet.", icon="INFO")
+        run = recording.current(context.scene)
+        if run is None:
+            sentence(layout, context, recording.problem() or "Nothing was measured yet.", "INFO")
             return
         column = layout.column()
         row = column.row()
@@ -32,10 +34,20 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
             column.prop(shown, "tail")
         column.prop(shown, "body")
         column.prop(shown, "contour")
+        if shown.contour:
+            self._draw_contour(column, context, run)
         column.prop(shown, "graph")
         layout.operator("tricap.look_closer", icon="VIEWZOOM")
         if recording.problem():
-            layout.label(text=recording.problem(), icon="ERROR")
+            sentence(layout, context, recording.problem(), "ERROR")
+
+    def _draw_contour(self, layout: bpy.types.UILayout, context: bpy.types.Context, run: recording.Recording) -> None:
+        clip = context.space_data.clip
+        view = recording.view_of(clip) if clip is not None else ""
+        if view in run.cameras and not run.contour(view):
+            row = layout.row()
+            row.enabled = not context.window_manager.tricap.running
+            row.operator("tricap.follow_contours", icon="MOD_OUTLINE").view = view
 
 
 class TRICAP_PT_frames(ClipPanel, bpy.types.Panel):

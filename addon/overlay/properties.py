@@ -28,7 +28,7 @@ class TricapOverlay(bpy.types.PropertyGroup):
             ("removed", "Gone", "Only what was taken out; Look Closer tells why"),
             ("both", "Both", "Kept ones in blue, removed ones in red")])
     tail: bpy.props.IntProperty(name="Tail", description="Frames", default=8, min=1, max=200, update=_changed)  # type: ignore[valid-type]
-    contour: _switch("Contour", "The tracked outline of the person, where `tricap contour` made one")  # type: ignore[valid-type]
+    contour: _switch("Contour", "The tracked outline of the person")  # type: ignore[valid-type]
     body: _switch("Fitted Body", "The outline of the fitted body's skin")  # type: ignore[valid-type]
     graph: _switch("Graph of Frames", "Residual and sigma of every frame; bad frames are red")  # type: ignore[valid-type]
 

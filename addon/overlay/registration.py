@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import draw, operators, panel, properties, recording
+from . import contours, draw, operators, panel, properties, recording
 
-CLASSES = (*properties.CLASSES, *operators.CLASSES, *panel.CLASSES)
+CLASSES = (*properties.CLASSES, *operators.CLASSES, *contours.CLASSES, *panel.CLASSES)
 
 
 @bpy.app.handlers.persistent

@@ -210,3 +210,29 @@ def test_the_clicks_are_drawn_where_they_are(blender: ModuleType, drawn: Any, sc
     assert len(inside) > 5 and all(lit(picture, xy)[2] > 0.5 for xy in inside)
     assert lit(picture, np.array([100.0 + 11 / 3, 50.0]))[1] > 0.8, "the ring of the proposal"
 
+
+
+@pytest.mark.slow
+def test_a_real_run_is_looked_at_and_corrected(blender: ModuleType, empty: ModuleType, tmp_path: Path) -> None:
+    from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
+
+    make_arm_take(tmp_path / "arm", ArmTakeSettings(frames=3, width_px=384, interlaced="none"))
+    scene, ops, layers = empty.context.scene, empty.ops.tricap, module("overlay.layers")
+    module("project").open_take(scene, tmp_path / "arm")
+    scene.tricap.out = str(tmp_path / "out")
+    assert ops.track() == {"FINISHED"}
+    run = module("overlay.recording").current(scene)
+    points, history = run.points(1), run.tracks()
+    assert len(points.xyz_m) > 500 and np.isfinite(points.correlation).all() and history.kept.sum() > 100
+    number = int(np.flatnonzero(history.kept[1])[10])
+    xy = history.at(run.cameras["L"], 1)[0][number]
+    found = layers.look(run, "L", 1, points.xy_px[100, 0], 4.0)
+    assert set(found.found) == {"L", "C", "R"} and np.isfinite(found.found["R"]).all()
+    assert ops.remove_trajectory(view="L", frame=1, x=float(xy[0]), y=float(xy[1])) == {"FINISHED"}
+    assert ops.track() == {"FINISHED"}
+    run = module("overlay.recording").current(scene)
+    status = run.tracks().status[:, number]
+    assert set(status[np.isfinite(run.tracks().xyz_m[:, number, 0])]) == {TrackStatus.REMOVED_BY_USER}
+    assert ops.follow_contours(view="C") == {"FINISHED"} and scene.tricap_overlay.contour
+    outline, on_edge = module("overlay.recording").current(scene).contour("C")[1]
+    assert len(outline) > 50 and on_edge.mean() > 0.4
