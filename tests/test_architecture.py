@@ -17,10 +17,12 @@ LAYERS = (
     "errors progress settings values store lock geometry images matching calibration surface tracking "
     "body fitting motion keypoint_sources take take_file results fit_sources measuring measured following "
     "frame_table inspection correcting calibrating footage_files checking report stages pipeline "
-    "arguments calibrate_command track2d_command contour_command points_command check_command commands"
+    "arguments calibrate_command track2d_command contour_command points_command check_command batch "
+    "batch_command commands"
 ).split()
 SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}
 THIRD_PARTY = {"numpy", "scipy", "cv2"}
+OPTIONAL = {"core/batch.py": {"dask", "distributed"}}  # the extra [batch]; imported only when it is used
 NETWORK = {"socket", "ssl", "http", "urllib", "ftplib", "smtplib", "xmlrpc", "requests", "asyncio"}
 SERIALIZERS = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "joblib"}
 LONGEST_FILE = 400
@@ -66,8 +68,11 @@ def layer_order(name: str, source: str) -> list[str]:
 
 
 def core_is_pure(name: str, source: str) -> list[str]:
-    """Core uses the standard library, numpy, scipy and cv2: no bpy, no mathutils."""
+    """Core uses the standard library, numpy, scipy and cv2: no bpy, no mathutils; Dask in one place, which loads without it."""
     known = THIRD_PARTY | set(sys.stdlib_module_names)
+    head = {alias.name.split(".")[0] for node in ast.parse(source).body if isinstance(node, ast.Import) for alias in node.names}
+    head |= {str(node.module).split(".")[0] for node in ast.parse(source).body if isinstance(node, ast.ImportFrom) and not node.level}
+    known |= OPTIONAL.get(name, set()) - head
     return [
         f"{name}:{line} imports {module[0]}"
         for line, relative, module in imported(name, source)
@@ -143,6 +148,8 @@ REJECTED: list[tuple[Rule, str, str]] = [
     (core_is_pure, "core/body/skin.py", "import bpy"),
     (core_is_pure, "core/body/skin.py", "from mathutils import Vector"),
     (core_is_pure, "core/report.py", "def draw():\n    import matplotlib.pyplot"),
+    (core_is_pure, "core/pipeline.py", "def f():\n    from distributed import Client"),
+    (core_is_pure, "core/batch.py", "from distributed import Client"),
     (bpy_stays_in_the_addon, "__init__.py", "import bpy"),
     (bpy_stays_in_the_addon, "__init__.py", "from . import addon"),
     (imports_are_relative, "core/take.py", "from tricap.core.errors import InputError"),
@@ -163,6 +170,7 @@ ACCEPTED: list[tuple[Rule, str, str]] = [
     (layer_order, "core/commands.py", "from .synthetic import arm\nfrom . import pipeline"),
     (layer_order, "addon/jobs.py", "from ..core import pipeline"),
     (core_is_pure, "core/images/sampling.py", "import json\nimport cv2\nimport numpy as np\nfrom scipy import ndimage"),
+    (core_is_pure, "core/batch.py", "def f():\n    from distributed import Client"),
     (bpy_stays_in_the_addon, "__init__.py", "def register():\n    from . import addon"),
     (imports_are_relative, "addon/jobs.py", "import bpy\nfrom ..core import pipeline"),
     (core_does_not_print, "core/commands.py", "print('done')"),

@@ -1,0 +1,133 @@
+"""Many takes on Dask: the results of one by one, whatever happens to the others or to a worker, and a summary that says so."""
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tricap.core import batch, commands, pipeline
+from tricap.core.batch import BUG, DONE, LOST, MEND, Engine, Outcome, out_folders, run_batch, run_take, summary
+from tricap.core.errors import InputError
+from tricap.core.lock import NAME
+from tricap.core.progress import Cancelled, Monitor
+
+COARSE = {"growing": {"spacing_px": 8}}
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def killing() -> ModuleType:
+    """How the files of two runs are compared."""
+    spec = importlib.util.spec_from_file_location("killing_for_batch", Path(__file__).parents[1] / "killing.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    import sys
+
+    sys.modules["killing_for_batch"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def takes(plane_take: Path, tmp_path: Path) -> list[Path]:
+    """A take, one without rig, and another take."""
+    folders = [Path(shutil.copytree(plane_take, tmp_path / "takes" / name)) for name in ("kick é", "no rig", "throw")]
+    (folders[1] / "rig.toml").unlink()
+    return folders
+
+
+def without_blend(files: dict[str, bytes]) -> dict[str, bytes]:
+    """One by one, in this test, makes no body.blend."""
+    return {name: data for name, data in files.items() if name != "body.blend"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="SIGKILL")
+def test_a_worker_killed_in_mid_take(takes: list[Path], tmp_path: Path, killing: ModuleType, capfd: Capture) -> None:
+    """The first take's worker dies when two of its frames are measured; all takes end as one by one, and the bad one is told."""
+    out, killed = tmp_path / "out", list[int]()
+
+    def kill() -> None:
+        while not (out / takes[0].name / "cache" / "surface" / "0001.npz").exists():
+            time.sleep(0.01)
+        killed.append(json.loads((out / takes[0].name / NAME).read_text())["pid"])
+        os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    code = commands.main(["batch", *map(str, takes), "--out", str(out), "--workers", "2", "--set", "growing.spacing_px=8"])
+    assert killed and killed[0] != os.getpid() and code == 2
+    printed = capfd.readouterr()
+    assert "3 takes: 2 done, 1 needs mending" in printed.out and "kick é: surface" in printed.err
+    told = json.loads((out / "batch.json").read_text())["takes"]
+    assert [t["status"] for t in told] == [DONE, MEND, DONE] and "rig.toml" in told[1]["said"]
+    for take in (takes[0], takes[2]):
+        pipeline.run(take, tmp_path / "single" / take.name, COARSE)
+        single, many = (without_blend(killing.contents(folder / take.name)) for folder in (tmp_path / "single", out))
+        assert killing.differences(single, many) == []
+    assert not (out / "no rig").exists()
+
+
+def test_a_scheduler_by_its_address(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers as threads of this process, so that they see what is patched here: a run that is short, and a bug."""
+    from distributed import LocalCluster
+
+    def stages(job: pipeline.Run, monitor: Monitor) -> None:
+        monitor.step("surface", 1, 2)
+        if job.footage.take.folder.name == "throw":
+            raise ZeroDivisionError("ours")
+
+    monkeypatch.setattr(pipeline, "all_stages", stages)
+    monkeypatch.setattr(batch, "_scene", lambda job: None)
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        engine = Engine(scheduler=cluster.scheduler_address)
+        outcomes = run_batch(takes, tmp_path / "out", engine, COARSE, Monitor())
+        assert [o.status for o in outcomes] == [DONE, MEND, BUG]
+        assert "throw_error.txt" in outcomes[2].said and "ZeroDivisionError: ours" in (tmp_path / "out" / "throw_error.txt").read_text()
+        monitor = Monitor()
+        monitor.cancel()
+        with pytest.raises(Cancelled):
+            run_batch(takes, tmp_path / "other", engine, {}, monitor)
+    assert {t["status"] for t in json.loads((tmp_path / "other" / "batch.json").read_text())["takes"]} <= {"waiting", MEND, DONE, BUG}
+
+
+def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch.importlib.util, "find_spec", lambda name: None)  # no Blender
+    told = run_take(str(takes[0]), str(tmp_path / "out"), COARSE, False)
+    assert told["status"] == DONE and "4 frames" in told["said"] and (tmp_path / "out" / "report" / "report.html").exists()
+    (tmp_path / "file").write_text("")
+    assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == MEND
+
+
+def test_without_dask(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture) -> None:
+    monkeypatch.setattr(batch.importlib.util, "find_spec", lambda name: None)
+    assert commands.main(["batch", str(takes[0]), "--out", str(tmp_path / "out")]) == 2
+    assert capfd.readouterr().err == f"tricap: {batch.MISSING}\n"
+
+
+def test_no_scheduler_there(takes: list[Path], tmp_path: Path, capfd: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "CONNECT_S", 0.5)
+    assert commands.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9", "--quiet"]) == 2
+    assert "No Dask scheduler answers at tcp://127.0.0.1:9" in capfd.readouterr().err.splitlines()[-1]
+    assert commands.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--workers", "0"]) == 2
+
+
+def test_names_of_results(tmp_path: Path) -> None:
+    a, b, c = tmp_path / "monday" / "kick", tmp_path / "tuesday" / "kick", tmp_path / "throw"
+    assert [p.name for p in out_folders([a, b, c], tmp_path)] == ["monday_kick", "tuesday_kick", "throw"]
+    with pytest.raises(InputError, match="is named twice"):
+        out_folders([a, a], tmp_path)
+
+
+def test_the_summary() -> None:
+    fine = Outcome(take="/t/a", out="/o/a", status=DONE, said="fine", seconds=61.0)
+    lost = Outcome(take="/t/bb", out="/o/bb", status=LOST, said="")
+    lines = summary([fine, lost])
+    assert lines[0].startswith("a   done") and "61.0 s  fine" in lines[0] and lines[-1] == "2 takes: 1 done, 1 lost"
