@@ -27,7 +27,8 @@ def property_of(field: "dataclasses.Field[Any]") -> Any:
     """
     meta, default = field.metadata, field.default
     unit = f" [{meta['unit']}]" if meta.get("unit") else ""
-    words: dict[str, Any] = dict(name=field.name.replace("_", " ") + unit, description=meta.get("about", "").rstrip("."))
+    words: dict[str, Any] = dict(name=title(field.name, meta.get("unit", "")) + unit, description=meta.get("about", "").rstrip("."))
+    words["update"] = take_properties.tell_touched
     if isinstance(default, bool):
         return bpy.props.BoolProperty(default=default, **words)
     if isinstance(default, str) and meta.get("choices"):
@@ -40,6 +41,12 @@ def property_of(field: "dataclasses.Field[Any]") -> Any:
     if isinstance(default, float):
         return bpy.props.FloatProperty(default=default, precision=4, **limits, **words)
     raise TypeError(f"Knob {field.name} is a {type(default).__name__}, for which there is no property")
+
+
+def title(name: str, unit: str) -> str:
+    """What a knob is called on screen: "patch_px" in px is Patch."""
+    short = name.removesuffix("_" + unit.replace("/", "_").replace("²", "2")) if unit else name
+    return short.replace("_", " ").title()
 
 
 def group_class(name: str, settings: type) -> type:
@@ -99,9 +106,9 @@ def register() -> None:
     """Make the classes of all stages and hang them onto the scene as `scene.tricap`."""
     groups = {name: group_class(name, settings) for name, settings in stages().items()}
     annotations: dict[str, Any] = {
-        "take": bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,
+        "take": bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE, update=take_properties.tell_touched,
                                          description="Folder of the recording; it holds take.toml"),
-        "out": bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,
+        "out": bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE, update=take_properties.tell_touched,
                                         description="Folder for the results; empty: beside the .blend, or beside the take"),
         "last": bpy.props.StringProperty(name="Result", description="What the last run found"),
     }

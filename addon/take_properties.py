@@ -1,11 +1,13 @@
 """What the scene keeps of a take besides its clips and clicks: the views in their order, and what take.toml says of the whole recording."""
 
+from collections.abc import Callable
 from typing import Any
 
 import bpy
 
 from ..core.images.fields import INTERLACE
 
+TOUCHED: list[Callable[[], None]] = []  # told when a value of the panel was changed
 MODELS = (
     ("none", "No Body", "Clouds and trajectories only"),
     ("full", "Whole Body", "All limbs"),
@@ -21,14 +23,22 @@ LINES = {"none": ("Progressive", "Every image is whole"),
          "even": ("Even Lines", "Interlaced video: keep lines 2, 4, 6 …")}
 
 
+def tell_touched(_: Any, __: Any) -> None:
+    """Somebody changed a value; Blender does not tell of changes by scripts otherwise."""
+    for listener in TOUCHED:
+        listener()
+
+
 def _renamed(view: Any, _: bpy.types.Context) -> None:
     if view.clip is not None:
         view.clip["tricap_view"] = view.name
+    tell_touched(view, _)
 
 
 def _shifted(view: Any, _: bpy.types.Context) -> None:
     if view.clip is not None:
         view.clip.frame_start = -view.offset_frames
+    tell_touched(view, _)
 
 
 class View(bpy.types.PropertyGroup):
@@ -45,22 +55,25 @@ class View(bpy.types.PropertyGroup):
 
 def annotations() -> dict[str, Any]:
     """The properties, for the group that hangs on the scene."""
-    props = bpy.props
+    props, told = bpy.props, dict(update=tell_touched)
     return {
         "views": props.CollectionProperty(type=View),
         "view_index": props.IntProperty(name="View"),
         "fps": props.FloatProperty(name="Frame Rate", default=25.0, min=0.1, max=10_000.0, precision=3,
-                                   description="Images per second of the footage"),
+                                   description="Images per second of the footage", **told),
         "interlaced": props.EnumProperty(name="Lines", items=[(name, *LINES[name]) for name in INTERLACE],
-                                         description="Which lines of interlaced video are measured"),
+                                         description="Which lines of interlaced video are measured", **told),
         "reference_view": props.StringProperty(name="Reference View",
-                                               description="The view that the others are compared with; empty: the middle one"),
-        "all_frames": props.BoolProperty(name="All Frames", default=True, description="Measure all that the footage has"),
-        "first_frame": props.IntProperty(name="First", min=0, description="First frame to measure"),
-        "last_frame": props.IntProperty(name="Last", min=0, description="Last frame to measure"),
-        "model": props.EnumProperty(name="Body", items=MODELS, default="full", description="Which part of the body is filmed and fitted"),
-        "model_file": props.StringProperty(name="Model File", description="Name of the .toml model in the project's folder"),
+                                               description="The view that the others are compared with; empty: the middle one", **told),
+        "all_frames": props.BoolProperty(name="All Frames", default=True, description="Measure all that the footage has", **told),
+        "first_frame": props.IntProperty(name="First", min=0, description="First frame to measure", **told),
+        "last_frame": props.IntProperty(name="Last", min=0, description="Last frame to measure", **told),
+        "model": props.EnumProperty(name="Body", items=MODELS, default="full",
+                                    description="Which part of the body is filmed and fitted", **told),
+        "model_file": props.StringProperty(name="Model File", description="Name of the .toml model in the project's folder", **told),
         "seed_frame": props.IntProperty(name="Seed Frame", min=0,
-                                        description="The frame in which the joints are clicked; measuring starts from it"),
+                                        description="The frame in which the joints are clicked; measuring starts from it", **told),
+        "check_said": props.StringProperty(name="Check", description="What the check of footage and cameras found"),
+        "check_key": props.StringProperty(options={"HIDDEN"}),
         "take_digest": props.StringProperty(options={"HIDDEN"}),
     }

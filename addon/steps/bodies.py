@@ -13,7 +13,7 @@ from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
 from ..panels import sentence
 from ..retarget.panel import draw_retarget
-from . import states, watch
+from . import check, states, watch
 
 KNOBS = {  # what a person touches; the others are under Advanced
     "surface": (("matching", "patch_px"), ("growing", "spacing_px")),
@@ -92,6 +92,14 @@ def cameras(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
     column.enabled = project.bound(context.scene)
     primary(column, "tricap.cameras_from_file", is_next, icon="FILE_CACHE", text="From a Calibration File")
     column.operator("tricap.cameras_from_scene", icon="OUTLINER_OB_CAMERA", text="From This Scene's Cameras")
+    now, props = watch.look(context.scene), context.scene.tricap
+    if now.states["cameras"].word == "done":
+        column.operator("tricap.check", icon="VIEWZOOM")
+        if props.check_said and props.check_key == now.keys.get("measure"):
+            for line in props.check_said.splitlines():
+                sentence(column.box(), context, line, "CHECKMARK" if line == check.GOOD else "INFO")
+            if "offset" in props.check_said:
+                column.operator("tricap.mend_offsets", icon="TIME")
 
 
 def seeds_of(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
@@ -178,8 +186,8 @@ def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) 
         _section(layout, context, "onto", "Onto a Character", draw_retarget)
     if step == "footage":
         _section(layout, context, "where", "Advanced", _where)
-    for group in CONCERNS[states.STAGE[step]].settings if step in states.STAGE else ():
-        _section(layout, context, group, f"Advanced: {group}", lambda inside, _, group=group: _knobs(inside, context, step, group))
+    if step in states.STAGE:
+        _section(layout, context, f"knobs_{step}", "Advanced", lambda inside, _: _knobs(inside, context, step))
 
 
 def _section(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, title: str, draw: Any) -> None:
@@ -198,7 +206,12 @@ def _where(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     layout.prop_search(props, "reference_view", props, "views", icon="CAMERA_DATA")
 
 
-def _knobs(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, group: str) -> None:
-    for field in dataclasses.fields(properties.stages()[group]):
-        if (group, field.name) not in KNOBS[step]:
-            layout.prop(getattr(context.scene.tricap, group), field.name)
+def _knobs(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
+    """All the knobs of a step's groups, made from core's definitions."""
+    for group in CONCERNS[states.STAGE[step]].settings:
+        header, inside = layout.panel(f"tricap_group_{group}", default_closed=True)
+        header.label(text=group.capitalize())
+        if inside is not None:
+            for field in dataclasses.fields(properties.stages()[group]):
+                if (group, field.name) not in KNOBS[step]:
+                    inside.prop(getattr(context.scene.tricap, group), field.name)

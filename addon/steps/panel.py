@@ -41,7 +41,7 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         header.label(text=f"{STEPS.index(step) + 1}  {TITLES[STEPS.index(step)]}", icon=ICONS[state.word])
         word = header.row()
         word.alignment, word.alert = "RIGHT", state.word in ("failed", "stale")
-        word.label(text=("next" if step == now.next and state.word == "ready" else state.word) + " ")
+        word.label(text=("next" if step == now.next and state.word in ("ready", "empty") else state.word) + " ")
         if body is None:
             return
         column = body.column()
@@ -63,7 +63,7 @@ def tell(layout: bpy.types.UILayout, context: bpy.types.Context, state: State) -
 def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """What runs, how far it is, how long it still takes, and how to stop it."""
     job = context.window_manager.tricap
-    layout.progress(factor=job.progress, text=f"{job.stage}  {job.progress:.0%}  {job.left}", type="BAR")
+    layout.progress(factor=job.progress, text=f"{job.stage.capitalize()}  {job.progress:.0%}  {job.left}", type="BAR")
     layout.operator("tricap.cancel", icon="X", text="Cancel (Esc)")
 
 

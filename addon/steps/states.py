@@ -24,7 +24,7 @@ from .. import folders, project
 from ..scene.build import KEYS_KEY, OUT_KEY
 
 STEPS = ("footage", "cameras", "seeds", "surface", "tracks", "body", "rig", "retarget")
-TITLES = ("Footage", "Cameras", "Seeds", "Surface", "Tracks", "Body", "Rig", "Retarget and Export")
+TITLES = ("Footage", "Cameras", "Seeds (Joint Clicks)", "Surface", "Tracks", "Body", "Rig", "Retarget and Export")
 STAGE = {"surface": "measure", "tracks": "track", "body": "fit"}  # the stage of core that a step runs
 WRITES = {"surface": "clouds", "tracks": "trajectories.npz", "body": "motion.csv"}
 NEEDED_JOINTS = 2  # the fit's own least number
@@ -49,6 +49,8 @@ class Look:
     @property
     def next(self) -> str | None:
         """The step that is the next thing to do: the first that is not done."""
+        if self.states["footage"].word == "empty":
+            return "footage"
         return next((step for step in STEPS if self.states[step].word in ("ready", "stale", "failed")), None)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import InputError
-from .. import folders, jobs, project
+from .. import folders, jobs, project, take_properties
 from . import states
 from .states import STEPS, Look, State
 
@@ -137,6 +137,7 @@ def register() -> None:
     for name, handler in HANDLERS.items():
         getattr(bpy.app.handlers, name).append(handler)
     jobs.ENDED.append(_ended)
+    take_properties.TOUCHED.append(mark)
     bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
 
 
@@ -144,6 +145,7 @@ def unregister() -> None:
     """Watch no longer."""
     bpy.app.timers.unregister(_tick)
     jobs.ENDED.remove(_ended)
+    take_properties.TOUCHED.remove(mark)
     for name, handler in HANDLERS.items():
         getattr(bpy.app.handlers, name).remove(handler)
     del bpy.types.WindowManager.tricap_steps

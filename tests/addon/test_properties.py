@@ -52,7 +52,7 @@ def test_limits_units_and_words(group: tuple) -> None:
     kinds.patch_px = 1000
     assert kinds.patch_px == 101
     definition = kinds.bl_rna.properties["patch_px"]
-    assert (definition.name, definition.description) == ("patch px [px]", "Width of a patch")
+    assert (definition.name, definition.description) == ("Patch [px]", "Width of a patch")
     assert [item.identifier for item in kinds.bl_rna.properties["method"].enum_items] == ["fast", "exact"]
 
 

@@ -1,0 +1,65 @@
+"""bpy.ops.tricap.check(), bpy.ops.tricap.mend_offsets()"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+
+from ...core.checking.findings import Checked
+from ...core.checking.take_check import check_take
+from ...core.progress import Monitor
+from .. import project
+from ..jobs import JobOperator
+from . import watch
+from .footage import Told
+
+GOOD = "Nothing to complain about."
+_late: dict[str, dict[str, int]] = {}  # by the key of what was checked: by how many whole frames each view is late
+
+
+class Check(JobOperator, bpy.types.Operator):
+    """See whether the footage is in step, the cameras belong to it, no views are swapped, and there is texture to measure"""
+
+    bl_idname = "tricap.check"
+    bl_label = "Check Footage, Cameras and Sync"
+    step = "cameras"
+    last_words = "Nothing was changed."
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Checked]:
+        """The project, as the scene says it."""
+        folder: Path = project.chosen(context.scene, "", "")[0]
+        return lambda monitor: check_take(folder, monitor)
+
+    def finish(self, context: bpy.types.Context, result: Checked) -> set[str]:
+        """Keep what was found, for the panel."""
+        props = context.scene.tricap
+        props.check_said = "\n".join(str(finding) for finding in result.findings) or GOOD
+        props.check_key = watch.refresh(context.scene).keys.get("measure", "")
+        offsets = result.figures.get("offsets", {})
+        _late[props.check_key] = {view: round(o["late_frames"]) for view, o in offsets.items() if o["late_frames"] is not None}  # type: ignore
+        for line in props.check_said.splitlines():
+            self.report({"INFO" if line == GOOD else "WARNING"}, line)
+        return {"FINISHED"}
+
+
+class MendOffsets(Told, bpy.types.Operator):
+    """Set the views' offsets as the check found them, in whole frames"""
+
+    bl_idname = "tricap.mend_offsets"
+    bl_label = "Set Offsets"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only with a check of this session that found something to set."""
+        return any(_late.get(context.scene.tricap.check_key, {}).values())
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Set them."""
+        late = _late[context.scene.tricap.check_key]
+        for view in context.scene.tricap.views:
+            view.offset_frames -= late.get(view.name, 0)
+        return "Offsets: " + ", ".join(f"{view.name} {view.offset_frames}" for view in context.scene.tricap.views)
+
+
+CLASSES = (Check, MendOffsets)
