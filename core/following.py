@@ -19,9 +19,10 @@ from .tracking.settings import TrackingSettings
 from .tracking.step import FramePair, TrackingView, track_step
 from .tracking.surface import on_surface, regenerate, start_tracks
 from .tracking.templates import Templates, Tiles, cut_tiles, no_templates
-from .tracking.tracked import TrackedFrame, nothing
+from .tracking.tracked import TrackedFrame, joined, nothing
+from .tracking.waiting import Waiting, nobody
 
-ALGORITHM = "tracking 6"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 7"  # part of every key: raise it when the same input gives other numbers
 DROPOUT = 0.1  # of the points: where fewer are found in a frame, it is the frame that is missing
 
 
@@ -32,16 +33,20 @@ class _State:
     before: TrackedFrame | None
     current: TrackedFrame | None
     templates: Templates
+    waiting: Waiting
     born: int  # the next identity
 
     def after(self, tracked: TrackedFrame, cut: Tiles, view: TrackingView) -> "_State":
         """The state after a frame, with the templates that were cut in it; a frame that was left out changes nothing."""
         if self.current is not None and not len(tracked.identity) and not len(tracked.ended):
             return self
+        waiting = self.waiting if self.current is None else self.waiting.after(self.current, tracked, view.tracking)
+        wanted = np.concatenate([tracked.identity, waiting.points.identity])
         return _State(
             before=self.current,
             current=tracked,
-            templates=self.templates.only(tracked.identity).with_tiles(cut, view.matching, view.rows.step),
+            templates=self.templates.only(wanted).with_tiles(cut, view.matching, view.rows.step),
+            waiting=waiting,
             born=max([self.born, *(tracked.identity[-1:] + 1)]),
         )
 
@@ -57,7 +62,8 @@ def track_frames(
 ) -> Iterator[TrackedFrame]:
     """Follow the surface through the frames (in the order of time), in which rays were allowed to miss by `limit_px`."""
     view = tracking_view(footage, matching, tracking, limit_px)
-    state = _State(before=None, current=None, templates=no_templates(view.matching, view.rows.step), born=0)
+    none = no_templates(view.matching, view.rows.step)
+    state = _State(before=None, current=None, templates=none, waiting=nobody(len(view.cameras)), born=0)
     key = store.digest(ALGORITHM, repr((matching, tracking, limit_px)))
     images: FrameImages | None = None
     for i, m in enumerate(measured):
@@ -106,7 +112,9 @@ def _advance(
     tracked = track_step(view, state.before, state.current, state.templates, pair, m.frame, monitor)
     if len(tracked.identity) < DROPOUT * len(state.current.identity) and m.frame - state.current.frame <= view.tracking.bridge_frames:
         return nothing(m.frame, len(view.cameras))
-    tracked = on_surface(tracked, m.field, m.cloud, view)
+    waiting = state.waiting.carried(state.current, tracked, view.tracking)
+    regained = on_surface(waiting.retaken(view, state.templates, following.spline), m.field, m.cloud, view)
+    tracked = joined(on_surface(tracked, m.field, m.cloud, view), regained)
     every = view.tracking.regenerate_every
     return regenerate(tracked, m.field, m.cloud, view, state.born) if every and index % every == 0 else tracked
 

@@ -36,6 +36,9 @@ class TrackingSettings:
     bridge_frames: int = knob(
         3, "So many frames may be missing or black before all trajectories end (0: none).", unit="frames", low=0, high=100
     )
+    wait_frames: int = knob(
+        5, "So many frames a lost point is looked for where its neighbours take it (0: it ends at once).", unit="frames", low=0, high=100
+    )
     max_speed: float = knob(10.0, "Trajectories faster than this are cut.", unit="m/s", low=0.1, high=100.0)
     max_acceleration: float = knob(150.0, "Trajectories that accelerate more than this are cut.", unit="m/s²", low=1.0, high=10_000.0)
     uniformity: str = knob(

@@ -84,8 +84,7 @@ def test_new_points_start_where_the_surface_has_none(tmp_path: Path, scenes: Any
     assert all((np.diff(s.identity) > 0).all() for s in steps) and identities.max() + 1 == len(np.unique(identities))
     none = scenes.track(take, tmp_path / "none", measured, {"tracking": {"regenerate_every": 0}})
     assert all(set(s.identity) <= set(none[0].identity) for s in none)
-    ended = np.concatenate([s.ended for s in steps])
-    assert len(ended) == len(np.unique(ended))  # nobody ends twice
+    assert all(len(s.ended) == len(np.unique(s.ended)) for s in steps)
     for before, after in zip(steps, steps[1:]):
         assert set(before.identity) - set(after.identity) == set(after.ended)
 
@@ -103,6 +102,25 @@ def test_a_point_that_is_covered_ends_and_says_why(tmp_path: Path, scenes: Any) 
     before = steps[1].xyz_m[np.searchsorted(steps[1].identity, steps[2].identity)]
     moved = np.linalg.norm(steps[2].xyz_m[:, :2] - before[:, :2], axis=1)
     assert moved.max() < 0.3 * scenes.pixel_m
+
+
+def test_lost_points_wait_and_go_on_under_their_identity(tmp_path: Path, scenes: Any) -> None:
+    """A bar passes before a travelling plane in one frame: what it hid is taken up again in its place, and without waiting it is not."""
+    bodies = [scenes.Body(half_m=(0.24, 0.18)).moved(np.eye(3), [0.004 * i, 0.002 * i, 0.0]) for i in range(4)]
+    bar = scenes.Body(half_m=(0.01, 0.3), t=np.array([0.0, 0.0, 1.95]), seed=5)
+    shown = [[b, bar] if i == 2 else [b] for i, b in enumerate(bodies)]
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), shown, noise=1.0)
+    measured = scenes.measure(take, tmp_path / "out")
+    regained = {}
+    for wait in (5, 0):
+        steps = scenes.track(take, tmp_path / "out", measured, {"tracking": {"regenerate_every": 0, "wait_frames": wait}})
+        hidden = np.setdiff1d(steps[1].identity, steps[2].identity)
+        regained[wait] = np.isin(hidden, steps[3].identity)
+        back = np.isin(steps[3].identity, hidden)
+        was = steps[1].xyz_m[np.searchsorted(steps[1].identity, steps[3].identity[back])]
+        away = np.linalg.norm((steps[3].xyz_m[back] - was)[:, :2] - [0.008, 0.004], axis=1)
+        assert len(hidden) > 20 and (away < 0.3 * scenes.pixel_m).all()
+    assert regained[5].mean() > 0.8 and not regained[0].any()
 
 
 def step(frame: int, identity: list[int], xyz: object, ended: list[int] | None = None) -> Any:
