@@ -29,7 +29,7 @@ from .take import Clicks, Footage
 
 ALGORITHM = "surface 4"  # part of every key: raise it when the same input gives other numbers
 CLICK_SIGMA_PX = 4.0
-CLICK_MISS_PX = 25.0
+CLICK_MISS_PX = 3 * CLICK_SIGMA_PX  # from each click to where the rays meet: two clicks may be 24 px apart across their epipolar lines
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
 

@@ -20,11 +20,9 @@ import cv2
 import numpy as np
 
 from ..settings import knob
+from .sampling import noise_sigma
 
 NOISE_SIGMAS = 2.0
-IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6  # unit response to white noise
-MIN_NOISE = 0.3  # grey values: rounding alone
-SATURATED = 0.02
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -59,18 +57,6 @@ def wallis(image: np.ndarray, settings: EnhanceSettings, *, row_step: int = 1) -
     c, b, target = np.float32(settings.contrast_share), np.float32(settings.mean_share), np.float32(settings.contrast)
     gain = c * target / (c * s + (1 - c) * target)
     return (d - m) * gain + b * np.float32(settings.mean) + (1 - b) * (m + centre)
-
-
-def noise_sigma(image: np.ndarray) -> float:
-    """Standard deviation of the sensor's noise [grey values], from what a plane does not explain; at least that of rounding.
-
-    The median keeps texture out, as long as half of the image is smooth at the scale of a pixel; saturated pixels have no noise.
-    """
-    g = np.asarray(image, dtype=np.float32)
-    inner = g[1:-1, 1:-1]
-    usable = (inner > g.min() + SATURATED * 255) & (inner < g.max() - SATURATED * 255)
-    residual = np.abs(cv2.filter2D(g, cv2.CV_32F, IMMERKAER)[1:-1, 1:-1])[usable]
-    return max(MIN_NOISE, float(np.median(residual)) / 0.6745) if residual.size > 100 else MIN_NOISE
 
 
 def texture_strength(image: np.ndarray, *, row_step: int = 1) -> float:

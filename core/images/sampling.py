@@ -12,6 +12,9 @@ from scipy.interpolate import BSpline
 from scipy.ndimage import spline_filter1d
 
 FINENESS, ORDER = 4, 5
+IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6  # unit response to white noise
+MIN_NOISE = 0.3  # grey values: rounding alone
+SATURATED = 0.02
 LONGEST_LOOK_UP = 32_000  # OpenCV looks up at most 32,766 rows at once
 
 
@@ -92,13 +95,17 @@ def _width(sigma_px: float) -> int:
     return 2 * round(4 * sigma_px) + 1
 
 
-def noise_sigma(grey: np.ndarray) -> float:
-    """Standard deviation of the noise of an image, from its second differences (Immerkær 1996, doi:10.1006/cviu.1996.0060), robust."""
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-    if min(grey.shape) < 3:
-        return 0.0
-    response = np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel)[1:-1, 1:-1])
-    return float(np.median(response)) / (0.6745 * 6.0)
+def noise_sigma(image: np.ndarray) -> float:
+    """Standard deviation of the sensor's noise [grey values], from what a plane does not explain; at least that of rounding.
+
+    Second differences (Immerkær 1996, doi:10.1006/cviu.1996.0060); their median keeps texture out, as long as half of the image is smooth
+    at the scale of a pixel. Saturated pixels have no noise.
+    """
+    g = np.asarray(image, dtype=np.float32)
+    inner = g[1:-1, 1:-1]
+    usable = (inner > g.min() + SATURATED * 255) & (inner < g.max() - SATURATED * 255)
+    residual = np.abs(cv2.filter2D(g, cv2.CV_32F, IMMERKAER)[1:-1, 1:-1])[usable]
+    return max(MIN_NOISE, float(np.median(residual)) / 0.6745) if residual.size > 100 else MIN_NOISE
 
 
 def _refine(image: np.ndarray, axis: int) -> np.ndarray:

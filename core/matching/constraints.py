@@ -20,7 +20,7 @@ from ..geometry.camera import Camera
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from .foreground import Foreground
-from .growing import LESS_SURE, RETRY_SMOOTHING_PX, TEMPLATE_SIGMA_PX, TripletField
+from .growing import RETRY_SMOOTHING_PX, TEMPLATE_SIGMA_PX, TripletField, loosened
 from .least_squares import MatchingSettings, MatchStatus, patch_offsets
 from .multi_image import MultiImageMatches, match_multi_image
 from .neighbourhood import RADIUS_CELLS, NeighbourFit, fit_neighbours, neighbours_of
@@ -40,7 +40,7 @@ MEDIAN_OF_CHI2 = 0.4549
 SCATTER_SHARE = 0.3  # of the neighbours' scatter about their quadric: what the model does not follow
 # Limits of a piece of surface: held by all views and its neighbours, it may look less alike in each; and its sigma is honest,
 # on skin up to four times the naive one.
-LOOSER, LESS_ALIKE = 2.0, 0.15
+LOOSER = 2.0
 MAX_STEEPNESS = 5.0  # change of depth per distance across
 OUTLINE_SIGMA_PX = 1.3  # across the ray where no neighbour supports a point: at an outline the patch hangs over the edge
 
@@ -100,13 +100,7 @@ def _object_space(
     around = _surface_of(field, cameras[reference], reference, speed)
     xy, start = field.grid.xy(field.cell), around.coefficients[:, : 6 if neighbours else 3]
     prior = _prior(start, speed)
-    wide = replace(
-        settings,
-        patch_px=settings.patch_px + WINDOW_EXTRA_PX,
-        max_sigma_px=LESS_SURE * settings.max_sigma_px,
-        max_sigma0=LOOSER * settings.max_sigma0,
-        min_correlation=max(0.0, settings.min_correlation - LESS_ALIKE),
-    )
+    wide = replace(loosened(settings), patch_px=settings.patch_px + WINDOW_EXTRA_PX, max_sigma0=LOOSER * settings.max_sigma0)
 
     def match(
         which: np.ndarray, prior: SurfacePrior, sigma_c: float, views: Sequence[SplineImage] = images, extra_px: int = 0

@@ -29,7 +29,8 @@ EQUAL_SIGMA_PX = 1.0  # far above matching's own: all rays weigh alike
 PATCH_STEP_PX = 4
 SMOOTH_FROM = 2
 RETRY_SMOOTHING_PX = 1.0  # what fails is weak texture: noise that is finer than its details is kept out
-LESS_SURE = 4.0  # the sigma of smoothed patches is honest: on skin up to four times the naive one
+# Limits where sigmas are honest, on skin up to four times the naive one, and the texture is little more than the noise.
+LESS_SURE, LESS_ALIKE = 4.0, 0.15
 LARGEST_PATCH_M = 0.03
 SEED_MEDIANS, MAX_LIMIT_PX = 3.0, 2.5
 
@@ -145,7 +146,7 @@ def grow(
             state.attempts[:] = 0
             cells, start, shape, parent_depth = _front_from(state, np.flatnonzero(state.accepted), grid, growing.attempts, camera)
         if level >= SMOOTH_FROM:
-            settings = replace(settings, max_sigma_px=LESS_SURE * matching.max_sigma_px)
+            settings = loosened(settings)
             views = [image.smoothed(RETRY_SMOOTHING_PX, grid.rows.step) for image in images]
         while len(cells):
             monitor.step("surface", int(state.accepted.sum()), n_cells)
@@ -157,6 +158,12 @@ def grow(
             state.smoothed[cells[good]] = level >= SMOOTH_FROM
             cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
     return _field(state, grid, limit_px)
+
+
+def loosened(matching: MatchingSettings) -> MatchingSettings:
+    """The settings with the limits for matches whose sigmas are honest."""
+    less_alike = max(0.0, matching.min_correlation - LESS_ALIKE)
+    return replace(matching, max_sigma_px=LESS_SURE * matching.max_sigma_px, min_correlation=less_alike)
 
 
 def rounds_of_larger_patches(matching: MatchingSettings, growing: GrowingSettings, depth_m: np.ndarray, camera: Camera) -> int:

@@ -25,7 +25,7 @@ class SurfaceSettings:
 
     min_island: int = knob(20, "Groups of fewer connected points than this are removed.", low=1, high=10_000)
     max_deviation: float = knob(4.0, "Largest distance from the neighbours' surface, in units of their scatter.", low=1.0, high=20.0)
-    correct_curvature: bool = knob(True, "Correct the flattening of round surfaces by the patch.")
+    correct_curvature: bool = knob(True, "Correct round surfaces' flattening by the patch; matching in object space needs no correction.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

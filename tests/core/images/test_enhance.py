@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from tricap.core.images.enhance import EnhanceSettings, enhanced, noise_sigma, texture_strength, wallis
+from tricap.core.images.enhance import EnhanceSettings, enhanced, texture_strength, wallis
+from tricap.core.images.sampling import noise_sigma
 
 
 def textured(contrast: float, noise: float, seed: int = 0, blur: float = 1.5) -> np.ndarray:
