@@ -96,4 +96,4 @@ def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np
 
 
 def _observe(fit: Conditions, points: CloudPoints, wide: float) -> Callable[[int, BodyState], list[Observation]]:
-    return lambda t, state: [fit.surface(points, state, wide), *fit.joints(fit.click), *fit.priors]
+    return lambda t, state: [fit.surface(points, state, wide), *fit.joints(fit.click), *fit.beliefs(state)]

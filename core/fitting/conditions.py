@@ -12,6 +12,7 @@ from .acceleration import Acceleration
 from .clicks import Clicks
 from .cloud_points import CloudPoints
 from .joint_tracks import JointTracks
+from .limbs_apart import LimbsApart
 from .observations import ClickedJoints, EqualRadii, Observation, ShapePrior, SurfacePoints, Symmetry
 from .problem import Problem
 from .robust import robust_weights
@@ -38,6 +39,11 @@ class Conditions:
     clicked: Mapping[int, ClickedJoints]  # by frame index
     tracks: JointTracks
     silhouettes: Silhouettes
+    limbs: LimbsApart
+
+    def beliefs(self, state: BodyState) -> list[Observation]:
+        """What is known of any posture: limits, beliefs, and that limbs are no ghosts."""
+        return [*self.priors, *self.limbs.observe(state)]
 
     def joints(self, t: int) -> list[Observation]:
         """What is known of the joints in frame index `t`: clicks and keypoints."""

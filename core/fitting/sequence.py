@@ -28,6 +28,7 @@ from .fit_input import FitInput
 from .frame_to_frame import follow
 from .inverse_kinematics import clicked_stature, dof_priors, lasting
 from .joint_tracks import JointTracks
+from .limbs_apart import LimbsApart
 from .material_tracks import MaterialTracks
 from .observations import Observation
 from .problem import Problem, linearise, variance_factors
@@ -90,7 +91,8 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
     return Conditions(cameras=given.rig.cameras, model=model, parameters=ShapeParameters(shape), settings=settings, clicks=clicks,
                       click=begin, priors=priors, clicked=clicked, tracks=tracks,
-                      silhouettes=Silhouettes(given, model.surface, settings))
+                      silhouettes=Silhouettes(given, model.surface, settings),
+                      limbs=LimbsApart(model.skeleton, shape.metaballs.bone_index))
 
 
 def _best_known(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
@@ -115,7 +117,7 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
 
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [fit.surface(points[t], state, held=held), *fit.joints(t), *fit.silhouettes.observe(t, state, held),
-                *priors]
+                *priors, *fit.limbs.observe(state)]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
     return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),

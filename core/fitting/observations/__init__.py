@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..state import BodyState
+from .apart import Apart
 from .blocks import Block, FromBlocks
 from .clicked_joint import ClickedJoints
 from .equal_radii import EqualRadii
@@ -20,8 +21,8 @@ from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
 from .symmetry import Symmetry
 
-__all__ = ["Block", "ClickedJoints", "EqualRadii", "FootOnFloor", "FromBlocks", "JointLimits", "Keypoints", "MaterialSteps", "MotionPrior",
-           "Observation", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints", "Symmetry"]
+__all__ = ["Apart", "Block", "ClickedJoints", "EqualRadii", "FootOnFloor", "FromBlocks", "JointLimits", "Keypoints", "MaterialSteps",
+           "MotionPrior", "Observation", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints", "Symmetry"]
 
 
 class Observation(Protocol):

@@ -59,7 +59,7 @@ class SurfacePoints(FromBlocks):
             if self.form == "paper":
                 scale = np.full(len(rows), 4 * THRESHOLD * VISIBLE * typical)
             else:
-                slope = np.linalg.norm(field.gradient, axis=1) * np.abs(_distance(field.F)[1])
+                slope = np.linalg.norm(field.gradient, axis=1) * np.abs(distance(field.F)[1])
                 scale = np.clip(slope, SCALE_RANGE[0] * typical, SCALE_RANGE[1] * typical)
             parts.append(_Scaled(rows=rows, bone=int(b), field=field, scale=scale, log_radius=field.shares @ _log_radii(field)))
         return replace(self, parts=tuple(parts))
@@ -107,7 +107,7 @@ class SurfacePoints(FromBlocks):
         return self.sigma_m[held.rows] * held.scale * np.exp(held.log_radius - held.field.shares @ _log_radii(field))
 
     def _value(self, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (THRESHOLD - F, np.full_like(F, -1.0)) if self.form == "paper" else _distance(F)
+        return (THRESHOLD - F, np.full_like(F, -1.0)) if self.form == "paper" else distance(F)
 
 
 def _log_radii(field: PartField) -> np.ndarray:
@@ -115,8 +115,8 @@ def _log_radii(field: PartField) -> np.ndarray:
     return np.log(field.state.balls.radii_m[field.part.balls][:, CROSS]).mean(axis=1)
 
 
-def _distance(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """D and dD/dF.  (1)"""
+def distance(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """D and dD/dF of values (N,) of a field.  (1)"""
     F = np.maximum(F, SMALLEST)
     u = -0.5 * np.log(F)
     root = np.sqrt(np.maximum(u, LINEAR))

@@ -5,11 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import limb_skin
 from tricap.core.errors import InputError
 from tricap.core.fitting.fit_input import FitInput, JointPlaces, ViewContours
+from tricap.core.fitting.limbs_apart import LimbsApart
+from tricap.core.fitting.observations import MotionPrior
+from tricap.core.fitting.problem import Problem
 from tricap.core.fitting.sequence import fit_sequence
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.solver import solve
+from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.raster import rasterize
 from tricap.core.tracking.contour import contour_of_mask, outward_normals
 
@@ -97,3 +104,22 @@ def test_keypoints_begin_the_fit_and_carry_it_without_clicks(make_scene, space) 
     assert np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2).mean() < 8e-3  # measured 6.3 mm
     with pytest.raises(InputError, match="at least two of the joints"):
         fit_sequence(_given(scene, clicks={}), SETTINGS)
+
+
+def test_a_hidden_arm_stays_outside_of_the_trunk() -> None:
+    model = read_model("full")
+    shape, names = default_shape(model), [bone.name for bone in model.skeleton.bones]
+    parameters, limbs = ShapeParameters(shape), LimbsApart(model.skeleton, shape.metaballs.bone_index)
+    motion = np.zeros(len(model.skeleton.dofs))
+    assert limbs.observe(parameters.state(motion, parameters.vector())) == []  # nothing touches anything at rest
+    layout = model.skeleton.layout
+    for name, angle in {"shoulder.R abduction": 30, "shoulder.R flexion": -10, "elbow.R flexion": 80, "shoulder.R twist": -75}.items():
+        motion[layout[name]] = np.radians(angle)
+    inside = parameters.state(motion, parameters.vector())
+    found = limbs.observe(inside)[0]
+    assert {names[b] for b in found.bone[found.residual(inside) > 1]} <= {"forearm.R", "hand.R"}
+    prior = MotionPrior(mean=motion, sigma=np.full(len(motion), np.radians(20)))
+    problem = Problem(parameters=parameters, observe=lambda t, state: [prior, *limbs.observe(state)])
+    freed = parameters.state(solve(problem, motion[None], parameters.vector(), steps=20).motion[0], parameters.vector())
+    before, after = (max(np.max(o.residual(state), initial=0.0) for o in limbs.observe(state)) for state in (inside, freed))
+    assert before > 3 and after < 1.0  # a centimetre

@@ -6,6 +6,7 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.fitting.observations import (
+    Apart,
     ClickedJoints,
     EqualRadii,
     FootOnFloor,
@@ -51,7 +52,14 @@ def _cases(parameters: ShapeParameters, state, rng):
             ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)), EqualRadii(sigma=0.1, log_ratio=0.3),
             FootOnFloor(joint=np.arange(joints), height_m=rng.normal(0, 0.1, joints), floor_m=0.1, sigma_m=0.02),
             Keypoints(joint=np.arange(joints), xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=rng.uniform(0.005, 0.02, joints)),
-            _rays(state, near, bone, sigma, rng), Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=0.03)]
+            _apart(state, rng), _rays(state, near, bone, sigma, rng), Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=0.03)]
+
+
+def _apart(state, rng):
+    """Places on the last bone that are less than a large radius away from the bone before it."""
+    last = len(state.lengths_m) - 1
+    return Apart(bone=np.full(6, last), fraction=rng.uniform(0.1, 0.6, 6), other=np.full(6, state.skeleton.parents[last]),
+                 radius_m=rng.uniform(0.5, 1.0, 6), sigma_m=0.01).scaled(state)
 
 
 def _rays(state, near, bone, sigma, rng):
