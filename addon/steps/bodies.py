@@ -15,10 +15,10 @@ from ..panels import sentence
 from ..retarget.panel import draw_retarget
 from . import check, states, watch
 
-KNOBS = {  # what a person touches; the others are under Advanced
+KNOBS: dict[str, tuple[tuple[str, str], ...]] = {  # what a person touches; the others are under Advanced
     "surface": (("matching", "patch_px"), ("growing", "spacing_px")),
     "tracks": (("tracking", "smooth_frames"), ("tracking", "min_length")),
-    "body": (("fitting", "gate_m"),),
+    "body": (),
 }
 
 
@@ -130,10 +130,12 @@ def _seeds(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
         clicked = seeds_of(context)
     except InputError:
         return  # the step's sentence says it
-    grid = layout.grid_flow(columns=2, even_columns=True, align=True)
+    column = layout.column(align=True)
+    column.scale_y = 0.8
     for name, views in clicked:
-        icon = "CHECKMARK" if len(views) > 1 else "LAYER_USED" if views else "BLANK1"
-        grid.label(text=f"{name}  {' '.join(views)}", icon=icon)
+        row = column.row()
+        row.label(text=name, icon="CHECKMARK" if len(views) > 1 else "LAYER_USED" if views else "BLANK1")
+        row.label(text="  ".join(views))
 
 
 def surface(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:

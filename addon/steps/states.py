@@ -144,6 +144,8 @@ def _seeds(scene: bpy.types.Scene, found: _Found) -> State:
         return State(word="empty", why="Comes after the footage.")
     if take.body_model is None:
         return State(word="done", why="No body is wanted: surface and tracks need no clicks.")
+    if take.keypoints:
+        return State(word="done", why="Keypoints of another system stand for clicks; clicks may be added.")
     wanted = joints_of(take.body_model)
     clicked = take.seeds.joints
     if found.footage is not None:

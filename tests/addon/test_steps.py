@@ -410,3 +410,15 @@ def test_time_left(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None
     job._note("tracks", 0, 20)
     assert job.seconds_left is None, "another stage, another pace"
     assert [jobs.time_words(s) for s in (40.2, 100, 3600, 7260)] == ["40 s", "2 min", "60 min", "2 h 1 min"]
+
+
+@pytest.mark.slow
+def test_the_script_in_the_readme_runs(blender: ModuleType, words: Words, sample: Path, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    script = next(part for part in text.split("```python\n")[1:] if "add_footage" in part).split("```")[0]
+    shutil.copytree(sample, tmp_path / "films" / "kick")
+    (tmp_path / "films" / "kick" / "take.toml").unlink()
+    shutil.copytree(sample, tmp_path / "takes" / "jump")
+    exec(script.replace('"/films', f'"{tmp_path}/films').replace('"/takes', f'"{tmp_path}/takes'), {})
+    assert words().startswith("done done done done done empty")
+    assert (tmp_path / "takes" / "jump_out" / "trajectories.npz").exists()

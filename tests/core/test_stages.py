@@ -1,6 +1,7 @@
 """What a change concerns: the right stages become stale, and only those."""
 
 import shutil
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 
 from tricap.core import pipeline, store
 from tricap.core.stages import CONCERNS, STAGES, stage_keys, stage_of, still_good
-from tricap.core.take import open_take
+from tricap.core.take import Take, open_take
 from tricap.core.take_file import read_table, take_of_table
 
 from .conftest import Body, three_cameras, write_take
@@ -93,6 +94,24 @@ def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
     before = keys(tmp_path / "take")
     store.write_text(tmp_path / "take" / "out" / "contours" / "L.csv", "frame,x,y\n")
     assert [stage for stage in STAGES if keys(tmp_path / "take")[stage] != before[stage]] == ["fit"]
+
+
+def test_every_part_of_a_take_concerns_a_stage() -> None:
+    """A new field of Take must be said in stages.py too: then add it here, and a case above."""
+    measure = {"views", "rig_path", "interlaced", "reference_view", "frames", "seeds", "corrections"}
+    fit = {"body_model", "locked", "limits", "keyframes", "keypoints"}
+    assert {field.name for field in fields(Take)} == measure | fit | {"fps", "folder", "settings"}
+
+
+def test_keypoints_concern_the_fit(take: Path, tmp_path: Path) -> None:
+    shutil.copytree(take, tmp_path / "take")
+    points = tmp_path / "take" / "points.trc"
+    points.write_text("one")
+    entry = {"keypoints": [{"files": "points.trc"}]}
+    assert stale(tmp_path / "take", **entry) == ["fit"]
+    before = keys(tmp_path / "take", **entry)
+    points.write_text("longer")
+    assert [stage for stage in STAGES if keys(tmp_path / "take", **entry)[stage] != before[stage]] == ["fit"]
 
 
 def test_every_group_of_knobs_concerns_one_stage() -> None:
