@@ -37,9 +37,12 @@ class NothingMeasured(InputError):
     """The first frame of a take gave no surface. `why` is what the footage says about it, if it was asked."""
 
     def __init__(self, frame: int, why: str = "") -> None:
-        self.frame = frame
+        self.frame, self.why = frame, why
         guess = "no texture is found alike in all views. Check that rig.toml belongs to this footage and that the views are not swapped, "
         super().__init__(f"No surface could be measured in frame {frame}: {why or guess + 'or click surface seeds.'}")
+
+    def __reduce__(self) -> tuple[type, tuple[int, str]]:
+        return type(self), (self.frame, self.why)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

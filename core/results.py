@@ -33,6 +33,9 @@ class Results:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
+        away = [name for name in ("run.json", "cache", *OURS) if not _inside(self.folder / name, self.folder)]
+        if away:
+            raise InputError(f"{self.folder / away[0]} is a link to a place outside {folder}; remove the link, or choose another folder.")
         theirs = _not_ours(self.folder)
         if theirs:
             raise InputError(
@@ -129,6 +132,11 @@ class Results:
     def write_run(self, run: Mapping[str, Any]) -> None:
         """run.json"""
         store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})
+
+
+def _inside(path: Path, folder: Path) -> bool:
+    """Whether what a path leads to, over links, lies in the folder."""
+    return not path.is_symlink() or path.resolve().is_relative_to(folder)
 
 
 def _not_ours(folder: Path) -> list[str]:

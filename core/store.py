@@ -21,6 +21,7 @@ from .errors import InputError
 
 HEADER = "header_json"
 STORE_VERSION = 1
+LARGEST_BOMB, LARGEST_RATIO = 400_000_000, 100  # bytes that a file may unpack to, whatever its size; and times its size
 DAMAGED = (  # what numpy, zipfile and zlib raise for a file with wrong bytes, or for another kind of file
     OSError,
     ValueError,
@@ -106,6 +107,7 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         InputError: it is missing, damaged, of a newer version, or was not written by Tricap.
     """
     try:
+        _refuse_bomb(Path(path))
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         header = json.loads(str(arrays.pop(HEADER)))
@@ -118,6 +120,14 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if header.pop("arrays", sorted(arrays)) != sorted(arrays):
         raise InputError(f"{path} is damaged: it lacks a part; remove it and run again.")
     return arrays, header
+
+
+def _refuse_bomb(path: Path) -> None:
+    """A small archive may not unpack to gigabytes."""
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(info.file_size for info in archive.infolist())
+    if unpacked > max(LARGEST_BOMB, LARGEST_RATIO * path.stat().st_size):
+        raise InputError(f"{path} would unpack to {unpacked / 1e9:.1f} GB, which no result of its size does; remove it and run again.")
 
 
 def digest(*parts: bytes | str | Path) -> str:

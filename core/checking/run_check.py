@@ -15,6 +15,7 @@ from ..progress import Monitor
 from ..results import FORMAT
 from .findings import Checked, Finding, doubtful, wrong
 
+MOST_FRAMES = 10_000_000
 LOOKED_AT = 40  # clouds, spread over the run
 THIN = 0.4  # of the usual number of points
 UNSURE_MM, UNSURE_DEG = 5.0, 15.0  # sigmas: a point's, a joint angle's
@@ -45,7 +46,11 @@ def _refuse_other(run: Any, folder: Path) -> None:
     if not isinstance(run, dict) or run.get("format") != FORMAT or any(not isinstance(run.get(k), kind) for k, kind in tables.items()):
         raise InputError(f"{folder / 'run.json'} is not that of a run of Tricap; run again.")
     whole = [f for f in run["frames"] if isinstance(f, int)]
-    if len(whole) != 2 or any(not isinstance(figures, dict) for figures in run["stages"].values()):
+    if (
+        len(whole) != 2
+        or not 0 <= whole[1] - whole[0] <= MOST_FRAMES
+        or any(not isinstance(figures, dict) for figures in run["stages"].values())
+    ):
         raise InputError(f"{folder / 'run.json'} is damaged; run again.")
 
 
@@ -70,20 +75,15 @@ def _complete(run: Mapping[str, Any], folder: Path) -> list[Finding]:
 def _same_inputs(run: Mapping[str, Any], folder: Path) -> list[Finding]:
     """Input files that have changed since the run; a take that is not there any more is not held against its result."""
     take = Path(str(run.get("take", "")))
-    if not take.is_dir():
+    try:
+        known = {p.name: store.digest(p) for p in (take / Path(name).name for name in run["inputs"]) if p.is_file()}
+    except (OSError, ValueError):  # a folder that cannot be: from another system, or damaged
         return []
-    changed = [name for name, digest in run["inputs"].items() if (take / name).is_file() and store.digest(take / name) != digest]
-    return (
-        [
-            wrong(
-                "stale result",
-                f"{', '.join(changed)} of {take} has changed since this run.",
-                "Run again; what does not depend on it is kept.",
-            )
-        ]
-        if changed
-        else []
-    )
+    changed = [name for name, digest in run["inputs"].items() if known.get(name, digest) != digest]
+    if not changed:
+        return []
+    said = f"{', '.join(changed)} of {take} has changed since this run."
+    return [wrong("stale result", said, "Run again; what does not depend on it is kept.")]
 
 
 def _rays(run: Mapping[str, Any]) -> list[Finding]:
@@ -117,7 +117,8 @@ def _clouds(run: Mapping[str, Any], folder: Path, figures: dict[str, Any], monit
     """Frames without a cloud or with a thin one, and sigmas too large."""
     found = []
     frames = range(*run["frames"])
-    missing = [f for f in frames if not (folder / "clouds" / f"{f:04d}.ply").is_file()]
+    measured = {path.name for path in (folder / "clouds").glob("*.ply")}
+    missing = [f for f in frames if f"{f:04d}.ply" not in measured]
     if missing:
         found.append(
             wrong(

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from ..errors import InputError
+from .headers import claimed_size
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
-MAX_PIXELS, MAX_SIDE_PX = 64_000_000, 8191  # the side: four times as many are still looked up by OpenCV
+MAX_PIXELS, MAX_SIDE_PX = 36_000_000, 8191  # 8K video; the side: four times as many are still looked up by OpenCV
 SIGNATURES = (
     b"\x89PNG\r\n\x1a\n",
     b"\xff\xd8\xff",
@@ -88,6 +89,8 @@ class Movie:
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
         if count < 1:
             raise InputError(f"{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files.")
+        w, h = (int(self._capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        _refuse_size((w, h), path)
         self._count = count
 
     @property
@@ -157,23 +160,30 @@ def read_image(path: Path) -> np.ndarray:
     """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour.
 
     Raises:
-        InputError: the file is missing, is not an image, is larger than 64 megapixels or 8191 pixels a side, or of a strange kind.
+        InputError: the file is missing, is not an image, is larger than 36 megapixels or 8191 pixels a side, or of a strange kind.
     """
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
+    _refuse_size(claimed_size(data.tobytes()), path)
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
         raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
-    if image.shape[0] * image.shape[1] > MAX_PIXELS or max(image.shape[:2]) > MAX_SIDE_PX:
-        raise InputError(f"{path} has {image.shape[1]}×{image.shape[0]} pixels, more than can be measured; scale the footage down.")
+    _refuse_size(image.shape[1::-1], path)
     if image.dtype.name not in KINDS:
         raise InputError(f"{path} holds {image.dtype.name} pixels; save it with 8 or 16 bits a channel.")
     return grey(image)
+
+
+def _refuse_size(size_px: tuple[int, int] | None, path: Path) -> None:
+    if size_px is None or min(size_px) < 1:
+        raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
+    if size_px[0] * size_px[1] > MAX_PIXELS or max(size_px) > MAX_SIDE_PX:
+        raise InputError(f"{path} has {size_px[0]}×{size_px[1]} pixels, more than can be measured; scale the footage down.")
 
 
 def grey(image: np.ndarray) -> np.ndarray:

@@ -129,7 +129,10 @@ def _values(body: str, columns: int, path: Path) -> tuple[np.ndarray, float]:
     frames, frame_time = int(_number(words[1], path)), _number(words[4], path)
     if frames < 1 or frame_time <= 0:
         raise InputError(f"{path} has {frames} frames of {frame_time:g} s; a motion needs some.")
-    values = np.fromstring(words[5], sep=" ") if len(words) > 5 and _is_plain(words[5]) else np.zeros(0)
+    try:
+        values = np.fromstring(words[5], sep=" ") if len(words) > 5 and _is_plain(words[5]) else np.zeros(0)
+    except ValueError:  # numpy 2: something like “1e” or “--1” among the numbers
+        values = np.zeros(0)
     if len(values) < frames * columns:
         raise InputError(f"{path} promises {frames} frames of {columns} values but holds {len(values)} good values; export it again.")
     table = values[:frames * columns].reshape(frames, columns)

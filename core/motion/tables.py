@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..fitting.body_motion import BodyMotion
 from ..values import frozen
 
+LARGEST_FRAME = 2**53
 JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")
 
 
@@ -100,7 +101,7 @@ def read_joints(path: Path) -> JointTable:
     times: dict[int, float] = {}
     found: dict[str, dict[int, list[float]]] = {}
     for line, row in enumerate(rows, 2):
-        frame = int(_number(row[columns["frame"]], path, line))
+        frame = _whole(row[columns["frame"]], path, line)
         times[frame] = _number(row[columns["time_s"]], path, line)
         found.setdefault(row[columns["joint"]], {})[frame] = [_number(row[columns[c]], path, line) for c in ("x", "y", "z", "sigma")]
     frames = sorted(times)
@@ -140,6 +141,13 @@ def _column(header: Sequence[str], name: str, path: Path) -> int:
     if name not in header:
         raise InputError(f"The table {path} has no column “{name}”; it belongs to another body, or run the fit again.")
     return list(header).index(name)
+
+
+def _whole(text: str, path: Path, line: int) -> int:
+    value = _number(text, path, line)
+    if not abs(value) < LARGEST_FRAME:
+        raise InputError(f"Row {line} of {path} has the frame number {text[:40]}; run the fit again.")
+    return int(value)
 
 
 def _number(text: str, path: Path, line: int) -> float:

@@ -18,56 +18,9 @@ from ...errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
-from .reading import five, make_camera, numbers, text_of
+from .file_storage import Nodes
+from .reading import five, make_camera
 from .refit import plain
-
-
-class Nodes:
-    """The top-level entries of a FileStorage."""
-
-    def __init__(self, path: Path) -> None:
-        text = text_of(path)
-        try:
-            self._storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-            opened = self._storage.isOpened()
-        except (cv2.error, SystemError):
-            opened = False
-        if not opened:
-            raise InputError(f"{path} is no YAML or XML that OpenCV can read; write it with cv2.FileStorage.")
-        self._path = path
-
-    def _node(self, key: str) -> Any:
-        return self._storage.getNode(key)
-
-    def has(self, key: str) -> bool:
-        """Whether there is such an entry."""
-        return not self._node(key).empty()
-
-    def matrix(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
-        """An entry that is a matrix.
-
-        Raises:
-            InputError: it is missing or has another shape.
-        """
-        try:
-            value = self._node(key).mat() if self.has(key) else None
-        except (cv2.error, SystemError):
-            value = None
-        if value is None:
-            raise InputError(f"{self._path} lacks the matrix “{key}”; it is no complete calibration.")
-        return numbers(value, shape, f"“{key}” in {self._path}")
-
-    def number(self, *keys: str) -> float | None:
-        """The first of some entries that is a number."""
-        for key in keys:
-            if self.has(key) and (self._node(key).isReal() or self._node(key).isInt()):
-                return float(self._node(key).real())
-        return None
-
-    def names(self) -> list[str]:
-        """The sequence of texts `names`."""
-        node = self._node("names")
-        return [node.at(n).string() for n in range(node.size())] if self.has("names") and node.isSeq() else []
 
 
 def read(path: Path) -> Rig:

@@ -84,7 +84,13 @@ def _camera(file: Path, size: tuple[int, int], pixel_mm: tuple[float, float]) ->
     name = file.name.split(".")[0]
     rays = _rays(parameters, size, pixel_mm)
     ours = camera_of(name, size, start, np.eye(3), np.zeros(3))
-    interior, turn = _fit_ours(ours, rays, image(parameters, rays, size, pixel_mm), start)
+    try:
+        with np.errstate(all="ignore"):
+            interior, turn = _fit_ours(ours, rays, image(parameters, rays, size, pixel_mm), start)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise InputError(f"No camera agrees with the parameters in {extra}; the file is damaged.") from error
+    if not np.isfinite(interior).all():
+        raise InputError(f"No camera agrees with the parameters in {extra}; the file is damaged.")
     R = turn @ R
     fitted_camera = camera_of(name, size, interior, np.eye(3), np.zeros(3))
     t = -R @ (values[:3] / 1000)
@@ -105,6 +111,8 @@ def _fit_ours(camera: Camera, rays: np.ndarray, xy_px: np.ndarray, start: np.nda
         points = rays @ turn.T
         xy, J, G = image_with_derivatives(interior, points)
         A = np.concatenate([J, exterior_derivatives(G, points)[..., :3]], axis=-1).reshape(-1, 13)
+        if not np.isfinite(A).all():
+            raise np.linalg.LinAlgError("no finite derivatives")
         scale = np.linalg.norm(A, axis=0)
         step = np.linalg.lstsq(A / scale, (xy_px - xy).ravel(), rcond=1e-13)[0] / scale
         interior, turn = interior + step[:10], rotation_from_vector(step[10:]) @ turn

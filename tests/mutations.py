@@ -1,0 +1,190 @@
+"""Damaged copies of files, and the child process that reads them: the engine of test_fuzz.py.
+
+    python tests/mutations.py FOLDER COUNT [NAME…]      COUNT damaged copies for each reader; one line of JSON each on standard output
+
+A copy is damaged as transfers, disks and strangers do it: cut, with bytes changed, numbers too large or not finite, values of another kind,
+nested too deeply, with endless lines, in another encoding, empty. Never larger than a megabyte.
+"""
+
+import json
+import random
+import re
+import struct
+import sys
+import time
+import traceback
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+LARGEST = 1_000_000
+SECONDS, MEGABYTES = 2.0, 500.0
+NUMBERS = (b"1e308", b"-1e308", b"nan", b"inf", b"-inf", b"-1", b"0", b"99999999999999999999", b"2147483648", b"4294967295", b"1e-320",
+           b"65536", b"0x10", b"1_0", b"9" * 5000)  # fmt: skip
+KINDS = (b'"text"', b"[]", b"{}", b"[[1, 2], [3]]", b"null", b"true", b"''", b"-", b"1979-05-27", b"[" * 60, b"&a;", b"%n")
+WORDS = (struct.pack("<I", 0xFFFFFFFF), struct.pack("<I", 0x7FFFFFFF), struct.pack("<I", 0x10000000), struct.pack("<H", 0xFFFF),
+         struct.pack("<f", float("nan")), struct.pack("<f", 1e38), struct.pack("<d", float("inf")), struct.pack(">I", 0x00FFFFFF),
+         b"\0" * 8, struct.pack("<I", 1 << 24))  # fmt: skip
+NEST = (b"[", b'{"a":', b"<a>", b"((", b"a = [[", b"{ ", b"- ")
+
+
+def mutate(data: bytes, r: random.Random) -> bytes:
+    """A damaged copy."""
+    for _ in range(r.choice((1, 1, 1, 2, 4))):
+        data = r.choice(DAMAGES)(data, r)
+    return data[:LARGEST]
+
+
+def _place(data: bytes, r: random.Random) -> int:
+    """Anywhere, but often in the head, where the counts stand."""
+    return r.randrange(min(len(data), r.choice((64, 400, len(data) or 1))) or 1)
+
+
+def _cut(data: bytes, r: random.Random) -> bytes:
+    return data[: _place(data, r)] if r.random() < 0.7 else data[_place(data, r) :]
+
+
+def _flip(data: bytes, r: random.Random) -> bytes:
+    changed = bytearray(data or b"\0")
+    for _ in range(r.choice((1, 1, 3, 20))):
+        changed[_place(changed, r)] = r.randrange(256)
+    return bytes(changed)
+
+
+def _word(data: bytes, r: random.Random) -> bytes:
+    i, word = _place(data, r), r.choice(WORDS)
+    i -= i % r.choice((1, 2, 4))
+    return data[:i] + word + data[i + len(word) :]
+
+
+def _value(data: bytes, r: random.Random) -> bytes:
+    """A number becomes another number, or something else."""
+    found = list(re.finditer(rb"-?\d+\.?\d*(e[-+]?\d+)?", data[:200_000]))
+    if not found:
+        return _flip(data, r)
+    m = r.choice(found[: r.choice((8, 40, len(found)))])
+    return data[: m.start()] + r.choice(NUMBERS if r.random() < 0.7 else KINDS) + data[m.end() :]
+
+
+def _name(data: bytes, r: random.Random) -> bytes:
+    """A word becomes another one of the file."""
+    found = list(re.finditer(rb"[A-Za-z_]{2,}", data[:200_000]))
+    if not found:
+        return _word(data, r)
+    m, n = r.choice(found), r.choice(found)
+    return data[: m.start()] + (n.group() if r.random() < 0.7 else b"constructor\xc3\xa9") + data[m.end() :]
+
+
+def _lines(data: bytes, r: random.Random) -> bytes:
+    lines = data.split(b"\n")
+    i, j = r.randrange(len(lines)), r.randrange(len(lines))
+    what = r.randrange(4)
+    if what == 0:
+        del lines[i]
+    elif what == 1:
+        lines[i:i] = [lines[j]] * r.choice((1, 3, 2000))
+    elif what == 2:
+        lines[i], lines[j] = lines[j], lines[i]
+    else:
+        lines[i] = lines[i] * r.choice((2, 500))
+    return b"\n".join(lines)
+
+
+def _insert(data: bytes, r: random.Random) -> bytes:
+    i = _place(data, r)
+    deep, long = r.choice((20, 600, 100_000)), r.choice((1000, 300_000))
+    endless = r.choice((b"9", b"a", b" ", b"\xff", b"\0", b"0,", b"\t")) * long
+    what = r.choice((r.choice(NEST) * deep, endless, b"\xff\xfe", b"\0", b"\xed\xa0\x80", b"\r", "é\uffff".encode()))
+    return data[:i] + what + data[i:]
+
+
+def _nothing(data: bytes, r: random.Random) -> bytes:
+    return r.choice((b"", b"\n", b"\0" * 100, b"\xef\xbb\xbf" + data, data.decode("latin-1").encode("utf-16")))
+
+
+def _sound_sums(data: bytes, r: random.Random) -> bytes:
+    """A damaged PNG whose check sums are right, so that the decoder does not stop at once."""
+    if not data.startswith(b"\x89PNG") or len(data) < 33:
+        return _word(data, r)
+    head = bytearray(data[12:29])
+    i = r.choice((4, 8, 12, 13, 16))
+    head[i : i + 4] = r.choice(WORDS)[:4] if i < 12 else bytes([r.randrange(20)])
+    head = head[:17]
+    return data[:12] + bytes(head) + struct.pack(">I", zlib.crc32(head)) + data[33:]
+
+
+DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
+    _cut, _flip, _flip, _word, _word, _value, _value, _value, _name, _lines, _insert, _nothing, _sound_sums)  # fmt: skip
+
+
+def memory_mb() -> tuple[float, float]:
+    """Resident memory of this process now, and the most it ever had; zeros where the system does not say."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return 0.0, 0.0
+    sizes = {line.split(":")[0]: float(line.split()[1]) / 1024 for line in lines if line.startswith(("VmRSS", "VmHWM"))}
+    return sizes["VmRSS"], sizes["VmHWM"]
+
+
+def forget_the_most() -> None:
+    """The most memory is counted anew from here (Linux)."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError as error:
+        sys.stderr.write(f"Memory is not counted anew: {error}\n")
+
+
+def attack(name: str, folder: Path, count: int) -> dict[str, Any]:
+    """Damage a reader's files `count` times; what came of it. The faults carry the damaged file's number."""
+    from readers import FAULTY, READERS, InputError
+
+    make, read = (READERS | FAULTY)[name]
+    files = make(folder)
+    whole = {path: path.read_bytes() for path in files}
+    read(folder)
+    said = {"reader": name, "read": 0, "refused": 0, "slowest_s": 0.0, "most_mb": 0.0, "faults": []}
+    for number in range(count):
+        r = random.Random(f"{name} {number}")
+        target = r.choice(files)
+        for path in files:
+            path.write_bytes(mutate(whole[path], r) if path == target else whole[path])
+        (folder / "number").write_text(str(number))
+        forget_the_most()
+        before, began, fault = memory_mb()[0], time.process_time(), ""
+        try:
+            read(folder)
+            said["read"] += 1
+        except InputError as error:
+            said["refused"] += 1
+            if len(str(error)) > 2000 or not str(error).isprintable():
+                fault = f"an unreadable sentence of {len(str(error))} characters: {str(error)[:200]!r}"
+        except BaseException:
+            fault = traceback.format_exc(limit=-4)
+        seconds, most = time.process_time() - began, memory_mb()[1] - before
+        said["slowest_s"], said["most_mb"] = max(said["slowest_s"], seconds), max(said["most_mb"], most)
+        if seconds > SECONDS or most > MEGABYTES:
+            fault = fault or f"{seconds:.1f} s of work, {most:.0f} MB"
+        if fault:
+            said["faults"].append({"number": number, "file": target.name, "fault": fault})
+    return said
+
+
+def main() -> None:
+    """Attack the readers named, or all."""
+    sys.path.insert(0, str(Path(__file__).parent))
+    import readers
+
+    folder, count = Path(sys.argv[1]), int(sys.argv[2])
+    for name in sys.argv[3:] or readers.READERS:
+        own = folder / name.replace(".", "_")
+        own.mkdir(parents=True, exist_ok=True)
+        sys.stderr.write(f"@{name}\n")
+        sys.stderr.flush()
+        sys.stdout.write(json.dumps(attack(name, own, count)) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,245 @@
+"""Every reader of files, with what makes a sound small file for it: (files made in a folder, the reader of that folder)."""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from tricap.core import frame_table, store
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape, read_body, write_body
+from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
+from tricap.core.checking.run_check import check_run
+from tricap.core.errors import InputError
+from tricap.core.geometry.rig import read_rig, write_rig
+from tricap.core.images.sequence import open_sequence
+from tricap.core.motion import bvh, c3d, keypoints_json, points_csv, tables, trc
+from tricap.core.motion.markers import Markers
+from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
+from tricap.core.motion.retarget.mapping import read_preset
+from tricap.core.motion.retarget.vrm import read_humanoid
+from tricap.core.progress import Monitor
+from tricap.core.results import Results
+from tricap.core.synthetic.arm import arm_rig
+from tricap.core.take import read_take
+from tricap.core.tracking.point_tables import read_points, read_polygon
+
+__all__ = ["FAULTY", "READERS", "InputError"]
+Make = Callable[[Path], list[Path]]
+Read = Callable[[Path], Any]
+HERE = Path(__file__).resolve().parent
+RIG = arm_rig(96)
+FRAMES = ",".join(("frame", *frame_table.COLUMNS, "fit")) + "\n0" + len(frame_table.COLUMNS) * ",1" + ",fitted\n"
+TAKE = """format = "tricap-take"
+version = 1
+fps = 25.0
+interlaced = "odd"
+rig = "rig.toml"
+reference_view = "C"
+frames = [0, 4]
+[[views]]
+name = "L"
+images = "L/*.png"
+offset_frames = 1
+[[views]]
+name = "C"
+movie = "c.mp4"
+[body]
+model = "arm.R"
+[seeds]
+frame = 0
+surface = [ { L = [20.0, 24.0], C = [55.0, 38.0] } ]
+[seeds.joints]
+"elbow.R" = { C = [43.0, 26.0], L = [45.0, 26.2] }
+[settings.matching]
+patch_px = 13
+"""
+
+
+def points() -> Markers:
+    xyz = np.random.default_rng(0).uniform(-1, 1, (12, 2, 3))
+    xyz[3, 1] = np.nan
+    return Markers(names=("elbow.R", "wrist.R"), fps=50.0, frames=np.arange(12), xyz_m=xyz, sigma_m=np.full((12, 2), 1e-3))
+
+
+def text(name: str, content: str) -> Make:
+    def make(folder: Path) -> list[Path]:
+        (folder / name).write_text(content, encoding="utf-8")
+        return [folder / name]
+
+    return make
+
+
+def written(name: str, write: Callable[[Path], Any]) -> Make:
+    def make(folder: Path) -> list[Path]:
+        write(folder / name)
+        return [folder / name]
+
+    return make
+
+
+def calibration(kind: str) -> tuple[Make, Read]:
+    name = "" if kind in FOLDERS else "rig.xml" if kind == "agisoft" else "rig.yml" if kind == "opencv" else "rig.toml"
+
+    def make(folder: Path) -> list[Path]:
+        return [p for p in write_as(folder / name, RIG, kind) if p.is_file()]
+
+    return make, lambda folder: read_any(folder / name)
+
+
+def picture(ending: str, dtype: type = np.uint8, shape: tuple[int, ...] = (24, 32)) -> tuple[Make, Read]:
+    def make(folder: Path) -> list[Path]:
+        image = np.random.default_rng(1).integers(0, 255, shape)
+        image = (image / 255).astype(np.float32) if ending == ".exr" else (image * (257 if dtype == np.uint16 else 1)).astype(dtype)
+        data = cv2.imencode(ending, image)[1].tobytes()
+        (folder / f"0{ending}").write_bytes(data)
+        return [folder / f"0{ending}"]
+
+    return make, lambda folder: open_sequence(folder, images=f"*{ending}", movie=None, view="C").read(0)
+
+
+def movie(ending: str, code: str) -> tuple[Make, Read]:
+    def make(folder: Path) -> list[Path]:
+        writer = cv2.VideoWriter(str(folder / f"c{ending}"), cv2.VideoWriter_fourcc(*code), 25.0, (64, 48))
+        for i in range(6):
+            writer.write(np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8))
+        writer.release()
+        return [folder / f"c{ending}"]
+
+    def read(folder: Path) -> None:
+        sequence = open_sequence(folder, images=None, movie=f"c{ending}", view="C")
+        for i in (0, min(5, sequence.count - 1)):
+            sequence.read(i)
+
+    return make, read
+
+
+def cloud(folder: Path) -> list[Path]:
+    xyz = np.random.default_rng(0).uniform(0, 1, (20, 3))
+    write_cloud(folder / "a.ply", xyz_m=xyz, sigma_m=xyz[:, 0], normals=xyz, intensity=xyz[:, 0] * 255)
+    write_mesh(folder / "b.ply", xyz, np.array([[0, 1, 2], [3, 4, 5]]))
+    return [folder / "a.ply", folder / "b.ply"]
+
+
+def run_folder(folder: Path) -> list[Path]:
+    results = Results(folder)
+    results.write_run({"take": str(folder / "nowhere"), "frames": [0, 2], "stages": {"measure": {"residual_px": 0.1}}, "inputs": {},
+                       "warnings": []})  # fmt: skip
+    cloud(folder)
+    (folder / "clouds").mkdir(exist_ok=True)
+    (folder / "a.ply").rename(folder / "clouds" / "0000.ply")
+    (folder / "b.ply").rename(folder / "clouds" / "0001.ply")
+    return [folder / "run.json", folder / "clouds" / "0000.ply"]
+
+
+def body(path: Path) -> None:
+    write_body(path, default_shape(read_model("arm.R")))
+
+
+def motion_table(path: Path) -> None:
+    names = read_model("arm.R").skeleton.dof_names
+    rows = [["frame", "time_s", *names, *(f"sigma {n}" for n in names)], *([str(i)] * (2 + 2 * len(names)) for i in range(5))]
+    path.write_text("\n".join(",".join(row) for row in rows))
+
+
+def person(path: Path) -> None:
+    people = [{"pose_keypoints_2d": np.random.default_rng(0).uniform(0, 90, 75).round(2).tolist()}]
+    path.write_text(json.dumps({"version": 1.3, "people": people}))
+
+
+def coco(path: Path) -> None:
+    rows = [{"image_id": i, "keypoints": np.random.default_rng(i).uniform(1, 90, 51).round(2).tolist()} for i in range(3)]
+    path.write_text(json.dumps({"annotations": rows, "images": [{"id": i, "file_name": f"{i}.png"} for i in range(3)]}))
+
+
+def glb(path: Path) -> None:
+    table = json.dumps({"nodes": [{"name": "Hips"}], "extensions": {"VRM": {"humanoid": {"humanBones": [{"bone": "hips", "node": 0}]}}}})
+    data = table.encode()
+    data += b" " * (-len(data) % 4)
+    path.write_bytes(b"glTF" + np.array([2, 20 + len(data), len(data)], "<u4").tobytes() + b"JSON" + data)
+
+
+def arrays(path: Path) -> None:
+    store.save(path, {"xyz_m": np.zeros((5, 4, 3)), "status": np.zeros((5, 4), np.int8)}, {"key": "k"})
+
+
+def checkpoint(path: Path) -> None:
+    Results(path).save_checkpoint("surface", "0000", "k", {"field": np.zeros((40, 3))})
+
+
+def own_model(path: Path) -> None:
+    path.write_bytes((HERE.parent / "core" / "body" / "models" / "arm.R.toml").read_bytes())
+
+
+def bvh_file(path: Path) -> None:
+    offsets = "OFFSET 0 10 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+    end = "End Site\n{\nOFFSET 0 8 0\n}\n"
+    root = "OFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n"
+    joints = f"ROOT Hips\n{{\n{root}JOINT Spine\n{{\n{offsets}{end}}}\n}}"
+    frames = "\n".join(" ".join(f"{i + k * 0.5:.2f}" for k in range(9)) for i in range(4))
+    path.write_text(f"HIERARCHY\n{joints}\nMOTION\nFrames: 4\nFrame Time: 0.04\n{frames}\n")
+
+
+def _raise(folder: Path) -> None:
+    if (folder / "a").read_bytes() != b"sound":
+        raise KeyError("what nobody caught")
+
+
+def _sleep(folder: Path) -> None:
+    began = time.process_time()
+    while (folder / "a").read_bytes() != b"sound" and time.process_time() - began < 2.2:
+        pass
+
+
+def _swell(folder: Path) -> int:
+    return 0 if (folder / "a").read_bytes() == b"sound" else np.ones(75_000_000).size
+
+
+def _die(folder: Path) -> None:
+    if (folder / "a").read_bytes() != b"sound":
+        os._exit(11)
+
+
+FAULTY: dict[str, tuple[Make, Read]] = {  # what the engine must find
+    "test raises": (text("a", "sound"), _raise), "test sleeps": (text("a", "sound"), _sleep),
+    "test swells": (text("a", "sound"), _swell), "test dies": (text("a", "sound"), _die),
+}  # fmt: skip
+READERS: dict[str, tuple[Make, Read]] = {
+    "take.toml": (text("take.toml", TAKE), read_take),
+    "rig.toml": (written("rig.toml", lambda p: write_rig(p, RIG)), lambda f: read_rig(f / "rig.toml")),
+    **{f"calibration {kind}": calibration(kind) for kind in sorted(FORMATS)},
+    "ply": (cloud, lambda f: [read_ply(f / "a.ply"), read_ply(f / "b.ply")]),
+    "npz": (written("a.npz", arrays), lambda f: store.load(f / "a.npz")),
+    "checkpoint": (lambda f: (checkpoint(f), [f / "cache" / "surface" / "0000.npz"])[1],
+                   lambda f: Results(f).load_checkpoint("surface", "0000", "k")),
+    "run.json": (run_folder, lambda f: Results(f).read_run()),
+    "check of a run": (run_folder, lambda f: check_run(f, Monitor())),
+    "trc": (written("a.trc", lambda p: trc.write_trc(p, points())), lambda f: trc.read_trc(f / "a.trc")),
+    "c3d": (written("a.c3d", lambda p: c3d.write_c3d(p, points())), lambda f: c3d.read_c3d(f / "a.c3d")),
+    "csv of points": (written("a.csv", lambda p: points_csv.write_points_csv(p, points())),
+                      lambda f: points_csv.read_points_csv(f / "a.csv")),
+    "bvh": (written("a.bvh", bvh_file), lambda f: bvh.read_bvh(f / "a.bvh")),
+    "joints.csv": (text("joints.csv", "frame,time_s,joint,x,y,z,sigma\n0,0.0,elbow.R,1,2,3,0.1\n1,0.04,elbow.R,1,2,3,0.1\n"),
+                   lambda f: tables.read_joints(f / "joints.csv")),
+    "motion.csv": (written("motion.csv", motion_table), lambda f: tables.read_motion(f / "motion.csv", read_model("arm.R").skeleton)),
+    "frames.csv": (text("frames.csv", FRAMES),
+                   lambda f: frame_table.read_frame_table(f / "frames.csv")),
+    "chosen points": (text("points.csv", "point,x,y,joined_to\na,10,12,b\nb,20,30,\nc,5,6.5,a\n"),
+                      lambda f: read_points(f / "points.csv")),
+    "polygon": (text("polygon.csv", "x,y\n10,12\n40,13\n38,60\n9,55\n"), lambda f: read_polygon(f / "polygon.csv")),
+    "body.toml": (written("body.toml", body), lambda f: read_body(f / "body.toml")),
+    "own model": (written("own.toml", own_model), lambda f: read_model(f / "own.toml")),
+    "mapping": (text("map.json", (HERE.parent / "addon" / "presets" / "mixamo.json").read_text()), lambda f: read_preset(f / "map.json")),
+    "keypoints of OpenPose": (written("a.json", person), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
+    "keypoints of COCO": (written("a.json", coco), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
+    "vrm": (written("a.vrm", glb), lambda f: read_humanoid(f / "a.vrm")),
+    **{f"picture {ending[1:]}": picture(ending) for ending in (".png", ".jpg", ".tif", ".bmp", ".webp", ".pgm")},
+    "picture png 16 bit colour": picture(".png", np.uint16, (24, 32, 3)),
+    "movie avi": movie(".avi", "MJPG"),
+    "movie mp4": movie(".mp4", "mp4v"),
+}  # fmt: skip

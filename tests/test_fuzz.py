@@ -1,0 +1,95 @@
+"""Damaged files: whatever stands in a file of at most a megabyte, a reader gives its content or one sentence, within 2 s and 500 MB.
+
+`python tests/mutations.py FOLDER 10000` does the same at length. All readers share a child process: a decoder that crashes kills only it.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core import store
+from tricap.core.errors import LONGEST, InputError
+from tricap.core.images.headers import claimed_size
+from tricap.core.images.sequence import read_image
+from tricap.core.results import Results
+
+HERE = Path(__file__).resolve().parent
+COUNT = 100
+
+
+def fuzz(folder: Path, count: int, *names: str) -> tuple[list[dict], str]:
+    """What the child process says of each reader, and the reader at which it died, if it did."""
+    environment = {**os.environ, "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_LOG_LEVEL": "SILENT", "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, str(HERE / "mutations.py"), str(folder), str(count), *names]
+    done = subprocess.run(command, capture_output=True, env=environment, timeout=600)
+    began = [line[1:] for line in done.stderr.decode(errors="replace").splitlines() if line.startswith("@")]
+    return [json.loads(line) for line in done.stdout.splitlines()], began[-1] if done.returncode and began else ""
+
+
+def test_only_input_errors_come_out_of_damaged_files(tmp_path: Path) -> None:
+    said, died = fuzz(tmp_path, COUNT)
+    assert not died, f"the process died in “{died}”"
+    faults = [(row["reader"], fault) for row in said for fault in row["faults"]]
+    assert not faults, "\n".join(f"{name}, number {f['number']}: {f['fault']}" for name, f in faults)
+    assert len(said) > 35 and all(row["read"] + row["refused"] == COUNT for row in said)
+    assert sum(row["refused"] for row in said) > 0.4 * COUNT * len(said)  # the damage is real
+
+
+def test_a_faulty_reader_is_found(tmp_path: Path) -> None:
+    """The engine itself: readers that raise something else, that are slow, that take memory, and that crash."""
+    said, died = fuzz(tmp_path, 5, "test raises", "test sleeps", "test swells", "test dies")
+    assert [bool(row["faults"]) for row in said] == [True, True, True] and died == "test dies"
+
+
+def bomb_png(w: int, h: int) -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+
+    head = w.to_bytes(4, "big") + h.to_bytes(4, "big") + b"\x08\x00\x00\x00\x00"
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
+
+
+def test_bombs_are_refused_before_they_unpack(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(bomb_png(30_000, 30_000))
+    (tmp_path / "a.pgm").write_bytes(b"P5 30000 30000 255\n" + b"\0" * 100)
+    for name in ("a.png", "a.pgm"):
+        with pytest.raises(InputError, match="30000×30000 pixels, more than can be measured"):
+            read_image(tmp_path / name)
+    store.save(tmp_path / "a.npz", {"zeros": np.zeros(500_000_000, np.int8)}, {})
+    assert (tmp_path / "a.npz").stat().st_size < 1_000_000
+    with pytest.raises(InputError, match="would unpack to 0.5 GB"):
+        store.load(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".tif", ".bmp", ".webp", "portable"])
+@pytest.mark.parametrize("shape", [(24, 41), (33, 20, 3)])
+def test_the_claimed_size_is_the_size(ending: str, shape: tuple[int, ...]) -> None:
+    ending = {2: ".pgm", 3: ".ppm"}[len(shape)] if ending == "portable" else ending
+    data = cv2.imencode(ending, np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8))[1].tobytes()
+    assert claimed_size(data) == (shape[1], shape[0])
+    assert claimed_size(data[:5]) is None and claimed_size(b"GIF89a") is None
+
+
+def test_sentences_are_fit_for_a_terminal() -> None:
+    assert str(InputError("a\x1b[2Jb\nc\0")) == "a\N{REPLACEMENT CHARACTER}[2Jb c\N{REPLACEMENT CHARACTER}"
+    assert len(str(InputError("x" * 100_000))) < LONGEST + 10
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_results_are_not_written_through_links_out_of_their_folder(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "letter.txt").write_text("mine")
+    for name in ("clouds", "cache", "report", "run.json"):
+        out = tmp_path / f"out {name}"
+        out.mkdir()
+        (out / name).symlink_to(tmp_path / "elsewhere" / ("letter.txt" if name == "run.json" else ""))
+        with pytest.raises(InputError, match="is a link to a place outside"):
+            Results(out)
+    assert (tmp_path / "elsewhere" / "letter.txt").read_text() == "mine" and len(list((tmp_path / "elsewhere").iterdir())) == 1
