@@ -66,7 +66,7 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
         centre = sheet.to_region(offer.xy_px)
         parts = np.concatenate([canvas.ring(centre, OFFER_PX), canvas.cross(centre, OFFER_PX + 5, OFFER_PX - 4)])
         canvas.draw_lines(canvas.line_batch(parts), 2.0, OFFER)
-        canvas.text(f"{session.name}? ±{max(offer.sigma_px, 0.1):.1f} px", centre[0] + OFFER_PX + 6, centre[1] + 6, OFFER, size=11)
+        canvas.text(f"{session.name}? ±{max(offer.sigma_px, 0.1):.1f} px", centre[0] + OFFER_PX + 6, centre[1] - 20, OFFER, size=11)
     _draw_headline(session, view, sheet)
     draw_figure(session, sheet)
     x, y = mouse[0] - sheet.region.x, mouse[1] - sheet.region.y

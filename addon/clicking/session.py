@@ -49,6 +49,7 @@ class ClickSession:
         self.proposals: dict[str, Proposal] = {}
         self.asking, self.problem = False, ""
         self._history: list[_Step] = []
+        self._looked_at: dict[str, np.ndarray] = {}
         self.go_to_next(from_turn=0)
 
     @property
@@ -140,7 +141,7 @@ class ClickSession:
     def look(self) -> None:
         """Ask for the proposals that go with what is clicked now."""
         self.proposals, self.problem, self.asking = {}, "", False
-        clicked = self.clicks()
+        clicked = self._looked_at = self.clicks()
         if self.finder is None or not clicked or len(clicked) == len(self.views):
             return
         if len(clicked) > 1:
@@ -153,7 +154,11 @@ class ClickSession:
         self.finder.ask(Question(name=self.name, frame=self.frame, view=at, xy_px=xy, depth_range_m=self._depth_range(at)))
 
     def poll(self) -> bool:
-        """Take the finder's answer when it is there; True when something changed."""
+        """Take the finder's answer when it is there, and see what was dragged meanwhile; True when something changed."""
+        now, before = self.clicks(), self._looked_at
+        if now.keys() != before.keys() or any(not np.array_equal(xy, before[view]) for view, xy in now.items()):
+            self.look()
+            return True
         answer = self.finder.poll() if self.finder is not None else None
         return answer is not None and self.take_answer(answer)
 

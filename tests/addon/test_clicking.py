@@ -129,6 +129,18 @@ def test_a_click_near_the_proposal_takes_it(session: Any, truth: Truth) -> None:
     assert np.allclose(session.clicks()["L"], offer + [30.0, 2.0], atol=1e-3)
 
 
+def test_what_is_dragged_is_looked_for_again(session: Any, truth: Truth, scene: Any) -> None:
+    camera = dict(zip(session.views, session.finder.cameras))
+    session.click("C", camera["C"].project(sleeve_point(session, truth, 0)))
+    session.take_answer(session.finder.wait())
+    before = session.proposals["L"].xy_px
+    assert not session.poll()
+    to = camera["C"].project(sleeve_point(session, truth, 1))
+    module("seeds").set_click(module("project").clips_of(scene)["C"], session.name, 0, (float(to[0]), float(to[1])))  # as G does
+    assert session.poll() and session.asking and not session.proposals
+    assert session.take_answer(session.finder.wait()) and np.linalg.norm(session.proposals["L"].xy_px - before) > 5
+
+
 def test_a_late_answer_is_not_taken_for_another_joint(session: Any) -> None:
     session.click("C", np.array([150.0, 120.0]))
     late = session.finder.wait()
