@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 import bpy
 
 from ...core.errors import InputError
-from .. import project
+from .. import project, seeds
 from ..overlay import canvas
 
 NAME = "Tricap Clicks"
@@ -15,10 +15,12 @@ CLOSED = ("OUTLINER", "PROPERTIES")
 
 
 class OpenViews(bpy.types.Operator):
-    """Show all views beside each other in a workspace of its own, “Tricap Clicks”; your other workspaces stay as they are"""
+    """Show all views beside each other in a workspace of its own, “Tricap Clicks”; your other workspaces stay as they are. Before the first
+    click it goes to the seed frame"""
 
     bl_idname = "tricap.open_views"
     bl_label = "Open the Views"
+    bl_options = {"UNDO"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -43,6 +45,8 @@ class OpenViews(bpy.types.Operator):
             known.name = NAME
         if window.workspace != known:
             window.workspace = known
+        if not any(seeds.frames_of(clip) for clip in clips):
+            context.scene.frame_set(context.scene.tricap.seed_frame)
         names = [clip.name for clip in clips]
         bpy.app.timers.register(_waiter(window, names), first_interval=SOON_S)
         return {"FINISHED"}

@@ -12,7 +12,7 @@ import window
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-SCRIPTS = ("sample", "smooth")
+SCRIPTS = ("sample", "over_footage", "smooth")
 LIMIT_S = 300.0
 SIZE = (1600, 1000)
 
