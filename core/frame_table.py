@@ -11,7 +11,7 @@ import numpy as np
 from . import store
 from .errors import InputError
 from .fitting.body_motion import FITTED, BodyFit
-from .surface.cloud import PointCloud
+from .measured import FrameNote
 from .tracking.trajectories import Trajectories
 
 COLUMNS = ("points", "sigma_mm", "residual_px", "tracks", "track_sigma_mm", "fit_sigma0", "joint_sigma_mm")
@@ -55,13 +55,13 @@ class FrameTable:
         return much, tuple(words)
 
 
-def frame_table(clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
-    """The table of a run, as far as it is."""
-    frames = np.zeros(len(clouds), dtype=np.int64)
+def frame_table(notes: Sequence[FrameNote], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
+    """The table of a run, as far as it is; points count as measured, before corrections."""
+    frames = np.array([n.frame for n in notes], dtype=np.int64)
     values = {name: np.full(len(frames), np.nan) for name in COLUMNS}
-    for i, c in enumerate(clouds):  # once: each may be read from the disk
-        frames[i], values["points"][i] = c.frame, len(c.xyz_m)
-        values["sigma_mm"][i], values["residual_px"][i] = 1e3 * _median(c.sigma_m), _median(c.residual_px)
+    values["points"] = np.array([float(n.points) for n in notes])
+    values["sigma_mm"] = 1e3 * np.array([n.sigma_m for n in notes])
+    values["residual_px"] = np.array([n.residual_px for n in notes])
     if trajectories is not None:
         for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
             at = np.searchsorted(frames, trajectories.frames[t])

@@ -90,7 +90,7 @@ class Run:
         """Note what a stage took and found, and write run.json."""
         key = self.keys.get(stage, self.keys.get("fit", ""))
         self.account["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
-        write_frame_table(self.results.path("frames.csv"), frame_table(self.clouds, self.trajectories, self.body))
+        write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.notes, self.trajectories, self.body))
         self.results.write_run(self.account)
 
     def __str__(self) -> str:

@@ -46,10 +46,8 @@ def move_mouse(x: int, y: int) -> None:
 def _draw() -> None:
     session, context = _shown["session"], bpy.context
     clip = canvas.clip_of(context.area)
-    if session is None or clip is None:
-        return
-    view = next((view for view, mine in session.clips.items() if mine == clip), None)
-    if view is not None:
+    view = session.view_of(clip) if session is not None and session.whole else None
+    if view is not None and clip is not None:
         draw_session(session, view, Canvas(context.region, tuple(clip.size)), _shown["mouse"])
 
 

@@ -1,5 +1,6 @@
 """Finds a click's proposals on a thread of its own: the window stays alive while images are read and matched. No Blender in here."""
 
+import logging
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from ...core.images.sampling import SplineImage
 from ...core.matching.least_squares import MatchingSettings
 from ...core.matching.proposals import Proposal, propose
 from ...core.take import Footage
+
+log = logging.getLogger(__name__)
 
 KEPT_FRAMES = 2
 
@@ -88,10 +91,13 @@ class Finder:
         nothing: tuple[Any, ...] = (None,) * len(self.cameras)
         try:
             images = self._load(question.frame)
+            rows, asked = self._footage.take.rows, question
+            found = propose(images, self.cameras, rows, asked.view, asked.xy_px, self._settings, asked.depth_range_m)
         except InputError as error:
             return Answer(question=question, proposals=nothing, problem=str(error))
-        rows, asked = self._footage.take.rows, question
-        found = propose(images, self.cameras, rows, asked.view, asked.xy_px, self._settings, asked.depth_range_m)
+        except Exception as error:  # the edge of the thread: a mistake of ours takes no click away
+            log.exception("No proposals for %s.", question.name)
+            return Answer(question=question, proposals=nothing, problem=f"Tricap made a mistake ({error}); the console shows where.")
         return Answer(question=question, proposals=found)
 
     def _load(self, frame: int) -> list[SplineImage]:

@@ -137,8 +137,7 @@ class ClickOperator:
             show_view(area, self.session.clips[wanted])
 
     def _view(self, area: bpy.types.Area) -> str | None:
-        clip = canvas.clip_of(area)
-        return next((view for view, mine in self.session.clips.items() if mine == clip), None) if clip is not None else None
+        return self.session.view_of(canvas.clip_of(area))
 
     def _show(self, context: bpy.types.Context) -> None:
         if context.workspace is not None:
@@ -148,8 +147,8 @@ class ClickOperator:
     def _end(self, context: bpy.types.Context) -> set[str]:
         self.clear(context)
         session = self.session
-        if not session.changed:
-            return {"CANCELLED"}
+        if not session.changed or not session.whole:
+            return {"FINISHED" if session.changed else "CANCELLED"}
         done = sum(len(session.clicks(name)) > 1 for name in session.names)
         self.report({"INFO"}, f"Frame {session.frame}: {done} of them are clicked in two views or more.")  # type: ignore[attr-defined]
         return {"FINISHED"}

@@ -66,6 +66,15 @@ class ClickSession:
         return found
 
     @property
+    def whole(self) -> bool:
+        """Whether all clips are still there under their names."""
+        return all(name in bpy.data.movieclips for name in self._clip_names.values())
+
+    def view_of(self, clip: bpy.types.MovieClip | None) -> str | None:
+        """The view that a clip shows, None for other clips."""
+        return next((view for view, name in self._clip_names.items() if clip is not None and clip.name == name), None)
+
+    @property
     def name(self) -> str:
         """What is to be clicked now; "" when all is done."""
         return self.names[self.turn] if self.turn < len(self.names) else ""

@@ -224,8 +224,21 @@ def test_undo_takes_the_clicks_back(blender: ModuleType, scene: Any) -> None:
 
 def test_a_deleted_clip_is_told(blender: ModuleType, session: Any, scene: Any) -> None:
     blender.data.movieclips.remove(module("project").clips_of(scene)["L"])
+    assert not session.whole and session.view_of(None) is None
     with pytest.raises(module("jobs").InputError, match="view L was deleted"):
         session.clicks()
+
+
+def test_unreadable_images_are_told_and_take_no_click(session: Any, arm_take: Path) -> None:
+    images = arm_take / "C"
+    images.rename(arm_take / "gone")
+    try:
+        session.show_frame(2)  # the images of the first frame may be read already
+        session.click("C", np.array([150.0, 120.0]))
+        assert session.take_answer(session.finder.wait())
+    finally:
+        (arm_take / "gone").rename(images)
+    assert "0002.png" in session.problem and not session.proposals and "C" in session.clicks() and session.curves("L")
 
 
 def lay_out(window: Any, clips: list[Any]) -> list[str]:

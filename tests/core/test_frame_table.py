@@ -7,24 +7,22 @@ import pytest
 
 from tricap.core.errors import InputError
 from tricap.core.frame_table import COLUMNS, FrameTable, frame_table, read_frame_table, write_frame_table
-from tricap.core.surface.cloud import PointCloud
+from tricap.core.measured import FrameNote
 from tricap.core.tracking.trajectories import with_kinematics
 
 
-def cloud(frame: int, points: int, sigma_m: float, residual: float) -> PointCloud:
-    covariance = np.tile(np.eye(3) * sigma_m**2 / 3, (points, 1, 1))
-    return PointCloud(frame=frame, xyz_m=np.zeros((points, 3)), covariance_m2=covariance, normals=np.zeros((points, 3)),
-                      intensity=np.zeros(points), xy_px=np.zeros((points, 2, 2)), residual_px=np.full(points, residual))  # fmt: skip
+def note(frame: int, points: int, sigma_m: float, residual: float) -> FrameNote:
+    return FrameNote(frame=frame, key="", points=points, limit_px=1.0, residual_px=residual, sigma_m=sigma_m)
 
 
 def table() -> FrameTable:
-    clouds = [cloud(4, 100, 1e-3, 0.1), cloud(5, 90, 1e-3, 0.4), cloud(6, 0, 1e-3, 0.1), cloud(7, 110, 1.1e-3, 0.12)]
-    clouds.append(cloud(8, 100, 1e-3, 0.1))
+    notes = [note(4, 100, 1e-3, 0.1), note(5, 90, 1e-3, 0.4), note(6, 0, np.nan, np.nan), note(7, 110, 1.1e-3, 0.12)]
+    notes.append(note(8, 100, 1e-3, 0.1))
     xyz = np.zeros((4, 3, 3))
     xyz[2, :2] = np.nan
     tracks = with_kinematics(np.arange(4, 8), np.arange(4, 8) / 25, xyz, np.where(np.isfinite(xyz[..., 0]), 2e-3, np.nan),
                              np.ones((4, 3), dtype=np.int8), 0)  # fmt: skip
-    return frame_table(clouds, tracks, None)
+    return frame_table(notes, tracks, None)
 
 
 def test_what_stands_in_it() -> None:
