@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .errors import InputError
-from .fitting.fit_input import ClickedAt, FitInput, JointPlaces, ViewContours
+from .fitting.fit_input import ClickedAt, EmptyView, FitInput, JointPlaces, ViewContours
 from .keypoint_sources import KeypointSource
 from .motion.c3d import read_c3d
 from .motion.keypoints_json import natural_order, read_keypoints
@@ -30,7 +30,8 @@ LEAST_CONFIDENCE = 0.2
 COLUMNS = ("frame", "x", "y", "normal_x", "normal_y", "sigma", "on_edge")
 
 
-def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results) -> FitInput:
+def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results,
+              empty: Sequence[EmptyView] = ()) -> FitInput:
     """All that the fit can use of a run.
 
     Raises:
@@ -47,6 +48,7 @@ def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Traj
         trajectories=trajectories,  # type: ignore[arg-type]
         contours=read_contours(results, [v.name for v in take.views]),
         keypoints=[read_source(footage, source) for source in take.keypoints],
+        empty=empty,
         locked=take.locked,
         limits={name: (radians(low), radians(high)) for name, (low, high) in take.limits.items()},
     )

@@ -19,6 +19,7 @@ from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
 from .checking.take_check import causes_of_failure, first_look, with_cause
 from .correcting import corrected_cloud, corrected_tracks
+from .empty_sources import find_empty
 from .errors import InputError
 from .fit_sources import fit_input
 from .fitting.body_motion import BodyFit
@@ -302,9 +303,9 @@ def fit(run: Run, monitor: Monitor) -> None:
         run.finish_stage("fit", began, not_done=missing)
         return
     try:
-        given = fit_input(run.footage, run.clouds, run.trajectories, run.results)
-        body = fit_sequence(given, run.settings["fitting"], monitor)
-        run.body = body
+        empty = find_empty(run.footage, run.clouds, monitor) if run.settings["fitting"].use_background else []
+        given = fit_input(run.footage, run.clouds, run.trajectories, run.results, empty)
+        run.body = body = fit_sequence(given, run.settings["fitting"], monitor)
         _write_body(run, body, monitor)
     except Cancelled as stop:
         run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")

@@ -11,6 +11,7 @@ from ..geometry.camera import Camera
 from .acceleration import Acceleration
 from .clicks import Clicks
 from .cloud_points import CloudPoints
+from .empty_views import EmptyViews
 from .joint_tracks import JointTracks
 from .limbs_apart import LimbsApart
 from .observations import ClickedJoints, EqualRadii, Observation, ShapePrior, SurfacePoints, Symmetry
@@ -39,6 +40,7 @@ class Conditions:
     clicked: Mapping[int, ClickedJoints]  # by frame index
     tracks: JointTracks
     silhouettes: Silhouettes
+    empty: EmptyViews
     limbs: LimbsApart
 
     def beliefs(self, state: BodyState) -> list[Observation]:

@@ -51,6 +51,29 @@ class JointPlaces:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class EmptyView:
+    """How far every place of a view is from the nearest pixel that may show the person: 0 inside the person's outline.
+
+    Node (j, i) is the middle of a square of `step_px` × `step_px` pixels. Distances are stored in steps of `unit_px`.
+    """
+
+    view: str
+    frame: np.ndarray  # (T,) the take's frame numbers
+    distance: np.ndarray  # (T, h, w) uint8
+    step_px: int
+    unit_px: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame", frozen(self.frame, (None,), np.int64, "frame"))
+        object.__setattr__(self, "distance", frozen(self.distance, (len(self.frame), None, None), np.uint8, "distance"))
+
+    def of_frame(self, frame: int) -> np.ndarray | None:
+        """(h, w) of one frame; None if it is not known."""
+        at = np.flatnonzero(self.frame == frame)
+        return self.distance[at[0]] if len(at) else None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FitInput:
     """A recording as the fit takes it: `clouds` in the order of time, `time_s` (T,) their times, clicks by frame number."""
 
@@ -63,6 +86,7 @@ class FitInput:
     trajectories: Trajectories | None = None
     contours: Sequence[ViewContours] = ()
     keypoints: Sequence[JointPlaces] = ()
+    empty: Sequence[EmptyView] = ()
     locked: Sequence[str] = ()  # degrees of freedom that are held at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # rad, by degree of freedom
 

@@ -100,7 +100,7 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
         prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
-            return [fit.surface(points, state, wide, held), *fit.joints(i), *moved, prior, *fit.beliefs(state)]
+            return [fit.surface(points, state, wide, held), *fit.joints(i), *fit.empty.observe(i), *moved, prior, *fit.beliefs(state)]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
         support = fit.support(points, solution.motion[0], first.vector)

@@ -24,6 +24,7 @@ from .click_frame import clicked_lengths, fit_click_frame
 from .clicks import enough, read_clicks
 from .cloud_points import CloudPoints, thinned
 from .conditions import Conditions
+from .empty_views import EmptyViews
 from .fit_input import FitInput
 from .frame_to_frame import follow
 from .inverse_kinematics import clicked_stature, dof_priors, lasting
@@ -89,9 +90,10 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
     shape = default_shape(model)
     shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
-    return Conditions(cameras=given.rig.cameras, model=model, parameters=ShapeParameters(shape), settings=settings, clicks=clicks,
+    parameters = ShapeParameters(shape)
+    return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,
                       click=begin, priors=priors, clicked=clicked, tracks=tracks,
-                      silhouettes=Silhouettes(given, model.surface, settings),
+                      silhouettes=Silhouettes(given, model.surface, settings), empty=EmptyViews(given, parameters, settings),
                       limbs=LimbsApart(model.skeleton, shape.metaballs.bone_index))
 
 
@@ -117,7 +119,7 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
 
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [fit.surface(points[t], state, held=held), *fit.joints(t), *fit.silhouettes.observe(t, state, held),
-                *priors, *fit.limbs.observe(state)]
+                *fit.empty.observe(t), *priors, *fit.limbs.observe(state)]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
     return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),

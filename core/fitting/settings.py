@@ -22,6 +22,8 @@ class FitSettings:
     shared_frames: float = knob(40.0, "Over how many frames the model's error stays the same; beliefs of the shape weigh as much more.",
                                 low=1.0, high=1e5)
     use_contours: bool = knob(True, "Let the views' outlines (tricap contour) be touched by the body.")
+    use_background: bool = knob(True, "Keep limbs out of pixels that show the still background (cameras and background must stand still).")
+    empty_sigma_px: float = knob(4.0, "How exactly the person's outline is known from the background.", unit="px", low=0.5, high=50.0)
     gate_m: float = knob(0.035, "A point further than this from a limb's surface is not the limb's.", unit="m", low=0.005, high=0.3)
     click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)
     length_sigma: float = knob(0.15, "Relative sigma of the model's bone lengths.", low=0.001, high=1.0)

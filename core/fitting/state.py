@@ -45,6 +45,12 @@ class BodyState:
         return len(self.lengths_m) + 2 * len(self.balls.weight)
 
     @cached_property
+    def joints_m(self) -> np.ndarray:
+        """Joint positions (J, 3)."""
+        bones, at_tail = (np.array(column) for column in zip(*self.skeleton.joint_bones))
+        return self.head_m[bones] + np.where(at_tail[:, None], self.lengths_m[bones, None] * self.R[bones, :, 1], 0.0)
+
+    @cached_property
     def joint_jacobian(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint positions (J, 3) and their derivative (J, 3, D + S) to motion and shape."""
         sk, L = self.skeleton, self.lengths_m

@@ -11,6 +11,7 @@ from ..state import BodyState
 from .apart import Apart
 from .blocks import Block, FromBlocks
 from .clicked_joint import ClickedJoints
+from .empty_space import EmptySpace
 from .equal_radii import EqualRadii
 from .foot_on_floor import FootOnFloor
 from .gaussian_prior import MotionPrior, ShapePrior
@@ -21,8 +22,8 @@ from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
 from .symmetry import Symmetry
 
-__all__ = ["Apart", "Block", "ClickedJoints", "EqualRadii", "FootOnFloor", "FromBlocks", "JointLimits", "Keypoints", "MaterialSteps",
-           "MotionPrior", "Observation", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints", "Symmetry"]
+__all__ = ["Apart", "Block", "ClickedJoints", "EmptySpace", "EqualRadii", "FootOnFloor", "FromBlocks", "JointLimits", "Keypoints",
+           "MaterialSteps", "MotionPrior", "Observation", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints", "Symmetry"]
 
 
 class Observation(Protocol):

@@ -8,6 +8,7 @@ from tricap.core.body.shape import default_shape
 from tricap.core.fitting.observations import (
     Apart,
     ClickedJoints,
+    EmptySpace,
     EqualRadii,
     FootOnFloor,
     JointLimits,
@@ -19,6 +20,7 @@ from tricap.core.fitting.observations import (
     SurfacePoints,
     Symmetry,
 )
+from tricap.core.fitting.observations.empty_space import Distances
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.camera import Camera
 
@@ -52,7 +54,8 @@ def _cases(parameters: ShapeParameters, state, rng):
             ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)), EqualRadii(sigma=0.1, log_ratio=0.3),
             FootOnFloor(joint=np.arange(joints), height_m=rng.normal(0, 0.1, joints), floor_m=0.1, sigma_m=0.02),
             Keypoints(joint=np.arange(joints), xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=rng.uniform(0.005, 0.02, joints)),
-            _apart(state, rng), _rays(state, near, bone, sigma, rng), Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=0.03)]
+            _apart(state, rng), _empty(camera, joints, rng), _rays(state, near, bone, sigma, rng),
+            Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=0.03)]
 
 
 def _apart(state, rng):
@@ -60,6 +63,14 @@ def _apart(state, rng):
     last = len(state.lengths_m) - 1
     return Apart(bone=np.full(6, last), fraction=rng.uniform(0.1, 0.6, 6), other=np.full(6, state.skeleton.parents[last]),
                  radius_m=rng.uniform(0.5, 1.0, 6), sigma_m=0.01).scaled(state)
+
+
+def _empty(camera: Camera, joints: int, rng) -> EmptySpace:
+    """Distances that rise evenly to the right and downwards: without the kinks between the nodes of a real table."""
+    rise = 0.05 * np.arange(201)[None, :] + 0.03 * np.arange(151)[:, None]
+    view = Distances(camera=camera, values_px=rise, step_px=4.0, first_px=0.0)
+    return EmptySpace(views=[view, view], head=np.arange(joints), tail=(np.arange(joints) + 1) % joints,
+                      fraction=rng.uniform(0.1, 0.9, joints), sigma_px=4.0)
 
 
 def _rays(state, near, bone, sigma, rng):

@@ -1,0 +1,36 @@
+"""Where the views show the background, frame by frame, as observations of a body: no limb is there.
+
+Only limbs whose posture must be seen: a hand that the model holds straight would pull its forearm.
+"""
+
+import numpy as np
+
+from .fit_input import FitInput
+from .observations import EmptySpace
+from .observations.empty_space import Distances
+from .settings import FitSettings
+from .state import ShapeParameters, free_bones
+
+ALONG = (0.2, 0.5, 0.8, 1.0)  # where on a bone's axis
+
+
+class EmptyViews:
+    """The views' empty parts in all frames."""
+
+    def __init__(self, given: FitInput, parameters: ShapeParameters, settings: FitSettings) -> None:
+        skeleton = parameters.skeleton
+        names = {joint: i for i, joint in enumerate(skeleton.joint_names)}
+        limbs = [bone for bone, free in zip(skeleton.bones, free_bones(parameters)) if free]
+        self._head = np.repeat([names[bone.head_joint] for bone in limbs], len(ALONG))
+        self._tail = np.repeat([names[bone.tail_joint] for bone in limbs], len(ALONG))
+        self._fraction = np.tile(ALONG, len(limbs))
+        self._given, self._sigma_px = (given.empty if settings.use_background else ()), settings.empty_sigma_px
+        self._rig, self._frames = given.rig, given.frames
+
+    def observe(self, t: int) -> list[EmptySpace]:
+        """What is empty in frame index `t`; nothing where that is not known."""
+        views = [Distances(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
+                 for v in self._given if (d := v.of_frame(self._frames[t])) is not None]
+        if not views:
+            return []
+        return [EmptySpace(views=views, head=self._head, tail=self._tail, fraction=self._fraction, sigma_px=self._sigma_px)]

@@ -1,0 +1,29 @@
+"""The still background: found from images of a passing square, and where it shows."""
+
+import numpy as np
+import pytest
+
+from tricap.core.images.background import FEWEST, shows, still_background
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 6.0])
+def test_a_passing_square_hides_the_background(noise: float) -> None:
+    rng = np.random.default_rng(3)
+    wall = 110 + 8 * rng.standard_normal((90, 160)).astype(np.float32)
+    square = 150 + 25 * rng.standard_normal((20, 20)).astype(np.float32)
+    images = []
+    for i in range(11):
+        image = wall + noise * rng.standard_normal(wall.shape).astype(np.float32)
+        image[30:50, 5 + 12 * i : 25 + 12 * i] = square
+        images.append(np.rint(image))
+    background = still_background(images)
+    assert background is not None and np.abs(background - wall).mean() < 0.5 + 0.6 * noise
+    there = shows(background, images[5])
+    assert not there[32:48, 67:83].any()  # inside the square, though its mean is near the wall's
+    away = np.ones_like(there)
+    away[25:55, 60:90] = False
+    assert there[away].mean() > 0.995
+
+
+def test_too_few_images_tell_nothing() -> None:
+    assert still_background([np.zeros((9, 9))] * (FEWEST - 1)) is None
