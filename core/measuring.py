@@ -13,6 +13,7 @@ from . import store
 from .errors import InputError
 from .geometry.intersection import forward_intersection
 from .images.enhance import EnhanceSettings, enhanced
+from .images.retime import retimed
 from .images.sampling import SplineImage
 from .images.sequence import IMAGE_ENDINGS
 from .matching import foreground as fg
@@ -64,13 +65,32 @@ class MeasuredFrame:
     key: str
 
 
+def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
+    """The measured rows (h', w) float32 of all views at one frame, of views that are late at the moment of the others.
+
+    Raises:
+        InputError: see `Footage.read`.
+    """
+    take = footage.take
+
+    def neighbour(k: int, at: int) -> np.ndarray | None:
+        at += take.views[k].offset_frames
+        return take.rows.rows(footage.sequences[k].read(at)) if 0 <= at < footage.sequences[k].count else None
+
+    rows = [take.rows.rows(image) for image in footage.read(frame)]
+    for k, late in enumerate(footage.late_frames):
+        if late:
+            rows[k] = retimed(rows[k], neighbour(k, frame - 1), neighbour(k, frame + 1), late)
+    return rows
+
+
 def load_images(footage: Footage, frame: int, enhance: EnhanceSettings | None = None) -> FrameImages:
     """Read a frame and prepare it; what is matched may be enhanced, the grey values stay as they were taken.
 
     Raises:
         InputError: see `Footage.read`.
     """
-    grey = [footage.take.rows.rows(image) for image in footage.read(frame)]
+    grey = measured_rows(footage, frame)
     matched = enhanced(grey, enhance, row_step=footage.take.rows.step) if enhance is not None else grey
     return FrameImages(grey=grey, spline=[SplineImage(g) for g in matched])
 
@@ -99,6 +119,7 @@ def measure_frames(
         take.rig_path,
         repr((take.interlaced, take.reference_view, _seed_table(footage))),
         repr([(v.name, v.offset_frames) for v in take.views]),
+        repr(footage.late_frames) if any(footage.late_frames) else "",
     )
     start = before = None
     for done, frame in enumerate(order):
@@ -118,9 +139,11 @@ def measure_frames(
 
 
 def _image_digests(footage: Footage, frame: int) -> list[str]:
-    """What identifies the images of a frame: the content of image files; the size and date of a movie."""
+    """What identifies the images of a frame: the content of image files; the size and date of a movie. With views put to the others'
+    moment the frames before and after count as well."""
+    near = (frame - 1, frame, frame + 1) if any(footage.late_frames) else (frame,)
     parts = []
-    for path in footage.files(frame):
+    for path in (path for f in near if f in footage.frames or f == frame for path in footage.files(f)):
         try:
             state = path.stat()
             parts.append(store.digest(path) if path.suffix.lower() in IMAGE_ENDINGS else f"{state.st_size} {state.st_mtime_ns}")

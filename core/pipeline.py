@@ -17,7 +17,8 @@ from . import store
 from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
-from .checking.take_check import causes_of_failure, first_look, with_cause
+from .checking.take_check import causes_of_failure, doubts, with_cause
+from .checking.timing import in_step
 from .correcting import corrected_cloud, corrected_tracks
 from .empty_sources import find_empty
 from .errors import InputError
@@ -28,6 +29,7 @@ from .fitting.settings import FitSettings
 from .following import track_frames
 from .frame_table import frame_table, write_frame_table
 from .images.enhance import EnhanceSettings
+from .images.retime import TimingSettings
 from .matching.growing import GrowingSettings
 from .matching.least_squares import MatchingSettings
 from .measured import Clouds, MeasuredFrames, note_of
@@ -45,6 +47,7 @@ from .tracking.settings import TrackingSettings, TrackStatus
 from .tracking.trajectories import Trajectories, assemble
 
 SETTINGS: dict[str, type] = {
+    "timing": TimingSettings,
     "enhance": EnhanceSettings,
     "matching": MatchingSettings,
     "growing": GrowingSettings,
@@ -54,7 +57,6 @@ SETTINGS: dict[str, type] = {
     "skin": SkinSettings,
 }
 Overrides = Mapping[str, Mapping[str, Any]]
-DOUBTFUL_RESIDUAL_PX = 1.0
 
 
 @dataclass(kw_only=True)
@@ -196,6 +198,8 @@ def measure(run: Run, monitor: Monitor) -> None:
     began, s = time.perf_counter(), run.settings
     _forget_other_clouds(run)
     done, room = [], None
+    if s["timing"].correct and not run.footage.late_frames:
+        run.footage, run.account["offsets"] = in_step(run.footage, monitor)
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
             run.results.write_cloud(run.corrected(m.cloud))
@@ -213,7 +217,8 @@ def measure(run: Run, monitor: Monitor) -> None:
     notes = tuple(sorted(done, key=lambda n: n.frame))
     run.measured = MeasuredFrames(footage=run.footage, results=run.results, notes=notes)
     residual = _median([n.residual_px for n in notes])
-    _warn_of_doubts(run, residual, monitor)
+    for sentence in doubts(run.footage, notes[0].frame, [n.frame for n in notes if not n.points], residual, monitor):
+        run.warn(sentence)
     run.finish_stage(
         "measure",
         began,
@@ -224,21 +229,6 @@ def measure(run: Run, monitor: Monitor) -> None:
         foreground=room.method if room else "",
         background_planes=len(room.planes) if room else 0,
     )
-
-
-def _warn_of_doubts(run: Run, residual_px: float, monitor: Monitor) -> None:
-    """What is odd about the clouds, and what is wrong with the take if anything is."""
-    empty = [n.frame for n in run.measured.notes if not n.points]
-    if empty:
-        run.warn(f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}.")
-    if residual_px > DOUBTFUL_RESIDUAL_PX:
-        run.warn(
-            f"The rays of matched points miss each other by {residual_px:.1f} px: "
-            "does rig.toml belong to this recording, and were the views in step?"
-        )
-    thorough = empty or residual_px > DOUBTFUL_RESIDUAL_PX
-    for cause in causes_of_failure(run.footage, monitor) if thorough else first_look(run.footage, run.measured.notes[0].frame):
-        run.warn(f"{cause.sentence} {cause.advice}".strip())
 
 
 def track(run: Run, monitor: Monitor) -> None:

@@ -47,7 +47,7 @@ def _fitted(footage: Footage) -> Any:
 
 
 CONCERNS: dict[str, Concern] = {
-    "measure": Concern(settings=("enhance", "matching", "growing", "surface"), take=_seen, files=()),
+    "measure": Concern(settings=("timing", "enhance", "matching", "growing", "surface"), take=_seen, files=()),
     "track": Concern(settings=("tracking",), take=_followed, files=("trajectories.npz", "trajectories_raw.npz")),
     "fit": Concern(
         settings=("fitting", "skin"),

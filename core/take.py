@@ -107,6 +107,7 @@ class Footage:
     rig: Rig
     sequences: tuple[Sequence, ...]
     frames: range
+    late_frames: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
 
     def read(self, frame: int) -> list[np.ndarray]:
         """The grey images (h, w) float32 of all views at one frame of the take.

@@ -17,6 +17,8 @@ from .texture import texture_findings
 from .timing import Film, Offset, estimate_offsets
 from .view_matches import match_views
 
+DOUBTFUL_RESIDUAL_PX = 1.0
+SMALL = 0.05  # frames: not worth an interpolation
 SPARE = 0.25  # frames: an offset beyond it spoils a measurement
 UNUSABLE = ("blank view", "identical views", "swapped views", "foreign rig", "no texture")  # after them, timing says nothing
 
@@ -61,7 +63,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         found += [_lonely(name) for name in lonely]
         found += [timing_finding(o) for o in offsets if o.significant or (o.method == "energy" and o.late_frames)]
         found += stale_finding({o.view: o.miss_px for o in offsets if math.isfinite(o.miss_px)})
-        figures["offsets"] = {o.view: offset_table(o) for o in offsets}
+        figures["offsets"] = {o.view: o.to_table() for o in offsets}
     return found, figures
 
 
@@ -72,6 +74,21 @@ def causes_of_failure(footage: Footage, monitor: Monitor) -> list[Finding]:
         InputError: an image cannot be read.
     """
     return sorted(check_footage(footage, monitor)[0], key=lambda finding: not finding.certain)
+
+
+def doubts(footage: Footage, first: int, empty: list[int], residual_px: float, monitor: Monitor) -> list[str]:
+    """What is odd about measured clouds, in sentences: `empty` frames, rays that miss by `residual_px` (median), and the causes.
+
+    Every run has a look at its first frame; one with odd figures is checked throughout.
+    """
+    said = [f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}."] if empty else []
+    if residual_px > DOUBTFUL_RESIDUAL_PX:
+        said.append(
+            f"The rays of matched points miss each other by {residual_px:.1f} px: "
+            "does rig.toml belong to this recording, and were the views in step?"
+        )
+    causes = causes_of_failure(footage, monitor) if said else first_look(footage, first)
+    return said + [f"{cause.sentence} {cause.advice}".strip() for cause in causes]
 
 
 def first_look(footage: Footage, frame: int) -> list[Finding]:
@@ -95,28 +112,18 @@ def timing_finding(offset: Offset) -> Finding:
     """What to do about a view that is early or late."""
     late, sigma = offset.late_frames, offset.sigma_frames
     word = "later" if late > 0 else "earlier"
-    whole = f"Add {-round(late):+d} to `offset_frames` of view {offset.view} in take.toml" if round(late) else ""
-    advice = f"{whole or 'Synchronize the cameras'}."
+    steps = [f"add {-round(late):+d} to `offset_frames` of view {offset.view} in take.toml"] if round(late) else []
+    if abs(late - round(late)) > SMALL:
+        steps.append("set `correct = true` under [settings.timing], which puts its pictures to the others' moment")
+    advice = " and ".join(steps or ["measure it as it is"]) + "; or synchronize the cameras."
+    advice = advice[0].upper() + advice[1:]
     costs = f"; the rays of moving points miss by up to {offset.effect_px:.1f} px" if offset.method == "rays" else ""
     return (wrong if abs(late) > SPARE else doubtful)(
         "out of step",
         f"View {offset.view} is {abs(late):.2f} ± {sigma:.2g} frames {word} than the reference view{costs}.",
         advice,
-        **offset_table(offset),
+        **offset.to_table(),
     )
-
-
-def offset_table(offset: Offset) -> dict[str, object]:
-    """The figures of an offset, for JSON."""
-    late = round(offset.late_frames, 4) if math.isfinite(offset.late_frames) else None
-    sigma = round(offset.sigma_frames, 4) if math.isfinite(offset.sigma_frames) else None
-    return {
-        "late_frames": late,
-        "sigma_frames": sigma,
-        "from": offset.method,
-        "moving_matches": offset.moving,
-        "miss_px": round(offset.miss_px, 3) if math.isfinite(offset.miss_px) else None,
-    }
 
 
 def _lonely(name: str) -> Finding:

@@ -9,11 +9,14 @@ from the epipolar line as if view k had been exposed s frames later. Points that
 of b. The sigma of `late` comes from the adjustment (3).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import isfinite
 
 import cv2
 import numpy as np
 
+from ..errors import InputError
+from ..images.retime import LARGEST, Recent
 from ..progress import Monitor
 from ..take import Footage
 from .survey import Survey, survey
@@ -23,6 +26,7 @@ FRAMES = 6  # looked at for the part of a frame
 MOST_LAG = 50
 FEWEST = 10  # moving matches
 LEAST = 0.3  # part of the moving matches that must fit
+FARTHEST = 0.95  # frames that (2) reaches; what lies beyond belongs to another L
 CLEAR = 0.7  # frames within which whole frames need not be looked for
 GOES_TOGETHER = 0.7  # correlation of the motion energies
 SCALE_PX, MOVES_PX, FITS_PX = 0.5, 0.3, 0.5
@@ -47,6 +51,20 @@ class Offset:
     def significant(self) -> bool:
         """Larger than its noise, and than what matters to a measurement."""
         return self.method == "rays" and abs(self.late_frames) > max(0.05, 4 * self.sigma_frames) and self.effect_px > 0.1
+
+    def to_table(self) -> dict[str, object]:
+        """The figures, for JSON; what is not known is None."""
+
+        def rounded(value: float, digits: int) -> float | None:
+            return round(value, digits) if isfinite(value) else None
+
+        return {
+            "late_frames": rounded(self.late_frames, 4),
+            "sigma_frames": rounded(self.sigma_frames, 4),
+            "from": self.method,
+            "moving_matches": self.moving,
+            "miss_px": rounded(self.miss_px, 3),
+        }
 
     @property
     def effect_px(self) -> float:
@@ -81,6 +99,24 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
             miss_px=link.miss_px,
         )
     return tuple(found[k] for k in range(len(names)))
+
+
+def in_step(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str, dict[str, object]]]:
+    """The footage with every late view put to the moment of the reference view (`images.retime`), and a table of the offsets by view.
+
+    Raises:
+        InputError: a view is late by more than can be interpolated.
+    """
+    offsets = estimate_offsets(footage, monitor)
+    for o in offsets:
+        if o.method in ("rays", "energy") and abs(o.late_frames) > LARGEST:
+            raise InputError(
+                f"View {o.view} is {o.late_frames:+.2f} frames late, too much to interpolate; add {-round(o.late_frames):+d} to its "
+                "`offset_frames` in take.toml, the rest is then corrected."
+            )
+    late = tuple(round(o.late_frames, 4) if o.significant else 0.0 for o in offsets)
+    sequences = tuple(Recent(s) if t else s for s, t in zip(footage.sequences, late))
+    return replace(footage, sequences=sequences, late_frames=late), {o.view: o.to_table() for o in offsets}
 
 
 class Film:
@@ -214,7 +250,7 @@ def _fit(misses: list[np.ndarray], lag: int, name: str) -> Offset | None:
         ds, db = np.linalg.solve(normal, -(A * w[:, None]).T @ v)
         s, b = float(np.clip(s + ds, -1, 1)), b + float(db)
     good = moving & (np.abs(miss(s) - b) < FITS_PX)
-    if good.sum() < max(FEWEST, LEAST * moving.sum()):
+    if abs(s) > FARTHEST or good.sum() < max(FEWEST, LEAST * moving.sum()):
         return None
     frame = np.repeat(np.arange(len(misses)), [len(m) for m in misses])
     return Offset(

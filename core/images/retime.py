@@ -1,0 +1,88 @@
+"""Pictures of a view that was exposed early or late, put to the moment of the other views: every pixel goes back along its own way.
+
+    d(x) = −τ (f₊ − f₋) / 2 + τ² (f₊ + f₋) / 2 ,   J(x + d(x)) = I(x)                          (1)
+
+f₊, f₋: optical flow from the picture to the next and to the one before (Kroeger et al. 2016, doi:10.1007/978-3-319-46493-0_29); τ: how many
+frames too late the picture I is, |τ| ≤ ½ or so; the parabola through three places allows for acceleration. At the recording's ends the
+flow that there is goes straight on. What is uncovered between two pictures cannot be known; it is at outlines, where nothing is measured.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..settings import knob
+from .sampling import SplineImage
+from .sequence import Sequence
+
+LARGEST = 0.75  # frames
+STEPS = 4  # of the inversion of (1)
+KEPT = 4  # pictures
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TimingSettings:
+    """Views that were not exposed at the same instants."""
+
+    correct: bool = knob(
+        False, "Find by how much of a frame each view is late, and put its pictures to the others' moment along the motion."
+    )
+
+
+def retimed(grey: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, late_frames: float) -> np.ndarray:
+    """The picture (h, w) float32 as it would have been `late_frames` earlier; `before` and `after` are its neighbours in time.  (1)"""
+    forward, back = (None if other is None else _flow(grey, other) for other in (after, before))
+    if forward is None or back is None:
+        only = forward if forward is not None else -back if back is not None else np.zeros((*grey.shape, 2), np.float32)
+        d = -late_frames * only
+    else:
+        d = -late_frames * (forward - back) / 2 + late_frames**2 * (forward + back) / 2
+    h, w = grey.shape
+    y, x = np.mgrid[0:h, 0:w].astype(np.float32)
+    u, v = x, y
+    for _ in range(STEPS):
+        at = cv2.remap(d.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        u, v = x - at[..., 0], y - at[..., 1]
+    return np.asarray(SplineImage(grey).sample(np.clip(u, 0, w - 1), np.clip(v, 0, h - 1)))
+
+
+def _flow(here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    low, high = np.percentile(here, [0.5, 99.5])
+    scale = 255.0 / max(float(high - low), 1.0)
+    pictures = [np.clip((p - low) * scale, 0, 255).astype(np.uint8) for p in (here, there)]
+    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(0)
+    return np.asarray(method.calc(pictures[0], pictures[1], None))
+
+
+class Recent:
+    """A sequence that keeps its last pictures, so that neighbours in time are not decoded again."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self._sequence = sequence
+        self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return self._sequence.count
+
+    @property
+    def source(self) -> str:
+        """Where the frames come from."""
+        return self._sequence.source
+
+    def files(self) -> tuple[Path, ...]:
+        """The files behind the frames."""
+        return self._sequence.files()
+
+    def read(self, index: int) -> np.ndarray:
+        """Grey values (h, w) float32 of frame `index`."""
+        if index not in self._kept:
+            self._kept[index] = self._sequence.read(index)
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[index]
