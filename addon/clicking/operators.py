@@ -31,6 +31,10 @@ class ClickOperator:
         """What is clicked, one after the other."""
         raise NotImplementedError
 
+    def follow(self, context: bpy.types.Context) -> None:
+        """The scene may show another frame now."""
+        self.session.show_frame(context.scene.frame_current)
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Begin; opens the views where no Clip Editor shows one."""
         if self.running:
@@ -57,7 +61,7 @@ class ClickOperator:
         """One event."""
         try:
             if event.type == "TIMER":
-                self.session.show_frame(context.scene.frame_current)
+                self.follow(context)
                 if self.session.poll():
                     self._show(context)
                 return {"PASS_THROUGH"}
@@ -202,8 +206,19 @@ class ClickSeeds(ClickOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
-        """Seeds without end."""
+        """Seeds without end, in the frame of the first clicks."""
+        if any(seeds.frames_of(clip) for clip in clips.values()):
+            context.scene.frame_set(context.scene.tricap.seed_frame)
         return free_seed_names(clips, context.scene.frame_current)
+
+    def follow(self, context: bpy.types.Context) -> None:
+        """Seeds belong to one frame.
+
+        Raises:
+            InputError: the scene shows another one.
+        """
+        if context.scene.frame_current != self.session.frame:
+            raise InputError(f"Surface seeds belong to frame {self.session.frame}, where measuring starts; go back there for more.")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Clicking needs a window."""

@@ -179,6 +179,22 @@ def test_the_first_clicks_say_the_frame(blender: ModuleType, scene: Any) -> None
     assert blender.ops.tricap.click(name="elbow.R", view="C", frame=1, remove=True) == {"CANCELLED"}
 
 
+def test_surface_seeds_belong_to_the_frame_of_the_first_clicks(blender: ModuleType, scene: Any) -> None:
+    operators = module("clicking.operators")
+    blender.ops.tricap.click(name="elbow.R", view="C", x=200, y=100)
+    scene.frame_set(2)
+    names = lambda context, clips: operators.ClickSeeds.names(None, context, clips)  # noqa: E731
+    session, _ = operators.begin_session(scene, names)
+    assert scene.frame_current == session.frame == 0 and session.name == "seed 1"
+    session.click("C", np.array([250.0, 200.0]))
+    session.click("L", np.array([250.0, 200.0]))
+    session.skip()
+    assert session.name == "seed 2" and module("project").table(scene)["seeds"]["surface"] == [{"L": [250, 200], "C": [250, 200]}]
+    scene.frame_set(1)
+    with pytest.raises(module("jobs").InputError, match="belong to frame 0"):
+        operators.ClickSeeds.follow(SimpleNamespace(session=session), blender.context)
+
+
 @pytest.mark.parametrize(("wrong", "why"), [
     ({"name": "elbow"}, "is no joint"), ({"name": "elbow.R", "view": "X"}, "no view “X”"),
     ({"name": "elbow.R", "view": "C", "x": 1e4}, "outside the image")])  # fmt: skip
