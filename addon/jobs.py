@@ -34,8 +34,8 @@ BUG = "Tricap made a mistake ({error}); the console shows where. Please report i
 class Job:
     """One computation with its progress, and afterwards its `result` or `error` (with `trace`, the traceback as text)."""
 
-    def __init__(self, compute: Callable[[Monitor], Any]) -> None:
-        self._compute = compute
+    def __init__(self, compute: Callable[[Monitor], Any], step_at: Callable[[str], str] = str) -> None:
+        self._compute, self._step_at = compute, step_at
         self._thread: threading.Thread | None = None
         self.monitor = Monitor(self._note)
         self.stage, self.done, self.total = "", 0.0, 0.0
@@ -89,6 +89,22 @@ class Job:
         (since, before), (_, now) = pace[0], pace[-1]
         return (time.monotonic() - since) / (now - before) * (1.0 - before) - (time.monotonic() - since)
 
+    @property
+    def stage_words(self) -> str:
+        """What is being done, for people."""
+        return "Stopping" if self.monitor.cancelled else self.stage or "Starting"
+
+    @property
+    def left_words(self) -> str:
+        """The time left of the present stage, "" where it cannot be told."""
+        left = self.seconds_left
+        return "" if left is None or self.monitor.cancelled else f"{time_words(left)} left"
+
+    @property
+    def step(self) -> str:
+        """The step of the workflow to which the present stage belongs."""
+        return self._step_at(self.stage)
+
     def _note(self, stage: str, done: float, total: float) -> None:
         if stage != self.stage:
             self._pace.clear()
@@ -110,17 +126,19 @@ def time_words(seconds: float) -> str:
 
 
 class JobState(bpy.types.PropertyGroup):
-    """What the panel shows of the running job; lives in the WindowManager, so it is neither saved nor undone."""
+    """What the panel shows of the running job. Only read: setting a property would draw the whole window again, the 3-D view with it."""
 
-    running: bpy.props.BoolProperty(name="Running", options={"SKIP_SAVE"})  # type: ignore[valid-type]
-    progress: bpy.props.FloatProperty(name="Progress", min=0.0, max=1.0, options={"SKIP_SAVE"})  # type: ignore[valid-type]
-    stage: bpy.props.StringProperty(name="Stage", options={"SKIP_SAVE"})  # type: ignore[valid-type]
-    left: bpy.props.StringProperty(name="Time Left", options={"SKIP_SAVE"})  # type: ignore[valid-type]
-    step: bpy.props.StringProperty(name="Step", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    running: bpy.props.BoolProperty(name="Running", get=lambda _: bool(_watched))  # type: ignore[valid-type]
+    progress: bpy.props.FloatProperty(name="Progress", min=0.0, max=1.0,  # type: ignore[valid-type]
+                                      get=lambda _: _watched[0].fraction if _watched else 0.0)
+    stage: bpy.props.StringProperty(name="Stage", get=lambda _: _watched[0].stage_words if _watched else "")  # type: ignore[valid-type]
+    left: bpy.props.StringProperty(name="Time Left", get=lambda _: _watched[0].left_words if _watched else "")  # type: ignore[valid-type]
+    step: bpy.props.StringProperty(name="Step", get=lambda _: _watched[0].step if _watched else "")  # type: ignore[valid-type]
 
 
 _current: list[Job] = []  # the one job that runs, or nothing
 _watching: list["JobOperator"] = []  # the modal operator that watches it
+_watched: list[Job] = []  # the job that it watches
 ENDED: list[Callable[[bpy.types.Context, str, str], None]] = []  # told of the end of every job: its step, and what went wrong or ""
 
 
@@ -152,6 +170,7 @@ class JobOperator:
 
     job: Job
     timer: Any = None
+    shown: str = ""
     step: ClassVar[str] = ""  # of the workflow, in which the job is at its beginning
     last_words: ClassVar[str] = ""
 
@@ -159,9 +178,10 @@ class JobOperator:
         """Main thread: read everything from Blender and return the computation."""
         raise NotImplementedError
 
-    def step_at(self, stage: str) -> str:
+    @classmethod
+    def step_at(cls, stage: str) -> str:
         """The step of the workflow to which a stage of the computation belongs."""
-        return self.step
+        return cls.step
 
     def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
         """Main thread: write the result into the scene; returns the operator's result."""
@@ -184,10 +204,8 @@ class JobOperator:
         if job is None:
             return {"CANCELLED"}
         self.job = job
-        _current[:], _watching[:] = [job], [self]
+        _current[:], _watching[:], _watched[:] = [job], [self], [job]
         wm = context.window_manager
-        wm.tricap.running, wm.tricap.progress, wm.tricap.stage = True, 0.0, "Starting"
-        wm.tricap.step, wm.tricap.left = self.step, ""
         self.timer = wm.event_timer_add(TICK_S, window=context.window)
         wm.modal_handler_add(self)
         job.start()
@@ -212,7 +230,7 @@ class JobOperator:
 
     def _prepare(self, context: bpy.types.Context) -> Job | None:
         try:
-            return Job(self.snapshot(context))
+            return Job(self.snapshot(context), type(self).step_at)
         except InputError as error:
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
             return None
@@ -228,7 +246,7 @@ class JobOperator:
             self._tell(job, error)
         failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else str(error)
         for listener in ENDED:
-            listener(context, self.step_at(job.stage), failed)
+            listener(context, job.step, failed)
         return ended
 
     def _tell(self, job: Job, error: BaseException) -> None:
@@ -241,26 +259,24 @@ class JobOperator:
             self.report({"ERROR"}, BUG.format(error=f"{type(error).__name__}: {error}"))  # type: ignore[attr-defined]
 
     def _show(self, context: bpy.types.Context) -> None:
-        state = context.window_manager.tricap
-        stopping = self.job.monitor.cancelled
-        state.progress, state.stage = self.job.fraction, "Stopping" if stopping else self.job.stage
-        state.step, left = self.step_at(self.job.stage), self.job.seconds_left
-        state.left = "" if left is None or stopping else f"{time_words(left)} left"
-        if context.workspace is not None:
-            words = "stopping…" if stopping else f"{self.job.stage} {self.job.fraction:.0%}  {state.left}  (Esc stops)"
-            context.workspace.status_text_set(f"Tricap: {words}")
-        redraw(context)
+        job = self.job
+        words = job.stage_words + ("" if job.monitor.cancelled else f" {job.fraction:.0%}  {job.left_words}  (Esc stops)")
+        if words != self.shown:  # where drawing is slow, the window has time for its user
+            self.shown = words
+            if context.workspace is not None:
+                context.workspace.status_text_set(f"Tricap: {words}")
+            redraw(context)
 
     def clear(self, context: bpy.types.Context) -> None:
         """The watching is over: no timer, no progress."""
         _watching.clear()
+        _watched.clear()
         wm = context.window_manager
         if self.timer is not None:
             wm.event_timer_remove(self.timer)
             self.timer = None
         if self.job in _current:
             _current.remove(self.job)
-        wm.tricap.running, wm.tricap.progress, wm.tricap.stage, wm.tricap.step, wm.tricap.left = False, 0.0, "", "", ""
         if context.workspace is not None:
             context.workspace.status_text_set(None)
         redraw(context)

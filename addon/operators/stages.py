@@ -21,9 +21,10 @@ class StageOperator(JobOperator):
 
     stages: ClassVar[tuple[str, ...]] = ()
 
-    def step_at(self, stage: str) -> str:
+    @classmethod
+    def step_at(cls, stage: str) -> str:
         """Measuring comes first wherever it is not done."""
-        return STEP_WORDS.get(stage.split()[0] if stage else "", self.step)
+        return STEP_WORDS.get(stage.split()[0] if stage else "", cls.step)
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], pipeline.Run]:
         """Folders and settings as they are now; the project's take.toml is written."""

@@ -81,7 +81,7 @@ def _mend_footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_nex
         row.operator("tricap.reload_take", icon="FILE_REFRESH")
         row.operator("tricap.keep_mine", icon="FILE_TICK")
     elif state.word == "failed" and "frame" in state.why:
-        layout.operator("tricap.common_frames", icon="PREVIEW_RANGE")
+        primary(layout, "tricap.common_frames", True, icon="PREVIEW_RANGE")
     elif len(scene.tricap.views) < 2:
         primary(layout, "tricap.add_footage", is_next, icon="FILE_MOVIE")
 

@@ -118,6 +118,10 @@ def _footage(scene: bpy.types.Scene, found: _Found) -> State:
         return State(word="ready", why="Add the footage of a second camera.")
     take = project.take(scene)
     found.sequences = tuple(_sequence(folder, view) for view in take.views)
+    spans = [(-view.offset_frames, s.count - view.offset_frames) for view, s in zip(take.views, found.sequences)]
+    if take.frames is None and len({stop for _, stop in spans}) > 1:
+        lengths = ", ".join(f"{view.name} to {stop - 1}" for view, (_, stop) in zip(take.views, spans))
+        raise InputError(f"The views do not end with the same frame ({lengths}): press Use Common Frames, or mend the offsets.")
     found.frames, found.take = footage_frames(take, found.sequences), take
     sizes = " and ".join(sorted({f"{view.clip.size[0]}×{view.clip.size[1]}" for view in props.views}))
     return State(word="done", why=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels.")

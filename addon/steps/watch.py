@@ -80,7 +80,7 @@ def _ended(context: bpy.types.Context, step: str, failed: str) -> None:
 
 def _unfold(before: Look | None, now: Look) -> None:
     shown: Mapping[str, Any] = bpy.context.window_manager.tricap_steps
-    if before is not None and before.next and now.states[before.next].word == "done":
+    if before is not None and before.next and now.states[before.next].word in ("done", "empty"):
         setattr(shown, before.next, False)
     if now.next:
         setattr(shown, now.next, True)

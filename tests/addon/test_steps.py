@@ -249,7 +249,7 @@ def test_wrong_moves_with_footage(blender: ModuleType, words: Words, why: Any, s
     assert not blender.context.scene.tricap.views and not any((tmp_path / "x_tricap").iterdir()), "nothing half made"
     scene = new_project(blender, sample, tmp_path)
     scene.tricap.views[0].offset_frames = 2
-    assert words().split()[0] == "failed" and "not equally long" in why("footage")
+    assert words().split()[0] == "failed" and "press Use Common Frames" in why("footage")
     assert blender.ops.tricap.common_frames() == {"FINISHED"}
     assert words().split()[0] == "done" and why("footage").startswith("3 views, 1 frames")
     scene.tricap.views[1].name = "L"
