@@ -43,6 +43,7 @@ from .state import BodyState, ShapeParameters, free_bones
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
 
 SUSPICIOUS = 3.0  # times the usual sigma0
+ERRORS_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
@@ -135,7 +136,7 @@ def _shared_weight(points: list[CloudPoints], settings: FitSettings) -> float:
 
 def _result(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem) -> BodyFit:
     parameters, skeleton = fit.parameters, fit.model.skeleton
-    pose, mixed, shape = _covariance(problem, solution)
+    pose, mixed, shape = _covariance(fit, points, problem, solution)
     T, J = len(points), len(skeleton.joint_names)
     joints, joint_sigma, sigma0 = np.empty((T, J, 3)), np.empty((T, J)), np.full(T, np.nan)
     counts = np.zeros((T, len(skeleton.bones)), dtype=np.int64)
@@ -155,13 +156,27 @@ def _result(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solu
                    converged=solution.converged, points=counts)
 
 
-def _covariance(problem: Problem, solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _covariance(fit: Conditions, points: list[CloudPoints], problem: Problem,
+                solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Blocks of the covariance: pose (T, D, D), pose with shape (T, D, S), shape (S, S)."""
     lin = linearise(problem, solution.motion, solution.vector, solution.scales)
-    understated = variance_factors(problem, lin, solution.scales)
+    found = variance_factors(problem, lin, solution.scales)
+    own = [p.sigma_m for p in points if len(p.sigma_m)]
+    wider = _wider(fit.settings, float(np.median(np.concatenate(own))) if own else 0.0)
+    understated = replace(found, points=wider * found.points, contours=wider * found.contours, steps=wider * found.steps)
     pose, mixed, shape = linearise(problem, solution.motion, solution.vector, solution.scales, understated).equations.covariance()
     pose[:, problem.held] = pose[:, :, problem.held] = mixed[:, problem.held] = 0.0
     return pose, mixed, shape
+
+
+def _wider(settings: FitSettings, own_m: float) -> float:
+    """By how much variances grow when the model's error is shared within `ERRORS_REACH_M`, and not only within the patches of the weights.
+
+    What a limb differs from its metaballs it differs along much of it, and the frames after show the same.
+    """
+    own, model = own_m**2 + 1e-12, settings.model_sigma_m**2
+    near, far = (max(1.0, (reach / settings.voxel_m) ** 2) for reach in (settings.model_patch_m, ERRORS_REACH_M))
+    return max(1.0, (own + far * model) / (own + near * model))
 
 
 def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
