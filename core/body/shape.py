@@ -11,7 +11,7 @@ import numpy as np
 from .. import store
 from ..errors import InputError
 from ..values import frozen
-from .metaballs import Metaballs, three_balls
+from .metaballs import VISIBLE, Metaballs, three_balls
 from .model_file import BodyModel, base_dofs, dof_from_table
 from .skeleton import Bone, Skeleton
 from .trunk_profile import smoothed, stout_chain
@@ -44,6 +44,16 @@ def default_shape(model: BodyModel) -> BodyShape:
         balls = smoothed(balls, model.skeleton, lengths, chain, model.visible_radii_m, model.stations)
     return BodyShape(model=model.name, skeleton=model.skeleton, lengths_m=lengths, metaballs=balls,
                      length_sigma_m=np.full(len(lengths), np.nan), radius_sigma_m=np.full((len(balls.weight), 3), np.nan))
+
+
+def one_ball_shape(shape: BodyShape) -> BodyShape:
+    """The same body with one ellipsoid a bone, from joint to joint: what bodies were made of before metaballs, for comparison."""
+    balls = shape.metaballs
+    bones = np.unique(balls.bone_index)
+    cross = np.array([balls.radii_m[balls.bone_index == b][:, [0, 2]].mean(axis=0) for b in bones]) / (1.534 * VISIBLE)
+    radii = np.stack([cross[:, 0], shape.lengths_m[bones] / (2 * VISIBLE), cross[:, 1]], axis=1)
+    single = Metaballs(bone_index=bones, centre=np.tile([0.0, 0.5, 0.0], (len(bones), 1)), radii_m=radii, weight=np.ones(len(bones)))
+    return replace(shape, metaballs=single, radius_sigma_m=np.full((len(bones), 3), np.nan))
 
 
 def scaled_shape(shape: BodyShape, factor: float) -> BodyShape:

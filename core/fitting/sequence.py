@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..body.model_file import read_model, with_limits
-from ..body.shape import default_shape, scaled_shape
+from ..body.shape import default_shape, one_ball_shape, scaled_shape
 from ..progress import Monitor
 from .acceleration import Acceleration, typical_acceleration
 from .body_motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
@@ -89,7 +89,7 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     known = np.where(np.isfinite(places[begin]), places[begin], known) if begin in places else known
     clicks = enough(known, names, [*([clicked[begin]] if begin in clicked else []), *tracks.observe(begin)])
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
-    shape = default_shape(model)
+    shape = default_shape(model) if settings.balls == "three" else one_ball_shape(default_shape(model))
     shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
     parameters = ShapeParameters(shape)
     return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,

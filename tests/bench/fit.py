@@ -7,6 +7,7 @@ The scene is the model's own surface seen from the front, with 1 mm noise: 48 DO
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,9 @@ from types import SimpleNamespace
 
 import numpy as np
 from scipy.optimize import least_squares
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "core" / "fitting"))
+import limb_scene  # noqa: E402  the scenes of the tests
 
 from tricap.core.body.metaballs import field_and_derivatives
 from tricap.core.body.model_file import read_model
@@ -143,15 +147,50 @@ def beside_scipy(settings: FitSettings) -> dict[str, float]:
             "ours_cost": cost[0], "scipy_2point_cost": cost[1], "scipy_jacobian_cost": cost[2]}
 
 
+def ablation(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
+    """What each kind of observation and each choice is worth: errors of an arm of unknown shape, 3 mm of noise, seen from the front."""
+    base = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
+    rows: list[tuple[str, tuple[str, ...], FitSettings]] = [
+        ("points", (), base),
+        ("points, wide beliefs of the shape", (), replace(base, length_sigma=1.0, radius_sigma=1.0, roundness_sigma=1.0)),
+        ("+ trajectories", ("trajectories",), base), ("+ trajectories + outlines", ("trajectories", "contours"), base),
+        ("  in turns as published", ("trajectories", "contours"), replace(base, method="alternating")),
+        ("  the published residual", ("trajectories", "contours"), replace(base, residual="paper")),
+        ("  one ellipsoid a bone", ("trajectories", "contours"), replace(base, balls="one"))]
+    scenes = [limb_scene.make_scene(frames=frames, seed=s, shape=limb_scene.other_person("arm.R", np.random.default_rng(s)))
+              for s in range(seeds)]
+    extra = [{"trajectories": s.trajectories, "contours": limb_scene.outlines(s)} for s in scenes]
+    return [{"with": name} | _errors(scenes, [{k: e[k] for k in used} for e in extra], settings) for name, used, settings in rows]
+
+
+def _errors(scenes: list, extra: list[dict], settings: FitSettings) -> dict[str, object]:
+    """Errors [mm] of joints across the view and in depth, of the radii [%], and of the elbow [deg]."""
+    joints, radii, elbow = [], [], []
+    for s, more in zip(scenes, extra):
+        given = FitInput(rig=s.rig, model=s.model, clouds=s.clouds, clicks={0: s.clicks}, time_s=s.time_s, **more)
+        fit = sequence.fit_sequence(given, settings)
+        joints.append(fit.motion.joints_m - s.joints_m)
+        if len(fit.shape.metaballs.weight) == len(s.shape.metaballs.weight):
+            radii.append(np.log(fit.shape.metaballs.radii_m / s.shape.metaballs.radii_m)[:, [0, 2]])
+        at = s.shape.skeleton.layout["elbow.R flexion"]
+        elbow.append(np.degrees(fit.motion.values[:, at] - s.motion[:, at]))
+    e = 1e3 * np.concatenate(joints)
+    return {"across_mm": float(np.sqrt((e[..., [0, 2]] ** 2).sum(-1).mean())), "depth_mm": float(np.sqrt((e[..., 1] ** 2).mean())),
+            "radii_percent": 100 * float(np.sqrt(np.mean(np.concatenate(radii) ** 2))) if radii else float("nan"),
+            "elbow_deg": float(np.sqrt(np.mean(np.concatenate(elbow) ** 2)))}
+
+
 def main() -> None:
     """Print a table, and write it as JSON where it is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     settings = FitSettings()
-    result = {"sequence": [fit_times(frames, settings) for frames in (10, 20)], "one_frame": beside_scipy(settings)}
+    result = {"sequence": [fit_times(frames, settings) for frames in (10, 20)], "one_frame": beside_scipy(settings), "ablation": ablation()}
     for row in (*result["sequence"], result["one_frame"]):
         print("  ".join(f"{key} {value:.4g}" for key, value in row.items()))
+    for row in result["ablation"]:
+        print("  ".join(f"{value:<34}" if key == "with" else f"{key} {value:6.2f}" for key, value in row.items()))
     if arguments.json:
         arguments.json.write_text(json.dumps(result, indent=1))
 

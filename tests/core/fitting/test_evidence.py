@@ -10,7 +10,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import limb_skin
 from tricap.core.errors import InputError
-from tricap.core.fitting.fit_input import EmptyView, FitInput, JointPlaces, ViewContours
+from tricap.core.fitting.fit_input import EmptyView, FitInput, JointPlaces
 from tricap.core.fitting.limbs_apart import LimbsApart
 from tricap.core.fitting.observations import MotionPrior
 from tricap.core.fitting.problem import Problem
@@ -19,7 +19,8 @@ from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solver import solve
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.raster import rasterize
-from tricap.core.tracking.contour import contour_of_mask, outward_normals
+
+from .limb_scene import outlines
 
 SETTINGS = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
 
@@ -27,23 +28,6 @@ SETTINGS = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
 def _given(scene, **changes) -> FitInput:
     values = dict(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={0: scene.clicks}, time_s=scene.time_s)
     return FitInput(**{**values, **changes})
-
-
-def _outlines(scene) -> list[ViewContours]:
-    """The true outlines of every frame and view, found in a mask of four samples a pixel."""
-    found = []
-    for camera in scene.rig.cameras:
-        parts = []
-        for frame, motion in enumerate(scene.motion):
-            skin = limb_skin(scene.shape, motion)
-            raster = rasterize(camera, skin.vertices_m, skin.triangles, factor=4)
-            xy = contour_of_mask(raster.image(np.ones(len(raster.sample)), 0.0) > 0, 16.0)
-            normal = outward_normals(xy)
-            parts.append(np.column_stack([np.full(len(xy), frame), (xy + 0.5) / 4 - 0.5, normal]))
-        table = np.concatenate(parts)
-        found.append(ViewContours(view=camera.name, frame=table[:, 0], xy_px=table[:, 1:3], normal=table[:, 3:],
-                                  sigma_px=np.full(len(table), 0.5)))
-    return found
 
 
 def _empty(scene, step_px: int = 4) -> list[EmptyView]:
@@ -83,7 +67,7 @@ def test_outlines_tell_the_thickness_that_points_from_one_side_do_not(make_scene
     before, after = [], []
     for seed in range(4):
         scene = make_scene(seed=seed, shape=other_person("arm.R", np.random.default_rng(seed)))
-        for contours, errors in (((), before), (_outlines(scene), after)):
+        for contours, errors in (((), before), (outlines(scene), after)):
             fit = fit_sequence(_given(scene, contours=contours), SETTINGS)
             errors.append(fit.motion.joints_m - scene.joints_m)
     depth = [np.sqrt(np.mean(np.array(e)[..., 1] ** 2)) for e in (before, after)]
