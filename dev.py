@@ -185,8 +185,8 @@ def test(everything: bool, pytest_arguments: list[str]) -> int:
     return linted or tested
 
 
-def bench(stage: str | None, json_path: str | None) -> int:
-    """Run tests/bench/<stage>.py, or all but the long ones; each takes `--json FILE`, and their results become one file."""
+def bench(stage: str | None, json_path: str | None, save: bool) -> int:
+    """Run tests/bench/<stage>.py, or all but the long ones; each takes `--json FILE`, and their results become one file and one table."""
     found = sorted((ROOT / "tests" / "bench").glob("[!_]*.py"))
     stages = [path for path in found if path.stem == stage or (stage is None and path.stem not in LONG_BENCHES)]
     if not stages:
@@ -198,9 +198,10 @@ def bench(stage: str | None, json_path: str | None) -> int:
             if code := run(venv_program("python"), path, "--json", part):
                 return code
             results[path.stem] = json.loads(part.read_text(encoding="utf-8"))
-    if json_path:
-        Path(json_path).write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    return 0
+        every = Path(json_path or Path(folder) / "all.json")
+        every.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        say("\nAll figures beside their peers and bounds, and beside the last committed ones (tests/bench/baseline.json):")
+        return run(venv_program("python"), ROOT / "tests" / "bench" / "_table.py", every, *(["--save"] if save else []))
 
 
 # ---- the extension ---------------------------------------------------------------------------------------------------
@@ -339,6 +340,7 @@ def parser() -> argparse.ArgumentParser:
     part = commands.add_parser("bench", help="performance and accuracy, stage by stage")
     part.add_argument("stage", nargs="?", help="only this stage")
     part.add_argument("--json", metavar="FILE", help="write the results to FILE")
+    part.add_argument("--save", action="store_true", help="make these results the baseline that later ones are compared with")
     part = commands.add_parser("gui-test", help="the workflow in a true Blender window (set up in .gui; Linux, as root)")
     part.add_argument("--out", default=str(ROOT / "out" / "gui"), help="folder of pictures and logs (default: out/gui)")
     part.add_argument("script", nargs="*", help="only these scripts")
@@ -360,7 +362,7 @@ def main() -> int:
     if options.command == "build":
         build(options.platform, options.out, not options.without_wheels)
     if options.command == "bench":
-        return bench(options.stage, options.json)
+        return bench(options.stage, options.json, options.save)
     if options.command == "gui-test":
         return gui_test(options.out, options.script)
     return lint() if options.command == "lint" else 0
