@@ -56,6 +56,7 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
     for other, curve in session.curves(view).items():
         colour = LINES[session.views.index(other) % len(LINES)]
         canvas.draw_lines(canvas.line_batch(canvas.chain(sheet.to_region(curve))), 1.5, colour)
+    _draw_others(session, view, sheet)
     at = session.clicks().get(view)
     if at is not None:
         canvas.draw_lines(canvas.line_batch(canvas.cross(sheet.to_region(at), 12.0, 3.0)), 2.0, PRESENT)
@@ -72,11 +73,21 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
         canvas.text(session.name, x + 16, y + 10, PRESENT, size=15)
 
 
+def _draw_others(session: ClickSession, view: str, sheet: Canvas) -> None:
+    """What else was clicked in this frame, with names: Blender's own markers are seen in frames in which nothing was clicked, too."""
+    for name in session.names[: session.turn + 1] if session.endless else session.names:
+        at = session.clicks(name).get(view) if name != session.name else None
+        if at is not None:
+            place = sheet.to_region(at)
+            canvas.draw_lines(canvas.line_batch(canvas.cross(place, 6.0)), 1.5, DONE)
+            canvas.text(name, place[0] + 9, place[1] - 4, DONE, size=10)
+
+
 def headline(session: ClickSession, view: str) -> str:
     """What to do now in a view, in words."""
     if not session.name:
         return "All clicked"
-    what = f"{session.name} ({session.turn + 1}/{len(session.names)})"
+    what = session.name if session.endless else f"{session.name} ({session.turn + 1}/{len(session.names)})"
     if view in session.clicks():
         return f"{what}: clicked here"
     if view in session.proposals:

@@ -1,12 +1,13 @@
 """bpy.ops.tricap.click_joints() and .click_seeds() in the window; .click(name="elbow.R", view="C", x=430, y=260) from scripts."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any, ClassVar
 
 import bpy
 
 from ...core import pipeline
-from ...core.body.model_file import joint_depths_m, read_model
+from ...core.body.model_file import BodyModel, joint_depths_m, read_model
 from ...core.errors import InputError
 from ...core.take import JOINTS, Seeds, open_take
 from .. import project, properties, seeds
@@ -67,7 +68,7 @@ class ClickOperator:
                 return {"PASS_THROUGH"}
             if event.type == "MOUSEMOVE":
                 draw.move_mouse(event.mouse_x, event.mouse_y)
-                canvas.redraw_clips(context)
+                canvas.redraw_clips(context, pictures_only=True)
                 return {"PASS_THROUGH"}
             return self._act(context, event)
         except InputError as error:
@@ -299,15 +300,24 @@ def model_joints(scene: bpy.types.Scene) -> tuple[str, ...]:
     Raises:
         InputError: none is chosen, or its file is faulty.
     """
-    name = project.take(scene).body_model
-    if name is None:
+    if not project.model_of(scene):
         raise InputError("Choose a body model first: it tells which joints to click.")
-    return read_model(name).skeleton.joint_names
+    return _model(scene).skeleton.joint_names
 
 
 def _depths(scene: bpy.types.Scene) -> dict[str, float]:
-    name = project.take(scene).body_model
-    return joint_depths_m(read_model(name)) if name is not None else {}
+    return joint_depths_m(_model(scene)) if project.model_of(scene) else {}
+
+
+def _model(scene: bpy.types.Scene) -> BodyModel:
+    name = project.model_of(scene)
+    return read_model(project.folder_of(scene) / name) if name.endswith(".toml") else _known_model(name)
+
+
+@cache
+def _known_model(name: str) -> BodyModel:
+    """One of Tricap's own; a panel asks for it each time that it is drawn."""
+    return read_model(name)
 
 
 def note_first_frame(scene: bpy.types.Scene, clips: dict[str, bpy.types.MovieClip], frame: int) -> None:

@@ -66,6 +66,11 @@ class ClickSession:
         return found
 
     @property
+    def endless(self) -> bool:
+        """Whether surface seeds are clicked, of which there are as many as one likes."""
+        return self.names[0].startswith("seed")
+
+    @property
     def whole(self) -> bool:
         """Whether all clips are still there under their names."""
         return all(name in bpy.data.movieclips for name in self._clip_names.values())

@@ -107,7 +107,7 @@ class RemoveTrajectory(Correct, bpy.types.Operator):
         frame, said = context.scene.frame_current, context.scene.tricap_correcting.corrections
         if event.type == "MOUSEMOVE":
             draw.show_looked(frame, layers.look(run, view, frame, xy, reach))
-            canvas.redraw_clips(context)
+            canvas.redraw_clips(context, pictures_only=True)
         elif event.type == "BACK_SPACE" and event.value == "PRESS" and self.added:
             said.remove(len(said) - 1)
             self.added -= 1

@@ -77,12 +77,12 @@ def area_under(window: bpy.types.Window, x: int, y: int) -> bpy.types.Area | Non
     return None
 
 
-def redraw_clips(context: bpy.types.Context) -> None:
-    """Have all Clip Editors drawn again."""
+def redraw_clips(context: bpy.types.Context, *, pictures_only: bool = False) -> None:
+    """Have all Clip Editors drawn again, with their sidebars or without."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "CLIP_EDITOR":
-                area.tag_redraw()
+                (window_region(area) if pictures_only else area).tag_redraw()
 
 
 def line_batch(segments: np.ndarray, colours: np.ndarray | None = None) -> gpu.types.GPUBatch:

@@ -44,7 +44,7 @@ class LookCloser(bpy.types.Operator):
             run = recording.current(context.scene)
             frame = context.scene.frame_current
             draw.show_looked(frame, layers.look(run, view, frame, xy, reach) if run is not None else None)
-            canvas.redraw_clips(context)
+            canvas.redraw_clips(context, pictures_only=True)
         if event.type == "LEFTMOUSE" and event.value == "PRESS" and place is not None:
             return self._end(context, {"FINISHED"})
         return {"PASS_THROUGH"}
