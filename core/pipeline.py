@@ -40,7 +40,7 @@ from .progress import Cancelled, Monitor
 from .report.pages import write_report
 from .results import Results
 from .settings import from_table, nearest_name, to_table
-from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
+from .stages import CONCERNS, DERIVED, STAGES, command_of, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
 from .take import Footage, open_take, read_take
 from .tracking.settings import TrackingSettings, TrackStatus
@@ -183,6 +183,7 @@ def _account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
         "settings": {name: to_table(value) for name, value in settings.items()},
         "inputs": {"take.toml": store.digest(take.folder / "take.toml"), take.rig_path.name: store.digest(take.rig_path)},
         "rig": {k: v for k, v in footage.rig.metadata.items() if isinstance(v, (str, int, float))},
+        "repeat": command_of(footage, settings),
         "stages": {},
         "warnings": [],
     }

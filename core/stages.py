@@ -4,6 +4,8 @@ The key of a stage is a digest of all that its result depends on, the stages bef
 stage was done; a stage is stale when its key now is another. Footage counts by names and sizes: checkpoints look at its content.
 """
 
+import json
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 
 from . import following, measuring, store
 from .errors import InputError
+from .settings import to_table
 from .take import Footage, Seeds, Take
 
 STAGES = ("measure", "track", "fit")
@@ -73,6 +76,18 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict
     except OSError as error:
         raise InputError(f"Cannot read {error.filename}: {error.strerror or error}.") from error
     return keys
+
+
+def command_of(footage: Footage, settings: Mapping[str, Any]) -> str:
+    """The command that runs this again; what take.toml says of settings need not be repeated, but does no harm."""
+    said = [
+        f"--set {group}.{name}={shlex.quote(json.dumps(value) if isinstance(value, bool) else str(value))}"
+        for group, chosen in settings.items()
+        for name, value in to_table(chosen).items()
+        if value != to_table(type(chosen)())[name]
+    ]
+    frames = f"--frames {footage.frames.start}:{footage.frames.stop}"
+    return " ".join(["tricap run", shlex.quote(str(footage.take.folder)), "--out OUT", frames, *said])
 
 
 def stage_of(group: str) -> str:

@@ -16,6 +16,7 @@ from ..surface.cloud import PointCloud
 from ..take import Footage
 from ..tracking.trajectories import Trajectories
 from . import pictures
+from .figures import Row, figure_rows, quoted
 from .graphs import curve_graph
 
 STYLE = (
@@ -47,11 +48,14 @@ def write_report(
     for done, (name, (caption, picture)) in enumerate(shown.items()):
         monitor.step("report", len(shown) + done, 2 * len(shown))
         files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
-    page = _page(account, {name: (caption, small) for name, (caption, _, small) in files.items()}, _graphs(clouds, trajectories, body))
+    rows = figure_rows(account, clouds, trajectories, body)
+    small = {name: (caption, picture) for name, (caption, _, picture) in files.items()}
+    page = _page(account, rows, small, _graphs(clouds, trajectories, body))
     monitor.step("report", 1, 1)
     results.remove("report")
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
+    store.write_json(results.path("report", "report.json"), {"format": "tricap-report", "version": 1, **account, "figures": rows})
     store.write_text(results.path("report", "report.html"), page)
 
 
@@ -116,7 +120,7 @@ def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, bod
     return graphs
 
 
-def _page(account: Mapping[str, Any], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
+def _page(account: Mapping[str, Any], rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
     notes = "".join(f'<p class="note">{html.escape(w)}</p>' for w in account["warnings"])
     stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in account["stages"].items())
     shown = "".join(
@@ -127,14 +131,26 @@ def _page(account: Mapping[str, Any], files: Mapping[str, tuple[str, bytes]], gr
     settings = html.escape(
         "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in account["settings"].items())
     )
+    repeat = html.escape(str(account.get("repeat", "")))
     take = html.escape(account["take"].rsplit("/", 1)[-1])
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tricap: {take}</title><style>{STYLE}</style><h1>{take}</h1>'
         f"<p>{len(account['views'])} views ({html.escape(', '.join(account['views']))}), "
         f"frames {account['frames'][0]} to {account['frames'][1] - 1}, {account['fps']:g} frames/s, "
-        f"interlaced: {account['interlaced']}</p>{notes}<h2>Stages</h2><table>{stages}</table>"
-        f"<h2>Over time</h2>{''.join(graphs)}<h2>Pictures</h2>{shown}<h2>Settings</h2><pre>{settings}</pre></html>\n"
+        f"interlaced: {account['interlaced']}</p>{notes}<h2>Figures</h2>{_quotable(rows)}<h2>Stages</h2><table>{stages}</table>"
+        f"<h2>Over time</h2>{''.join(graphs)}<h2>Pictures</h2>{shown}"
+        f"<h2>To repeat it</h2><pre>{repeat}</pre><h2>Settings</h2><pre>{settings}</pre></html>\n"
     )
+
+
+def _quotable(rows: Sequence[Row]) -> str:
+    """The table of what was measured."""
+    cells = []
+    for row in rows:
+        value, sigma = quoted(row["value"], row["sigma"])
+        texts = (value, f"± {sigma}", row["unit"], row["sigma_of"])
+        cells.append(f"<tr><th>{html.escape(row['name'])}</th>{''.join(f'<td>{t}</td>' for t in texts)}</tr>")
+    return f"<table><tr><th></th><th>value</th><th>sigma</th><th>unit</th><th>the sigma is</th></tr>{''.join(cells)}</table>"
 
 
 def _figures(figures: Mapping[str, Any]) -> str:

@@ -1,0 +1,60 @@
+"""What a run measured, as rows that can be quoted: name, value, sigma, unit. For people in report.html, for programs in report.json."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..fitting.body_motion import BodyFit
+from ..surface.cloud import PointCloud
+from ..tracking.trajectories import Trajectories
+
+FRAME_TO_FRAME = "scatter from frame to frame"
+ESTIMATED = "from the adjustment"
+Row = dict[str, Any]
+
+
+def figure_rows(
+    account: Mapping[str, Any], clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None
+) -> list[Row]:
+    """The rows; `sigma_of` says what each sigma is made of. NaN, where there is nothing to make it of, becomes null in the file."""
+    per_frame = {
+        ("points a frame", "points"): [float(len(c.xyz_m)) for c in clouds],
+        ("rays miss each other by (median)", "px"): [float(np.median(c.residual_px)) for c in clouds if len(c.residual_px)],
+        ("sigma of a point (median)", "mm"): [1e3 * float(np.median(c.sigma_m)) for c in clouds if len(c.sigma_m)],
+    }
+    if trajectories is not None:
+        per_frame["tracked points a frame", "points"] = trajectories.seen.sum(axis=1).astype(float).tolist()
+    rows = [_row(name, np.median(v), np.std(v), unit, FRAME_TO_FRAME) for (name, unit), v in per_frame.items() if v]
+    for view, offset in account.get("offsets", {}).items():
+        if offset["late_frames"] is not None and offset["sigma_frames"] is not None:
+            rows.append(_row(f"view {view} is late by", offset["late_frames"], offset["sigma_frames"], "frames", ESTIMATED))
+    return rows + (_of_body(body) if body is not None else [])
+
+
+def _of_body(body: BodyFit) -> list[Row]:
+    """Lengths of bones, and of each joint angle the least and the greatest."""
+    skeleton, motion, rows = body.shape.skeleton, body.motion, []
+    for bone, length, sigma in zip(skeleton.bones, body.shape.lengths_m, body.shape.length_sigma_m):
+        rows.append(_row(f"length of {bone.name}", 1e3 * length, 1e3 * sigma, "mm", ESTIMATED))
+    base = set(skeleton.layout.set("base").tolist())
+    for d, name in enumerate(motion.dof_names):
+        values = np.degrees(motion.values[:, d])
+        if d in base or not np.isfinite(values).any():
+            continue
+        for word, at in (("least", int(np.nanargmin(values))), ("greatest", int(np.nanargmax(values)))):
+            said = f"{name}, {word} (frame {motion.frames[at]})"
+            rows.append(_row(said, values[at], np.degrees(motion.sigma[at, d]), "°", ESTIMATED))
+    return rows
+
+
+def _row(name: str, value: float, sigma: float, unit: str, sigma_of: str) -> Row:
+    return {"name": name, "value": float(value), "sigma": float(sigma), "unit": unit, "sigma_of": sigma_of}
+
+
+def quoted(value: float, sigma: float) -> tuple[str, str]:
+    """Value and sigma as they are printed: the sigma with two digits that count, the value to the same place."""
+    if not np.isfinite(sigma) or sigma <= 0:
+        return f"{value:.4g}", "–"
+    places = max(0, 1 - int(np.floor(np.log10(sigma))))
+    return f"{value:.{places}f}", f"{sigma:.{places}f}"
