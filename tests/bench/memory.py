@@ -1,6 +1,6 @@
 """Peak memory against the length of a clip: three cameras, 25 frames a second, so that 20 minutes are 30,000 frames.
 
-    python tests/bench/memory.py [--frames 100 400] [--json FILE]
+    python tests/bench/memory.py [--frames 40 160] [--json FILE]
 
 The clip is 40 pictures a camera shown to and fro, each a hard link, so that a long one takes no more room than a short one. Each length is
 run in a process of its own; what grows is told per frame and for 30,000 frames.
@@ -75,7 +75,7 @@ def growth(stages: tuple[str, ...], lengths: list[int], width_px: int = 192, pic
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, nargs="+", default=[100, 400])
+    parser.add_argument("--frames", type=int, nargs="+", default=[40, 160])
     parser.add_argument("--stages", nargs="+", default=list(STAGES), choices=STAGES)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
