@@ -16,7 +16,7 @@ from . import draw
 from .finder import Finder
 from .session import ClickSession, free_seed_names, joints_of
 
-TICK_S, SNAP_PX = 0.05, 14.0
+TICK_S, SNAP_PX = 0.05, 6.0
 NUMBERS = ("ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE")
 KEYS = "Click: set    Return: take the proposals    S / right click: skip    Backspace: back    Tab, 1…9: view    Esc: done"
 

@@ -116,6 +116,7 @@ def move(x: float, y: float) -> Steps:
 
 def click(x: float, y: float, button: str = "LEFTMOUSE", **held: bool) -> Steps:
     """Move, press, release. `held`: shift, ctrl, alt."""
+    yield from move(x - 2, y)
     yield from move(x, y)
     yield
     for value in ("PRESS", "RELEASE"):
@@ -147,14 +148,12 @@ def key(name: str, **held: bool) -> Steps:
 
 
 def enter_text(x: float, y: float, text: str) -> Steps:
-    """Into the field at (x, y): Enter, paste over what it holds, Enter."""
-    yield from move(x, y)
-    yield
-    yield from key("RET")
+    """Into the field at (x, y): click, paste over what it holds, Enter."""
+    yield from click(x, y)
     yield from key("A", ctrl=True)
     bpy.context.window_manager.clipboard = text
     yield from key("V", ctrl=True)
-    yield from key("RET")
+    yield from key("NUMPAD_ENTER")
     yield
 
 
@@ -171,7 +170,10 @@ def area_of(kind: str) -> bpy.types.Area:
 
 def region_of(area: bpy.types.Area, kind: str = "WINDOW") -> bpy.types.Region:
     """Its region of that kind."""
-    return next(region for region in area.regions if region.type == kind)
+    found = [region for region in area.regions if region.type == kind]
+    if not found:
+        need(False, f"{area.ui_type} has a region {kind}")
+    return found[0]
 
 
 def middle(area: bpy.types.Area) -> tuple[float, float]:
@@ -264,11 +266,50 @@ def fill(area: bpy.types.Area, what: str, text: str, kind: str = "UI") -> Steps:
     yield from settle()
 
 
+def choose(operator_label: str, folder: Path, name: str = "") -> Steps:
+    """Answer the file browser that an operator has opened: folder, perhaps a file's name, and its button."""
+    yield from wait_for(lambda: any(a.type == "FILE_BROWSER" for a in window().screen.areas), 10, f"a file browser opens: {operator_label}")
+    yield from settle(10)
+    area = next(a for a in window().screen.areas if a.type == "FILE_BROWSER")
+    yield from fill(area, "directory", f"{folder}/", kind="UI")
+    yield from click(*middle(area))  # one Enter shows the folder, and the field is still open
+    yield from settle()
+    foot = region_of(area, "EXECUTE")
+    if name:
+        yield from enter_text(foot.x + 0.4 * foot.width, foot.y + 0.5 * foot.height, name)
+        yield from settle()
+    yield from shot(f"file_browser_{operator_label}")
+    yield from settle()
+    yield from click(foot.x + 0.95 * foot.width, foot.y + 0.5 * foot.height)
+    yield from wait_for(lambda: all(a.type != "FILE_BROWSER" for a in window().screen.areas), 10, "the file browser closes")
+    yield from settle(10)
+
+
+def pick(area: bpy.types.Area, what: str, owner: bpy.types.bpy_struct, name: str, value: str) -> Steps:
+    """Open a drop-down menu, go down to an item by the arrow keys, take it."""
+    button = yield from find(area, what)
+    yield from click(button.x, button.y)
+    yield from settle()
+    for _ in range(owner.bl_rna.properties[name].enum_items.keys().index(value) + 1):
+        yield from key("DOWN_ARROW")
+    yield from shot(f"menu_{name}")
+    yield from key("RET")
+    yield from settle()
+    need(getattr(owner, name) == value, f"{value} is chosen for {name} (it is {getattr(owner, name)})")
+
+
 def image_place(area: bpy.types.Area, x_px: float, y_px: float) -> tuple[float, float]:
     """Where the centre of a clip's pixel (x right, y down, full frame) is in the window."""
     region, size = region_of(area), area.spaces.active.clip.size
-    rx, ry = region.view2d.view_to_region((x_px + 0.5) / size[0], 1 - (y_px + 0.5) / size[1], clip=False)
-    return region.x + rx, region.y + ry
+    left, bottom = region.view2d.view_to_region(0, 0, clip=False)
+    right, top = region.view2d.view_to_region(1, 1, clip=False)
+    u, v = (x_px + 0.5) / size[0], 1 - (y_px + 0.5) / size[1]
+    return region.x + left + u * (right - left), region.y + bottom + v * (top - bottom)
+
+
+def pixel_of(area: bpy.types.Area) -> float:
+    """How large a pixel of the clip is on the screen."""
+    return image_place(area, 1, 0)[0] - image_place(area, 0, 0)[0]
 
 
 def reports() -> list[str]:
@@ -363,6 +404,7 @@ class Pulse:
 def run(script: str) -> None:
     """Step through `script`.steps(), then end Blender: exit code 0 if all is so, 1 if not, 3 after an exception."""
     bpy.context.preferences.view.show_splash = False
+    bpy.context.preferences.view.filebrowser_display_type = "SCREEN"  # in this window, where events can be simulated
     going: list[Steps] = []
 
     def step() -> float:

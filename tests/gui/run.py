@@ -12,8 +12,8 @@ import window
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-SCRIPTS = ("sample", "over_footage", "smooth")
-LIMIT_S = 300.0
+SCRIPTS = ("sample", "workflow", "over_footage", "smooth")
+LIMIT_S = 480.0
 SIZE = (1600, 1000)
 
 

@@ -1,0 +1,166 @@
+"""From an empty Blender to a rig that moves, by mouse and keys alone: footage, cameras, clicks, surface, tracks, body, rig; then the
+same numbers by the command line."""
+
+import random
+import subprocess
+import time
+from pathlib import Path
+
+import bpy
+import drive
+from bl_ext.user_default.tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
+from bl_ext.user_default.tricap.core.take import read_take
+
+CLICK_ERROR_PX = 5.0
+LAYOUT, CLICKS = "Layout", "Tricap Clicks"
+COMPARED = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply")
+STAGE_S = 60.0
+Joints = dict[str, dict[str, tuple[float, float]]]
+
+
+def steps() -> drive.Steps:
+    film, blend = drive.HERE / "film", drive.HERE / "mon élan" / "kick.blend"
+    blend.parent.mkdir()
+    joints = make_film(film)
+    yield from footage(film, blend)
+    yield from cameras(film)
+    yield from seeds(joints)
+    yield from body(blend)
+    yield from commands_numbers(blend.with_name("kick_tricap"))
+
+
+def make_film(film: Path) -> Joints:
+    """A folder of images for every view and rig.toml, and where the joints are in them."""
+    make_arm_take(film, ArmTakeSettings(frames=6, width_px=512, interlaced="none", click_error_px=0.0))
+    joints = read_take(film).seeds.joints
+    for name in ("take.toml", "truth.npz"):
+        (film / name).unlink()
+    return {name: {view: (float(xy[0]), float(xy[1])) for view, xy in at.items()} for name, at in joints.items()}
+
+
+def footage(film: Path, blend: Path) -> drive.Steps:
+    """Save the file; choose the folder with the footage."""
+    area = yield from drive.sidebar("VIEW_3D", "Tricap")
+    yield from drive.shot("01_empty")
+    yield from drive.press(area, "wm.save_mainfile")
+    yield from drive.choose("save", blend.parent, blend.name)
+    drive.need(bpy.data.filepath == str(blend), "the file is saved")
+    area = yield from drive.sidebar("VIEW_3D", "Tricap")
+    yield from drive.shot("02_saved")
+    yield from drive.press(area, "tricap.add_footage")
+    yield from drive.choose("footage", film)
+    yield from drive.shot("03_footage")
+    drive.need([view.name for view in bpy.context.scene.tricap.views] == ["L", "C", "R"], "three views were added")
+
+
+def cameras(film: Path) -> drive.Steps:
+    """Choose the calibration."""
+    area = yield from drive.sidebar("VIEW_3D", "Tricap")
+    yield from drive.press(area, "tricap.cameras_from_file")
+    yield from drive.choose("cameras", film, "rig.toml")
+    yield from drive.shot("04_cameras")
+
+
+def seeds(wanted: Joints) -> drive.Steps:
+    """Choose the body, open the views, click every joint in every view, each a little beside it."""
+    area, props = (yield from drive.sidebar("VIEW_3D", "Tricap")), bpy.context.scene.tricap
+    yield from drive.pick(area, "tricap.model", props, "model", "arm.R")
+    yield from drive.press(area, "tricap.open_views")
+    yield from drive.wait_for(lambda: drive.window().workspace.name == CLICKS, 10, "the views are opened")
+    yield from drive.wait_for(lambda: len(clip_areas()) == 3, 10, "each view has an editor")
+    yield from drive.settle(10)
+    first = clip_areas()[0]
+    yield from drive.move(*drive.middle(first))
+    yield from drive.key("N")
+    yield from drive.settle(10)
+    drive.region_of(first, "UI").active_panel_category = "Tricap"
+    yield from drive.settle(10)
+    yield from drive.shot("05_views")
+    yield from drive.press(first, "tricap.click_joints()")
+    yield from drive.shot("06_clicking")
+    rng = random.Random(3)
+    for name, at in wanted.items():
+        for area in clip_areas():
+            x, y = at[view_of(area)]
+            yield from drive.click(*drive.image_place(area, x + beside(rng), y + beside(rng)))
+            yield from drive.pause(0.5)
+            if name == "elbow.R" and area == clip_areas()[0]:
+                yield from drive.pause(3)
+                yield from drive.shot("07_one_view_clicked")
+    yield from drive.settle(10)
+    check_clicks(wanted)
+    yield from drive.shot("08_clicked")
+    yield from workspace(LAYOUT)
+
+
+def beside(rng: random.Random) -> float:
+    """A person's error in x or y [px]."""
+    return rng.uniform(-1, 1) * CLICK_ERROR_PX / 2**0.5
+
+
+def clip_areas() -> list[bpy.types.Area]:
+    """The Clip Editors, from left to right."""
+    return sorted((a for a in drive.window().screen.areas if a.type == "CLIP_EDITOR"), key=lambda a: a.x)
+
+
+def view_of(area: bpy.types.Area) -> str:
+    """The view that an editor shows."""
+    return next(view.name for view in bpy.context.scene.tricap.views if view.clip == area.spaces.active.clip)
+
+
+def check_clicks(wanted: Joints) -> None:
+    """Each joint is clicked in each view, as close as it was meant to be; one screen pixel more is allowed."""
+    for view in bpy.context.scene.tricap.views:
+        size, tracks, areas = view.clip.size, view.clip.tracking.tracks, {view_of(a): a for a in clip_areas()}
+        pixel = 1 / drive.pixel_of(areas[view.name])
+        for name, at in wanted.items():
+            co = tracks[name].markers[0].co if name in tracks else (0.0, 0.0)
+            off = max(abs(co[0] * size[0] - 0.5 - at[view.name][0]), abs((1 - co[1]) * size[1] - 0.5 - at[view.name][1]))
+            drive.check(off <= CLICK_ERROR_PX + pixel, f"{name} in {view.name} is clicked {off:.1f} px beside it")
+
+
+def workspace(name: str) -> drive.Steps:
+    """Ctrl + Page Up or Down, as far as needed."""
+    yield from drive.move(*drive.middle(max(drive.window().screen.areas, key=lambda a: a.width * a.height)))
+    for key_name in ("PAGE_UP",) * 12 + ("PAGE_DOWN",) * 12:
+        if drive.window().workspace.name == name:
+            break
+        yield from drive.key(key_name, ctrl=True)
+        yield from drive.settle()
+    drive.need(drive.window().workspace.name == name, f"the workspace {name} is shown")
+
+
+def body(blend: Path) -> drive.Steps:
+    """Surface, tracks, body, rig, one button each."""
+    for operator in ("tricap.measure(", "tricap.track(", "tricap.fit(", "tricap.build_scene("):
+        area = yield from drive.sidebar("VIEW_3D", "Tricap")
+        yield from drive.press(area, operator)
+        yield from drive.wait_for(lambda: not bpy.context.window_manager.tricap.running, STAGE_S * drive.slowness(), f"{operator}) ends")
+        yield from drive.shot(f"1_{operator[7:-1]}")
+    drive.need("Body" in bpy.data.objects, "there is a body")
+    armature, scene = bpy.data.objects["Body"], bpy.context.scene
+    yield from drive.move(*drive.middle(drive.area_of("VIEW_3D")))
+    yield from drive.key("LEFT_ARROW", shift=True)
+    start = (armature.matrix_world @ armature.pose.bones[-1].tail).copy()
+    yield from drive.key("RIGHT_ARROW", shift=True)
+    yield from drive.settle()
+    path = (armature.matrix_world @ armature.pose.bones[-1].tail - start).length
+    drive.check(scene.frame_current == scene.frame_end, "the last frame is shown")
+    drive.check(path > 0.02, f"from the first frame to the last the wrist moves {path * 1e3:.0f} mm")
+    yield from drive.shot("2_moving")
+    yield from drive.key("S", ctrl=True)
+    yield from drive.settle()
+    drive.check(not bpy.data.is_dirty, "the file is saved with it")
+
+
+def commands_numbers(project: Path) -> drive.Steps:
+    """`tricap run` on the take.toml that the clicks made gives the same bytes."""
+    out = drive.HERE / "command"
+    began, line = time.monotonic(), [bpy.app.binary_path, "--command", "tricap", "run", str(project), "--out", str(out), "--quiet"]
+    command = subprocess.Popen(line)
+    yield from drive.wait_for(lambda: command.poll() is not None, 3 * STAGE_S * drive.slowness(), "the command line ends")
+    drive.say(f"the command took {time.monotonic() - began:.1f} s, exit code {command.returncode}")
+    for name in COMPARED:
+        same = (out / name).read_bytes() == (project / "results" / name).read_bytes()
+        drive.check(same, f"{name} is the command line's, byte by byte")
+    (drive.OUT / "take.toml").write_bytes((project / "take.toml").read_bytes())
