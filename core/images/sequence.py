@@ -5,7 +5,7 @@ Files are read when they are needed, so a long sequence costs no more memory tha
 
 import re
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ SIGNATURES = (
     b"P6",
     b"\x76\x2f\x31\x01",
 )
+WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
 KINDS = ("uint8", "uint16", "float32", "float64")
 
 
@@ -55,6 +56,7 @@ class ImageFiles:
 
     def __init__(self, paths: tuple[Path, ...], source: str) -> None:
         self._paths, self._source = paths, source
+        self._top: float | None = None
 
     @property
     def count(self) -> int:
@@ -76,7 +78,19 @@ class ImageFiles:
         Raises:
             InputError: the file is gone or is not an image.
         """
-        return read_image(self._paths[index])
+        return read_image(self._paths[index], self._white())
+
+    def _white(self) -> float:
+        """The grey value of white: cameras of 10 or 12 bits often write 16 bits without filling them."""
+        if self._top is None:
+            some = sorted({0, len(self._paths) // 2, len(self._paths) - 1})
+            first = decoded(self._paths[0])
+            if first.dtype != np.uint16:
+                self._top = 0.0
+            else:
+                brightest = max(int(decoded(self._paths[i]).max()) for i in some)
+                self._top = float(next(white for white in WHITES if brightest <= white))
+        return self._top
 
 
 class Movie:
@@ -84,7 +98,7 @@ class Movie:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._capture = cv2.VideoCapture(str(path))
+        self._capture = _capture(path)
         self._next = 0
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
         if count < 1:
@@ -115,7 +129,7 @@ class Movie:
         """
         if index < self._next:
             self._capture.release()
-            self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
+            self._capture, self._next = _capture(self._path), 0
         image = np.zeros(0)
         while self._next <= index:
             ok = self._capture.grab() if self._next < index else None
@@ -128,6 +142,14 @@ class Movie:
                 )
             self._next += 1
         return grey(image)
+
+
+def _capture(path: Path) -> Any:
+    """A decoder that turns pictures as the movie's header says; OpenCV 4 must be asked to."""
+    capture = cv2.VideoCapture(str(path))
+    if capture.isOpened():
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+    return capture
 
 
 def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: str) -> Sequence:
@@ -156,8 +178,17 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
     return ImageFiles(paths, pattern)
 
 
-def read_image(path: Path) -> np.ndarray:
-    """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour.
+def read_image(path: Path, white: float = 0.0) -> np.ndarray:
+    """Grey values (h, w) float32 0…255 of one image file of 8 or 16 bits, grey or colour; `white` of 16 bits if it is not 65535.
+
+    Raises:
+        InputError: see `decoded`.
+    """
+    return grey(decoded(path), white)
+
+
+def decoded(path: Path) -> np.ndarray:
+    """An image file's own pixels (h, w) or (h, w, channels).
 
     Raises:
         InputError: the file is missing, is not an image, is larger than 36 megapixels or 8191 pixels a side, or of a strange kind.
@@ -176,7 +207,7 @@ def read_image(path: Path) -> np.ndarray:
     _refuse_size(image.shape[1::-1], path)
     if image.dtype.name not in KINDS:
         raise InputError(f"{path} holds {image.dtype.name} pixels; save it with 8 or 16 bits a channel.")
-    return grey(image)
+    return np.asarray(image)
 
 
 def _refuse_size(size_px: tuple[int, int] | None, path: Path) -> None:
@@ -186,14 +217,14 @@ def _refuse_size(size_px: tuple[int, int] | None, path: Path) -> None:
         raise InputError(f"{path} has {size_px[0]}×{size_px[1]} pixels, more than can be measured; scale the footage down.")
 
 
-def grey(image: np.ndarray) -> np.ndarray:
-    """Grey values (h, w) float32 0…255 of an image of 8 or 16 bits or float 0…1, grey, BGR or BGRA."""
+def grey(image: np.ndarray, white: float = 0.0) -> np.ndarray:
+    """Grey values (h, w) float32 0…255 of an image of 8 or 16 bits (of which `white` is white) or float 0…1, grey, BGR or BGRA."""
     if image.dtype == np.float64:
         image = image.astype(np.float32)
     if image.ndim == 3:
         image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY) if image.shape[2] >= 3 else image[:, :, 0]
     if image.dtype == np.uint16:
-        return (image / np.float32(257.0)).astype(np.float32)
+        return (image / np.float32((white or WHITES[-1]) / 255)).astype(np.float32)
     if image.dtype.kind == "f":
         return np.ascontiguousarray(np.nan_to_num(image, nan=0.0) * 255.0, dtype=np.float32)
     return image.astype(np.float32)

@@ -189,3 +189,41 @@ def test_movies_that_are_none(tmp_path: Path) -> None:
     for name in ("missing.mp4", "", "\0"):
         with pytest.raises(InputError, match="of view L is missing"):
             open_sequence(tmp_path, images=None, movie=name, view="L")
+
+
+@pytest.mark.parametrize(("bits", "shape"), [(10, (20, 30)), (12, (20, 30, 3)), (16, (20, 30))])
+def test_cameras_of_more_bits_fill_the_range(tmp_path: Path, bits: int, shape: tuple[int, ...]) -> None:
+    """10 and 12 bits in files of 16: white is what their bits allow, for the whole sequence alike."""
+    for i in range(3):
+        image = np.full(shape, (2**bits - 1) * (i + 1) // 3, np.uint16)
+        write(tmp_path / f"{i}.png", image)
+    found = [open_sequence(tmp_path, images="*.png", movie=None, view="C").read(i).mean() for i in range(3)]
+    assert np.allclose(found, [85, 170, 255], atol=0.3)
+
+
+def turned_movie(path: Path) -> Path:
+    """A movie of 64×48, bright at the left, whose header says that it is shown a quarter turn to the right."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (64, 48))
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:, :20] = 220
+    for _ in range(4):
+        writer.write(picture)
+    writer.release()
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 4 + 4 + 20 + 8 + 8  # version and flags; times, number, length; reserved; layer, group, volume
+    matrix = (0, 1 << 16, 0, -(1 << 16), 0, 0, 48 << 16, 0, 1 << 30)
+    data[at : at + 36] = b"".join(v.to_bytes(4, "big", signed=True) for v in matrix)
+    path.write_bytes(data)
+    return path
+
+
+def test_a_movie_held_upright_is_read_upright(tmp_path: Path) -> None:
+    turned_movie(tmp_path / "phone.mp4")
+    image = open_sequence(tmp_path, images=None, movie="phone.mp4", view="C").read(0)
+    assert image.shape == (64, 48) and image[:16].mean() > 180 and image[28:].mean() < 40  # the left edge became the upper one
+
+
+def test_4k_and_portrait(tmp_path: Path) -> None:
+    for size in ((3840, 2160), (2160, 3840)):
+        write(tmp_path / "a.jpg", np.full(size[::-1], 77, np.uint8))
+        assert read_image(tmp_path / "a.jpg").shape == size[::-1]
