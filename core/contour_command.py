@@ -66,6 +66,8 @@ def write_contour(
     contours = dict(track_contour(job, names.index(name), ContourSettings(), polygon, background, monitor))
     path = job.results.path("contours", f"{name}.csv")
     store.write_text(path, _table(contours))
+    job.account["stages"].pop("fit", None)  # the body is to be fitted again
+    job.results.write_run(job.account)
     seen = float(np.mean([c.seen.mean() for c in contours.values()]))
     return f"{path}: the outline in {len(contours)} frames, {100 * seen:.0f} % of its vertices on an edge."
 

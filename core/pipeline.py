@@ -318,6 +318,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         converged=body.converged,
         sigma0=_median(body.motion.sigma0),
         joint_sigma_mm=1e3 * _median(body.motion.joint_sigma_m),
+        **({"outline_mm": 1e3 * _median(body.outline_m)} if len(body.outline_m) else {}),
     )
 
 

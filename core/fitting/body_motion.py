@@ -54,3 +54,4 @@ class BodyFit:
     iterations: int  # of the adjustment over the whole sequence
     converged: bool
     points: np.ndarray  # (T, B) points that each bone's surface had in each frame
+    outline_m: np.ndarray  # (K,) distances of the views' outlines from the limbs that they touch; none without contours

@@ -139,7 +139,7 @@ def _result(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solu
     pose, mixed, shape = _covariance(fit, points, problem, solution)
     T, J = len(points), len(skeleton.joint_names)
     joints, joint_sigma, sigma0 = np.empty((T, J, 3)), np.empty((T, J)), np.full(T, np.nan)
-    counts = np.zeros((T, len(skeleton.bones)), dtype=np.int64)
+    counts, outline = np.zeros((T, len(skeleton.bones)), dtype=np.int64), [np.zeros(0)]
     for t in range(T):
         state = parameters.state(solution.motion[t], solution.vector)
         joints[t], A = state.joint_jacobian
@@ -149,11 +149,12 @@ def _result(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solu
         counts[t] = np.bincount(found.bone, minlength=len(skeleton.bones))
         if len(found.bone):
             sigma0[t] = robust_scale(found.residual(state))
+        outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
     motion = BodyMotion(frames=np.array([p.frame for p in points]), time_s=time_s, dof_names=skeleton.dof_names, values=solution.motion,
                         covariance=pose, joint_names=skeleton.joint_names, joints_m=joints, joint_sigma_m=joint_sigma,
                         status=_statuses(fit, counts, sigma0), sigma0=sigma0)
     return BodyFit(shape=parameters.shape(solution.vector, np.sqrt(np.diag(shape))), motion=motion, iterations=solution.iterations,
-                   converged=solution.converged, points=counts)
+                   converged=solution.converged, points=counts, outline_m=np.concatenate(outline))
 
 
 def _covariance(fit: Conditions, points: list[CloudPoints], problem: Problem,

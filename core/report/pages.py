@@ -29,6 +29,7 @@ LABELS = {
     "residual_px": "rays miss by [px], median",
     "sigma_mm": "sigma of a position [mm], median",
     "joint_sigma_mm": "sigma of a joint's coordinate [mm], median",
+    "outline_mm": "outlines from the body [mm], median",
     "mean_length_frames": "mean length [frames]",
 }
 

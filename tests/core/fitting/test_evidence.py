@@ -70,6 +70,7 @@ def test_outlines_tell_the_thickness_that_points_from_one_side_do_not(make_scene
         for contours, errors in (((), before), (outlines(scene), after)):
             fit = fit_sequence(_given(scene, contours=contours), SETTINGS)
             errors.append(fit.motion.joints_m - scene.joints_m)
+            assert len(fit.outline_m) == 0 if not contours else np.median(fit.outline_m) < 1e-3
     depth = [np.sqrt(np.mean(np.array(e)[..., 1] ** 2)) for e in (before, after)]
     across = [np.sqrt(np.mean(np.array(e)[..., [0, 2]] ** 2)) for e in (before, after)]
     assert depth[1] < 0.4 * depth[0]  # measured 6.4 mm and 0.5 mm
