@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..images.sequence import Movie
 from ..progress import Monitor
 from ..take import Footage
 from .findings import Finding, doubtful, wrong
@@ -12,6 +13,7 @@ from .findings import Finding, doubtful, wrong
 LONGEST = 240  # frames; a longer take is looked at from its middle
 WIDTH_PX = 96
 BLANK_SPREAD, DARK, WHITE, WHITE_SHARE = 1.0, 24.0, 253.0, 0.03  # grey values; share of the pixels
+UNEVEN = 0.6  # frames; time stamps are rounded
 REPEATED = 0.2  # of a view's usual motion energy, noise included
 
 
@@ -82,6 +84,18 @@ def picture_findings(seen: Survey, names: tuple[str, ...]) -> list[Finding]:
                 )
             )
     return [*found, *_repeated(seen, names)]
+
+
+def rate_findings(footage: Footage) -> list[Finding]:
+    """Movies whose frames, as far as they were looked at, do not follow each other evenly."""
+    found = []
+    for view, sequence in zip(footage.take.views, footage.sequences):
+        uneven = sequence.unevenness if isinstance(sequence, Movie) else 0.0
+        if uneven > UNEVEN:
+            said = f"View {view.name} has a variable frame rate: its frames are up to {uneven:.1f} frames off an even rate."
+            advice = "Convert the movie to a constant frame rate, each frame at its own moment."
+            found.append(wrong("variable frame rate", said, advice, uneven_frames=uneven))
+    return found
 
 
 def _blank(seen: Survey, name: str, blank: np.ndarray) -> Finding:

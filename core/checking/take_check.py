@@ -12,7 +12,7 @@ from .clicks import seed_findings
 from .findings import Checked, Finding, doubtful, wrong
 from .rig_check import geometry_findings
 from .rig_fit import ENOUGH, rig_findings, same_views, share, stale_finding
-from .survey import picture_findings, survey
+from .survey import picture_findings, rate_findings, survey
 from .texture import texture_findings
 from .timing import Film, Offset, estimate_offsets
 from .view_matches import match_views
@@ -45,7 +45,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     names = tuple(v.name for v in footage.take.views)
     matching = from_table(MatchingSettings, footage.take.settings.get("matching", {}), "[matching]")
     film = Film(footage, survey(footage, monitor))
-    found = [*geometry_findings(footage.rig), *picture_findings(film.seen, names)]
+    found = [*geometry_findings(footage.rig), *picture_findings(film.seen, names), *rate_findings(footage)]
     pairs = film.matches()
     alike = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)

@@ -100,6 +100,7 @@ class Movie:
         self._path = path
         self._capture = _capture(path)
         self._next = 0
+        self._shown_ms: dict[int, float] = {}
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
         if count < 1:
             raise InputError(f"{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files.")
@@ -140,8 +141,20 @@ class Movie:
                     f"Frame {index} of {self._path} cannot be decoded; it promises {self._count} frames. "
                     "Set `frames` in take.toml to leave the end out, or convert the movie again."
                 )
+            self._shown_ms[self._next] = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
             self._next += 1
         return grey(image)
+
+    @property
+    def unevenness(self) -> float:
+        """By how many frames the moments of the frames decoded so far differ from an even rate, at most; 0 where that is not known."""
+        frames = np.array(sorted(self._shown_ms), dtype=np.float64)
+        shown = np.array([self._shown_ms[int(f)] for f in frames])
+        if len(frames) < 4 or not np.ptp(shown) > 0:
+            return 0.0
+        even = np.polynomial.Polynomial.fit(frames, shown, 1)
+        step = float(even.convert().coef[1])
+        return float(np.abs(shown - even(frames)).max() / step) if step > 0 else 0.0
 
 
 def _capture(path: Path) -> Any:

@@ -227,3 +227,33 @@ def test_4k_and_portrait(tmp_path: Path) -> None:
     for size in ((3840, 2160), (2160, 3840)):
         write(tmp_path / "a.jpg", np.full(size[::-1], 77, np.uint8))
         assert read_image(tmp_path / "a.jpg").shape == size[::-1]
+
+
+def with_a_pause(data: bytes) -> bytes:
+    """A movie whose first two frames last as long as ever and the others three times: a second row in its table of durations."""
+    at = data.index(b"stts")
+    count, length = (int.from_bytes(data[at + i : at + i + 4], "big") for i in (12, 16))
+    rows = b"".join(v.to_bytes(4, "big") for v in (2, 2, length, count - 2, 3 * length))
+    grown = bytearray(data[: at + 8] + rows + data[at + 20 :])
+    for box in (b"stts", b"stbl", b"minf", b"mdia", b"trak", b"moov"):
+        head = grown.index(box) - 4
+        grown[head : head + 4] = (int.from_bytes(grown[head : head + 4], "big") + 8).to_bytes(4, "big")
+    if b"elst" in grown:  # how long it is shown
+        place = grown.index(b"elst") + 12
+        grown[place : place + 4] = (3 * int.from_bytes(grown[place : place + 4], "big")).to_bytes(4, "big")
+    return bytes(grown)
+
+
+def test_a_variable_frame_rate_is_noticed(tmp_path: Path) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "even.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (64, 48))
+    for i in range(12):
+        writer.write(np.full((48, 64, 3), 20 * i, np.uint8))
+    writer.release()
+    (tmp_path / "uneven.mp4").write_bytes(with_a_pause((tmp_path / "even.mp4").read_bytes()))
+    found = {}
+    for name in ("even", "uneven"):
+        movie = Movie(tmp_path / f"{name}.mp4")
+        for i in range(movie.count):
+            assert abs(movie.read(i).mean() - 20 * i) < 4
+        found[name] = movie.unevenness
+    assert found["even"] < 0.1 and found["uneven"] > 0.6, found
