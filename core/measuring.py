@@ -26,10 +26,11 @@ from .matching.seeds import Approximations, approximations_at_depth, sweep_seeds
 from .progress import Monitor
 from .results import Results
 from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
-from .take import Clicks, Footage
+from .take import Clicks, Footage, footage_frames
 
-ALGORITHM = "surface 4"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 5"  # part of every key: raise it when the same input gives other numbers
 CLICK_SIGMA_PX = 4.0
+MIN_MOVED = 20  # seeds
 CLICK_MISS_PX = 3 * CLICK_SIGMA_PX  # from each click to where the rays meet: two clicks may be 24 px apart across their epipolar lines
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
@@ -219,20 +220,23 @@ def _first_foreground(
     swept = sweep_seeds(
         images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=None, monitor=monitor
     )
+    room, person = _room_and_person(footage, images, swept, frame)
     clicks = [*take.seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface))]
-    if clicks:
-        depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
+    depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
+    if clicks and frame == take.seeds.frame:
         where = fg.around_clicks(depth)
-    elif len(swept.depth_m):
-        where = fg.nearest_surface(swept.depth_m)
+    elif clicks:
+        where = fg.since_clicks(depth, abs(frame - take.seeds.frame) / take.fps, person)
+    elif len(person):
+        where = fg.nearest_surface(person)
     else:
         where = fg.Foreground(depth_range_m=(0.05, 1e3), method="everything")
-    where = replace(where, planes=_room(footage, images, swept, frame))
+    where = replace(where, planes=room)
     near, far = where.depth_range_m
     seeds = sweep_seeds(
         images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=(near, far), monitor=monitor
     )
-    if take.seeds.surface:
+    if take.seeds.surface and frame == take.seeds.frame:
         seeds = _with_clicked(footage, seeds, depth[len(take.seeds.joints) :])
     return where, seeds
 
@@ -274,20 +278,26 @@ def _with_clicked(footage: Footage, seeds: Approximations, depth_m: np.ndarray) 
 
 
 def _furthest_frame(footage: Footage, frame: int) -> int:
-    """The frame that differs most in time."""
-    return max(footage.frames, key=lambda f: abs(f - frame))
+    """The frame of the take that differs most in time, whether it is to be measured or not."""
+    return max(footage_frames(footage.take, footage.sequences), key=lambda f: abs(f - frame))
 
 
-def _room(footage: Footage, images: FrameImages, seeds: Approximations, frame: int) -> np.ndarray:
-    """Planes of floor and walls, from the seeds whose patch is the same in the frame furthest in time."""
+def _room_and_person(footage: Footage, images: FrameImages, seeds: Approximations, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Planes (P, 4) of floor and walls, and the depths of seeds that are not on them: those that moved, unless these are too few to tell.
+
+    What moved is what the frame furthest in time does not show at the same place.
+    """
     ref, camera = footage.take.reference, footage.rig.cameras[footage.take.reference]
     other = _furthest_frame(footage, frame)
     if other == frame or not len(seeds.depth_m):
-        return np.zeros((0, 4))
+        return np.zeros((0, 4)), seeds.depth_m
     later = load_images(footage, other).grey[ref]
     xyz = camera.points_at_depth(footage.take.rows.to_frame(seeds.xy[:, ref]), seeds.depth_m)
-    static = fg.unchanged(images.grey[ref], later, seeds.xy[:, ref])
-    return fg.background_planes(xyz[static], xyz, [c.centre_m for c in footage.rig.cameras])
+    still = fg.unchanged(images.grey[ref], later, seeds.xy[:, ref])
+    planes = fg.background_planes(xyz[still], xyz, [c.centre_m for c in footage.rig.cameras])
+    beside = ~fg.Foreground(depth_range_m=(0.0, np.inf), method="", planes=planes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
+    moved = beside & ~still
+    return planes, seeds.depth_m[moved if moved.sum() >= MIN_MOVED else beside]
 
 
 def _single(field: TripletField) -> TripletField:

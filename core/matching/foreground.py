@@ -1,8 +1,9 @@
 """The person, not the wall: in which depths to measure, and which planes of the room to leave out.
 
-The depth range comes from what the user clicked; without clicks, from the nearest surface that carries many seeds; later from the
-frame before. Floor and walls are planes of seeds that do not change over time and have nothing behind them; they are found once per
-take, and points on them are not measured. Which of these was used is said in `method`.
+The depth range comes from what the user clicked in that frame; without clicks, or where they are of another frame, from the nearest
+surface that carries many seeds, of those that moved if these are enough; later from the frame before. Floor and walls are planes of seeds
+that do not change over time and have nothing behind them; they are found once per take, and points on them are not measured. Which of
+these was used is said in `method`.
 """
 
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 
 REACH_M = 0.55  # a body's extent in depth beyond clicked joints
+SPEED_M_S = 2.0  # of someone who walks, in depth
 MARGIN_M = 0.30  # what a person may move in depth between frames, and a limb beyond the cloud of the frame before
 CLUSTER_WIDTH, CLUSTER_SHARE = 0.12, 0.3  # of log depth; of the seeds in the richest cluster
 PLANE_TOLERANCE_M, PLANE_SHARE, PLANE_MIN, BEHIND_SHARE = 0.015, 0.3, 20, 0.03
@@ -43,6 +45,20 @@ class Foreground:
 def around_clicks(depth_m: np.ndarray) -> Foreground:
     """The depths of a body some of whose joints or surface points were clicked."""
     return Foreground(depth_range_m=(max(0.05, float(depth_m.min()) - REACH_M), float(depth_m.max()) + REACH_M), method="clicks")
+
+
+def since_clicks(depth_m: np.ndarray, seconds: float, person_m: np.ndarray) -> Foreground:
+    """The depths `seconds` before or after joints were clicked: of what is nearest among the seeds' depths `person_m` (N,) that a body
+    can have reached since; where there is none, all that it can have reached."""
+    near, far = around_clicks(depth_m).depth_range_m
+    near, far = max(0.05, near - SPEED_M_S * seconds), far + SPEED_M_S * seconds
+    reached = person_m[(person_m >= near) & (person_m <= far)]
+    if not len(reached):
+        return Foreground(depth_range_m=(near, far), method="clicks")
+    found = nearest_surface(reached)
+    return Foreground(
+        depth_range_m=(max(near, found.depth_range_m[0]), min(far, found.depth_range_m[1])), method="clicks and nearest surface"
+    )
 
 
 def nearest_surface(depth_m: np.ndarray) -> Foreground:

@@ -11,13 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import measuring
+from tricap.core import measuring, pipeline
 from tricap.core.errors import InputError
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.matching.growing import TripletField
 from tricap.core.measuring import MeasuredFrame
 from tricap.core.progress import Cancelled, Monitor
+from tricap.core.results import Results
 from tricap.core.surface.cloud import PointCloud
+from tricap.core.take import open_take, read_take
 
 
 def same(a: MeasuredFrame, b: MeasuredFrame) -> None:
@@ -114,6 +116,21 @@ def test_the_person_and_not_the_wall(tmp_path: Path, scenes: Any) -> None:
         assert m.foreground.method in ("nearest surface", "frame before")
         distance = body.distance_m(m.cloud.xyz_m)
         assert len(distance) > 200 and np.mean(np.abs(distance) < 0.02) > 0.9 and (m.cloud.xyz_m[:, 2] < 3.2).all()
+
+
+def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any) -> None:
+    """`--frames 3:4` of a take clicked in frame 0: the person is what moved, though she could have got to the wall."""
+    rig, bodies = scenes.three_cameras(), moving_body_before_a_wall(scenes, 4)
+    take = scenes.write_take(tmp_path / "take", rig, bodies)
+    at = ", ".join("{} = [{:.1f}, {:.1f}]".format(c.name, *c.project(np.array([-0.1, 0.0, 2.0]))) for c in rig.cameras)
+    text = (take / "take.toml").read_text().replace("fps = 25.0", "fps = 2.0")
+    (take / "take.toml").write_text(text + f'[seeds]\nframe = 0\n[seeds.joints]\n"elbow.R" = {{ {at} }}\n')
+    footage = pipeline.only_frames(open_take(read_take(take)), (3, 4))
+    s = pipeline.settings_of({}, {}, "take.toml")
+    (m,) = measuring.measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(tmp_path / "out"), Monitor())
+    assert m.foreground.method == "clicks and nearest surface" and m.foreground.depth_range_m[1] < 4
+    distance = bodies[3][1].distance_m(m.cloud.xyz_m)
+    assert len(distance) > 200 and np.mean(np.abs(distance) < 0.02) > 0.9
 
 
 def test_a_checkpoint_belongs_to_the_frame_that_showed_the_room(tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
