@@ -150,7 +150,6 @@ def attack(name: str, folder: Path, count: int) -> dict[str, Any]:
         target = r.choice(files)
         for path in files:
             path.write_bytes(mutate(whole[path], r) if path == target else whole[path])
-        (folder / "number").write_text(str(number))
         forget_the_most()
         before, began, fault = memory_mb()[0], time.process_time(), ""
         try:
