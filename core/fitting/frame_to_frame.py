@@ -6,11 +6,15 @@ the next is tried from both. A limb without points (hidden behind another) comes
 and wider gate, so that it is found where it comes out.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..progress import Monitor
 from .cloud_points import CloudPoints
 from .conditions import Conditions
+from .inverse_kinematics import lasting
+from .lost_limbs import found_again
 from .material_tracks import MaterialTracks
 from .observations import MotionPrior, Observation, StepsFromFixed
 from .segmentation import HeldSegments, crop
@@ -28,7 +32,7 @@ WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per fram
 def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first: Solution, tracks: MaterialTracks | None,
            monitor: Monitor) -> tuple[np.ndarray, list[CloudPoints], np.ndarray]:
     """Motion (T, D) of all frames, the points near the body in each, and where each DOF (T, D) was seen."""
-    T, done = len(points), 1
+    fit, T, done = replace(fit, priors=lasting(fit.priors, time_s)), len(points), 1  # the frame before has said them already
     motion = np.empty((T, first.motion.shape[1]))
     motion[fit.click] = first.motion[0]
     known = np.ones(motion.shape, dtype=bool)
@@ -40,7 +44,7 @@ def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first
             before = fit.parameters.state(motion[t - direction], first.vector)
             moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else []
             near = _some(crop(points[t], before, REACH_M))
-            predictions = _predictions(motion, time_s, seen, t, _slowing(fit, unseen))
+            predictions = _predictions(motion, time_s, seen, t, np.where(_came_out(known, seen), 0.0, _slowing(fit, unseen)))
             wide = 1 + np.minimum(WIDENING * unseen, WIDEST - 1)
             motion[t], found = _next_posture(fit, t, near, moved, predictions, first, support, wide)
             known[t] = False
@@ -73,6 +77,11 @@ def _slowing(fit: Conditions, unseen: np.ndarray) -> np.ndarray:
     return np.where(seen.any(axis=0) | ~(free[:, None] & moved).any(axis=0), 1.0, SLOWING)
 
 
+def _came_out(known: np.ndarray, seen: list[int]) -> np.ndarray:
+    """Which DOFs (D,) were seen in the last frame but not in the one before: the change says how wrong the prediction was, not how fast."""
+    return known[seen[-1]] & ~known[seen[-2]] if len(seen) > 1 else np.zeros(known.shape[1], dtype=bool)
+
+
 def _predictions(motion: np.ndarray, time_s: np.ndarray, seen: list[int], t: int, slowing: np.ndarray) -> list[np.ndarray]:
     last = motion[seen[-1]]
     if len(seen) < 2 or abs(t - seen[-1]) > COASTING:
@@ -96,16 +105,24 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
     sigma[skeleton.layout.set("base")] = s.prediction_sigma_m
     best, best_support = predictions[0], 0.0
-    for start in predictions:
+
+    def adjusted(start: np.ndarray) -> tuple[np.ndarray, float]:
         prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
             return [fit.surface(points, state, wide, held), *fit.joints(i), *fit.empty.observe(i), *moved, prior, *fit.beliefs(state)]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
-        support = fit.support(points, solution.motion[0], first.vector)
+        return solution.motion[0], fit.support(points, solution.motion[0], first.vector)
+
+    for start in predictions:
+        posture, support = adjusted(start)
         if support > best_support:
-            best, best_support = solution.motion[0], support
+            best, best_support = posture, support
         if last_support is None or best_support > LOST_SUPPORT * last_support:
             break
+    for start in found_again(fit, points, best, first.vector):
+        posture, support = adjusted(start)
+        if support > best_support + s.min_points / 4:
+            best, best_support = posture, support
     return (predictions[0], None) if best_support < s.min_points else (best, best_support)

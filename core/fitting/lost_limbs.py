@@ -1,0 +1,106 @@
+"""Limbs that have lost their points are looked for among the points that no part of the body explains.
+
+A limb that moved on while it was not measured is no longer where it is predicted, and its points lie beyond the gate. Postures all over
+what its joints allow are tried, evenly spread (Halton 1960), then closer ones around the best; the last best is a new start for the
+adjustment.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import qmc
+
+from .cloud_points import CloudPoints
+from .conditions import Conditions
+from .segmentation import from_bone
+from .state import BodyState, free_bones
+
+ROUNDS = ((400, 150.0, 0.03, 4), (60, 25.0, 0.02, 2), (60, 10.0, 0.015, 1))  # postures, spread [°], width [m] of weights, best kept
+BEYOND_M = 0.05  # points so far beyond a limb's reach, or so near to another bone, are none of its
+
+
+def lost_limbs(fit: Conditions, counts: np.ndarray) -> list[np.ndarray]:
+    """The limbs (bones of each, from the body outwards) whose bones all have too few points; `counts` (B,) of a posture."""
+    skeleton, free = fit.model.skeleton, free_bones(fit.parameters)
+    few = counts < fit.settings.min_points / 2
+    roots = [b for b in np.flatnonzero(free) if skeleton.parents[b] >= 0 and not free[skeleton.parents[b]] and _limb(fit, int(b))]
+    limbs = [np.array([c for c in np.flatnonzero(free) if root in _line(skeleton.parents, int(c))]) for root in roots]
+    return [limb for limb in limbs if few[limb].all()]
+
+
+def found_again(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> list[np.ndarray]:
+    """Postures (D,) in which limbs without points explain points that nothing else does; none where there are too few such points.
+
+    At most one for each lost limb; each includes those before it.
+    """
+    state = fit.parameters.state(motion, vector)
+    surface = fit.surface(points, state)
+    counts = np.bincount(surface.bone, minlength=len(state.lengths_m))
+    found, now = [], motion
+    for limb in lost_limbs(fit, counts):
+        rows = _unexplained(fit, points, state, limb)
+        if len(rows) < fit.settings.min_points / 2:
+            continue
+        kept = now[None]
+        for count, spread, width, best in ROUNDS:
+            tried = np.concatenate([_postures(fit, m, limb, count, np.radians(spread)) for m in kept])
+            support = np.array([_explained(fit, points, rows, s, limb, width) for s in fit.parameters.states(tried, vector)])
+            kept = tried[np.argsort(-support, kind="stable")[:best]]
+        if support.max() > fit.settings.min_points / 4:
+            now = kept[0]
+            found.append(now)
+    return found
+
+
+def _limb(fit: Conditions, bone: int) -> bool:
+    return fit.model.skeleton.bones[bone].name.endswith((".L", ".R"))
+
+
+def _line(parents: np.ndarray, bone: int) -> list[int]:
+    line = [int(bone)]
+    while parents[line[-1]] >= 0:
+        line.append(int(parents[line[-1]]))
+    return line
+
+
+def _unexplained(fit: Conditions, points: CloudPoints, state: BodyState, limb: np.ndarray) -> np.ndarray:
+    """Rows of the points within a limb's reach that are near no other part of the body, nor near a hand, foot or other bone's axis."""
+    reach = float(state.lengths_m[limb].sum()) + BEYOND_M
+    near = np.linalg.norm(points.xyz_m - state.head_m[limb[0]], axis=1) < reach
+    hanging = {c for c in range(len(state.lengths_m)) if limb[0] in _line(fit.model.skeleton.parents, c)}
+    fleshy = set(state.balls.bone_index.tolist())
+    for b in set(range(len(state.lengths_m))) - hanging:
+        rows = np.flatnonzero(near)
+        if b in fleshy:
+            near[rows] = from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] > fit.settings.gate_m
+        else:
+            w, axis = points.xyz_m[rows] - state.head_m[b], state.R[b][:, 1]
+            along = np.clip(w @ axis, 0.0, state.lengths_m[b] + BEYOND_M)
+            near[rows] = np.linalg.norm(w - along[:, None] * axis, axis=1) > BEYOND_M
+    return np.flatnonzero(near)
+
+
+def _postures(fit: Conditions, motion: np.ndarray, limb: np.ndarray, count: int, spread: float) -> np.ndarray:
+    """Postures (count, D) of one limb, evenly within `spread` [rad] of a posture and the joints' limits; the rest of the body as it is."""
+    skeleton = fit.model.skeleton
+    columns = np.flatnonzero(np.isin(skeleton.dof_bone, limb) & ~np.isin(np.arange(len(motion)), skeleton.held))
+    low, high = (np.array([skeleton.dofs[c].limits[i] for c in columns]) for i in (0, 1))
+    low, high = np.maximum(low, motion[columns] - spread), np.minimum(high, motion[columns] + spread)
+    tried = np.tile(motion, (count, 1))
+    tried[:, columns] = low + _even(len(columns), count) * np.maximum(high - low, 0.0)
+    return tried
+
+
+@lru_cache(maxsize=8)
+def _even(dimensions: int, count: int) -> np.ndarray:
+    return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))
+
+
+def _explained(fit: Conditions, points: CloudPoints, rows: np.ndarray, state: BodyState, limb: np.ndarray, width_m: float) -> float:
+    """How many of the points a limb explains: the sum of their weights."""
+    best = np.zeros(len(rows))
+    for b in limb:
+        gap, along, facing = from_bone(points.xyz_m[rows], points.normals[rows], state, int(b))
+        own = facing & (along >= fit.model.surface[b, 0]) & (along <= fit.model.surface[b, 1])
+        best = np.maximum(best, own / (1 + (gap / width_m) ** 2) ** 2)
+    return float(best.sum())

@@ -1,0 +1,54 @@
+"""An arm that is not where it was predicted is found among the points that nothing else explains."""
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.fitting.cloud_points import CloudPoints
+from tricap.core.fitting.fit_input import FitInput
+from tricap.core.fitting.lost_limbs import found_again
+from tricap.core.fitting.sequence import conditions
+from tricap.core.fitting.settings import FitSettings
+
+from .limb_scene import front_rig, measured_cloud, surface
+
+WRIST = "wrist.R"
+
+
+def points_of(shape, motion: np.ndarray, bones: dict[str, int]) -> CloudPoints:
+    """Points on the fronts of some bones, so many on each."""
+    rng, names = np.random.default_rng(5), [bone.name for bone in shape.skeleton.bones]
+    bone = np.repeat([names.index(name) for name in bones], list(bones.values()))
+    along, angle = rng.uniform(0.15, 0.9, len(bone)), rng.uniform(0, 2 * np.pi, len(bone))
+    xyz, normals = surface(shape, motion, along, angle, bone)
+    front = normals[:, 1] < 0
+    return CloudPoints(frame=0, xyz_m=xyz[front], normals=normals[front], sigma_m=np.full(front.sum(), 0.001))
+
+
+@pytest.fixture(scope="module")
+def standing():
+    shape = default_shape(read_model("full"))
+    before = np.zeros(len(shape.skeleton.dof_names))
+    rig = front_rig()
+    joints = joint_positions(shape.skeleton, shape.lengths_m, before)
+    clicks = {name: {c.name: c.project(at) for c in rig.cameras} for name, at in joints.items()}
+    clouds = [measured_cloud(shape, before, 0, np.random.default_rng(0), points=200)]
+    given = FitInput(rig=rig, model="full", clouds=clouds, time_s=np.zeros(1), clicks={0: clicks})
+    return conditions(given, FitSettings()), shape, before
+
+
+def test_a_raised_arm_is_found(standing) -> None:
+    fit, shape, before = standing
+    layout, raised = shape.skeleton.layout, before.copy()
+    for name, degrees in (("shoulder.R flexion", 70.0), ("elbow.R flexion", 60.0)):
+        raised[layout[name]] = np.radians(degrees)
+    others = {"chest": 200, "spine": 100, "upper_arm.L": 60, "forearm.L": 60, "thigh.L": 60, "shin.L": 60, "thigh.R": 60, "shin.R": 60}
+    vector = fit.parameters.vector(shape)
+    (found,) = found_again(fit, points_of(shape, raised, others | {"upper_arm.R": 80, "forearm.R": 80}), before, vector)
+    true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)[WRIST] for m in (raised, before, found))
+    assert np.linalg.norm(was - true) > 0.3 and np.linalg.norm(now - true) < 0.08
+    moved = np.flatnonzero(np.abs(found - before) > 1e-9)
+    assert {shape.skeleton.dof_names[i].partition(" ")[0] for i in moved} <= {"shoulder.R", "elbow.R"}
+    assert not found_again(fit, points_of(shape, raised, others), before, vector)  # hidden: nothing is invented
