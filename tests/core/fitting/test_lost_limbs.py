@@ -34,7 +34,7 @@ def standing():
     rig = front_rig()
     joints = joint_positions(shape.skeleton, shape.lengths_m, before)
     clicks = {name: {c.name: c.project(at) for c in rig.cameras} for name, at in joints.items()}
-    clouds = [measured_cloud(shape, before, 0, np.random.default_rng(0), points=200)]
+    clouds = [measured_cloud(shape, before, 0, np.random.default_rng(0), points=200, noise=0.001, gross=0.0)]
     given = FitInput(rig=rig, model="full", clouds=clouds, time_s=np.zeros(1), clicks={0: clicks})
     return conditions(given, FitSettings()), shape, before
 
