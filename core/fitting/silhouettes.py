@@ -18,6 +18,7 @@ from .settings import FitSettings
 from .state import BodyState
 
 SPACING_M = 0.012  # of the rays, at the body
+OUTLINE_PATCHES = 3  # an outline that follows a wrong edge does so for about this many patches of the model's error, in all views
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,7 +57,7 @@ class Silhouettes:
             return []
         away = np.linalg.norm(state.head_m[bone] - rays.origin_m[rows], axis=1)
         own, model = (rays.angle[rows] * away) ** 2 + 1e-12, self._settings.model_sigma_m**2
-        share = max(1.0, len(self._tables) * self._settings.model_patch_m / SPACING_M)
+        share = max(1.0, len(self._tables) * OUTLINE_PATCHES * self._settings.model_patch_m / SPACING_M)
         found = SilhouetteRays(origin_m=rays.origin_m[rows], direction=rays.direction[rows], bone=bone, sigma_m=np.sqrt(own + model),
                                crowding=(own + share * model) / (own + model))
         return [found.scaled(state)]
