@@ -49,7 +49,10 @@ def read_bvh(path: Path, *, unit_m: float | None = None, up: str | None = None) 
     if not found or not head.lstrip("\ufeff \t\r\n").upper().startswith("HIERARCHY"):
         raise InputError(f"{path} is not a BVH file: it needs a HIERARCHY and a MOTION.")
     joints = _joints(head, path)
-    values, fps = _values(body, sum(len(j.channels) for j in joints), path)
+    count = sum(len(j.channels) for j in joints)
+    if any(column >= count for j in joints for column in j.columns):
+        raise InputError(f"{path} gives a joint its CHANNELS twice; it is damaged, export it again.")
+    values, fps = _values(body, count, path)
     return _motion(joints, values, fps, unit_m, up)
 
 

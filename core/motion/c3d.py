@@ -155,7 +155,7 @@ def _read(data: bytes, path: Path, rotation: np.ndarray) -> Markers:
 def _range(table: dict[tuple[str, str], Any], first: int, last: int) -> tuple[int, int]:
     """First frame and their number; the header's words overflow beyond 65535, TRIAL's do not."""
     begin, end = table.get(("TRIAL", "ACTUAL_START_FIELD")), table.get(("TRIAL", "ACTUAL_END_FIELD"))
-    if begin is not None and end is not None and len(begin) == 2 and len(end) == 2:
+    if begin is not None and end is not None and np.size(begin) == 2 and np.size(end) == 2:
         first, last = (int(pair[0]) + (int(pair[1]) << 16) for pair in (begin, end))
     return first, last - first + 1
 
