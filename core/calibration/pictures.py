@@ -58,7 +58,7 @@ def _error_map(calibration: Calibration, quality: Quality) -> np.ndarray:
         points, shape = _section(box, a, b)
         cameras = calibration.network.cameras(calibration.observations.names, calibration.observations.size_px)
         pairs = np.stack([points, points], axis=1)
-        predicted = predicted_error(cameras, calibration.unknowns, calibration.covariance, pairs + np.array([[0.0], [1e-6]]))
+        predicted = predicted_error(cameras, calibration.every_unknown, calibration.considered, pairs + np.array([[0.0], [1e-6]]))
         values = np.full(len(points), np.nan)
         values[_index_of(points, predicted.xyz_m[0::2])] = predicted.sigma_m[0::2]
         panels.append(_heat_panel(f"predicted error, section {title}", values.reshape(shape)[::-1] * 1e3))

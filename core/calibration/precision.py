@@ -4,16 +4,24 @@
     X(c): ∂X/∂c = −(Σ G_cᵀ G_c)⁻¹ G_cᵀ J_c                                      (2)   a point intersected by the cameras that see it
     ΔX_i − (τ + θ × X_i) → min over τ, θ                                         (3)   what no rigid motion of the whole explains
 
+    P = Q_r ⊕ 0 + [K; I] Σ [K; I]ᵀ ,   K = Q_rl Q_ll⁻¹                          (4)   l: unknowns that were left out, r: the others
+    Σ = max(0, F − 1) Q_gg for each group g of them ,   F = xᵀ Q_gg⁻¹ x / m      (5)
+
+(4) is what a left-out unknown of covariance Σ does to the others (Schmidt 1966, "consider" parameters); with Σ = Q_ll it is the covariance
+of the adjustment in which all were free. As E F = 1 + λ / m, F − 1 in (5) is the unbiased estimate of what a group is beyond its own noise,
+its positive part the empirical Bayes variance (Efron & Morris 1973).
+
 Mapping through (3) is an S-transformation to the datum of the points themselves (Baarda 1973), so the figures do not depend on the datum.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ..geometry.camera import Camera
-from ..geometry.camera_derivatives import exterior_derivatives, image_with_derivatives, interior_of
+from ..geometry.camera_derivatives import INTERIOR, exterior_derivatives, image_with_derivatives, interior_of
 from ..geometry.rotation import cross_matrix
 from .bundle import Network, Normals, Unknowns, free_network, reduce_to_cameras
 
@@ -37,6 +45,40 @@ def camera_covariance(network: Network, normals: Normals, unknowns: Unknowns) ->
     values, vectors = np.linalg.eigh(scaled + G @ G.T)
     Q = (vectors / np.maximum(values, 1e-15)) @ vectors.T - G @ G.T
     return Q * scale * scale[:, None]
+
+
+def group_of(
+    off: np.ndarray, unknowns: Unknowns, covariance: np.ndarray, names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a group of interior unknowns is beyond what was expected (m,), its covariance (m, m) and its columns (m,), all cameras together.
+
+    `off` (C, 10) are all interior unknowns less their expected values, `covariance` (C p, C p) that of the free ones.
+    """
+    columns = list(unknowns.columns)
+    at = [columns.index(INTERIOR.index(name)) for name in names]
+    index = np.array([c * len(columns) + a for c in range(len(off)) for a in at])
+    return off[:, [INTERIOR.index(name) for name in names]].ravel(), covariance[np.ix_(index, index)], index
+
+
+def with_left_out(
+    covariance: np.ndarray, unknowns: Unknowns, full: np.ndarray, off: np.ndarray, left_out: Sequence[Sequence[str]]
+) -> np.ndarray:
+    """Covariance (16 C, 16 C) of all unknowns when groups of interior unknowns are kept at their expected values.  (4), (5)
+
+    `covariance` (C p, C p) and `unknowns` are those of the adjustment without the groups, `full` (16 C, 16 C) and `off` (C, 10), values
+    less expected values, those of the adjustment with all unknowns free.
+    """
+    every = replace(unknowns, free=np.ones(len(INTERIOR), dtype=bool))
+    kept = (np.arange(len(off))[:, None] * 16 + unknowns.columns).ravel()
+    P = np.zeros_like(full)
+    P[np.ix_(kept, kept)] = covariance
+    if not left_out:
+        return P
+    groups = [group_of(off, every, full, names) for names in left_out]
+    index = np.concatenate([columns for _, _, columns in groups])
+    may_be = block_diag(*(max(0.0, x @ np.linalg.solve(Q, x) / len(x) - 1) * Q for x, Q, _ in groups))
+    K = np.linalg.solve(full[np.ix_(index, index)], full[index]).T
+    return P + K @ may_be @ K.T
 
 
 def point_derivatives(cameras: Sequence[Camera], unknowns: Unknowns, xyz_m: np.ndarray) -> np.ndarray:

@@ -94,7 +94,7 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     depth = [cameras[c].to_camera(network.ends_m[used[:, c]])[:, 2] for c in range(len(cameras))]
     both = used.all(axis=2).astype(int)
     quality = Quality(
-        predicted=predicted_error(cameras, calibration.unknowns, calibration.covariance, test_bars(box, network.length_m)),
+        predicted=predicted_error(cameras, calibration.every_unknown, calibration.considered, test_bars(box, network.length_m)),
         box_m=box,
         used_lengths=_lengths(calibration, cameras, np.ones(len(used), dtype=bool)),
         held_out=held_out,

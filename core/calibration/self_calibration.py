@@ -6,6 +6,7 @@
 4  least squares; Baarda's test w = v / (σ0 √q_vv) per image point, the worst of each bar is taken out, until nothing is        (1)
 5  unknowns of the lens that are not significant are left out, one group at a time (Wald's test of the group):
    F = xᵀ Q_xx⁻¹ x / (m σ0²) < F_{1−α}(m, r)                                                                                  (2)
+6  the precision that is foretold counts what an unknown that was left out may still be (`precision.with_left_out`).
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from .bars import enough_rays, labelled_ends, with_bars
 from .blunders import redundant_parts
 from .bundle import Adjusted, Network, Unknowns, adjust, normal_equations
 from .observations import BarObservations
-from .precision import camera_covariance
+from .precision import camera_covariance, group_of, with_left_out
 from .pseudo import lens_knowledge
 from .reference_bar import COARSE_CAUCHY_PX, initial_network
 
@@ -44,8 +45,14 @@ class Calibration:
     sigma0_px: float
     redundancy: float
     covariance: np.ndarray  # (C p, C p) of the camera unknowns, times sigma0², free network
+    considered: np.ndarray  # (16 C, 16 C) of all sixteen unknowns per camera, with what the left-out ones may still be
     decisions: tuple[str, ...]  # why unknowns were left out
     converged: bool
+
+    @property
+    def every_unknown(self) -> Unknowns:
+        """All sixteen unknowns of a camera, to which `considered` belongs."""
+        return replace(self.unknowns, free=np.ones(len(INTERIOR), dtype=bool))
 
 
 def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float | None = None) -> Calibration:
@@ -127,7 +134,8 @@ def without_insignificant(
     """Leave out the groups of interior unknowns that are not significant, adjusting anew after each.  (2)"""
     unknowns = lens_knowledge(observations.size_px, state.network.interior[:, 0])
     decisions: list[str] = []
-    covariance = _covariance(state, keep, unknowns, sigma)
+    first, all_free = state.network, unknowns
+    full = covariance = _covariance(state, keep, unknowns, sigma)
     doubted = list(GROUPS)
     while doubted:
         tests = [(wald(state.network, unknowns, covariance, group, redundancy), group) for group in doubted]
@@ -144,6 +152,8 @@ def without_insignificant(
     monitor.step("calibration", 5, 5)
     square = float(np.sum(state.residual_px[keep] ** 2))
     sigma = float(np.sqrt(square / redundancy))
+    covariance = _covariance(state, keep, unknowns, sigma)
+    left_out = tuple(group for group in GROUPS if group not in doubted)
     return Calibration(
         observations=observations,
         network=state.network,
@@ -152,7 +162,8 @@ def without_insignificant(
         unknowns=unknowns,
         sigma0_px=sigma,
         redundancy=redundancy,
-        covariance=_covariance(state, keep, unknowns, sigma),
+        covariance=covariance,
+        considered=with_left_out(covariance, unknowns, full, first.interior - all_free.expected, left_out),
         decisions=tuple(decisions),
         converged=state.converged,
     )
@@ -165,11 +176,5 @@ def _covariance(state: Adjusted, keep: np.ndarray, unknowns: Unknowns, sigma: fl
 
 def wald(network: Network, unknowns: Unknowns, covariance: np.ndarray, group: tuple[str, ...], redundancy: float) -> float:
     """Probability of values as large as those of a group in all cameras if they were as expected.  (2)"""
-    columns = list(unknowns.columns)
-    C, p = len(network.R), len(columns)
-    at = [columns.index(INTERIOR.index(name)) for name in group]
-    index = np.array([c * p + a for c in range(C) for a in at])
-    names = [INTERIOR.index(name) for name in group]
-    x = (network.interior - unknowns.expected)[:, names].ravel()
-    F = x @ np.linalg.solve(covariance[np.ix_(index, index)], x) / len(x)
-    return float(f_distribution.sf(F, len(x), redundancy))
+    x, Q = group_of(network.interior - unknowns.expected, unknowns, covariance, group)[:2]
+    return float(f_distribution.sf(x @ np.linalg.solve(Q, x) / len(x), len(x), redundancy))

@@ -52,7 +52,7 @@ def one(waved: WavedBar, sigma_px: float, free: np.ndarray | None = None) -> dic
     cameras = done.network.cameras(done.observations.names, done.observations.size_px)
     known = (done.used.sum(axis=1) >= 2).all(axis=1)
     R, t = rigid(waved.ends_m.mean(axis=1)[known], done.network.middle[known])
-    predicted = predicted_error(cameras, done.unknowns, done.covariance, TEST_BARS @ R.T + t).rms_m
+    predicted = predicted_error(cameras, done.every_unknown, done.considered, TEST_BARS @ R.T + t).rms_m
     actual = error_m(waved.cameras, cameras)
     return dict(mm=1e3 * actual, ratio=actual / bound(waved, sigma_px, free).rms_m, predicted=predicted / actual, seconds=seconds)
 
