@@ -98,18 +98,6 @@ def _rays(run: Mapping[str, Any]) -> list[Finding]:
                 residual_px=residual,
             )
         )
-    late = run["stages"].get("track", {}).get("late_frames", {})
-    for view, (frames, sigma) in late.items() if isinstance(late, dict) else ():
-        if abs(frames) > max(0.1, 4 * sigma):
-            found.append(
-                doubtful(
-                    "out of step",
-                    f"The tracks say that view {view} is {frames:+.2f} ± {sigma:.2g} frames late.",
-                    "Run `tricap check` on the take, and set `offset_frames` as it says.",
-                    late_frames=frames,
-                    sigma_frames=sigma,
-                )
-            )
     return found
 
 
