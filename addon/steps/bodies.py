@@ -111,7 +111,8 @@ def seeds_of(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
     scene = context.scene
     clips = project.clips_of(scene)
     frame = scene.tricap.seed_frame
-    wanted = states.joints_of(project.model_of(scene)) if project.model_of(scene) else ()
+    model = project.model_of(scene)
+    wanted = states.joints_of(str(project.folder_of(scene) / model) if model.endswith(".toml") else model) if model else ()
     return [(name, [view for view, clip in clips.items() if seeds.click(clip, name, frame) is not None]) for name in wanted]
 
 

@@ -7,6 +7,7 @@ from types import ModuleType
 
 import pytest
 
+from tricap.core.body.model_file import MODELS
 from tricap.core.take_file import read_table, write_table
 
 from .conftest import small_rig, write_take
@@ -90,6 +91,16 @@ def test_what_the_panel_does_not_edit_stays(project: ModuleType, blender: Module
     with pytest.raises(project.InputError, match="must be a table"):
         project.edit(scene, lambda table: table.update(body=3))
     assert read_table(take)["body"]["model"] == "arm.R"
+
+
+def test_a_model_of_ones_own_tells_which_joints_to_click(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    own = (MODELS / "arm.R.toml").read_text(encoding="utf-8")
+    (take / "my arm é.toml").write_text(own, encoding="utf-8")
+    write_table(take, read_table(take) | {"body": {"model": "my arm é.toml"}})
+    project.open_take(blender.context.scene, take)
+    assert blender.context.scene.tricap.model == "own"
+    bodies = importlib.import_module("bl_ext.user_default.tricap.addon.steps.bodies")
+    assert [name for name, _ in bodies.seeds_of(blender.context)] == ["shoulder.R", "elbow.R", "wrist.R"]
 
 
 def test_somebody_elses_change_is_not_written_over(project: ModuleType, blender: ModuleType, take: Path) -> None:
