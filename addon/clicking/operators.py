@@ -155,7 +155,8 @@ class ClickOperator:
         if not session.changed or not session.whole:
             return {"FINISHED" if session.changed else "CANCELLED"}
         done = sum(len(session.clicks(name)) > 1 for name in session.names)
-        self.report({"INFO"}, f"Frame {session.frame}: {done} of them are clicked in two views or more.")  # type: ignore[attr-defined]
+        said = f"Frame {session.frame}: {done} of {len(session.names)} are clicked in two views or more."
+        self.report({"INFO"}, f"{said} Go on in the 3-D view (workspace tabs at the top).")  # type: ignore[attr-defined]
         return {"FINISHED"}
 
 

@@ -11,7 +11,7 @@ from .. import folders
 from ..jobs import JobOperator
 from ..scene import armature
 from ..scene import build as scene_build
-from ..scene.build import SceneOptions, SceneReport, write_scene
+from ..scene.build import DEFAULTS, SceneOptions, SceneReport, write_scene
 from ..scene.cloud import COLOURS
 from ..scene.contents import Contents, read_contents
 from ..scene.rest_pose import POSES
@@ -54,15 +54,15 @@ class BuildScene(JobOperator, bpy.types.Operator):
         """Build the scene from what was read."""
         options = SceneOptions(rest_pose=self.rest_pose, detail=self.detail, exact_skin=self.exact_skin, colour=self.colour,
                                simplify_deg=math.degrees(self.simplify), arrows=self.arrows, implicit=self.implicit)
-        report = write_scene(result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
-        tell(self, report)
+        put_into_scene(self, context, result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         return {"FINISHED"}
 
 
-def put_into_scene(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents) -> None:
+def put_into_scene(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents, blend: Path | None = None,
+                   options: SceneOptions = DEFAULTS) -> None:
     """Build the scene and tell what it has; the first time, turn the 3-D views to the body."""
     first = scene_build.COLLECTION not in bpy.data.collections
-    tell(operator, write_scene(contents))
+    tell(operator, write_scene(contents, blend, options))
     body = bpy.data.objects.get(armature.NAME)
     if first and body is not None and context.window is not None and not bpy.app.background:
         for item in context.selected_objects:

@@ -125,8 +125,7 @@ def _seeds(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
     layout.prop(props, "seed_frame")
     buttons = layout.column()
     buttons.enabled = project.bound(context.scene)
-    if hasattr(bpy.types, "TRICAP_OT_open_views"):
-        primary(buttons, "tricap.open_views", is_next, icon="WINDOW", text="Open the Views and Click")
+    primary(buttons, "tricap.click_joints", is_next, icon="WINDOW", text="Open the Views and Click")
     try:
         clicked = seeds_of(context)
     except InputError:

@@ -84,6 +84,8 @@ class AddFootage(Told, bpy.types.Operator):
             raise
         if first:
             use_rate_of(scene)
+            scene.frame_start, scene.frame_end = 0, max(0, min(view.clip.frame_duration for view in scene.tricap.views) - 1)
+            scene.frame_set(0)
         if lengths_differ(scene, folder):
             use_common_frames(scene, folder)
         if len(entries) > 1:

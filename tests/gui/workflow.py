@@ -50,6 +50,7 @@ def footage(film: Path, blend: Path) -> drive.Steps:
     yield from drive.press(area, "tricap.add_footage")
     yield from drive.choose("footage", film)
     yield from drive.shot("03_footage")
+    drive.check(bpy.context.scene.frame_current == 0, "the first frame is shown")
     drive.need([view.name for view in bpy.context.scene.tricap.views] == ["L", "C", "R"], "three views were added")
 
 
@@ -65,19 +66,11 @@ def seeds(wanted: Joints) -> drive.Steps:
     """Choose the body, open the views, click every joint in every view, each a little beside it."""
     area, props = (yield from drive.sidebar("VIEW_3D", "Tricap")), bpy.context.scene.tricap
     yield from drive.pick(area, "tricap.model", props, "model", "arm.R")
-    yield from drive.press(area, "tricap.open_views")
+    yield from drive.press(area, "tricap.click_joints")
     yield from drive.wait_for(lambda: drive.window().workspace.name == CLICKS, 10, "the views are opened")
     yield from drive.wait_for(lambda: len(clip_areas()) == 3, 10, "each view has an editor")
-    yield from drive.settle(10)
-    first = clip_areas()[0]
-    yield from drive.move(*drive.middle(first))
-    yield from drive.key("N")
-    yield from drive.settle(10)
-    drive.region_of(first, "UI").active_panel_category = "Tricap"
-    yield from drive.settle(10)
-    yield from drive.shot("05_views")
-    yield from drive.press(first, "tricap.click_joints()")
-    yield from drive.shot("06_clicking")
+    yield from drive.settle(20)
+    yield from drive.shot("05_clicking")
     rng = random.Random(3)
     for name, at in wanted.items():
         for area in clip_areas():
@@ -86,10 +79,10 @@ def seeds(wanted: Joints) -> drive.Steps:
             yield from drive.pause(0.5)
             if name == "elbow.R" and area == clip_areas()[0]:
                 yield from drive.pause(3)
-                yield from drive.shot("07_one_view_clicked")
+                yield from drive.shot("06_one_view_clicked")
     yield from drive.settle(10)
     check_clicks(wanted)
-    yield from drive.shot("08_clicked")
+    yield from drive.shot("07_clicked")
     yield from workspace(LAYOUT)
 
 

@@ -1,0 +1,55 @@
+"""The window's test says in one line why it cannot be set up, and does not fail for it."""
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from collections import namedtuple
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+GUI = Path(__file__).with_name("gui")
+Usage = namedtuple("Usage", "total used free")
+
+
+@pytest.fixture
+def gui(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The module run, as `dev.py gui-test` starts it, by a root who has debootstrap and room."""
+    monkeypatch.syspath_prepend(str(GUI))
+    monkeypatch.setattr(os, "geteuid", lambda: 0, raising=False)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/sbin/{name}")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 0, 10**12))
+    yield importlib.import_module("run")
+    for name in ("run", "chroot", "window"):
+        sys.modules.pop(name, None)
+
+
+def said(gui: ModuleType, root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """What is printed, with exit code 0."""
+    monkeypatch.setattr(gui.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(sys, "argv", ["run.py", "--package", "none.zip", "--root", str(root)])
+    assert gui.main() == 0 and not root.exists()
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("gui-test: skipped, for ")
+    return lines[0]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no chroots on Windows")
+@pytest.mark.parametrize(("lacking", "why"), [("root", "rights of root"), ("debootstrap", "debootstrap is not installed"),
+                                              ("room", "GB free"), ("network", "could not fetch Debian sid (E: no network)")])
+def test_why_not(gui: ModuleType, lacking: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                 capsys: pytest.CaptureFixture[str]) -> None:
+    if lacking == "root":
+        monkeypatch.setattr(os, "geteuid", lambda: 1000, raising=False)
+    elif lacking == "debootstrap":
+        monkeypatch.setattr(shutil, "which", lambda _: None)
+    elif lacking == "room":
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**9, 0, 10**9))
+    else:
+        told = subprocess.CompletedProcess([], 1, "", "I: x\nE: no network\n")
+        monkeypatch.setattr(gui.chroot.subprocess, "run", lambda *_, **__: told)
+    assert why in said(gui, tmp_path / "gui" / "blender", capsys, monkeypatch)
