@@ -40,7 +40,7 @@ def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]]
     made = []
     for camera in rig.cameras:
         camera_object = add_camera(collection, camera)
-        camera_object[EXACT] = _exact_values(camera)
+        camera_object[EXACT] = exact_values(camera)
         if files.get(camera.name):
             clip = clips.load_clip(f"Bar {camera.name}", files[camera.name][0], camera)
             clips.show_behind(camera_object.data, clip)
@@ -77,6 +77,11 @@ def rig_of_scene(scene: bpy.types.Scene) -> Rig:
     return Rig(cameras=tuple(camera_of(scene, camera_object) for camera_object in found))
 
 
+def clip_behind(camera_object: bpy.types.Object) -> bpy.types.MovieClip | None:
+    """The movie clip that a camera shows in its background, or None."""
+    return next((b.clip for b in camera_object.data.background_images if b.source == "MOVIE_CLIP" and b.clip), None)
+
+
 def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera:
     """One camera of the scene.
 
@@ -86,7 +91,7 @@ def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera
     data = camera_object.data
     if data.type != "PERSP" or data.sensor_fit == "VERTICAL":
         raise InputError(f"{camera_object.name} is no perspective camera with the sensor fitted to its width; set both in its properties.")
-    clip = next((b.clip for b in data.background_images if b.source == "MOVIE_CLIP" and b.clip), None)
+    clip = clip_behind(camera_object)
     own = camera_object.get("tricap_size_px")
     size = tuple(int(v) for v in (own or (clip.size if clip else (scene.render.resolution_x, scene.render.resolution_y))))
     aspect = clip.tracking.camera.pixel_aspect if clip else scene.render.pixel_aspect_y / scene.render.pixel_aspect_x
@@ -113,7 +118,8 @@ def _distortions(clip: bpy.types.MovieClip | None) -> np.ndarray:
     raise InputError(f"The lens model “{lens.distortion_model}” of the clip {clip.name} cannot be read; choose Brown or Polynomial.")
 
 
-def _exact_values(camera: Camera) -> list[float]:
+def exact_values(camera: Camera) -> list[float]:
+    """All numbers of a camera, as they are kept beside Blender's own."""
     parts = (camera.matrix, camera.distortions, camera.affinity, camera.R_cam_world, camera.t_cam_world_m)
     return [float(v) for part in parts for v in part.ravel()]
 

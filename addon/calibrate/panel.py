@@ -27,6 +27,7 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
         box = layout.box()
         sentence(box, context, props.verdict, LIGHTS.get(props.light, "NONE"))
         sentence(box, context, f"To do better: {props.advice}.", "INFO")
+    layout.operator("tricap.set_world", icon="EMPTY_AXIS")
     row = layout.row(align=True)
     row.operator("tricap.import_rig", icon="IMPORT")
     row.operator("tricap.export_rig", icon="EXPORT")

@@ -3,7 +3,7 @@
 import bpy
 
 from .. import jobs
-from . import operators
+from . import operators, world
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -29,7 +29,7 @@ class TricapCalibrate(bpy.types.PropertyGroup):
     rig: bpy.props.StringProperty(name="Rig", subtype="FILE_PATH")  # type: ignore[valid-type]
 
 
-CLASSES = (TricapCalibrate, *operators.CLASSES)
+CLASSES = (TricapCalibrate, *operators.CLASSES, *world.CLASSES)
 
 
 def register() -> None:

@@ -1,15 +1,19 @@
 """Calibration in a real Blender: footage to cameras, undo, other tools' rigs, and the scene's cameras written exactly."""
 
+import importlib
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tricap.core.geometry.rig import read_rig, write_rig
+from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, waved_bar
 from tricap.core.synthetic.bar_images import BarPictures, write_bar_folder
 
 from .conftest import small_rig
+
+ADDON = "bl_ext.user_default.tricap.addon"
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +88,105 @@ def test_an_own_camera_of_blender(blender, empty, tmp_path: Path) -> None:
     read = read_rig(tmp_path / "out.toml")["mine"]
     assert read.matrix[0, 0] == pytest.approx(1920 * 50 / 36, rel=1e-6) and read.matrix[:2, 2].tolist() == pytest.approx([959.5, 539.5])
     assert read.project(np.array([1.0, 0.5, 0.0])) == pytest.approx([959.5 + 2666.667 / 5, 539.5 - 2666.667 / 10], abs=1e-3)
+
+
+FLOOR = {"World origin": [0.2, 0.5, 2.5], "World X": [0.45, 0.5, 2.6], "World Y": [0.1, 0.5, 2.9]}  # in the frame of the true cameras
+
+
+def with_footage_and_clicks(bpy, bar: Path, tmp_path: Path) -> list:
+    """The true cameras with their footage, and the three points clicked in every clip."""
+    cameras = benchmark_cameras()
+    write_rig(tmp_path / "rig é.toml", Rig(cameras=tuple(cameras)))
+    assert bpy.ops.tricap.import_rig(filepath=str(tmp_path / "rig é.toml")) == {"FINISHED"}
+    for camera in cameras:
+        clip = bpy.data.movieclips.load(str(sorted((bar / camera.name).iterdir())[0]))
+        clip.frame_start = 0
+        behind = next(o for o in bpy.context.scene.objects if o.get("tricap_view") == camera.name).data.background_images.new()
+        behind.source, behind.clip = "MOVIE_CLIP", clip
+        importlib.import_module(f"{ADDON}.scene.clips").set_lens(clip, camera)
+        for name, at in FLOOR.items():
+            x, y = camera.project(np.array([at]))[0]
+            w, h = clip.size
+            clip.tracking.tracks.new(name=name, frame=1).markers.insert_frame(1, co=((x + 0.5) / w, 1 - (y + 0.5) / h))
+    bpy.context.scene.frame_set(3)
+    bpy.context.view_layer.update()
+    return cameras
+
+
+def test_three_tracks_put_the_world_there_and_undo_takes_it_back(blender, empty, bar: Path, tmp_path: Path) -> None:
+    cameras = with_footage_and_clicks(empty, bar, tmp_path)
+    before = {o["tricap_view"]: np.array(o.matrix_world) for o in empty.context.scene.objects if o.type == "CAMERA"}
+    empty.ops.ed.undo_push(message="before")
+    assert empty.ops.tricap.set_world() == {"FINISHED"}
+    empty.ops.ed.undo_push(message="after")
+    empty.context.view_layer.update()
+    empty.ops.tricap.export_rig(filepath=str(tmp_path / "out.toml"))
+    moved = read_rig(tmp_path / "out.toml")
+    origin, x, y = (np.array(at) for at in FLOOR.values())
+    length = np.linalg.norm(x - origin)
+    for camera in cameras:
+        expected = camera.project(np.array([origin, x]))
+        assert np.abs(moved[camera.name].project(np.array([[0.0, 0, 0], [length, 0, 0]])) - expected).max() < 1e-2
+        along = moved[camera.name].centre_m[2] - abs(camera.centre_m[1] - 0.5)  # the floor lies 0.5 m below along +y
+        assert abs(along) < 1e-3
+    empty.ops.ed.undo()
+    back = {o["tricap_view"]: np.array(o.matrix_world) for o in empty.context.scene.objects if o.type == "CAMERA"}
+    for name, matrix in before.items():
+        np.testing.assert_allclose(back[name], matrix, atol=1e-6)
+
+
+def test_the_rig_of_the_project_says_the_new_world(blender, empty, bar: Path, tmp_path: Path) -> None:
+    shutil.copytree(bar, tmp_path / "film")
+    empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert empty.ops.tricap.add_footage(directory=str(tmp_path / "film")) == {"FINISHED"}
+    cameras = with_footage_and_clicks(empty, bar, tmp_path)
+    assert empty.ops.tricap.cameras_from_file(filepath=str(tmp_path / "rig é.toml")) == {"FINISHED"}
+    path = importlib.import_module(f"{ADDON}.project").take(empty.context.scene).rig_path
+    before = path.read_bytes()
+    for clip in empty.data.movieclips:
+        for track in clip.tracking.tracks:
+            track.markers[0].mute = track.name == "World Y"
+    with pytest.raises(RuntimeError, match="“World Y”"):
+        empty.ops.tricap.set_world()
+    assert path.read_bytes() == before
+    for clip in empty.data.movieclips:
+        for track in clip.tracking.tracks:
+            track.markers[0].mute = False
+    assert empty.ops.tricap.set_world() == {"FINISHED"}
+    rig = read_rig(path)
+    assert rig.metadata["floor"] is True
+    for camera in cameras:
+        ends = camera.project(np.array([FLOOR["World origin"]]))
+        assert np.abs(rig[camera.name].project(np.zeros((1, 3))) - ends).max() < 1e-2
+
+
+def test_tracks_that_make_no_world_are_told(blender, empty, bar: Path, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="no camera"):
+        empty.ops.tricap.set_world()
+    write_rig(tmp_path / "rig.toml", small_rig())
+    empty.ops.tricap.import_rig(filepath=str(tmp_path / "rig.toml"))
+    with pytest.raises(RuntimeError, match="No camera of the scene has a movie clip"):
+        empty.ops.tricap.set_world()
+    with_footage_and_clicks(empty, bar, tmp_path)
+    for clip in list(empty.data.movieclips)[:2]:
+        clip.tracking.tracks["World X"].markers[0].mute = True
+        clip.tracking.tracks["World X"].name = "else"
+    with pytest.raises(RuntimeError, match="“World X” is needed in the clips of two cameras at least; it is in 1"):
+        empty.ops.tricap.set_world()
+
+
+def test_undo_takes_calibrated_and_imported_cameras_away(blender, empty, bar: Path, tmp_path: Path) -> None:
+    def cameras() -> int:
+        return sum(o.type == "CAMERA" for o in empty.context.scene.objects)
+
+    write_rig(tmp_path / "rig.toml", small_rig())
+    for name, run in (("calibrate", lambda: empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)),
+                      ("import", lambda: empty.ops.tricap.import_rig(filepath=str(tmp_path / "rig.toml")))):
+        empty.ops.ed.undo_push(message=f"before {name}")
+        assert run() == {"FINISHED"} and cameras() == 3
+        empty.ops.ed.undo_push(message=f"after {name}")
+        empty.ops.ed.undo()
+        assert cameras() == 0, name
+        empty.ops.ed.redo()
+        assert cameras() == 3, name
+        empty.ops.ed.undo()
