@@ -13,12 +13,12 @@ from .body.model_file import read_model
 from .body.skeleton import Skeleton
 from .fitting.fit_input import EmptyView
 from .geometry.camera import Camera
-from .images.background import shows, still_background
+from .images.background import Background, still_background
 from .progress import Monitor
 from .surface.cloud import PointCloud
 from .take import Footage, Seeds
 
-SAMPLES = 15  # frames for the background
+SAMPLES = 11  # frames for the background
 STEP_PX, UNIT_PX = 4, 0.5
 LIMB_M = 0.06  # nothing is empty so near to a measured point or a clicked limb
 
@@ -31,8 +31,8 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
         Cancelled: the user asked to stop.
     """
     chosen = np.unique(np.linspace(0, len(clouds) - 1, min(SAMPLES, len(clouds))).round().astype(int))
-    samples = [footage.read(clouds[i].frame) for i in chosen]
-    backgrounds = [still_background(images) for images in zip(*samples)]
+    backgrounds = [still_background([s.read(clouds[i].frame + v.offset_frames) for i in chosen])
+                   for s, v in zip(footage.sequences, footage.take.views)]
     distances: list[list[np.ndarray]] = [[] for _ in backgrounds]
     if any(b is None for b in backgrounds):
         return []
@@ -41,7 +41,7 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
     for t, cloud in enumerate(clouds):
         monitor.step("background", t, len(clouds))
         for k, (camera, image) in enumerate(zip(footage.rig.cameras, footage.read(cloud.frame))):
-            empty = _coarse(shows(known[k], image)) & ~persons[k] & ~_near(camera, cloud.xyz_m, persons[k].shape)
+            empty = _coarse(known[k].shown_by(image)) & ~persons[k] & ~_near(camera, cloud.xyz_m, persons[k].shape)
             far = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) * (STEP_PX / UNIT_PX)
             distances[k].append(np.minimum(far, 255).astype(np.uint8))
     frames = np.array([cloud.frame for cloud in clouds])
@@ -69,15 +69,15 @@ def _near(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarr
     return cv2.dilate(seen, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))).astype(bool)
 
 
-def _clicked_limbs(footage: Footage, backgrounds: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _clicked_limbs(footage: Footage, backgrounds: Sequence[Background]) -> list[np.ndarray]:
     """Squares (h, w) of every view along clicked limbs that look in the click's frame as they do most of the time."""
     take = footage.take
-    masks = [np.zeros(_coarse(b > 0).shape, bool) for b in backgrounds]
+    masks = [np.zeros(_coarse(b.grey > 0).shape, bool) for b in backgrounds]
     skeleton = read_model(str(take.body_model)).skeleton
     for clicked in (take.seeds, *take.keyframes):
         if clicked.joints and clicked.frame in footage.frames:
             for mask, view, background, image in zip(masks, take.views, backgrounds, footage.read(clicked.frame)):
-                mask |= _limbs(skeleton, clicked, view.name, mask.shape) & _coarse(shows(background, image))
+                mask |= _limbs(skeleton, clicked, view.name, mask.shape) & _coarse(background.shown_by(image))
     return masks
 
 

@@ -1,28 +1,47 @@
 """The still background of a view: what each pixel shows most of the time, and where an image shows it again.
 
-A pixel shows the background when the images around it differ from the background's by no more than the noise; that noise is found from the
-differences themselves, since most of an image is background (Rousseeuw & Croux 1993, the median of absolute differences).
+A pixel shows the background when the images around it differ from the background's by no more than the noise. That noise is found from the
+differences of the images that the background is made of, since most of them is background (Rousseeuw & Croux 1993, the median of
+absolute differences). An image that is black, or lit otherwise, shows the background nowhere.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from ..values import frozen
+
 FEWEST = 5  # images that tell what stands still
+ROWS = 64
 WINDOW_PX = 7  # side of the window in which two images are compared
 LOOSE = 1.6  # times the noise: a window of 7×7 has a root mean square of 1.0 ± 0.1 times it
 QUANTISED = 0.5  # grey values: what rounding adds
 
 
-def still_background(images: Sequence[np.ndarray]) -> np.ndarray | None:
-    """The median (h, w) float32 of images (h, w) spread over time; None if they are too few to tell."""
-    return np.median(np.stack(images), axis=0).astype(np.float32) if len(images) >= FEWEST else None
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Background:
+    """The still background (h, w) of a view and the standard deviation of an image against it, in grey values."""
+
+    grey: np.ndarray
+    noise: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "grey", frozen(self.grey, (None, None), np.float32, "grey"))
+
+    def shown_by(self, image: np.ndarray) -> np.ndarray:
+        """Where (h, w) an image shows the background."""
+        square = cv2.blur((image.astype(np.float32) - self.grey) ** 2, (WINDOW_PX, WINDOW_PX), borderType=cv2.BORDER_REFLECT_101)
+        return np.asarray(square < (LOOSE * self.noise + QUANTISED) ** 2)
 
 
-def shows(background: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Where (h, w) an image shows the background."""
-    difference = image.astype(np.float32) - background
-    noise = 1.4826 * float(np.median(np.abs(difference)))
-    square = cv2.blur(difference**2, (WINDOW_PX, WINDOW_PX), borderType=cv2.BORDER_REFLECT_101)
-    return np.asarray(square < (LOOSE * noise + QUANTISED) ** 2)
+def still_background(images: Sequence[np.ndarray]) -> Background | None:
+    """The median of images (h, w) spread over time; None if they are too few to tell."""
+    if len(images) < FEWEST:
+        return None
+    median = np.empty(images[0].shape, np.float32)
+    for row in range(0, len(median), ROWS):  # piece by piece: a copy of all images would take too much memory
+        median[row : row + ROWS] = np.median([image[row : row + ROWS] for image in images], axis=0)
+    noise = np.median([1.4826 * float(np.median(np.abs(image - median))) for image in images])
+    return Background(grey=median, noise=float(noise))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tricap.core.images.background import FEWEST, shows, still_background
+from tricap.core.images.background import FEWEST, still_background
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 6.0])
@@ -17,12 +17,13 @@ def test_a_passing_square_hides_the_background(noise: float) -> None:
         image[30:50, 5 + 12 * i : 25 + 12 * i] = square
         images.append(np.rint(image))
     background = still_background(images)
-    assert background is not None and np.abs(background - wall).mean() < 0.5 + 0.6 * noise
-    there = shows(background, images[5])
+    assert background is not None and np.abs(background.grey - wall).mean() < 0.5 + 0.6 * noise
+    there = background.shown_by(images[5])
     assert not there[32:48, 67:83].any()  # inside the square, though its mean is near the wall's
     away = np.ones_like(there)
     away[25:55, 60:90] = False
     assert there[away].mean() > 0.995
+    assert not background.shown_by(np.zeros_like(wall)).any()  # a black image shows nothing
 
 
 def test_too_few_images_tell_nothing() -> None:
