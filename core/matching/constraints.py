@@ -29,7 +29,7 @@ from .template_patches import monomials
 
 WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
 SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SHARE = 0.1, 0.001, 1.0  # px/px and px/px² in the search view that moves fastest; of itself
-SAME_PLACE, SAME_PLACE_M = 0.15, 0.003  # of the patch's width; and never less
+SAME_PLACE, UNSURE_PX, SAME_PLACE_M = 0.25, 0.1, 0.003  # of the patch's width, half of it at this sigma; and never less
 SMOOTH_EXTRA_PX = 4  # wider where texture is weak
 STIFF = 0.1  # of these sigmas in the second try
 FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
@@ -144,12 +144,14 @@ def _agrees(field: TripletField, found: SurfacePatch, base: Camera, reference: i
     """(N,) where the piece of surface runs through the point that was matched without constraint.
 
     Over one surface both ways measure the same; where a patch holds two (an outline before a background, a border of occlusion), each
-    settles on a mixture of its own.
+    settles on a mixture of its own. The grey values fit neither surface there, so that the patch's sigma is large as well: the larger it
+    is, the closer must both agree.
     """
     u, v = (field.xy[:, reference] - field.grid.xy(field.cell)).T
     w = np.einsum("ni,ni->n", monomials(u, v, 2 if found.theta.shape[1] == 6 else 1), found.theta)
     depth = base.to_camera(field.xyz_m)[:, 2]
-    return np.abs(1 / np.maximum(w, 1e-6) - depth) < np.maximum(SAME_PLACE * patch_px * depth / base.focal_px, SAME_PLACE_M)
+    allowed = SAME_PLACE / (1 + found.sigma_px / UNSURE_PX) * patch_px * depth / base.focal_px
+    return np.abs(1 / np.maximum(w, 1e-6) - depth) < np.maximum(allowed, SAME_PLACE_M)
 
 
 def _prior(start: np.ndarray, speed: float) -> SurfacePrior:

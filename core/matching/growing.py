@@ -28,6 +28,8 @@ NOISE_SIGMAS = 4.0
 EQUAL_SIGMA_PX = 1.0  # far above matching's own: all rays weigh alike
 PATCH_STEP_PX = 4
 SMOOTH_FROM = 2
+NARROW = -1  # the last round: fingers, and what shows beside an outline, are narrower than the patch
+SMALLEST_PX, NARROW_SURE = 5, 0.5  # px; of the largest sigma: few pixels must have much texture
 RETRY_SMOOTHING_PX = 1.0  # what fails is weak texture: noise that is finer than its details is kept out
 # Limits where sigmas are honest, on skin up to four times the naive one, and the texture is little more than the noise.
 LESS_SURE, LESS_ALIKE = 4.0, 0.15
@@ -112,7 +114,8 @@ class _State:
         self.spread = np.zeros((cells, 2))
         self.smoothed = np.zeros(cells, dtype=bool)
         self.xyz, self.covariance_m2 = np.zeros((cells, 3)), np.zeros((cells, 3, 3))
-        self.accepted, self.attempts = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=np.int16)
+        self.accepted, self.tried = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=bool)
+        self.attempts = np.zeros(cells, dtype=np.int16)  # of this round
 
 
 def grow(
@@ -127,7 +130,7 @@ def grow(
     foreground: Foreground,
     monitor: Monitor,
 ) -> TripletField:
-    """Grow the field from the seeds until no neighbour can be matched any more.
+    """Grow the field from the seeds until no neighbour can be matched any more; again with larger patches, and at last with a smaller one.
 
     A point needs three rays, or all of them where there are two views; with `pairs`, two rays will do where the other views cannot see it.
     Only points that the foreground allows are accepted.
@@ -139,18 +142,20 @@ def grow(
     matched, point, _ = _measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching, EQUAL_SIGMA_PX, pairs=False)
     limit_px, rig_sigma_px = _rig_quality(matched, point, growing)
     depths = camera.to_camera(point.xyz_m)[:, 2]
-    views = images
-    for level in range(rounds_of_larger_patches(matching, growing, depths, camera) + 1):
-        settings = replace(matching, patch_px=matching.patch_px + PATCH_STEP_PX * level)
+    for level in (*range(rounds_of_larger_patches(matching, growing, depths, camera) + 1), NARROW):
+        views, settings = images, replace(matching, patch_px=max(SMALLEST_PX, matching.patch_px + PATCH_STEP_PX * level))
         if level:
             state.attempts[:] = 0
             cells, start, shape, parent_depth = _front_from(state, np.flatnonzero(state.accepted), grid, growing.attempts, camera)
+        if level == NARROW:
+            settings = replace(settings, max_sigma_px=NARROW_SURE * settings.max_sigma_px)
         if level >= SMOOTH_FROM:
             settings = loosened(settings)
             views = [image.smoothed(RETRY_SMOOTHING_PX, grid.rows.step) for image in images]
         while len(cells):
             monitor.step("surface", int(state.accepted.sum()), n_cells)
             state.attempts[cells] += 1
+            state.tried[cells] = True
             xy = grid.xy(cells)
             matched, point, depth = _measure(views, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px, growing.pairs)
             good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, foreground)
@@ -344,5 +349,5 @@ def _field(state: _State, grid: TemplateGrid, limit_px: float) -> TripletField:
         spread=state.spread[cell],
         smoothed=state.smoothed[cell],
         limit_px=limit_px,
-        tried=int((state.attempts > 0).sum()),
+        tried=int(state.tried.sum()),
     )
