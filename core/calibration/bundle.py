@@ -207,11 +207,26 @@ def reduce_to_cameras(normals: Normals, damping: float = 0.0) -> tuple[np.ndarra
     U = normals.U
     if damping:
         U = U + damping * U * np.eye(5)
-    inverse = np.linalg.inv(np.linalg.cholesky(U))
+    inverse = inverse_factors(U)
     Y = inverse @ normals.W
     z = (inverse @ normals.g_b[..., None])[..., 0]
     flat = Y.reshape(-1, Y.shape[2])
     return normals.V - flat.T @ flat, normals.g_c - flat.T @ z.ravel(), inverse, Y, z
+
+
+def inverse_factors(U: np.ndarray) -> np.ndarray:
+    """L⁻¹ (N, n, n) of U = L Lᵀ (N, n, n), all N at once: for many small blocks much faster than one after the other."""
+    n = U.shape[1]
+    A = np.ascontiguousarray(np.moveaxis(U, 0, -1))  # (n, n, N); becomes L column by column, B becomes L⁻¹ row by row
+    B = np.zeros_like(A)
+    for j in range(n):
+        A[j:, j] /= np.sqrt(A[j, j])
+        for k in range(j + 1, n):
+            A[k:, k] -= A[k:, j] * A[k, j]
+        B[j, j] = 1 / A[j, j]
+        if j:
+            B[j, :j] = -np.einsum("kN,kmN->mN", A[j, :j], B[:j, :j]) * B[j, j]
+    return np.ascontiguousarray(np.moveaxis(B, -1, 0))
 
 
 def solve_step(network: Network, normals: Normals, unknowns: Unknowns, damping: float) -> tuple[np.ndarray, np.ndarray]:

@@ -146,8 +146,8 @@ def same_steps(waved: WavedBar, start: Network, sigma: float) -> dict[str, float
     unknowns = lens_knowledge(observations.size_px, start.interior[:, 0])
     unknowns = unknowns.only(*(name for name in INTERIOR if name != "k3"))
     network, keep = with_bars(start, observations, 30.0)
-    for cauchy in (3 * sigma, None, None):
-        done = adjust(network, waved.xy_px, keep, unknowns, cauchy_px=cauchy, unit_px=sigma, max_iterations=30, tolerance=1e-3)
+    for cauchy, tolerance in ((3 * sigma, 1.0), (None, 1e-3), (None, 1e-3)):  # the robust one only has to tell the blunders
+        done = adjust(network, waved.xy_px, keep, unknowns, cauchy_px=cauchy, unit_px=sigma, max_iterations=30, tolerance=tolerance)
         network = done.network
         keep = enough_rays(keep & (np.abs(np.nan_to_num(done.residual_px, nan=np.inf)).max(axis=-1) < 6 * sigma))
     seconds = time.process_time() - seconds
