@@ -20,7 +20,7 @@ from ..geometry.camera import Camera
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from .foreground import Foreground
-from .growing import RETRY_SMOOTHING_PX, TEMPLATE_SIGMA_PX, TripletField, loosened
+from .growing import RETRY_SMOOTHING_PX, TripletField, loosened
 from .least_squares import MatchingSettings, MatchStatus, patch_offsets
 from .multi_image import MultiImageMatches, match_multi_image
 from .neighbourhood import RADIUS_CELLS, NeighbourFit, fit_neighbours, neighbours_of
@@ -33,6 +33,7 @@ SAME_PLACE, UNSURE_PX, SAME_PLACE_M = 0.25, 0.1, 0.003  # of the patch's width, 
 SMOOTH_EXTRA_PX = 4  # wider where texture is weak
 STIFF = 0.1  # of these sigmas in the second try
 FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
+RAY_SIGMA_PX = 0.01  # the point lies on its pixel's ray; this keeps the covariance regular
 MAX_RIG_SIGMA_PX = 0.3  # a rig that is worse knows less of a point's place than its own patch does
 SAMPLE = 1000  # points that tell the rig's quality
 NEIGHBOUR_NOISE_PX = 0.05
@@ -234,7 +235,7 @@ def _model_covariance(
 ) -> np.ndarray:
     """What matching cannot know of itself (N, 3, 3): the rig's own quality, what a quadric does not follow, and the body's outline."""
     along = (rig_sigma_px / np.maximum(speed, 1e-9)) ** 2 + (SCATTER_SHARE * around.scatter) ** 2
-    side_px2 = TEMPLATE_SIGMA_PX**2 + rig_sigma_px**2 + (OUTLINE_SIGMA_PX * (1 - around.support)) ** 2
+    side_px2 = RAY_SIGMA_PX**2 + rig_sigma_px**2 + (OUTLINE_SIGMA_PX * (1 - around.support)) ** 2
     return ray[:, :, None] * ray[:, None] * (along / w**4)[:, None, None] + (side_px2 / (base.focal_px * w) ** 2)[:, None, None] * np.eye(3)
 
 

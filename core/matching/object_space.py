@@ -34,7 +34,7 @@ from ..progress import Monitor
 from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
 from .template_patches import TemplatePatches, monomials
 
-MIN_NOISE = 1.0  # grey values: no image is better than its quantisation and interpolation
+MIN_NOISE = 0.4  # grey values, of a difference of two images: no image is better than its quantisation
 CONVERGED_SIGMAS = 0.05
 MAX_STEP_PX = 1.5
 MIN_REMAINING = 0.1  # of the gradients' energy is always texture
@@ -212,7 +212,7 @@ class _Adjustment:
             iterations[active] = iteration
             state.put(active, linear)
             away = (np.abs(theta[active, 0] - start[active, 0]) * linear.speed > 2 * s.max_shift_px) | ~np.isfinite(length)
-            done = length < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * linear.speed / np.sqrt(N[:, 0, 0]))
+            done = length < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * linear.speed / np.sqrt(np.maximum(N[:, 0, 0], 1e-30)))
             status[active[done]] = MatchStatus.OK
             status[active[away]] = MatchStatus.SHIFT_TOO_LARGE
             status[active[~linear.seen]] = MatchStatus.OUT_OF_IMAGE
