@@ -72,6 +72,44 @@ def test_our_rig_is_read_by_the_anipose_reader(tmp_path: Path) -> None:
     assert distance(rig, read_rig(tmp_path / "rig.toml")) < 1e-6
 
 
+ANIPOSE = """[cam_0]
+name = "A"
+size = [ 1280, 720,]
+matrix = [ [ 900.5, 0.0, 639.5,], [ 0.0, 900.5, 359.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.12, 0.03, 0.001, -0.002, 0.004,]
+rotation = [ 0.1, -0.2, 0.3,]
+translation = [ 100.0, -200.0, 1500.0,]
+
+[cam_1]
+name = "B"
+size = [ 1280, 720,]
+matrix = [ [ 910.0, 0.0, 639.5,], [ 0.0, 910.0, 359.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ 0.0, 0.0, 0.0, 0.0, 0.0,]
+rotation = [ 0.0, 0.0, 0.0,]
+translation = [ 0.0, 0.0, 0.0,]
+
+[metadata]
+adjusted = false
+error = 0.43
+"""
+
+
+def test_anipose_file(tmp_path: Path) -> None:
+    """As aniposelib's CameraGroup.dump writes it: a table of Camera.get_dict() per camera, [metadata] (aniposelib/cameras.py)."""
+    path = tmp_path / "calibration.toml"
+    path.write_text(ANIPOSE + 'unit = "mm"\n')
+    rig = read_any(path)
+    assert [c.name for c in rig.cameras] == ["A", "B"] and rig["A"].size_px == (1280, 720)
+    points = np.random.default_rng(0).uniform([-0.3, -0.3, 0.5], [0.3, 0.3, 1.0], (50, 3))
+    K = np.array([[900.5, 0, 639.5], [0, 900.5, 359.5], [0, 0, 1]])
+    D = np.array([-0.12, 0.03, 0.001, -0.002, 0.004])
+    expected, _ = cv2.projectPoints(points * 1000, np.array([0.1, -0.2, 0.3]), np.array([100.0, -200.0, 1500.0]), K, D)
+    assert np.abs(rig["A"].project(points) - expected[:, 0]).max() < 1e-6
+    path.write_text(ANIPOSE.replace("[cam_1]", "fisheye = true\n\n[cam_1]"))
+    with pytest.raises(InputError, match="fisheye"):
+        read_any(path)
+
+
 def test_pose2sim_file(tmp_path: Path) -> None:
     """Pose2Sim's documented layout: a table per camera, sizes as floats, four distortions, [metadata]."""
     text = """
