@@ -1,6 +1,7 @@
 """Targets in images: accuracy against drawn discs, speed, what is no target, and the whole way from pictures to a rig."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -167,6 +168,19 @@ def test_refusals_are_one_sentence_and_leave_no_file(change: str, says: str, bar
     assert main(["calibrate", str(bar), "--bar-length", "0.5", "--out", str(out), "--quiet"]) == 2
     message = capsys.readouterr().err.strip()
     assert says in message and "\n" not in message and not out.exists()
+
+
+def test_a_bar_parallel_to_the_images_is_refused_by_the_command(tmp_path: Path, capsys) -> None:
+    """From its pictures: the sentence says which motion is missing, and no file is left."""
+    waved = waved_bar(benchmark_cameras(), 40, np.random.default_rng(6), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    d = (waved.ends_m[:, 0] - waved.ends_m[:, 1]) * [1, 1, 0]
+    half = waved.length_m / 2 * d / np.linalg.norm(d, axis=1, keepdims=True)
+    middle = waved.ends_m.mean(axis=1)
+    write_bar_folder(tmp_path / "bar", replace(waved, ends_m=np.stack([middle + half, middle - half], axis=1)), BarPictures(radius_m=0.015))
+    out = tmp_path / "rig.toml"
+    assert main(["calibrate", str(tmp_path / "bar"), "--bar-length", "0.5", "--out", str(out), "--quiet"]) == 2
+    message = capsys.readouterr().err.strip()
+    assert "tilt the bar towards the cameras" in message and "\n" not in message and not out.exists()
 
 
 @pytest.mark.parametrize("length", ["0", "-1", "nan", "1e9"])
