@@ -1,7 +1,7 @@
 """A motion onto an armature of the open file: read the rig, map, transfer, write the action, and see that Blender plays what was meant."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
@@ -64,20 +64,33 @@ def map_of(rig: Rig, map_file: Path | None = None, *, steer: bool = False) -> Ri
     return find_map(rig, [preset for preset in presets() if steer or preset.steering is None])
 
 
-def read_target(armature_object: bpy.types.Object, map_file: Path | None = None) -> Target:
-    """Read an armature for retargeting. Main thread.
+def read_target(armature_object: bpy.types.Object, map_file: Path | None = None, edited: RigMap | None = None) -> Target:
+    """Read an armature for retargeting, with a mapping that is found, in a file, or edited in the panel. Main thread.
 
     Raises:
-        InputError: it is no armature that can be mapped.
+        InputError: it is no armature that can be mapped, or the mapping names bones that are not there.
     """
     rig = read_rig(armature_object)
     rig_map = map_of(rig, map_file, steer=True)
+    if edited is not None:
+        rig_map = _edited(rig, rig_map, edited)
     if rig_map.steering is not None:
         rig = controls_of(rig, rig_map.steering, rig_map.bones)
     rig = with_soles(rig, armature_object, rig_map)
     low = min([float(points[:, 2].min()) for points in rig.sole_m.values()] or [float(rig.head_m[:, 2].min())])
     origin = float(armature_object.matrix_world.translation.z)
     return Target(rig=rig, rig_map=rig_map, floor_m=origin if abs(low - origin) < LOW * rig.height_m else low)
+
+
+def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:
+    """The edited mapping; of a rig with controls it steers them as long as it names nothing else."""
+    names = [name for chain in (*edited.bones.values(), *edited.twist.values()) for name in chain]
+    unknown = [name for name in names if name not in rig.index]
+    if unknown:
+        raise InputError(f"The target has no bone “{unknown[0]}”; choose another in the mapping.")
+    steering = found.steering
+    controls = {*steering.follows, *steering.follows.values()} if steering is not None else set()
+    return replace(edited, steering=steering if controls.issuperset(names) else None)
 
 
 def transfer(source: Motion, source_map: RigMap, target: Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor

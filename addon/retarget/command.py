@@ -24,6 +24,8 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--armature", metavar="NAME", default="", help="which armature, if the rig's file has several")
     parser.add_argument("--root", choices=("travel", "in place", "still"), default="travel", help="how the body moves through the room")
     parser.add_argument("--feet", choices=("off", "auto", "always"), default="auto", help="when feet are held on the floor")
+    parser.add_argument("--hands", choices=("free", "keep"), default="free",
+                        help="keep: hands keep their distance from each other, head, hips and thighs where they are near")
     parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0, help="leave out keys within this tolerance")
     parser.add_argument("--report", action="store_true", help="also write figures (JSON) and a picture beside FILE.blend")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
@@ -60,7 +62,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
     if args.blend.suffix != ".blend":
         raise InputError(f"{args.blend.name} is no name of a Blender file; let it end in .blend.")
-    settings = from_table(RetargetSettings, {"root": args.root}, "--root")
+    settings = from_table(RetargetSettings, {"root": args.root, "hands": args.hands}, "--root, --hands")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
     motion = source.open_source(args.out, monitor)
     motion_map = apply.map_of(motion.rig)

@@ -55,10 +55,8 @@ class Retarget(JobOperator, bpy.types.Operator):
         moving = None if self.file else armature_of(self.source, props.source, "source", needed=not props.file)
         if moving is not None:
             apply.check_distinct(moving, self._target)
-        self._goal = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None)
         edited = properties.edited_map(props) if not self.map and props.target == self._target else None
-        if edited is not None:
-            self._goal = with_map(self._goal, edited)
+        self._goal = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None, edited)
         goal, scene = self._goal, context.scene
         fps, start = scene.render.fps / scene.render.fps_base, scene.frame_start
         if moving is not None:
@@ -88,18 +86,6 @@ def compute(read: Callable[[], Motion], goal: apply.Target, settings: RetargetSe
     source = read()
     source_map = apply.map_of(source.rig)
     return Made(source=source, source_map=source_map, result=apply.transfer(source, source_map, goal, settings, feet, monitor))
-
-
-def with_map(goal: apply.Target, rig_map: RigMap) -> apply.Target:
-    """The target with an edited mapping.
-
-    Raises:
-        InputError: it names bones that are not there.
-    """
-    unknown = [name for chain in (*rig_map.bones.values(), *rig_map.twist.values()) for name in chain if name not in goal.rig.index]
-    if unknown:
-        raise InputError(f"The target has no bone “{unknown[0]}”; choose another in the mapping.")
-    return apply.Target(rig=goal.rig, rig_map=rig_map, floor_m=goal.floor_m)
 
 
 def armature_of(name: str, chosen: bpy.types.Object | None, which: str, *, needed: bool = True) -> Any:
@@ -178,9 +164,7 @@ class Preview(bpy.types.Operator):
         try:
             source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
             apply.check_distinct(source, target)
-            source_rig, goal = read_rig(source), apply.read_target(target)
-            edited = properties.edited_map(props)
-            goal = goal if edited is None else with_map(goal, edited)
+            source_rig, goal = read_rig(source), apply.read_target(target, edited=properties.edited_map(props))
             count = preview.add_preview(source, source_rig, apply.map_of(source_rig), target, goal.rig, goal.rig_map)
         except InputError as error:
             self.report({"ERROR"}, str(error))

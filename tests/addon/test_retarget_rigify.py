@@ -1,6 +1,7 @@
 """A rig that Rigify generated: the keys go onto its FK controls, and what deforms the skin moves as it should."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -59,6 +60,11 @@ def test_controls_are_keyed_and_the_deform_bones_follow(generated: Any, tmp_path
     write_map(tmp_path / "map.json", goal.rig_map, "mine")
     again = apply_preset(whole, read_preset(tmp_path / "map.json"))
     assert again.steering is not None and again.steering.follows == goal.rig_map.steering.follows  # type: ignore[union-attr]
+    edited = replace(goal.rig_map, bones={role: chain for role, chain in goal.rig_map.bones.items() if role != "neck"}, steering=None)
+    kept = apply.read_target(generated, edited=edited)
+    assert kept.rig_map.steering is not None and "neck" not in kept.rig.names and len(kept.rig.names) == len(goal.rig.names) - 1
+    other = replace(edited, bones={**edited.bones, "head": ("DEF-spine.006",)})
+    assert apply.read_target(generated, edited=other).rig_map.steering is None
     the_preview_gives_back_what_it_set(generated)
 
 

@@ -346,15 +346,16 @@ def ankle_goals(leg: Leg, rig: Rig, R: np.ndarray, stands: list[Stand], places: 
     return goal, R
 
 
-def bend_leg(leg: Leg, rig: Rig, R: np.ndarray, hip_m: np.ndarray, goal_m: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """R with thigh and shin turned so that the ankle is at goal (T, 3), the hip staying at (T, 3).  (3)
+def bend_limb(rig: Rig, R: np.ndarray, thigh: tuple[int, ...], shin: tuple[int, ...], foot: int, hip_m: np.ndarray, goal_m: np.ndarray,
+              forward: np.ndarray) -> np.ndarray:
+    """R with thigh and shin (or the bones of an arm) turned so that the ankle is at goal (T, 3), the hip staying at (T, 3).  (3)
 
     `forward` (T, 3): where a straight knee would bend to. A goal out of reach is approached as far as the leg is long.
     """
     R = R.copy()
-    a, b = leg.thigh[0], leg.shin[0]
+    a, b = thigh[0], shin[0]
     upper = R[:, a] @ (rig.R_rest[a].T @ (rig.head_m[b] - rig.head_m[a]))
-    lower = R[:, b] @ (rig.R_rest[b].T @ (rig.head_m[leg.foot[0]] - rig.head_m[b]))
+    lower = R[:, b] @ (rig.R_rest[b].T @ (rig.head_m[foot] - rig.head_m[b]))
     l1, l2 = np.linalg.norm(upper[0]), np.linalg.norm(lower[0])
     now, then = upper + lower, goal_m - hip_m
     d = np.linalg.norm(then, axis=1)
@@ -368,7 +369,7 @@ def bend_leg(leg: Leg, rig: Rig, R: np.ndarray, hip_m: np.ndarray, goal_m: np.nd
     y = np.sqrt(np.maximum(l1**2 - x**2, 0.0))
     knee = along * x[:, None] + pole * y[:, None]  # (3)
     moved = np.linalg.norm(goal_m - hip_m - now, axis=1) > 1e-9
-    for bones, old, new in ((leg.thigh, upper, knee), (leg.shin, lower, along * d[:, None] - knee)):
+    for bones, old, new in ((thigh, upper, knee), (shin, lower, along * d[:, None] - knee)):
         turn = shortest(old, new)
         for bone in bones:
             R[moved, bone] = turn[moved] @ R[moved, bone]

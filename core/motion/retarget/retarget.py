@@ -13,6 +13,7 @@ from ...progress import Monitor
 from ...settings import knob
 from . import feet
 from .contacts import Contacts, FeetSettings, find_contacts
+from .hands import hold_hands
 from .mapping import RigMap
 from .rest import with_person_like_rest
 from .rig import Motion, Rig, channels, head_of
@@ -30,6 +31,8 @@ class RetargetSettings:
     root: str = knob("travel", "how the body moves through the room: as the source, on the spot, or not at all",
                      choices=("travel", "in place", "still"))
     scale: float = knob(0.0, "size of the target's steps against the source's; 0: by the length of the legs", low=0.0, high=1000.0)
+    hands: str = knob("free", "hands follow their arms, or keep their distance from each other, head, hips and thighs where they are near",
+                      choices=("free", "keep"))
     twist: bool = knob(True, "spread the twist of the limbs over twist bones and forearms")
 
 
@@ -82,6 +85,10 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     if settings.root == "in place" and carrier >= 0:
         shift = shift - (shift - shift[0]) * (1.0, 1.0, 0.0)
     head = _heads(target, R, carrier, shift, target_map)
+    if settings.hands == "keep":
+        held = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
+        R = follow(target, hold_hands(source, source_map, held, target_map, scale), driven)
+        head = _heads(target, R, carrier, shift, target_map)
     moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
     notes = (*filter(None, [rest_note]), *_notes(source_map, target_map, carrier))
     monitor.step("retargeting", 4, 4)
@@ -257,7 +264,7 @@ def _pinned(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, 
         thigh = leg.thigh[0]
         goal, R = feet.ankle_goals(leg, target, R, stands, places, heads[:, leg.foot[0]], floor_m, blend)
         forward = R[:, thigh] @ (target.R_rest[thigh].T @ front)
-        R = feet.bend_leg(leg, target, R, heads[:, thigh], goal, forward)
+        R = feet.bend_limb(target, R, leg.thigh, leg.shin, leg.foot[0], heads[:, thigh], goal, forward)
     return follow(target, R, driven)
 
 
