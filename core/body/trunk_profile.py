@@ -40,7 +40,7 @@ def smoothed(balls: Metaballs, skeleton: Skeleton, lengths_m: np.ndarray, chain:
     x = start.copy()
     for _ in range(STEPS):
         radii = balls.radii_m.copy()
-        radii[np.ix_(mine, [0, 2])] = np.exp(x)
+        radii[np.ix_(mine, np.array([0, 2]))] = np.exp(x)
         balls = replace(balls, radii_m=radii)
         F, _, dF, _ = field_and_derivatives(balls, lengths_m, R, head, X, active)
         F = np.maximum(F, 1e-6)

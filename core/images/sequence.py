@@ -152,9 +152,8 @@ class Movie:
         shown = np.array([self._shown_ms[int(f)] for f in frames])
         if len(frames) < 4 or not np.ptp(shown) > 0:
             return 0.0
-        even = np.polynomial.Polynomial.fit(frames, shown, 1)
-        step = float(even.convert().coef[1])
-        return float(np.abs(shown - even(frames)).max() / step) if step > 0 else 0.0
+        step, first = np.polyfit(frames, shown, 1)
+        return float(np.abs(shown - (first + step * frames)).max() / step) if step > 0 else 0.0
 
 
 def _capture(path: Path) -> Any:
