@@ -79,6 +79,8 @@ def rig_of_scene(scene: bpy.types.Scene) -> Rig:
 
 def clip_behind(camera_object: bpy.types.Object) -> bpy.types.MovieClip | None:
     """The movie clip that a camera shows in its background, or None."""
+    if clips.CLIP_KEY in camera_object.data and clips.clip_behind(camera_object.data) is None:
+        return None
     return next((b.clip for b in camera_object.data.background_images if b.source == "MOVIE_CLIP" and b.clip), None)
 
 

@@ -109,7 +109,7 @@ def remove_earlier() -> None:
         objects = [o for o in collection.all_objects if len(o.users_collection) == 1]
         used = {id_ for o in objects for id_ in (o.data, o.animation_data.action if o.animation_data else None) if id_ is not None}
         used |= {o[action.MEASURED_KEY] for o in objects if o.get(action.MEASURED_KEY) is not None}
-        used |= {background.clip for o in objects if o.type == "CAMERA" for background in o.data.background_images if background.clip}
+        used |= {clip for o in objects if o.type == "CAMERA" and (clip := clips.clip_behind(o.data)) is not None}
         used |= {modifier.node_group for o in objects for modifier in o.modifiers if modifier.type == "NODES" and modifier.node_group}
         used |= {m for o in objects if hasattr(o.data, "materials") for m in o.data.materials if m}
         if scene.active_clip in used:

@@ -11,6 +11,8 @@ from ...core.images.sequence import open_sequence
 from .. import folders
 from . import axes
 
+CLIP_KEY = "tricap_clip"  # custom property of a camera: the clip behind it
+
 
 def load_clip(name: str, first_file: Path, camera: Camera) -> bpy.types.MovieClip:
     """The image sequence that begins with `first_file`, or the movie, as a clip with the camera's lens."""
@@ -90,3 +92,16 @@ def show_behind(camera_data: bpy.types.Camera, clip: bpy.types.MovieClip) -> Non
     background.frame_method = "STRETCH"
     background.alpha = 1.0
     camera_data.show_background_images = True
+    camera_data[CLIP_KEY] = clip
+
+
+def clip_behind(camera_data: bpy.types.Camera) -> bpy.types.MovieClip | None:
+    """The clip that `show_behind` put there; None if it was deleted since.
+
+    Blender (4.5, 5.2) leaves a deleted clip's address in the background image, and crashes when that is looked at or given back; a
+    property that points to the clip is emptied. So the background goes first, untouched.
+    """
+    clip = camera_data.get(CLIP_KEY)
+    if clip is None and CLIP_KEY in camera_data:
+        camera_data.background_images.clear()
+    return clip

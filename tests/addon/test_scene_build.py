@@ -188,3 +188,17 @@ def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> 
     assert done.stdout.splitlines() == [done.stdout.strip()] and "2 bones" in done.stdout  # nothing of Blender's own
     wrong = subprocess.run([*line[:4], str(tmp_path), *line[5:]], capture_output=True, text=True, timeout=120)
     assert wrong.returncode == 2 and "Traceback" not in wrong.stderr and "no run.json" in wrong.stderr
+
+
+def test_clips_that_were_deleted_are_made_again(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+    from tricap.addon.scene.clips import clip_behind
+
+    build_scene(small_run.out)
+    for clip in list(empty.data.movieclips):
+        empty.data.movieclips.remove(clip)
+    cameras = [o.data for o in empty.data.objects if o.type == "CAMERA"]
+    assert len(cameras) == 3 and all(clip_behind(camera) is None and not camera.background_images for camera in cameras)
+    build_scene(small_run.out)
+    assert sorted(clip.name for clip in empty.data.movieclips) == ["Footage C", "Footage L", "Footage R"]
+    assert all(clip_behind(o.data) is not None for o in empty.data.objects if o.type == "CAMERA")
