@@ -103,7 +103,7 @@ def noise_sigma(image: np.ndarray) -> float:
     """
     g = np.asarray(image, dtype=np.float32)
     inner = g[1:-1, 1:-1]
-    usable = (inner > g.min() + SATURATED * 255) & (inner < g.max() - SATURATED * 255)
+    usable = (inner > SATURATED * 255) & (inner < max(255.0, float(g.max())) - SATURATED * 255)
     residual = np.abs(cv2.filter2D(g, cv2.CV_32F, IMMERKAER)[1:-1, 1:-1])[usable]
     return max(MIN_NOISE, float(np.median(residual)) / 0.6745) if residual.size > 100 else MIN_NOISE
 
