@@ -20,7 +20,7 @@ from .motion.trc import read_trc
 from .results import Results
 from .settings import nearest_name
 from .surface.cloud import PointCloud
-from .take import JOINTS, Footage, Seeds
+from .take import JOINTS, Footage, Seeds, Take
 from .tracking.trajectories import Trajectories
 
 OURS = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist", "thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "toe",
@@ -32,10 +32,10 @@ COLUMNS = ("frame", "x", "y", "normal_x", "normal_y", "sigma", "on_edge")
 
 def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results,
               empty: Sequence[EmptyView] = ()) -> FitInput:
-    """All that the fit can use of a run.
+    """All that the fit can use of a run; clicks in other frames than the footage's are left out.
 
     Raises:
-        InputError: a table of contours or keypoints cannot be read, or the clicks are in frames that were not measured.
+        InputError: a table of contours or keypoints cannot be read.
     """
     take = footage.take
     return FitInput(
@@ -43,7 +43,7 @@ def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Traj
         model=str(take.body_model),
         clouds=clouds,  # type: ignore[arg-type]
         time_s=np.array([c.frame for c in clouds]) / take.fps,
-        clicks={s.frame: _clicked(s) for s in (*take.keyframes, take.seeds) if s.joints},
+        clicks=clicks_in(footage),
         click_frame=take.seeds.frame,
         trajectories=trajectories,  # type: ignore[arg-type]
         contours=read_contours(results, [v.name for v in take.views]),
@@ -52,6 +52,35 @@ def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Traj
         locked=take.locked,
         limits={name: (radians(low), radians(high)) for name, (low, high) in take.limits.items()},
     )
+
+
+def clicks_in(footage: Footage) -> dict[int, ClickedAt]:
+    """The clicked joints in the footage's frames, by frame."""
+    return {s.frame: _clicked(s) for s in _with_joints(footage.take) if s.frame in footage.frames}
+
+
+def missing_for_fit(footage: Footage) -> str:
+    """Why no body can be fitted in these frames, as the end of “take.toml has …”; empty: it can."""
+    take = footage.take
+    if take.body_model is None:
+        return "no [body] model"
+    if take.keypoints or clicks_in(footage):
+        return ""
+    return "no clicked joints" + (f" in the frames {footage.frames.start} to {footage.frames.stop - 1}" if _with_joints(take) else "")
+
+
+def clicks_left_out(footage: Footage) -> list[str]:
+    """What the user should know of clicked joints outside the footage's frames."""
+    outside = [s.frame for s in _with_joints(footage.take) if s.frame not in footage.frames]
+    if not outside or missing_for_fit(footage):
+        return []
+    begins = "; the fit begins at other clicks or keypoints" if footage.take.seeds.frame in outside else ""
+    return [f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
+            f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."]
+
+
+def _with_joints(take: Take) -> list[Seeds]:
+    return [s for s in (*take.keyframes, take.seeds) if s.joints]
 
 
 def read_contours(results: Results, views: Sequence[str]) -> list[ViewContours]:

@@ -22,7 +22,7 @@ from .checking.timing import in_step
 from .correcting import corrected_cloud, corrected_tracks
 from .empty_sources import find_empty
 from .errors import InputError
-from .fit_sources import fit_input
+from .fit_sources import clicks_left_out, fit_input, missing_for_fit
 from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
 from .fitting.settings import FitSettings
@@ -285,10 +285,11 @@ def fit(run: Run, monitor: Monitor) -> None:
     """
     if run.trajectories is None:
         track(run, monitor)
-    began, take = time.perf_counter(), run.footage.take
+    began = time.perf_counter()
     run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
-    joints = take.seeds.joints or take.keyframes or take.keypoints
-    missing = "no [body] model" if take.body_model is None else "no clicked joints" if not joints else ""
+    missing = missing_for_fit(run.footage)
+    for sentence in clicks_left_out(run.footage):
+        run.warn(sentence)
     if missing:
         run.warn(f"No body was fitted: take.toml has {missing}.")
         run.finish_stage("fit", began, not_done=missing)
@@ -309,6 +310,11 @@ def fit(run: Run, monitor: Monitor) -> None:
             "Frames in which the body rests partly on prediction: "
             + ", ".join(f"{n} {w}" for w, n in states.items() if w != "fitted")
             + "."
+        )
+    if not body.converged:
+        run.warn(
+            f"The adjustment of the body has not settled after {body.iterations} steps: look at the pictures before you use it, "
+            "and raise fitting.sequence_steps."
         )
     run.finish_stage(
         "fit",

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import following, measuring, store
+from .body.model_file import model_files
 from .errors import InputError
 from .settings import to_table
 from .take import Footage, Seeds, Take
@@ -45,7 +46,7 @@ def _followed(footage: Footage) -> Any:
 def _fitted(footage: Footage) -> Any:
     take = footage.take
     model = take.body_model
-    own = store.digest(Path(model)) if model and Path(model).is_file() else ""
+    own = store.digest(*model_files(model)) if model and Path(model).is_file() else ""
     return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take)
 
 

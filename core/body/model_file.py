@@ -2,6 +2,7 @@
 
 A file with `mirror_of` is the mirror image (x → −x) of another: names change side, limits about y and z change sign. In a `symmetric`
 file the bones of the right side stand for both. A file with `part_of` is another model `without` some bones and what hangs on them.
+The other is one of ours by its name, or a .toml file beside this one.
 """
 
 import tomllib
@@ -53,18 +54,53 @@ def read_model(name: str | Path) -> BodyModel:
     Raises:
         InputError: there is no such model, or its file is faulty.
     """
-    path = Path(name) if str(name).endswith(".toml") else MODELS / f"{name}.toml"
-    if path.parent == MODELS and path.name.removesuffix(".toml") not in model_names():
+    sources = _sources(name)
+    path, table = sources[-1]
+    model = _model(table, path)
+    for path, table in reversed(sources[:-1]):
+        own = str(table.get("name", path.name.removesuffix(".toml")))
+        model = mirrored(model, own) if "mirror_of" in table else without(model, table.get("without", ()), own)
+    return model
+
+
+def model_files(name: str | Path) -> list[Path]:
+    """The file of a model, and those that it is a mirror image or a part of.
+
+    Raises:
+        InputError: as `read_model`.
+    """
+    return [path for path, _ in _sources(name)]
+
+
+def _sources(name: str | Path) -> list[tuple[Path, dict[str, Any]]]:
+    """A model's file and table, then those that it is made from; a file that another names lies beside it."""
+    found: list[tuple[Path, dict[str, Any]]] = []
+    wanted: Any = name
+    while wanted is not None:
+        path = _path(wanted, found[-1][0].parent if found else Path())
+        if any(path.resolve() == other.resolve() for other, _ in found):
+            raise InputError(f"The body model {found[0][0]} is made from itself, by way of “{wanted}”; mend `mirror_of` or `part_of`.")
+        found.append((path, _table(path)))
+        table = found[-1][1]
+        wanted = table.get("mirror_of", table.get("part_of"))
+    return found
+
+
+def _path(name: Any, folder: Path) -> Path:
+    if not isinstance(name, str | Path):
+        raise InputError(f"A body model in {folder} is made from {name!r}; write the name of a model, such as \"arm.R\", or a .toml file.")
+    if str(name).endswith(".toml"):
+        return folder / name
+    if name not in model_names():
         raise InputError(f"There is no body model “{name}”.{nearest_name(str(name), model_names())}")
+    return MODELS / f"{name}.toml"
+
+
+def _table(path: Path) -> dict[str, Any]:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"The body model {path} cannot be read: {error}.") from error
-    if "mirror_of" in table:
-        return mirrored(read_model(str(table["mirror_of"])), str(table.get("name", name)))
-    if "part_of" in table:
-        return without(read_model(str(table["part_of"])), table.get("without", ()), str(table.get("name", name)))
-    return _model(table, path)
 
 
 def joint_depths_m(model: BodyModel) -> dict[str, float]:

@@ -15,8 +15,8 @@ STATUSES = (FITTED, PARTIAL, BRIDGED, SUSPECT)
 class BodyMotion:
     """T frames of D DOFs and J joints.
 
-    status: "fitted"; "partial": a limb had too few points and rests on prediction; "bridged": no points, the whole posture is predicted;
-    "suspect": the residuals are far larger, or the points far fewer, than in the other frames.
+    status, the most serious that holds: "bridged": no points, the whole posture is predicted; "suspect": the residuals are far larger, or
+    the points far fewer, than in the other frames; "partial": a limb had too few points and rests on prediction; "fitted".
     """
 
     frames: np.ndarray  # (T,) the take's frame numbers

@@ -186,4 +186,4 @@ def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[
     total = counts.sum(axis=1)
     few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))
     strange = few | (np.nan_to_num(sigma0) > SUSPICIOUS * usual)
-    return tuple(BRIDGED if not e.any() else PARTIAL if not e.all() else SUSPECT if s else FITTED for e, s in zip(enough, strange))
+    return tuple(BRIDGED if not e.any() else SUSPECT if s else PARTIAL if not e.all() else FITTED for e, s in zip(enough, strange))

@@ -14,7 +14,10 @@ COST_DONE = 1e-4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """The adjusted motion (T, D) and shape vector (S,), what it cost, and the scales of the residuals (scales.points is sigma0)."""
+    """The adjusted motion (T, D) and shape vector (S,), what it cost, and the scales of the residuals (scales.points is sigma0).
+
+    converged: the cost is finite, and the last step was small or gained next to nothing.
+    """
 
     motion: np.ndarray
     vector: np.ndarray
@@ -42,13 +45,25 @@ def solve(problem: Problem, motion: np.ndarray, vector: np.ndarray, *, steps: in
         last = lin.cost
         new, damping = _accepted_step(problem, lin, motion, vector, damping)
         if new is None:
-            done = True
+            done = _at_minimum(lin)
             break
         size = max(float(np.abs(new[0] - motion).max()), float(np.abs(new[1] - vector).max()))
         done = size < STEP_DONE or (lin.cost - new[2]) < COST_DONE * lin.cost
         motion, vector, last = new
         scales = lin.scales(scales)
-    return Solution(motion=motion, vector=vector, cost=last, scales=scales, iterations=iteration, converged=done)
+    converged = done and bool(np.isfinite(last))
+    return Solution(motion=motion, vector=vector, cost=last, scales=scales, iterations=iteration, converged=converged)
+
+
+def _at_minimum(lin: Linearised) -> bool:
+    """Whether a linearisation from which no step lowers the cost is at its minimum: a whole step would be small, or gain nothing."""
+    try:
+        dx, ds = lin.equations.solve(START_DAMPING)
+    except np.linalg.LinAlgError:
+        return False
+    size = max(float(np.abs(dx).max(initial=0.0)), float(np.abs(ds).max(initial=0.0)))
+    gain = float(np.sum(dx * lin.equations.g) + ds @ lin.equations.h)
+    return bool(np.isfinite(lin.cost)) and (size < STEP_DONE or gain < COST_DONE * lin.cost)
 
 
 def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarray,

@@ -25,6 +25,7 @@ FACE, FEET = ("REye", "LEye", "REar", "LEar"), ("LBigToe", "LSmallToe", "LHeel",
 HALPE = (*COCO, "crown", "neck", "mid_hip", "left_big_toe", "right_big_toe", "left_small_toe", "right_small_toe", "left_heel", "right_heel")
 LAYOUTS = {17: COCO, 18: (*ARMS, *LEGS, *FACE), 25: (*ARMS, "MidHip", *LEGS, *FACE, *FEET), 26: HALPE}  # by the number of keypoints
 WHOLE_BODY = 133  # COCO with feet, face and hands: the body's come first
+NUMBER = re.compile(r"(\d{1,12})(?:_keypoints)?$", re.IGNORECASE)  # in the name of an image's file
 LARGEST_BYTES = 1 << 28
 Person = np.ndarray  # (K, 3) x, y, confidence
 
@@ -46,17 +47,18 @@ class ImagePoints:
 
 
 def read_keypoints(paths: Sequence[Path]) -> ImagePoints:
-    """Read one file of all images, or one file per image in the order of `paths`.
+    """Read one file of all images, or one file per image: its number is the one at the end of its name ("_keypoints" aside), so that a
+    missing file shifts no other; files without such numbers are counted in the order of `paths`.
 
     Raises:
         InputError: a file cannot be read, is of none of the kinds, or nobody is in any of them.
     """
     people: list[tuple[int, list[Person]]] = []
     names: tuple[str, ...] = ()
-    for i, path in enumerate(paths):
+    for number, path in zip(_numbers_of(paths), paths):
         table = _json(path)
         if isinstance(table, dict) and "people" in table:
-            people.append((i, [_numbers(p.get("pose_keypoints_2d"), path) for p in _dicts(table["people"], path)]))
+            people.append((number, [_numbers(p.get("pose_keypoints_2d"), path) for p in _dicts(table["people"], path)]))
         else:
             found, given = _coco(table, path)
             people += found
@@ -66,6 +68,12 @@ def read_keypoints(paths: Sequence[Path]) -> ImagePoints:
         raise InputError(f"{paths[0]} and the files beside it hold {'nobody' if not counts else 'people of different kinds'}; "
                          "give the keypoints of one detector.")
     return _followed(people, names or _layout(counts.pop(), paths[0]))
+
+
+def _numbers_of(paths: Sequence[Path]) -> Sequence[int]:
+    found = [NUMBER.search(path.stem) for path in paths]
+    numbers = [int(match[1]) for match in found if match]
+    return numbers if len(set(numbers)) == len(paths) else range(len(paths))
 
 
 def _followed(people: list[tuple[int, list[Person]]], names: tuple[str, ...]) -> ImagePoints:

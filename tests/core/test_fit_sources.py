@@ -1,19 +1,20 @@
 """Keypoints and outlines from files: OpenPose, COCO, TRC, CSV; the names of joints; what is refused."""
 
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tricap.core.errors import InputError
-from tricap.core.fit_sources import joint_named, read_contours, read_source
+from tricap.core.fit_sources import clicks_in, clicks_left_out, joint_named, missing_for_fit, read_contours, read_source
 from tricap.core.keypoint_sources import keypoint_sources
 from tricap.core.motion.keypoints_json import LAYOUTS
 from tricap.core.motion.markers import Markers
 from tricap.core.motion.trc import write_trc
 from tricap.core.results import Results
-from tricap.core.take import JOINTS
+from tricap.core.take import JOINTS, Seeds
 
 
 def _footage(folder):
@@ -43,6 +44,30 @@ def test_openpose_follows_one_person_in_the_takes_frames(tmp_path) -> None:
     assert found.place[knee, 0].tolist() == [10.0, 14.0, 18.0]
     assert "ankle.R" not in found.joint  # without confidence
     assert found.sigma[knee[0]] == pytest.approx(6.0 / 0.9**0.5)
+
+
+def test_a_missing_file_shifts_no_other(tmp_path) -> None:
+    _openpose(tmp_path / "kp", [_person(0)], [_person(4)], [_person(8)], [_person(12)])
+    (tmp_path / "kp" / "C_001_keypoints.json").unlink()
+    found = read_source(_footage(tmp_path), _source(files="kp/*.json", view="L"))
+    assert sorted(set(found.frame.tolist())) == [0, 2, 3]
+    (tmp_path / "kp" / "C_002_keypoints.json").rename(tmp_path / "kp" / "C_b_keypoints.json")  # no number: the order counts
+    found = read_source(_footage(tmp_path), _source(files="kp/*.json", view="L"))
+    assert sorted(set(found.frame.tolist())) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("frames", "seeds", "keyframes", "used", "missing", "said"), [
+    (range(0, 9), 2, (5,), [2, 5], "", ""), (range(0, 4), 2, (5,), [2], "", "in frame 5 are not used: only frames 0 to 3 are fitted."),
+    (range(4, 9), 2, (5,), [5], "", "in frame 2 .* begins at other clicks"), (range(6, 9), 2, (5,), [], "in the frames 6 to 8", "")])
+def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, missing, said) -> None:
+    joints = {"knee.R": {"L": np.zeros(2)}}
+    take = SimpleNamespace(seeds=Seeds(frame=seeds, joints=joints), keyframes=tuple(Seeds(frame=f, joints=joints) for f in keyframes),
+                           body_model="full", keypoints=())
+    footage = SimpleNamespace(take=take, frames=frames)
+    assert sorted(clicks_in(footage)) == used
+    assert missing in missing_for_fit(footage) and bool(missing) == bool(missing_for_fit(footage))
+    warnings = clicks_left_out(footage)
+    assert len(warnings) == bool(said) and all(re.search(said, w) for w in warnings)
 
 
 def test_coco_annotations_and_results(tmp_path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.body.model_file import model_names, read_model
+from tricap.core.body.model_file import model_files, model_names, read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
 from tricap.core.errors import InputError
 
@@ -45,3 +45,23 @@ def test_a_missing_body_or_model_is_named(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(InputError, match="mine.toml"):
         read_model(tmp_path / "mine.toml")
+
+
+def _own(folder: Path, name: str, text: str) -> Path:
+    (folder / name).write_text(f'format = "tricap-model"\nversion = 1\nname = "{name}"\n{text}\n')
+    return folder / name
+
+
+def test_a_model_is_made_from_one_beside_it(tmp_path: Path) -> None:
+    part = _own(tmp_path, "part.toml", 'part_of = "upper_body"\nwithout = ["head"]')
+    whole = _own(tmp_path, "mirror.toml", 'mirror_of = "part.toml"')
+    model = read_model(whole)
+    assert model.name == "mirror.toml" and "head" not in [bone.name for bone in model.skeleton.bones]
+    assert model_files(whole)[:2] == [whole, part] and len(model_files(whole)) == 4
+
+
+@pytest.mark.parametrize("text", ['mirror_of = "a.toml"', 'part_of = "b.toml"', "mirror_of = 3", 'mirror_of = "nobody"'])
+def test_a_model_made_from_itself_is_refused(text: str, tmp_path: Path) -> None:
+    _own(tmp_path, "b.toml", 'mirror_of = "a.toml"')
+    with pytest.raises(InputError, match="made from|no body model"):
+        read_model(_own(tmp_path, "a.toml", text))

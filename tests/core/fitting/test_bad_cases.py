@@ -11,8 +11,12 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.errors import InputError
 from tricap.core.fitting.fit_input import FitInput
-from tricap.core.fitting.sequence import fit_sequence
+from tricap.core.fitting.observations import MotionPrior
+from tricap.core.fitting.problem import Problem
+from tricap.core.fitting.sequence import _statuses, conditions, fit_sequence
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.solver import solve
+from tricap.core.fitting.state import ShapeParameters, free_bones
 
 from .limb_scene import front_rig, surface
 
@@ -128,3 +132,28 @@ def _front(shape, motion: np.ndarray, frame: int, rng: np.random.Generator) -> S
     keep = normal[:, 1] < -0.3
     X = (axis + low[:, None] * ray)[keep] + 0.001 * rng.normal(size=(keep.sum(), 1)) * normal[keep]
     return SimpleNamespace(frame=frame, xyz_m=X, normals=normal[keep], covariance_m2=np.repeat(np.eye(3)[None] * 1e-6, len(X), 0))
+
+
+@pytest.mark.parametrize(("mean", "known", "converged"), [(0.1, 1.0, True), (np.nan, 1.0, False), (0.1, 0.0, False)])
+def test_only_a_finite_minimum_is_called_converged(mean: float, known: float, converged: bool) -> None:
+    parameters = ShapeParameters(default_shape(read_model("arm.R")))
+    D = len(parameters.skeleton.dofs)
+    sigma = np.full(D, 1.0)
+    sigma[-1] = 1.0 if known else np.inf  # nothing is known of one angle: no damping makes the equations regular
+    problem = Problem(parameters=parameters, observe=lambda t, state: [MotionPrior(mean=np.full(D, mean), sigma=sigma)])
+    solution = solve(problem, np.zeros((1, D)), parameters.vector(), steps=20)
+    assert solution.converged is converged
+    if converged:
+        again = solve(problem, solution.motion, solution.vector, steps=20)  # from the minimum no step goes down
+        assert again.converged and np.allclose(again.motion, mean)
+
+
+def test_a_partial_frame_can_be_suspect(make_scene) -> None:
+    scene = make_scene(frames=4, seed=2)
+    fit = conditions(_given(scene), SETTINGS)
+    counts = np.where(free_bones(fit.parameters), 200, 0) * np.ones((5, 1), dtype=int)
+    counts[1, np.flatnonzero(free_bones(fit.parameters))[1]] = 0
+    counts[3:] = counts[1]
+    counts[4] = 0
+    sigma0 = np.array([1.0, 1.1, 1.0, 5.0, np.nan])
+    assert _statuses(fit, counts, sigma0) == ("fitted", "partial", "fitted", "suspect", "bridged")
