@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ..core.body.fields import EXPONENTIAL, POTENTIALS
 from ..core.errors import InputError
 from ..core.progress import Monitor
 
@@ -30,6 +31,8 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--detail", metavar="N", type=int, default=1, choices=range(1, 9), help="level of detail of the skin, 1 to 8")
     parser.add_argument("--exact-skin", action="store_true", help="also the run's skin of every frame, as FILE.pc2 beside the .blend")
     parser.add_argument("--implicit", action="store_true", help="also the implicit surface itself in the middle frame, for checking")
+    parser.add_argument("--field", choices=tuple(POTENTIALS), default=EXPONENTIAL.name,
+                        help="the field of that surface's balls, see `tricap fields` (default: the fitted one)")
     parser.add_argument("--rest-pose", choices=("A", "T"), default="A", help="of the armature (default A)")
     parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0,
                         help="play a second action with few keys, within this many degrees; the measured one is kept")
@@ -59,7 +62,7 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         look_through()
         contents = read_contents(args.out, monitor, skins=args.exact_skin)
         options = SceneOptions(detail=args.detail, exact_skin=args.exact_skin, rest_pose=args.rest_pose, simplify_deg=args.simplify,
-                               colour=args.colour, arrows=args.arrows, implicit=args.implicit)
+                               colour=args.colour, arrows=args.arrows, implicit=args.implicit, field=args.field)
         report = write_scene(contents, args.blend, options, monitor)
         if args.preview is not None:
             preview(contents, args.preview, args.frame)

@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from . import batch_command, calibrate_command, check_command, contour_command, pipeline, points_command, track2d_command
+from . import batch_command, calibrate_command, check_command, contour_command, fields_command, pipeline, points_command, track2d_command
 from .arguments import frame_range, overrides
 from .errors import InputError
 from .geometry.rig import read_rig
@@ -62,7 +62,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
     demo.set_defaults(run=_demo, json=False)
-    of_core = (check_command, calibrate_command, track2d_command, contour_command, batch_command)
+    of_core = (check_command, calibrate_command, track2d_command, contour_command, batch_command, fields_command)
     for add in (*(module.add_command for module in of_core), *adders):
         add(commands)
     for sub in commands.choices.values():

@@ -17,7 +17,7 @@ LAYERS = (
     "errors progress settings values store lock geometry images matching calibration surface tracking "
     "body fitting motion keypoint_sources take take_file results fit_sources empty_sources measuring measured following "
     "frame_table inspection correcting calibrating footage_files checking report stages pipeline "
-    "arguments calibrate_command track2d_command contour_command points_command check_command batch "
+    "arguments calibrate_command track2d_command contour_command points_command check_command fields_command batch "
     "batch_command commands"
 ).split()
 SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 
+from ...core.body.fields import POTENTIALS
 from ...core.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
@@ -40,6 +41,8 @@ class BuildScene(JobOperator, bpy.types.Operator):
                                        description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file")
     implicit: bpy.props.BoolProperty(name="Implicit Surface", default=False,  # type: ignore[valid-type]
                                      description="Also the surface of the exact field in the middle frame, to check skins against")
+    field: bpy.props.EnumProperty(name="Field", items=[(name, name.capitalize(), "") for name in POTENTIALS],  # type: ignore[valid-type]
+                                  description="The field of the implicit surface's balls; the exponential is the fitted one")
     simplify: bpy.props.FloatProperty(name="Simplify", default=0.0, min=0.0, max=math.radians(10), subtype="ANGLE",  # type: ignore[valid-type]
                                       description="Play an action with few keys within this angle; the measured one is kept. 0: measured")
     colour: bpy.props.EnumProperty(name="Cloud Colour", items=[(c, c.capitalize(), "") for c in COLOURS])  # type: ignore[valid-type]
@@ -53,7 +56,8 @@ class BuildScene(JobOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, result: Contents) -> set[str]:
         """Build the scene from what was read."""
         options = SceneOptions(rest_pose=self.rest_pose, detail=self.detail, exact_skin=self.exact_skin, colour=self.colour,
-                               simplify_deg=math.degrees(self.simplify), arrows=self.arrows, implicit=self.implicit)
+                               simplify_deg=math.degrees(self.simplify), arrows=self.arrows, implicit=self.implicit,
+                               field=self.field)
         put_into_scene(self, context, result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         return {"FINISHED"}
 

@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...core.body.fields import EXPONENTIAL, potential_named
 from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
@@ -37,6 +38,7 @@ class SceneOptions:
     detail: int = 1  # the skin's level of detail: pieces of each edge
     exact_skin: bool = False  # also the skin of every frame, as the run found it: a mesh cache beside the .blend
     implicit: bool = False  # also the implicit surface itself, in the middle frame
+    field: str = EXPONENTIAL.name  # of its balls, one of core.body.fields.POTENTIALS
     rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
     simplify_deg: float = 0.0  # above 0: the armature plays a second action with few keys, within this tolerance
     colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
@@ -245,7 +247,7 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
         row = len(values) // 2
         posture, frame = (values[row], int(motion.frames[row])) if motion is not None else (np.zeros(n), contents.frames[0])
         if np.isfinite(posture).all():
-            implicit.add_implicit(collection, shape, posture, frame, monitor)
+            implicit.add_implicit(collection, shape, posture, frame, monitor, potential_named(options.field))
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
         counts["frames of motion"] = len(motion.frames)

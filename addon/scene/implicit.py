@@ -4,6 +4,7 @@ import bpy
 import numpy as np
 
 from ...core.body.field_grid import field_grid
+from ...core.body.fields import EXPONENTIAL, Potential
 from ...core.body.metaballs import THRESHOLD
 from ...core.body.shape import BodyShape
 from ...core.errors import InputError
@@ -13,19 +14,20 @@ SPACING_M = 0.005
 
 
 def add_implicit(collection: bpy.types.Collection, shape: BodyShape, motion: np.ndarray, frame: int,
-                 monitor: Monitor | None = None) -> bpy.types.Object:
-    """The surface F = ½ of the body in one posture, `motion` (D,) rad and metres, to 0.4 mm (a grid of 5 mm). Its name tells the frame.
+                 monitor: Monitor | None = None, potential: Potential = EXPONENTIAL) -> bpy.types.Object:
+    """The surface F = ½ of the body in one posture, `motion` (D,) rad and metres, to 0.4 mm (a grid of 5 mm). Its name tells the frame,
+    and the field where it is not the fitted one.
 
     Raises:
         InputError: this Blender was built without OpenVDB.
         Cancelled: the monitor was cancelled.
     """
     openvdb = _openvdb()
-    sampled = field_grid(shape, motion, SPACING_M, monitor)
+    sampled = field_grid(shape, motion, SPACING_M, monitor, potential)
     grid = openvdb.FloatGrid()
     grid.copyFromArray(THRESHOLD - sampled.values)  # a level set: negative inside
     points, quads = grid.convertToQuads(0.0)
-    mesh = bpy.data.meshes.new(f"Implicit surface {frame:04d}")
+    mesh = bpy.data.meshes.new(f"Implicit surface {frame:04d}" + (f" {potential.name}" if potential.name != EXPONENTIAL.name else ""))
     mesh.from_pydata((sampled.origin_m + SPACING_M * points).tolist(), [], quads.tolist())
     mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
     mesh.update()

@@ -6,11 +6,10 @@ import numpy as np
 
 from ..progress import Monitor
 from ..values import frozen
+from .fields import EXPONENTIAL, Potential
 from .shape import BodyShape
 from .skeleton import bone_frames
 from .skin_parts import body_parts
-
-REACH = 1.9  # in units of l: beyond it exp(−2 d) is below a thousandth of the threshold
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -26,7 +25,8 @@ class FieldGrid:
         object.__setattr__(self, "origin_m", frozen(self.origin_m, (3,), name="origin_m"))
 
 
-def field_grid(shape: BodyShape, motion: np.ndarray, spacing_m: float = 0.005, monitor: Monitor | None = None) -> FieldGrid:
+def field_grid(shape: BodyShape, motion: np.ndarray, spacing_m: float = 0.005, monitor: Monitor | None = None,
+               potential: Potential = EXPONENTIAL) -> FieldGrid:
     """The field of a body in one posture, `motion` (D,) rad and metres, around everything that it reaches.
 
     The balls of a part (`skin_parts`: an arm, a leg, the trunk) add, and of the parts' fields the largest counts: the surface is the
@@ -40,7 +40,7 @@ def field_grid(shape: BodyShape, motion: np.ndarray, spacing_m: float = 0.005, m
     R, head = bone_frames(shape.skeleton, shape.lengths_m, np.asarray(motion, dtype=np.float64))
     turn = R[balls.bone_index]  # (M, 3, 3), columns: the bone's axes
     centre = head[balls.bone_index] + np.einsum("mij,mj->mi", turn, balls.centres_m(shape.lengths_m))
-    reach = REACH * np.sqrt(np.einsum("mij,mj->mi", turn**2, balls.radii_m**2))
+    reach = potential.reach * np.sqrt(np.einsum("mij,mj->mi", turn**2, balls.radii_m**2))
     low, high = (centre - reach).min(axis=0), (centre + reach).max(axis=0)
     size = np.ceil((high - low) / spacing_m).astype(int) + 1
     values = np.zeros(size, dtype=np.float32)
@@ -56,6 +56,6 @@ def field_grid(shape: BodyShape, motion: np.ndarray, spacing_m: float = 0.005, m
             q = [turn[m, i] / balls.radii_m[m] * axes[i][:, None] for i in range(3)]
             there = q[0][:, None, None] + q[1][None, :, None] + q[2][None, None, :]
             box = tuple(slice(a, b) for a, b in zip(first, last))
-            field[box] += (balls.weight[m] * np.exp(-2 * np.einsum("ijkc,ijkc->ijk", there, there))).astype(np.float32)
+            field[box] += (balls.weight[m] * potential.value(np.einsum("ijkc,ijkc->ijk", there, there))).astype(np.float32)
         np.maximum(values, field, out=values)
     return FieldGrid(values=values, origin_m=low, spacing_m=spacing_m)

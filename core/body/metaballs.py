@@ -6,6 +6,7 @@
 l is a field scale, not the visible half axis: an isolated ball with w = 1 is seen at r = l √(½ ln(w/T)) = 0.58871 l. The radius of a limb
 follows from the SUM: with three balls at 1/6, 1/2, 5/6 of a bone and 0.30 of its length along it, l = 1.534 R across.
 The fields of bones that meet at a joint add ("consistent mode"); balls further away do not.
+`fields` has other potentials than exp(−2 d), with which a body can be looked at; the fit knows this one only.
 """
 
 from dataclasses import dataclass
@@ -13,9 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..values import frozen
+from .fields import EXPONENTIAL, THRESHOLD, VISIBLE, Potential
 
-THRESHOLD = 0.5
-VISIBLE = float(np.sqrt(0.5 * np.log(1 / THRESHOLD)))  # r / l of an isolated ball
+__all__ = ["ALONG", "STATIONS", "THRESHOLD", "VISIBLE", "Metaballs", "active_balls", "field", "field_and_derivatives", "local_points",
+           "three_balls"]
+
 STATIONS = (1 / 6, 1 / 2, 5 / 6)  # centres of a segment's three balls, as fractions of the bone
 ALONG = 0.30  # l along the bone, as a fraction of its length
 PER_STOUTNESS, FURTHEST_ALONG = 0.85, 0.42  # for bones that are thick for their length
@@ -46,33 +49,35 @@ def local_points(R: np.ndarray, head_m: np.ndarray, xyz_m: np.ndarray) -> np.nda
     return np.einsum("nbi,bij->nbj", np.asarray(xyz_m)[:, None, :] - head_m, R, optimize=True)
 
 
-def ball_terms(balls: Metaballs, lengths_m: np.ndarray, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """q = (x/l_x, y/l_y, z/l_z) (N, M, 3) and w exp(−2 d) (N, M) of points given in every bone's axes (N, B, 3).  (7), (8)"""
+def squared_distances(balls: Metaballs, lengths_m: np.ndarray, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """q = (x/l_x, y/l_y, z/l_z) (N, M, 3) and d = q·q (N, M) of points given in every bone's axes (N, B, 3).  (7)"""
     q = (local[:, balls.bone_index] - balls.centres_m(lengths_m)) / balls.radii_m
-    return q, balls.weight * np.exp(-2 * np.einsum("nmi,nmi->nm", q, q))
+    return q, np.einsum("nmi,nmi->nm", q, q)
 
 
 def field(balls: Metaballs, lengths_m: np.ndarray, R: np.ndarray, head_m: np.ndarray, xyz_m: np.ndarray,
-          active: np.ndarray | None = None) -> np.ndarray:
+          active: np.ndarray | None = None, potential: Potential = EXPONENTIAL) -> np.ndarray:
     """F (N,) at world points (N, 3). `active`: bool (M,) or (N, M), the balls that count; default all.  (8)
 
     Arguments: bone lengths (B,), frames R (B, 3, 3) and heads (B, 3) of ONE posture (`skeleton.bone_frames`).
     """
-    terms = ball_terms(balls, lengths_m, local_points(R, head_m, xyz_m))[1]
-    return (terms if active is None else np.where(active, terms, 0.0)).sum(axis=1)
+    terms = balls.weight * potential.value(squared_distances(balls, lengths_m, local_points(R, head_m, xyz_m))[1])
+    return np.asarray((terms if active is None else np.where(active, terms, 0.0)).sum(axis=1))
 
 
 def field_and_derivatives(balls: Metaballs, lengths_m: np.ndarray, R: np.ndarray, head_m: np.ndarray, xyz_m: np.ndarray,
-                          active: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+                          active: np.ndarray | None = None, potential: Potential = EXPONENTIAL,
+                          ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """F (N,), its gradient in space (N, 3), and its derivatives to ln l (N, M, 3) and to the weights w (N, M).
 
-    Arguments as in `field`. ∇F = −4 Σ w e^(−2d) q/l in the world's axes; ∂F/∂ln l = 4 q² w e^(−2d); ∂F/∂w = e^(−2d).
+    Arguments as in `field`. ∇F = 2 Σ w f'(d) q/l in the world's axes; ∂F/∂ln l = −2 q² w f'(d); ∂F/∂w = f(d).
     """
-    q, terms = ball_terms(balls, lengths_m, local_points(R, head_m, xyz_m))
+    q, d = squared_distances(balls, lengths_m, local_points(R, head_m, xyz_m))
+    value, slope = potential.value(d), balls.weight * potential.slope(d)
     if active is not None:
-        terms = np.where(active, terms, 0.0)
-    gradient = -4 * np.einsum("nm,nmi,mji->nj", terms, q / balls.radii_m, R[balls.bone_index], optimize=True)
-    return terms.sum(axis=1), gradient, 4 * terms[..., None] * q**2, terms / balls.weight
+        value, slope = np.where(active, value, 0.0), np.where(active, slope, 0.0)
+    gradient = 2 * np.einsum("nm,nmi,mji->nj", slope, q / balls.radii_m, R[balls.bone_index], optimize=True)
+    return value @ balls.weight, gradient, -2 * slope[..., None] * q**2, value
 
 
 def active_balls(balls: Metaballs, neighbours: np.ndarray, bone: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Curves over the frames as SVG, with a band of one sigma."""
+"""Curves as SVG: over the frames, with a band of one sigma; fields of metaballs over the radius."""
 
 import html
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 520, 170, 56, 26, 26
-COLOURS = ("#c0392b", "#2471a3", "#1e8449")
+COLOURS = ("#c0392b", "#2471a3", "#1e8449", "#b9770e", "#7d3c98", "#515a5a")
 
 
 def curve_graph(title: str, unit: str, frames: np.ndarray, curves: Mapping[str, np.ndarray], sigma: np.ndarray | None = None) -> str:
@@ -45,6 +45,36 @@ def curve_graph(title: str, unit: str, frames: np.ndarray, curves: Mapping[str, 
             parts.append(f'<polygon points="{band}" fill="{COLOURS[0]}" opacity="0.18"/>')
     for (_, curve), stroke in zip(curves.items(), COLOURS):
         parts += [f'<polyline points="{_points(px, y(c))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>' for px, c in _runs(x, curve)]
+    return "".join(parts) + "</svg>"
+
+
+def field_graph(title: str, radius: np.ndarray, curves: Mapping[str, np.ndarray], marks: Mapping[str, tuple[float, float]],
+                threshold: float) -> str:
+    """Fields (values 0 to 1) over the radius (N,) from 0, with the threshold w_t as a line, and of each curve in `marks` r_t as a dot on it
+    and r_a as a stroke on the axis."""
+    high = 2 * HEIGHT
+
+    def x(r: np.ndarray | float) -> np.ndarray:
+        return LEFT + (WIDTH - LEFT - 10) * np.asarray(r) / radius[-1]
+
+    def y(value: np.ndarray | float) -> np.ndarray:
+        return TOP + (high - TOP - BOTTOM) * (1 - np.asarray(value))
+
+    line = '<line x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}" stroke="{}"/>'
+    parts = [f'<svg viewBox="0 0 {WIDTH} {high}" width="{WIDTH}" height="{high}" xmlns="http://www.w3.org/2000/svg" '
+             'font-family="sans-serif" font-size="11">', f'<text x="{LEFT}" y="15" font-size="13">{html.escape(title)}</text>',
+             line.format(LEFT, WIDTH - 10, y(0), y(0), "#888"), line.format(LEFT, LEFT, y(0), y(1), "#888"),
+             line.format(LEFT, WIDTH - 10, y(threshold), y(threshold), "#bbb"),
+             f'<text x="{LEFT - 6}" y="{y(threshold) + 4:.1f}" text-anchor="end">w_t = {threshold:g}</text>',
+             f'<text x="{WIDTH - 10}" y="{high - 8}" text-anchor="end">r / l</text>']
+    parts += [f'<text x="{x(r):.1f}" y="{high - 8}" text-anchor="middle">{r:g}</text>' for r in np.arange(0, radius[-1], 0.25)]
+    for i, ((name, curve), stroke) in enumerate(zip(curves.items(), COLOURS)):
+        seen, ends = marks[name]
+        row = f"{name}: r_t {seen:.3f}, r_a {ends:.3f}"
+        parts += [f'<polyline points="{_points(x(radius), y(curve))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>',
+                  f'<circle cx="{x(seen):.1f}" cy="{y(threshold):.1f}" r="3.5" fill="{stroke}"/>',
+                  line.format(x(ends), x(ends), y(0) - 7, y(0) + 5, stroke),
+                  f'<text x="{WIDTH - 14}" y="{TOP + 14 * (i + 1)}" text-anchor="end" fill="{stroke}">{html.escape(row)}</text>']
     return "".join(parts) + "</svg>"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core import store
+from tricap.core.body.fields import potential_named
 from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
@@ -68,6 +69,12 @@ def test_the_implicit_surface_is_that_of_the_field(empty: ModuleType, small_run:
     mesh.from_mesh(checked.data)
     assert all(edge.is_manifold for edge in mesh.edges) and mesh.calc_volume(signed=True) > 0
     mesh.free()
+    build_scene(small_run.out, options=SceneOptions(implicit=True, field="Wyvill"))
+    other = world_vertices(empty, empty.data.objects[f"Implicit surface {FRAMES[middle]:04d} Wyvill"])
+    found = field(small_run.shape.metaballs, small_run.shape.lengths_m, R, head, other, potential=potential_named("Wyvill"))
+    assert np.abs(found - 0.5).max() < 0.02 and points.shape != other.shape
+    with pytest.raises(InputError, match="no field"):
+        build_scene(small_run.out, options=SceneOptions(implicit=True, field="Shan"))
 
 
 def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:
