@@ -140,7 +140,7 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     footage = open_take(read_take(args.take))
     settings = pipeline.settings_of(footage.take.settings, overrides(args.set), str(args.take))
     frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
-    where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor)
+    where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor, settings["enhance"])
     near, far = where.depth_range_m
     return [
         f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (from {where.method}), "

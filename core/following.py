@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from . import store
+from .images.enhance import EnhanceSettings
 from .matching.least_squares import MatchingSettings
 from .measuring import FrameImages, MeasuredFrame, load_images
 from .progress import Monitor
@@ -22,7 +23,7 @@ from .tracking.templates import Templates, Tiles, cut_tiles, no_templates
 from .tracking.tracked import TrackedFrame, joined, nothing
 from .tracking.waiting import Waiting, nobody
 
-ALGORITHM = "tracking 7"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 8"  # part of every key: raise it when the same input gives other numbers
 DROPOUT = 0.1  # of the points: where fewer are found in a frame, it is the frame that is missing
 
 
@@ -59,12 +60,13 @@ def track_frames(
     tracking: TrackingSettings,
     results: Results,
     monitor: Monitor,
+    enhance: EnhanceSettings | None = None,
 ) -> Iterator[TrackedFrame]:
     """Follow the surface through the frames (in the order of time), in which rays were allowed to miss by `limit_px`."""
     view = tracking_view(footage, matching, tracking, limit_px)
     none = no_templates(view.matching, view.rows.step)
     state = _State(before=None, current=None, templates=none, waiting=nobody(len(view.cameras)), born=0)
-    key = store.digest(ALGORITHM, repr((matching, tracking, limit_px)))
+    key = store.digest(ALGORITHM, repr((matching, tracking, limit_px, enhance)))
     images: FrameImages | None = None
     for i, m in enumerate(measured):
         monitor.step("tracks", i, len(measured))
@@ -72,8 +74,8 @@ def track_frames(
         done = _from_checkpoint(results, m.frame, key)
         if done is None:
             if state.current is not None and images is None:
-                images = load_images(footage, state.current.frame)
-            following = load_images(footage, m.frame)
+                images = load_images(footage, state.current.frame, enhance)
+            following = load_images(footage, m.frame, enhance)
             tracked = _advance(view, state, images, following, m, i, monitor)
             done = tracked, _cut(view, tracked, following)
             _checkpoint(results, *done, key)

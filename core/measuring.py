@@ -10,8 +10,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from . import store
+from .clicked_points import clicked_depth, with_clicked
 from .errors import InputError
-from .geometry.intersection import forward_intersection
 from .images.enhance import EnhanceSettings, enhanced
 from .images.retime import retimed
 from .images.sampling import SplineImage
@@ -22,16 +22,14 @@ from .matching.grid import TemplateGrid, template_grid
 from .matching.growing import GrowingSettings, TripletField, grow
 from .matching.least_squares import MatchingSettings
 from .matching.scanning import scan
-from .matching.seeds import Approximations, approximations_at_depth, sweep_seeds
+from .matching.seeds import Approximations, sweep_seeds
 from .progress import Monitor
 from .results import Results
 from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
-from .take import Clicks, Footage, footage_frames
+from .take import Footage, footage_frames
 
-ALGORITHM = "surface 7"  # part of every key: raise it when the same input gives other numbers
-CLICK_SIGMA_PX = 4.0
+ALGORITHM = "surface 8"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds
-CLICK_MISS_PX = 3 * CLICK_SIGMA_PX  # from each click to where the rays meet: two clicks may be 24 px apart across their epipolar lines
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
 
@@ -198,11 +196,16 @@ def _measure(
 
 
 def first_seeds(
-    footage: Footage, matching: MatchingSettings, growing: GrowingSettings, frame: int, monitor: Monitor
+    footage: Footage,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    frame: int,
+    monitor: Monitor,
+    enhance: EnhanceSettings | None = None,
 ) -> tuple[fg.Foreground, Approximations]:
     """Where the person is in one frame, and the surface seeds there."""
-    images = load_images(footage, frame)
-    grid = template_grid(images.spline[0].shape, footage.take.rows, growing.spacing_px)
+    images = load_images(footage, frame, enhance)
+    grid = template_grid(images.spline[footage.take.reference].shape, footage.take.rows, growing.spacing_px)
     return _first_foreground(footage, images, grid, matching, growing, frame, monitor)
 
 
@@ -237,44 +240,8 @@ def _first_foreground(
         images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=(near, far), monitor=monitor
     )
     if take.seeds.surface and frame == take.seeds.frame:
-        seeds = _with_clicked(footage, seeds, depth[len(take.seeds.joints) :])
+        seeds = with_clicked(footage, images.spline, seeds, matching)
     return where, seeds
-
-
-def clicked_depth(footage: Footage, name: str, at: Clicks) -> float:
-    """Depth [m] in the reference camera of a clicked point.
-
-    Raises:
-        InputError: it was clicked in fewer than two views, or its rays miss each other.
-    """
-    cameras = footage.rig.cameras
-    xy = np.array([[at.get(c.name, np.full(2, np.nan)) for c in cameras]])
-    point = forward_intersection(cameras, xy, np.tile(np.eye(2) * CLICK_SIGMA_PX**2, (1, len(cameras), 1, 1)))
-    depth = float(cameras[footage.take.reference].to_camera(point.xyz_m)[0, 2])
-    if not np.isfinite(depth) or depth <= 0:
-        raise InputError(f"The click “{name}” is seen by {len(at)} view(s) and has no place in space; click it in two views at least.")
-    if float(point.rms_residual_px[0]) > CLICK_MISS_PX:
-        raise InputError(
-            f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px; click the same spot in every view, "
-            "and check that rig.toml belongs to this footage."
-        )
-    return depth
-
-
-def _with_clicked(footage: Footage, seeds: Approximations, depth_m: np.ndarray) -> Approximations:
-    """The swept seeds and the clicked surface points."""
-    take, cameras = footage.take, footage.rig.cameras
-    base = cameras[take.reference]
-    rows = []
-    for at, depth in zip(take.seeds.surface, depth_m):
-        known = [(c, at[c.name]) for c in cameras if c.name in at]
-        camera, xy = next(((c, xy) for c, xy in known if c is base), known[0])
-        point = camera.points_at_depth(
-            xy, float(camera.to_camera(base.points_at_depth(base.matrix[:2, 2], depth))[2]) if camera is not base else depth
-        )
-        rows.append(take.rows.from_frame(base.project(point)))
-    clicked = approximations_at_depth(cameras, take.reference, take.rows, np.array(rows), depth_m)
-    return Approximations(**{f.name: np.concatenate([getattr(seeds, f.name), getattr(clicked, f.name)]) for f in fields(Approximations)})
 
 
 def _furthest_frame(footage: Footage, frame: int) -> int:

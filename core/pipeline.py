@@ -19,6 +19,7 @@ from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
 from .checking.take_check import causes_of_failure, doubts, with_cause
 from .checking.timing import in_step
+from .clicked_points import clicked_depth
 from .correcting import corrected_cloud, corrected_tracks
 from .empty_sources import find_empty
 from .errors import InputError
@@ -33,7 +34,7 @@ from .images.retime import TimingSettings
 from .matching.growing import GrowingSettings
 from .matching.least_squares import MatchingSettings
 from .measured import Clouds, MeasuredFrames, note_of
-from .measuring import NothingMeasured, clicked_depth, measure_frames
+from .measuring import NothingMeasured, measure_frames
 from .motion.ply import write_mesh
 from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
@@ -243,7 +244,8 @@ def track(run: Run, monitor: Monitor) -> None:
         measure(run, monitor)
     began, s = time.perf_counter(), run.settings
     try:
-        steps = track_frames(run.footage, run.measured, run.measured.limit_px, s["matching"], s["tracking"], run.results, monitor)
+        limit_px = run.measured.limit_px
+        steps = track_frames(run.footage, run.measured, limit_px, s["matching"], s["tracking"], run.results, monitor, s["enhance"])
         raw = assemble(steps, run.footage.take.fps)
     except Cancelled as stop:
         raise Cancelled(

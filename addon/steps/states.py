@@ -14,10 +14,10 @@ import bpy
 from ...core import store
 from ...core.body.model_file import read_model
 from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
+from ...core.clicked_points import clicked_depth
 from ...core.errors import InputError
 from ...core.geometry.rig import read_rig
 from ...core.images.sequence import Sequence, open_sequence
-from ...core.measuring import clicked_depth
 from ...core.pipeline import settings_of
 from ...core.stages import stage_keys
 from ...core.take import Footage, Take, footage_frames, open_take

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from ..clicked_points import clicked_depth
 from ..errors import InputError
 from ..matching.foreground import unchanged
-from ..measuring import clicked_depth
 from ..take import Clicks, Footage
 from .findings import Finding, doubtful, wrong
 

@@ -5,7 +5,7 @@ about a pixel; the patch, warped as a plane facing the reference camera would be
 
     score(w) = Σ_k ρ_k(w) / K ,   w = 1 / depth ,   best w taken if it is high, alone, and found in every view          (1)
 
-Least squares matching then refines the winners. Clicked surface seeds go straight to the refinement.
+Least squares matching then refines the winners. Of a clicked surface seed only the depths near the click are swept.
 """
 
 from collections.abc import Sequence
@@ -29,6 +29,7 @@ PATCH_STRIDE = 2
 SWEEP_SMOOTHING_PX = 1.0  # a patch is compared at every other pixel: what is finer is noise to it
 MAX_SAMPLES = 1200
 LOOK_UP = 30_000_000
+CLICK_SIGMAS, CLICK_SHARE = 3.0, 0.5  # of depth, swept about a click; and not more than this part of it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -107,6 +108,30 @@ def sweep_ray(
     inverse = _inverse_depths(cameras, 0, *(depth_range_m or _default_range(cameras)))
     depth, good = _peaks(_sweep_scores(images, cameras, 0, rows, settings, at, inverse), inverse)
     return float(depth[0]) if good[0] else None
+
+
+def settled_depths(
+    images: Sequence[SplineImage],
+    cameras: Sequence[Camera],
+    reference: int,
+    rows: RowGrid,
+    xy: np.ndarray,
+    depth_m: np.ndarray,
+    sigma_m: np.ndarray,
+    settings: MatchingSettings,
+) -> np.ndarray:
+    """Depths (M,) near `depth_m` ± `sigma_m` at which the patches about `xy` (M, 2) (rows' pixels of the reference) look most alike in
+    all views; the given depth where that is not clear."""
+    smooth = [image.smoothed(SWEEP_SMOOTHING_PX, rows.step) for image in images]
+    settled = np.array(depth_m, dtype=np.float64)
+    for i, (depth, sigma) in enumerate(zip(depth_m, sigma_m)):
+        at = _textured(images[reference], settings, rows, xy[i : i + 1])
+        if len(at):
+            reach = min(CLICK_SIGMAS * sigma, CLICK_SHARE * depth)
+            inverse = _inverse_depths(cameras, reference, depth - reach, depth + reach)
+            best, clear = _peaks(_sweep_scores(smooth, cameras, reference, rows, settings, at, inverse), inverse)
+            settled[i] = best[0] if clear[0] else depth
+    return settled
 
 
 def _textured(image: SplineImage, settings: MatchingSettings, rows: RowGrid, xy: np.ndarray) -> np.ndarray:

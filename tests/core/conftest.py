@@ -125,7 +125,7 @@ def measure(folder: Path, out: Path, overrides: Mapping[str, Any] | None = None,
     """The measured surface of a take, in the order of time; checkpoints lie in `out`."""
     footage = open_take(read_take(folder))
     s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
-    done = measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(out), monitor or Monitor())
+    done = measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(out), monitor or Monitor(), s["enhance"])
     return sorted(done, key=lambda m: m.frame)
 
 
@@ -136,7 +136,8 @@ def track(
     footage = open_take(read_take(folder))
     s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
     limit_px = float(np.median([m.field.limit_px for m in measured]))
-    return list(track_frames(footage, measured, limit_px, s["matching"], s["tracking"], Results(out), monitor or Monitor()))
+    results, monitor = Results(out), monitor or Monitor()
+    return list(track_frames(footage, measured, limit_px, s["matching"], s["tracking"], results, monitor, s["enhance"]))
 
 
 @dataclass(frozen=True)

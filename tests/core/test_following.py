@@ -1,5 +1,6 @@
 """Tracking whole takes: checkpoints, and a resumed run that is the same run."""
 
+import shutil
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -64,3 +65,16 @@ def test_frames_without_a_surface(tmp_path: Path, scenes: Any) -> None:
     count = [len(s.identity) for s in steps]
     assert count[0] > 50 and count[2:8] == [0] * 6 and count[8] > 0.8 * count[0]
     assert steps[8].identity.min() > steps[0].identity.max()
+
+
+def test_the_tracks_follow_enhanced_images(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
+    """What was measured in enhanced images is tracked in them; the keys tell the two apart."""
+    take = Path(shutil.copytree(plane_take, tmp_path / "take"))
+    text = (take / "take.toml").read_text()
+    (take / "take.toml").write_text(text.replace("[[views]]", "frames = [0, 2]\n[[views]]", 1))
+    measured = scenes.measure(take, tmp_path / "out")
+    plain = scenes.track(take, tmp_path / "out", measured)[1]
+    enhanced = scenes.track(take, tmp_path / "out", measured, {"enhance": {"wallis": "on"}})[1]
+    both = np.intersect1d(plain.identity, enhanced.identity)
+    moved = [t.xy[np.searchsorted(t.identity, both)] for t in (plain, enhanced)]
+    assert len(both) > 50 and 0 < np.nanmedian(np.abs(moved[0] - moved[1])) < 0.2

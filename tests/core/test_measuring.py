@@ -13,8 +13,10 @@ import pytest
 
 from tricap.core import measuring, pipeline
 from tricap.core.errors import InputError
+from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.matching.growing import TripletField
+from tricap.core.matching.seeds import Approximations
 from tricap.core.measuring import MeasuredFrame
 from tricap.core.progress import Cancelled, Monitor
 from tricap.core.results import Results
@@ -161,6 +163,42 @@ def test_clicked_depths(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
     only_l = f"{{ L = [{rig['L'].project(X)[0]:.2f}, {rig['L'].project(X)[1]:.2f}], R = [{rig['R'].project(X)[0]:.2f}, 75.0] }}"
     seed = changed(plane_take, tmp_path / "without C", f"[seeds]\nsurface = [{only_l}]\n")
     assert len(scenes.measure(seed, tmp_path / "out seed")[0].cloud.xyz_m) > 500
+
+
+def no_seeds(*args: Any, **kwargs: Any) -> Approximations:
+    return Approximations(xy=np.zeros((0, 3, 2)), shape=np.zeros((0, 3, 2, 2)), depth_m=np.zeros(0))
+
+
+@pytest.mark.parametrize(("views", "off_px"), [("LR", (0, 0)), ("LR", (4, -4)), ("LCR", (-4, 4))])
+def test_one_clicked_seed_is_enough(
+    plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch, views: str, off_px: tuple[int, int]
+) -> None:
+    """Without any automatic seed: a click far from the middle, in views that converge, wrong by 4 px along the row in L and R."""
+    monkeypatch.setattr(measuring, "sweep_seeds", no_seeds)
+    rig, plane = scenes.three_cameras(), scenes.Body(R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
+    ray = rig["C"].rays(np.array([150.0, 110.0]))
+    X = ray * plane.hit(np.zeros(3), ray[None])[0][0]
+    wrong = {"L": off_px[0], "C": 0, "R": off_px[1]}
+    at = ", ".join("{} = [{:.2f}, {:.2f}]".format(v, *(rig[v].project(X) + (wrong[v], 0))) for v in views)
+    take = changed(plane_take, tmp_path / "take", f"[seeds]\nsurface = [{{ {at} }}]\n")
+    footage = pipeline.only_frames(open_take(read_take(take)), (0, 1))
+    s = pipeline.settings_of({}, {}, "take.toml")
+    (m,) = measuring.measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(tmp_path / "out"), Monitor())
+    assert len(m.cloud.xyz_m) > 500 and np.median(np.abs(plane.distance_m(m.cloud.xyz_m))) < 0.001
+
+
+def test_seeds_follow_the_reference_and_the_settings(tmp_path: Path, scenes: Any) -> None:
+    """`tricap seeds` covers a reference view that is larger than the first view, and looks at enhanced images where they are asked for."""
+    small, large = scenes.three_cameras(width=120, height=90), scenes.three_cameras()
+    rig = Rig(cameras=(small["L"], large["C"], large["R"]))
+    footage = open_take(read_take(scenes.write_take(tmp_path / "take", rig, [[scenes.Body()]])))
+    s = pipeline.settings_of({}, {"enhance": {"wallis": "on"}}, "take.toml")
+    plain, enhanced = (
+        measuring.first_seeds(footage, s["matching"], s["growing"], 0, Monitor(), enhance)[1] for enhance in (None, s["enhance"])
+    )
+    assert plain.xy[:, 1, 0].max() > 120 and len(enhanced.depth_m)
+    both = [np.flatnonzero((plain.xy[:, 1] == at).all(axis=1)) for at in enhanced.xy[:, 1]]
+    assert any(len(i) and plain.depth_m[i[0]] != enhanced.depth_m[n] for n, i in enumerate(both))
 
 
 @pytest.mark.parametrize("where", ["joints", "surface"])
