@@ -20,8 +20,22 @@ PROFILE = Path(tempfile.mkdtemp(prefix="tricap-profile-"))
 os.environ["BLENDER_USER_RESOURCES"] = str(PROFILE)
 
 
+_exit_code: list[int] = []
+
+
+def pytest_sessionfinish(exitstatus: int) -> None:
+    _exit_code.append(int(exitstatus))
+
+
+@pytest.hookimpl(trylast=True)
 def pytest_unconfigure() -> None:
+    """The last thing that pytest does. Blender 4.5 as a module can hang when the interpreter ends after it, whatever was unregistered before."""
     shutil.rmtree(PROFILE, ignore_errors=True)
+    bpy = sys.modules.get("bpy")
+    if bpy is not None and bpy.app.version < (5, 0) and _exit_code:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_exit_code[0])
 
 
 @pytest.fixture(scope="session")
