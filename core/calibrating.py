@@ -23,10 +23,9 @@ from .calibration.world_choice import WorldChoice, frame_of_bar
 from .errors import InputError
 from .geometry.rig import Rig
 from .images.fields import row_grid
-from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence, read_image
+from .images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, Sequence, open_sequence, read_image
 from .progress import Monitor
 
-MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
 Note = Callable[[str, int, int], None]  # view, images looked at, images with both targets
 MIN_POSITIONS = 12
 MIN_WAY = 0.02  # of the image width: a bar that moves less stands still

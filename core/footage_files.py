@@ -4,9 +4,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from .calibrating import MOVIE_ENDINGS
 from .errors import InputError
-from .images.sequence import IMAGE_ENDINGS, natural
+from .images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, natural
 
 SIDES = {  # words for the sides, in the order in which the cameras stand
     "L": ("l", "left", "links", "gauche", "izquierda", "sinistra"),

@@ -9,6 +9,7 @@ import errno
 import json
 import os
 import platform
+import stat
 import sys
 import threading
 import time
@@ -51,7 +52,7 @@ def locked(folder: Path) -> Iterator[None]:
 def _open(path: Path) -> int:
     """The handle of the lock file, locked and with our name in it."""
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
+        handle = _handle(path)
         try:
             system = _lock(handle)
             if not _same_file(path, handle):  # its holder removed it between our opening and locking it
@@ -67,6 +68,31 @@ def _open(path: Path) -> int:
             with suppress(OSError):
                 os.close(handle)
             raise
+
+
+def _handle(path: Path) -> int:
+    """The lock file opened, never what a link in its place leads to: that would be written over.
+
+    Raises:
+        InputError: a link, or no file at all, is in its place.
+        OSError: it cannot be opened.
+    """
+    flags = os.O_RDWR | os.O_CREAT
+    for name in ("O_BINARY", "O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"):  # not every system has each
+        flags |= getattr(os, name, 0)
+    refused = InputError(f"{path} is a link, or no file; remove it, or choose another folder for the results.")
+    if path.is_symlink():  # Windows knows no O_NOFOLLOW
+        raise refused
+    try:
+        handle = os.open(path, flags, 0o644)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise refused from error
+        raise
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise refused
+    return handle
 
 
 def _lock(handle: int) -> bool:

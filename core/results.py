@@ -33,9 +33,9 @@ class Results:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
-        away = [name for name in ("run.json", "cache", *OURS) if not _inside(self.folder / name, self.folder)]
+        away = [path for path in _written(self.folder) if not _inside(path, self.folder)]
         if away:
-            raise InputError(f"{self.folder / away[0]} is a link to a place outside {folder}; remove the link, or choose another folder.")
+            raise InputError(f"{away[0]} is a link to a place outside {folder}; remove the link, or choose another folder.")
         theirs = _not_ours(self.folder)
         if theirs:
             raise InputError(
@@ -132,6 +132,13 @@ class Results:
     def write_run(self, run: Mapping[str, Any]) -> None:
         """run.json"""
         store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})
+
+
+def _written(folder: Path) -> list[Path]:
+    """Everything that some command writes to in a folder of results, and the folders of checkpoints that are there."""
+    cache = folder / "cache"
+    names = ("run.json", "contours", "points2d.csv", "points3d.csv", NAME, *OURS)
+    return [*(folder / name for name in names), cache, *(cache.iterdir() if cache.is_dir() and not cache.is_symlink() else ())]
 
 
 def _inside(path: Path, folder: Path) -> bool:

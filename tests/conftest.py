@@ -29,7 +29,7 @@ def pytest_sessionfinish(exitstatus: int) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure() -> None:
-    """The last thing that pytest does. Blender 4.5 as a module can hang when the interpreter ends after it, whatever was unregistered before."""
+    """The last thing that pytest does. Blender 4.5 as a module can hang when the interpreter ends, whatever was unregistered before."""
     shutil.rmtree(PROFILE, ignore_errors=True)
     bpy = sys.modules.get("bpy")
     if bpy is not None and bpy.app.version < (5, 0) and _exit_code:

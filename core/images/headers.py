@@ -84,15 +84,7 @@ def _tiff(data: bytes) -> tuple[int, int] | None:
     return (found[256], found[257]) if all(found.values()) else None
 
 
-def _exr(data: bytes) -> tuple[int, int] | None:
-    at = data.find(b"dataWindow\0box2i\0", 0, 65_536)
-    if at < 0:
-        return None
-    x0, y0, x1, y1 = struct.unpack("<iiii", data[at + 21 : at + 37])
-    return x1 - x0 + 1, y1 - y0 + 1
-
-
 READERS = (
     (b"\x89PNG\r\n\x1a\n", _png), (b"\xff\xd8\xff", _jpeg), (b"BM", _bmp), (b"RIFF", _webp), (b"II", _tiff), (b"MM", _tiff),
-    (b"\x76\x2f\x31\x01", _exr), *((kind, _portable) for kind in (b"P2", b"P3", b"P5", b"P6")),
+    *((kind, _portable) for kind in (b"P2", b"P3", b"P5", b"P6")),
 )  # fmt: skip

@@ -14,6 +14,7 @@ from ..errors import InputError
 from .headers import claimed_size
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
+MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
 MAX_PIXELS, MAX_SIDE_PX = 36_000_000, 8191  # 8K video; the side: four times as many are still looked up by OpenCV
 SIGNATURES = (
     b"\x89PNG\r\n\x1a\n",
@@ -27,8 +28,11 @@ SIGNATURES = (
     b"P3",
     b"P5",
     b"P6",
-    b"\x76\x2f\x31\x01",
 )
+OPEN_EXR = b"\x76\x2f\x31\x01"
+MOVIE_SIGNATURES = (b"RIFF", b"\x1a\x45\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"\x47")  # AVI, Matroska, MPEG: program, video, transport
+MOVIE_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")  # of which the first begins an MP4 or QuickTime file
+NO_MOVIE = "{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files."
 WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
 KINDS = ("uint8", "uint16", "float32", "float64")
 
@@ -97,13 +101,14 @@ class Movie:
     """A movie file, decoded frame by frame; reading in order is quick, going back starts again."""
 
     def __init__(self, path: Path) -> None:
+        _check_movie(path)
         self._path = path
         self._capture = _capture(path)
         self._next = 0
         self._shown_ms: dict[int, float] = {}
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
         if count < 1:
-            raise InputError(f"{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files.")
+            raise InputError(NO_MOVIE.format(path=path))
         w, h = (int(self._capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         _refuse_size((w, h), path)
         self._count = count
@@ -209,6 +214,7 @@ def decoded(path: Path) -> np.ndarray:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
+    _refuse_open_exr(data[:8].tobytes(), path)
     _refuse_size(claimed_size(data.tobytes()), path)
     try:
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -242,13 +248,32 @@ def grey(image: np.ndarray, white: float = 0.0) -> np.ndarray:
     return image.astype(np.float32)
 
 
-def _check_signature(path: Path) -> None:
-    """What is no image by its first bytes is told before anything is computed, not when its turn comes."""
+def _check_movie(path: Path) -> None:
+    """Only what holds its pictures itself is given to the decoder: playlists and scripts would make it open other files, even URLs."""
+    if path.suffix.lower() not in MOVIE_ENDINGS:
+        raise InputError(f"The movie {path} is of no kind that is read here ({', '.join(MOVIE_ENDINGS)}); convert it to H.264 in .mp4.")
+    first = _first_bytes(path, "movie")
+    if not (first.startswith(MOVIE_SIGNATURES) or first[4:8] in MOVIE_BOXES):
+        raise InputError(NO_MOVIE.format(path=path))
+
+
+def _refuse_open_exr(first: bytes, path: Path) -> None:
+    if first.startswith(OPEN_EXR):
+        raise InputError(f"{path} is an OpenEXR image, which is not read here; save the sequence as PNG or TIFF of 16 bits.")
+
+
+def _first_bytes(path: Path, what: str) -> bytes:
     try:
         with open(path, "rb") as file:
-            first = file.read(8)
+            return file.read(8)
     except OSError as error:
-        raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
+        raise InputError(f"Cannot read the {what} {path}: {error.strerror or error}.") from error
+
+
+def _check_signature(path: Path) -> None:
+    """What is no image by its first bytes is told before anything is computed, not when its turn comes."""
+    first = _first_bytes(path, "image")
+    _refuse_open_exr(first, path)
     if not first.startswith(SIGNATURES):
         raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
 

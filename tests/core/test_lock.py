@@ -65,6 +65,23 @@ def test_what_a_crash_may_leave(tmp_path: Path, text: str) -> None:
         assert time.monotonic() - began < 1.0
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+def test_a_link_in_its_place_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "letter.txt").write_text("mine")
+    for target in (tmp_path / "letter.txt", tmp_path / "not there yet"):
+        (tmp_path / "out" / NAME).symlink_to(target)
+        with pytest.raises(InputError, match="is a link, or no file; remove it"), locked(tmp_path / "out"):
+            pass
+        (tmp_path / "out" / NAME).unlink()
+    for make in (os.mkfifo, os.mkdir):
+        make(tmp_path / "out" / NAME)
+        with pytest.raises(InputError, match="is a link, or no file; remove it"), locked(tmp_path / "out"):
+            pass
+        os.unlink(tmp_path / "out" / NAME) if make is os.mkfifo else os.rmdir(tmp_path / "out" / NAME)
+    assert (tmp_path / "letter.txt").read_text() == "mine" and not (tmp_path / "not there yet").exists()
+
+
 def test_another_machine(tmp_path: Path, quick: None) -> None:
     """Its count is watched: one that stands still belongs to a run that is no more."""
     count, text = threading.Event(), {"pid": 5, "host": "elsewhere"}

@@ -191,6 +191,28 @@ def test_movies_that_are_none(tmp_path: Path) -> None:
             open_sequence(tmp_path, images=None, movie=name, view="L")
 
 
+def test_a_playlist_is_no_movie(tmp_path: Path) -> None:
+    """A decoder would follow it out of the take, even into the network; whatever its name, it is not given to the decoder."""
+    write_movie(tmp_path / "elsewhere.avi", 4)
+    playlist = f"#EXTM3U\n#EXTINF:1,\n{tmp_path / 'elsewhere.avi'}\n"
+    for name, text in (("m.m3u8", playlist), ("m.txt", "ffconcat version 1.0\nfile elsewhere.avi\n")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=f"{name} is of no kind that is read here .*; convert it"):
+            open_sequence(tmp_path, images=None, movie=name, view="L")
+        for ending in sequence.MOVIE_ENDINGS:
+            path = (tmp_path / name).rename(tmp_path / f"m{ending}")
+            with pytest.raises(InputError, match="is not a movie that can be decoded"):
+                open_sequence(tmp_path, images=None, movie=path.name, view="L")
+            path.rename(tmp_path / name)
+
+
+def test_open_exr_is_told_by_name(tmp_path: Path) -> None:
+    (tmp_path / "0.exr").write_bytes(sequence.OPEN_EXR + b"\2\0\0\0" + b"\0" * 100)
+    for read in (lambda: open_sequence(tmp_path, images="*.exr", movie=None, view="L"), lambda: read_image(tmp_path / "0.exr")):
+        with pytest.raises(InputError, match="is an OpenEXR image, which is not read here; save the sequence as PNG"):
+            read()
+
+
 @pytest.mark.parametrize(("bits", "shape"), [(10, (20, 30)), (12, (20, 30, 3)), (16, (20, 30))])
 def test_cameras_of_more_bits_fill_the_range(tmp_path: Path, bits: int, shape: tuple[int, ...]) -> None:
     """10 and 12 bits in files of 16: white is what their bits allow, for the whole sequence alike."""
