@@ -13,10 +13,10 @@ from ...core.motion.bvh import read_bvh
 from ...core.motion.retarget.mapping import find_map
 from ...core.motion.retarget.rest import with_person_like_rest
 from ...core.motion.retarget.vrm import read_humanoid
+from ..scene.armature import ROLES_KEY
 from .build import build_armature
 
 RIG_FILES = (".blend", ".glb", ".gltf", ".vrm", ".fbx", ".bvh")
-ROLES_KEY = "tricap_roles"  # custom property of an armature: what its file says its bones are
 
 
 def open_rig(path: Path) -> None:

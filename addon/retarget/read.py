@@ -12,6 +12,7 @@ from ...core.errors import InputError
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.progress import Monitor
+from ..scene.armature import ROLES_KEY
 
 UNIFORM = 1e-3  # scales along the axes may differ by this part
 
@@ -81,8 +82,8 @@ def orthonormal(M: np.ndarray) -> np.ndarray:
 
 
 def humanoid_roles(armature_object: bpy.types.Object) -> dict[str, str]:
-    """What a VRM file says its bones are, as kept by our own import or by the add-on for VRM files."""
-    known = armature_object.data.get("tricap_roles")
+    """What a VRM file says its bones are, as kept by our own import or by the add-on for VRM files; and what bones of ours are."""
+    known = armature_object.data.get(ROLES_KEY)
     if known is not None:
         return {str(role): str(name) for role, name in known.items() if name in armature_object.data.bones}
     extension = getattr(armature_object.data, "vrm_addon_extension", None)

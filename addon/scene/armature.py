@@ -14,10 +14,12 @@ from mathutils import Vector
 
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone, Dof, bone_frames
+from ...core.motion.retarget.roles import model_roles
 
 ROOT = "root"
 ROOT_LENGTH_M = 0.1
 NAME = "Body"
+ROLES_KEY = "tricap_roles"  # custom property of armature data: bones by the part of the body that they are
 
 
 def add_armature(collection: bpy.types.Collection, shape: BodyShape) -> bpy.types.Object:
@@ -26,6 +28,7 @@ def add_armature(collection: bpy.types.Collection, shape: BodyShape) -> bpy.type
     armature.display_type = "STICK"
     armature_object = bpy.data.objects.new(NAME, armature)
     armature_object.show_in_front = True
+    armature[ROLES_KEY] = model_roles(bone.name for bone in shape.skeleton.bones)
     collection.objects.link(armature_object)
     _edit_bones(armature_object, shape)
     _bone_collections(armature)

@@ -4,11 +4,13 @@ Own and small: only the points are read and written, no analogue channels. The l
 lines, trusts the counts in a file's header, and leaves sigmas to its user; it serves the tests as an independent reader where it is there.
 
 Blocks of 512 bytes: header, parameters (groups and entries with relative pointers), then per frame and point x, y, z and a fourth word:
-negative for an unknown point, else its low byte times the scale is the residual; here that is the point's sigma.
+negative for an unknown point, else its low byte times the scale is the residual; here that is the point's sigma, 0 if that is unknown.
+Frames are numbered from 1 and without gaps: frames that are not there are written as unknown points, and TRICAP:FRAME_OFFSET says how far
+a take's own numbers, which may begin at 0, are from the file's.
 """
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import numpy as np
 
 from .. import store
 from ..errors import InputError
-from .markers import Markers, axes_of, check_size, metres_per
+from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
 
 BLOCK = 512
 INTEL, DEC, MIPS = 84, 85, 86
@@ -27,25 +29,45 @@ BATCH = 255  # labels in one parameter
 
 
 def write_c3d(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "mm") -> None:
-    """Write points as float32; sigmas as residuals in steps of 0.1 mm up to 25.5 mm.
+    """Write points as float32; sigmas as residuals in steps of 0.1 mm, from 0.1 to 25.5 mm.
 
     Raises:
-        InputError: axes or unit are not known, or the file cannot be written.
+        InputError: axes or unit are not known, the frames go back or are too far apart, or the file cannot be written.
     """
+    markers = without_gaps(markers, path)
     per_unit = metres_per(unit, path)
     xyz = markers.xyz_m @ axes_of(axes).T / per_unit
     t, n = xyz.shape[:2]
     scale = RESIDUAL_SCALE_MM * 1e-3 / per_unit
     known = np.isfinite(xyz).all(axis=2)
-    steps = np.clip(np.round(np.nan_to_num(markers.sigma_m) / per_unit / scale), 0, 255)
+    steps = np.where(np.isfinite(markers.sigma_m), np.clip(np.round(np.nan_to_num(markers.sigma_m) / per_unit / scale), 1, 255), 0)
     data = np.concatenate([np.where(known[..., None], xyz, 0.0), np.where(known, steps, -1.0)[..., None]], axis=2).astype("<f4")
-    first, last = int(markers.frames[0]), int(markers.frames[0]) + t - 1
+    first = int(markers.frames[0]) if 1 <= markers.frames[0] and markers.frames[-1] <= MOST_WORD else 1
+    last = first + t - 1
     parameters = _parameters(markers, t, n, scale, unit, first, last)
     start = 2 + len(parameters) // BLOCK
     parameters = _parameters(markers, t, n, scale, unit, first, last, start)
-    header = struct.pack("<BB5HfHHf", 2, 0x50, n, 0, min(max(first, 1), MOST_WORD), min(max(last, 1), MOST_WORD), 0, -scale, start, 0,
-                         markers.fps)
+    header = struct.pack("<BB5HfHHf", 2, 0x50, n, 0, first, min(last, MOST_WORD), 0, -scale, start, 0, markers.fps)
     store.write_bytes(Path(path), header.ljust(BLOCK, b"\0") + parameters + _padded(data.tobytes()))
+
+
+def without_gaps(markers: Markers, where: object) -> Markers:
+    """The points with a row for every frame number from the first to the last; those that were not there are unknown.
+
+    Raises:
+        InputError: the numbers do not rise, or are too far apart.
+    """
+    steps = np.diff(markers.frames)
+    if (steps == 1).all():
+        return markers
+    t, n = int(markers.frames[-1] - markers.frames[0]) + 1, len(markers.names)
+    if (steps < 1).any() or t * n * 4 > MOST_VALUES:
+        raise InputError(f"{where} cannot be written: C3D needs every frame from the first to the last, and these ({markers.frames[0]} … "
+                         f"{markers.frames[-1]}) do not rise or are too far apart; mend the frame numbers.")
+    xyz, sigma = np.full((t, n, 3), np.nan), np.full((t, n), np.nan)
+    rows = markers.frames - markers.frames[0]
+    xyz[rows], sigma[rows] = markers.xyz_m, markers.sigma_m
+    return replace(markers, frames=markers.frames[0] + np.arange(t), xyz_m=xyz, sigma_m=sigma)
 
 
 def _padded(data: bytes) -> bytes:
@@ -53,16 +75,18 @@ def _padded(data: bytes) -> bytes:
 
 
 def _parameters(markers: Markers, t: int, n: int, scale: float, unit: str, first: int, last: int, start: int = 0) -> bytes:
-    point: list[tuple[str, Any]] = [("USED", np.int16(0)), ("FRAMES", np.uint16(min(t, MOST_WORD))), ("DATA_START", np.uint16(start)),
+    point: list[tuple[str, Any]] = [("USED", np.uint16(n)), ("FRAMES", np.uint16(min(t, MOST_WORD))), ("DATA_START", np.uint16(start)),
                                     ("SCALE", np.float32(-scale)), ("RATE", np.float32(markers.fps)), ("UNITS", unit)]
-    point[0] = ("USED", np.uint16(n))
     for k in range(0, n, BATCH):
         number = "" if k == 0 else str(k // BATCH + 1)
         point.append((f"LABELS{number}", markers.names[k:k + BATCH]))
         point.append((f"DESCRIPTIONS{number}", tuple("" for _ in markers.names[k:k + BATCH])))
-    trial = [("ACTUAL_START_FIELD", np.array([first & 0xFFFF, first >> 16], dtype=np.uint16)),
+    trial: list[tuple[str, Any]] = [("ACTUAL_START_FIELD", np.array([first & 0xFFFF, first >> 16], dtype=np.uint16)),
              ("ACTUAL_END_FIELD", np.array([last & 0xFFFF, last >> 16], dtype=np.uint16))]
     groups = [("POINT", point), ("ANALOG", [("USED", np.uint16(0))]), ("TRIAL", trial)]
+    offset = (int(markers.frames[0]) - first) & 0xFFFFFFFF
+    if offset:
+        groups.append(("TRICAP", [("FRAME_OFFSET", np.array([offset & 0xFFFF, offset >> 16], dtype=np.uint16))]))
     body = b"".join(_entry(name, -k, b"\0") for k, (name, _) in enumerate(groups, 1))
     entries = [_entry(name, k, _value(value) + b"\0") for k, (_, rows) in enumerate(groups, 1) for name, value in rows]
     body += b"".join(entries) + b"\0\0"
@@ -147,9 +171,9 @@ def _read(data: bytes, path: Path, rotation: np.ndarray) -> Markers:
     xyz = raw[..., :3] * (1.0 if scale < 0 else scale) * unit
     known = (raw[..., 3] >= 0) & np.isfinite(xyz).all(axis=2)
     residual = np.clip(np.nan_to_num(raw[..., 3]), 0, MOST_WORD).astype(np.int64) & 0xFF
-    sigma = np.where(known, residual * abs(scale) * unit, np.nan)
+    sigma = np.where(known & (residual > 0), residual * abs(scale) * unit, np.nan)
     xyz[~known] = np.nan
-    return Markers(names=_labels(table, n), fps=fps, frames=first + np.arange(t), xyz_m=xyz @ rotation, sigma_m=sigma)
+    return Markers(names=_labels(table, n), fps=fps, frames=first + _offset(table) + np.arange(t), xyz_m=xyz @ rotation, sigma_m=sigma)
 
 
 def _range(table: dict[tuple[str, str], Any], first: int, last: int) -> tuple[int, int]:
@@ -158,6 +182,15 @@ def _range(table: dict[tuple[str, str], Any], first: int, last: int) -> tuple[in
     if begin is not None and end is not None and np.size(begin) == 2 and np.size(end) == 2:
         first, last = (int(pair[0]) + (int(pair[1]) << 16) for pair in (begin, end))
     return first, last - first + 1
+
+
+def _offset(table: dict[tuple[str, str], Any]) -> int:
+    """By how much the numbers of the take's frames are greater than the file's."""
+    pair = table.get(("TRICAP", "FRAME_OFFSET"))
+    if pair is None or np.size(pair) != 2:
+        return 0
+    value = int(pair[0]) + (int(pair[1]) << 16)
+    return value - (1 << 32) if value >= 1 << 31 else value
 
 
 def _labels(table: dict[tuple[str, str], Any], n: int) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..body.shape import read_body
+from ..body.shape import BodyShape, read_body
 from ..body.skeleton import bone_frames
 from ..errors import InputError
 from .bvh import read_bvh
@@ -12,6 +12,7 @@ from .c3d import read_c3d
 from .points_csv import rate, read_points_csv
 from .retarget.points import motion_from_points
 from .retarget.rig import Motion, Rig
+from .retarget.roles import model_roles
 from .tables import read_motion
 from .trc import read_trc
 
@@ -53,10 +54,15 @@ def from_run(out: Path) -> Motion:
     first, last = np.flatnonzero(known)[[0, -1]]
     frames = table.frames[first:last + 1]
     values = np.stack([np.interp(frames, table.frames[known], column) for column in table.values[known].T], axis=1)
+    return body_motion(shape, values, frames, rate(table.frames, table.time_s))
+
+
+def body_motion(shape: BodyShape, values: np.ndarray, frames: np.ndarray, fps: float) -> Motion:
+    """The motion of a body whose DOFs are `values` (T, D) [rad, m] at `frames` (T,)."""
     skeleton = shape.skeleton
     R_rest, head = bone_frames(skeleton, shape.lengths_m, np.zeros(len(skeleton.dof_names)))
     R, places = bone_frames(skeleton, shape.lengths_m, values)
     names = tuple(bone.name for bone in skeleton.bones)
     rig = Rig(names=names, parents=skeleton.parents, R_rest=R_rest, head_m=head, tail_m=head + shape.lengths_m[:, None] * R_rest[..., 1],
-              connected=skeleton.starts_at_tail, inherits_rotation=np.ones(len(names), dtype=bool))
-    return Motion(rig=rig, fps=rate(table.frames, table.time_s), frames=frames, R=R, head_m=places)
+              connected=skeleton.starts_at_tail, inherits_rotation=np.ones(len(names), dtype=bool), roles=model_roles(names))
+    return Motion(rig=rig, fps=fps, frames=frames, R=R, head_m=places)

@@ -92,14 +92,7 @@ def small_run(tmp_path: Path) -> SmallRun:
     shape, motion, sigma = arm()
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     store.write_json(out / "run.json", {"take": str(take)})
-    write_body(out / "body.toml", shape)
-    places = np.stack(list(joints.values()), axis=1)
-    fit = BodyMotion(
-        frames=np.array(FRAMES), time_s=np.array(FRAMES) / FPS, dof_names=shape.skeleton.dof_names, values=motion,
-        covariance=np.eye(motion.shape[1]) * sigma[..., None] ** 2, joint_names=tuple(joints), joints_m=places,
-        joint_sigma_m=np.full((len(FRAMES), len(joints)), 1e-3), status=("fitted",) * len(FRAMES), sigma0=np.ones(len(FRAMES)))
-    write_joints(out / "joints.csv", fit)
-    write_motion(out / "motion.csv", fit, shape.skeleton)
+    write_result(out, shape, np.array(FRAMES), motion, sigma)
     for frame, posture in zip(FRAMES, motion):
         skin = body_skin(shape, posture)
         write_mesh(out / "skin" / f"{frame:04d}.ply", skin.vertices_m, skin.faces)
@@ -115,6 +108,29 @@ def small_run(tmp_path: Path) -> SmallRun:
         frames=np.array(FRAMES), time_s=np.array(FRAMES) / FPS, xyz_m=xyz, velocity_m_s=np.gradient(xyz, axis=0) * FPS,
         acceleration_m_s2=np.zeros_like(xyz), sigma_m=np.full(xyz.shape[:2], 1e-3), status=np.zeros(xyz.shape[:2], dtype=np.int8)), {})
     return SmallRun(out=out, take=take, rig=rig, shape=shape, motion=motion, sigma=sigma, joints_m=joints)
+
+
+def write_result(out: Path, shape: BodyShape, frames: np.ndarray, motion: np.ndarray, sigma: np.ndarray) -> None:
+    """body.toml, joints.csv and motion.csv of a body that moves as `motion` (T, D) says."""
+    joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
+    write_body(out / "body.toml", shape)
+    fit = BodyMotion(
+        frames=frames, time_s=frames / FPS, dof_names=shape.skeleton.dof_names, values=motion,
+        covariance=np.eye(motion.shape[1]) * sigma[..., None] ** 2, joint_names=tuple(joints),
+        joints_m=np.stack(list(joints.values()), axis=1), joint_sigma_m=np.full((len(frames), len(joints)), 1e-3),
+        status=("fitted",) * len(frames), sigma0=np.ones(len(frames)))
+    write_joints(out / "joints.csv", fit)
+    write_motion(out / "motion.csv", fit, shape.skeleton)
+
+
+@pytest.fixture
+def full_run(tmp_path: Path) -> Path:
+    """The results of a run of one frame, numbered 0: a whole body that lowers its right shoulder by 30°."""
+    shape = default_shape(read_model("full"))
+    values = np.zeros((1, len(shape.skeleton.dof_names)))
+    values[0, shape.skeleton.dof_names.index("clavicle.R depression")] = np.radians(-30.0)
+    write_result(tmp_path / "full", shape, np.zeros(1, dtype=np.int64), values, np.full(values.shape, 1e-3))
+    return tmp_path / "full"
 
 
 def write_take(folder: Path, rig: Rig) -> None:

@@ -14,6 +14,9 @@ from tricap.addon.retarget import apply, files
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.preview import add_preview, remove_preview
 from tricap.addon.retarget.read import action_frames, read_motion, read_rig
+from tricap.addon.scene.armature import add_armature
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
 from tricap.core.errors import InputError
 from tricap.core.motion.bvh import write_bvh
 from tricap.core.motion.retarget.contacts import FeetSettings
@@ -182,6 +185,23 @@ def test_the_command_with_a_run_a_map_and_a_report(empty: ModuleType, small_run:
     source = read_motion_source(small_run.out)
     found = played(empty.data.objects["Target"], source.frames)
     assert measure(source, find_map(source.rig), found, find_map(found.rig), None).direction_worst_deg < PLAYED_DEG
+
+
+def test_a_run_of_one_frame_moves_the_clavicle(empty: ModuleType, full_run: Path, tmp_path: Path) -> None:
+    armature(person(arms_down_deg=45.0), "Target")
+    empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
+    out = tmp_path / "out.blend"
+    assert main(["retarget", str(full_run), "--rig", str(tmp_path / "rig.blend"), "--out", str(out), "--report", "--quiet"]) == 0
+    empty.ops.wm.open_mainfile(filepath=str(out))
+    target = empty.data.objects["Target"]
+    assert abs(np.degrees(angle_of(np.array(target.pose.bones["clavicle.R"].matrix_basis)[:3, :3])) - 30.0) < PLAYED_DEG
+
+
+def test_our_own_armature_says_what_its_bones_are(empty: ModuleType) -> None:
+    target = add_armature(empty.context.scene.collection, default_shape(read_model("full")))
+    found = apply.read_target(target).rig_map
+    assert found.bones["clavicle.R"] == ("shoulder.R",) and found.bones["hips"] == ("pelvis",) and not found.missing
+    assert onto(target, squat(person(), frames=8)).figures.direction_rms_deg < 1.0
 
 
 @pytest.mark.parametrize("rig", RIGS)

@@ -99,6 +99,18 @@ def test_names_by_preset(empty: ModuleType, small_run: SmallRun, tmp_path: Path)
     assert read_bvh(tmp_path / "a.bvh").rig.names == ("mixamorig:RightArm", "mixamorig:RightForeArm")
 
 
+def test_the_full_models_names(empty: ModuleType, full_run: Path, tmp_path: Path) -> None:
+    export_file(full_run, "bvh", tmp_path / "a.bvh", "mixamo", Monitor())
+    found = read_bvh(tmp_path / "a.bvh")
+    parents = {name: found.rig.names[p] for name, p in zip(found.rig.names, found.rig.parents)}
+    assert parents["mixamorig:RightArm"] == "mixamorig:RightShoulder" and parents["mixamorig:RightShoulder"] == "collar.R"
+
+
+@pytest.mark.parametrize("kind", ["bvh", "glb", "c3d"])
+def test_a_run_of_one_frame_goes_out(empty: ModuleType, full_run: Path, tmp_path: Path, kind: str) -> None:
+    assert export_file(full_run, kind, tmp_path / f"a.{kind}", "plain", Monitor()).endswith("1 frames")
+
+
 def test_what_cannot_go_out_is_said(empty: ModuleType, wave_file: Path, small_run: SmallRun, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="meshes"):
         export_file(wave_file, "abc", tmp_path / "a.abc", "plain", Monitor())

@@ -213,14 +213,21 @@ def carry_root(stands: list[Stand], ankles: Mapping[str, np.ndarray], hips: Mapp
     lever = W @ -cross_matrix(np.concatenate([hips[s.side][s.begin:s.end] for s in stands]))  # ω × h = −[h]× ω
     column = np.broadcast_to((3 * frame[:, None] + np.arange(3))[:, None, :], W.shape)
     turning = sparse.csr_matrix((lever.ravel(), (row.ravel(), column.ravel())), (3 * n, 3 * t))
-    bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(max(t - 2, 0), t)) * (SMOOTH_S * fps) ** 2
-    smooth = bend.T @ bend
+    smooth = _roughness(t) * (SMOOTH_S * fps) ** 4
     own = (TILT * leg_m) ** 2
     hold = [sparse.kron(smooth + HOLD * sparse.identity(t), sparse.identity(3)),
             sparse.kron(own * (smooth + sparse.identity(t)), sparse.identity(3)), 1e-9 * sparse.identity(2 * k)]
     A = sparse.hstack([at, turning, -place])
     x = spsolve((A.T @ A + sparse.block_diag(hold)).tocsc(), A.T @ np.einsum("nij,nj->ni", W, misfit).ravel())
     return x[:3 * t].reshape(t, 3), x[3 * t:6 * t].reshape(t, 3), np.column_stack([x[6 * t:].reshape(k, 2), np.zeros(k)])
+
+
+def _roughness(t: int) -> sparse.csr_matrix:
+    """(t, t): xᵀ M x is the sum of the squared second differences of x; nothing bends in fewer than three frames."""
+    if t < 3:
+        return sparse.csr_matrix((t, t))
+    bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(t - 2, t))
+    return (bend.T @ bend).tocsr()
 
 
 def _say(stand: Stand) -> np.ndarray:

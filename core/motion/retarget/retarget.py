@@ -3,7 +3,7 @@
     mapping (both) → contacts (source) → rotations (transfer) → root, scaled by the legs → feet → pose channels
 """
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,17 +90,17 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
         R = follow(target, hold_hands(source, source_map, held, target_map, scale), driven)
         head = _heads(target, R, carrier, shift, target_map)
     moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
-    notes = (*filter(None, [rest_note]), *_notes(source_map, target_map, carrier))
+    notes = (*filter(None, [rest_note]), *_notes(source_map, target_map, aligned))
     monitor.step("retargeting", 4, 4)
     loose = {b: head[:, b] - head_of(target, R, head, b) for b in loose_parts(target, target_map) if driven[b] and b != carrier}
     return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, loose_m=loose, driven=driven, scale=scale,
                       roles=tuple(aligned), contacts=contacts, notes=notes)
 
 
-def _notes(source_map: RigMap, target_map: RigMap, carrier: int) -> tuple[str, ...]:
+def _notes(source_map: RigMap, target_map: RigMap, common: Container[str]) -> tuple[str, ...]:
     lost = [role for role in source_map.bones if role not in target_map.bones and "." not in role[:-2]]
     notes = [f"the target has no {', '.join(lost)}: their parents take it up"] if lost else []
-    return (*notes, *([] if carrier >= 0 else ["the body does not travel: no hips in common"]))
+    return (*notes, *([] if "hips" in common else ["the body does not travel: no hips in common"]))
 
 
 def _place(rig: Rig, rig_map: RigMap, part: str, side: str) -> np.ndarray | None:

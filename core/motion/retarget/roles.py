@@ -4,6 +4,8 @@ A limb's bones are rigid parts: their directions are what a motion looks like. T
 bend, of as many bones as a rig happens to have.
 """
 
+from collections.abc import Iterable
+
 SIDES = ("L", "R")
 ARM = ("clavicle", "upper_arm", "forearm", "hand")
 LEG = ("thigh", "shin", "foot", "toe")
@@ -11,6 +13,7 @@ FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 
 SPREAD = ("spine", "neck", "hand")  # chains that bend: rotations are spread over them
 TORSO = ("hips", "spine", "neck", "head")
+OWN_NAMES = {"pelvis": "hips", "shoulder": "clavicle"}  # of the bones of Tricap's models that are not called like their part
 # what a limb's part begins and ends at: its own first bone, and the next part's
 SEGMENTS = (("upper_arm", "forearm"), ("forearm", "hand"), ("thigh", "shin"), ("shin", "foot"))
 
@@ -36,6 +39,18 @@ def finger_roles(side: str) -> tuple[str, ...]:
 
 
 ROLES = (*TORSO, *(sided(part, side) for side in SIDES for part in (*ARM, *LEG)), *(r for side in SIDES for r in finger_roles(side)))
+
+
+def model_roles(names: Iterable[str]) -> dict[str, str]:
+    """Bones of Tricap's own models by role. Of collar and shoulder it is the shoulder that moves like a clavicle."""
+    found: dict[str, str] = {}
+    for name in names:
+        part, side = part_of(name), side_of(name)
+        part = OWN_NAMES.get(part, part)
+        role = sided(part, side) if side else part
+        if role in ROLES:
+            found[role] = name
+    return found
 
 
 def parent_role(role: str) -> str:

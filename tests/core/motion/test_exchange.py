@@ -9,7 +9,7 @@ import pytest
 
 from tricap.core.errors import InputError
 from tricap.core.motion.bvh import read_bvh, write_bvh
-from tricap.core.motion.c3d import read_c3d, write_c3d
+from tricap.core.motion.c3d import BLOCK, _Number, _read_parameters, read_c3d, write_c3d
 from tricap.core.motion.markers import Markers
 from tricap.core.motion.points_csv import read_points_csv, write_points_csv
 from tricap.core.motion.retarget.mapping import find_map
@@ -51,6 +51,40 @@ def test_points_come_back(tmp_path: Path, kind: str, axes: str) -> None:
     np.testing.assert_allclose(found.xyz_m, points.xyz_m, atol=PLACE_M)
     if kind != "trc":
         np.testing.assert_allclose(found.sigma_m, points.sigma_m, atol=1e-6)
+
+
+@pytest.mark.parametrize(("frames", "written"), [
+    (range(40), range(1, 41)), (range(7, 47), range(7, 47)), (range(-3, 2), range(1, 6)), (range(70000, 70005), range(1, 6)),
+    ((0, 1, 2, 10, 11), range(1, 13)), ((5, 9), range(5, 10)), ((0,), (1,))], ids=str)
+def test_c3d_counts_from_one_and_the_take_keeps_its_numbers(tmp_path: Path, frames: range, written: range) -> None:
+    points = cloud()
+    numbers, some = np.array(frames), np.arange(len(frames))
+    few = Markers(names=points.names, fps=50.0, frames=numbers, xyz_m=points.xyz_m[some], sigma_m=points.sigma_m[some])
+    write_c3d(tmp_path / "a.c3d", few)
+    data = (tmp_path / "a.c3d").read_bytes()
+    assert struct.unpack_from("<HH", data, 6) == (written[0], written[-1])
+    table = _read_parameters(data, BLOCK, _Number(order="<", dec=False), tmp_path)
+    assert table["POINT", "FRAMES"] == len(written)
+    assert [int(table["TRIAL", f"ACTUAL_{end}_FIELD"] @ [1, 65536]) for end in ("START", "END")] == [written[0], written[-1]]
+    found = read_c3d(tmp_path / "a.c3d")
+    there = np.isin(found.frames, numbers)
+    np.testing.assert_array_equal(found.frames, np.arange(numbers[0], numbers[-1] + 1))
+    np.testing.assert_allclose(found.xyz_m[there], few.xyz_m, atol=PLACE_M)
+    assert np.isnan(found.xyz_m[~there]).all() and np.isnan(found.sigma_m[~there]).all()
+
+
+def test_a_sigma_in_c3d_is_known_or_not(tmp_path: Path) -> None:
+    """One that is unknown does not come back as 0, and one below the steps does not come back as unknown."""
+    sigma = np.array([[np.nan, 1e-6, 2e-3]])
+    write_c3d(tmp_path / "a.c3d", Markers(names=("a", "b", "c"), fps=50.0, frames=[1], xyz_m=np.ones((1, 3, 3)), sigma_m=sigma))
+    np.testing.assert_allclose(read_c3d(tmp_path / "a.c3d").sigma_m, [[np.nan, 1e-4, 2e-3]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("frames", [(3, 2), (0, 1 << 40)], ids=str)
+def test_frames_that_c3d_cannot_number_are_said(tmp_path: Path, frames: tuple[int, int]) -> None:
+    xyz = np.zeros((2, 1, 3))
+    with pytest.raises(InputError, match="mend the frame numbers"):
+        write_c3d(tmp_path / "a.c3d", Markers(names=("a",), fps=50.0, frames=frames, xyz_m=xyz, sigma_m=xyz[..., 0]))
 
 
 def test_wide_tables_are_read(tmp_path: Path) -> None:

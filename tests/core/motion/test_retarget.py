@@ -1,11 +1,15 @@
 """The transfer on stick people: directions, rest poses, rolls, headings, missing parts, twist, feet."""
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
 from tricap.core.errors import InputError
+from tricap.core.motion.bvh import write_bvh
 from tricap.core.motion.retarget.contacts import FeetSettings, hysteresis, without_short
 from tricap.core.motion.retarget.keys import needed_keys
 from tricap.core.motion.retarget.mapping import RigMap, find_map
@@ -22,6 +26,7 @@ from tricap.core.motion.retarget.turns import (
     quaternion_from_matrix,
     transposed,
 )
+from tricap.core.motion.sources import body_motion, read_motion_source
 
 from .persons import flail, person, squat
 
@@ -82,6 +87,29 @@ def test_feet_that_stand_stay_on_legs_of_other_proportions() -> None:
     assert figures.direction_rms_deg < 1.0, figures
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_motion_of_one_frame(frames: int, tmp_path: Path) -> None:
+    write_bvh(tmp_path / "one.bvh", squat(person(), frames=frames))
+    source, target = read_motion_source(tmp_path / "one.bvh"), person(thigh_part=0.55)
+    result = retarget(source, find_map(source.rig), target, find_map(target))
+    assert len(result.motion.frames) == frames and measure(source, find_map(source.rig), result.motion, find_map(target),
+                                                           result.contacts).direction_rms_deg < 1.0
+    assert len(resampled(result.motion, 60.0, 1.0).frames) == 2 * frames - 1
+
+
+@pytest.mark.parametrize("part", ["shoulder", "thigh"])
+def test_the_full_models_clavicle_moves_the_targets(part: str) -> None:
+    """30° of a joint of our own body are 30° on the target, and in the names of other programs, too."""
+    shape, target = default_shape(read_model("full")), person(arms_down_deg=45.0)
+    values = np.zeros((2, len(shape.skeleton.dof_names)))
+    values[1, shape.skeleton.dof_names.index({"shoulder": "clavicle.R depression", "thigh": "hip.R flexion"}[part])] = np.radians(-30.0)
+    source = body_motion(shape, values, np.arange(2), 25.0)
+    found, bone = find_map(source.rig), target.index[{"shoulder": "clavicle.R", "thigh": "thigh.R"}[part]]
+    assert found.bones["clavicle.R"] == ("shoulder.R",) and found.bones["spine"] == ("spine", "chest") and not found.missing
+    R = retarget(source, found, target, find_map(target), feet_settings=OFF).motion.R[:, bone]
+    assert abs(np.degrees(angle_of(R[0].T @ R[1])) - 30.0) < 1e-6
+
+
 def test_root_modes() -> None:
     source, target = flail(person()), person(size=2.0)
     maps = find_map(source.rig), find_map(target)
@@ -103,6 +131,8 @@ def test_a_measured_arm_alone_moves_an_arm_alone() -> None:
     result = retarget(source, find_map(rig), target, find_map(target))
     assert {target.names[b] for b in np.flatnonzero(result.driven)} == {"upper_arm.R", "forearm.R"}
     assert result.carrier == -1 and any("travel" in note for note in result.notes)
+    still = retarget(flail(person()), find_map(person()), target, find_map(target), RetargetSettings(root="still"), OFF)
+    assert still.carrier == -1 and not any("travel" in note for note in still.notes)
 
 
 def test_parts_that_hang_elsewhere_are_carried() -> None:
