@@ -19,7 +19,7 @@ from .trunk_profile import smoothed, stout_chain
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BodyShape:
-    """Skeleton, bone lengths (B,) and metaballs of one person. Sigmas are one standard deviation [m]; NaN: not estimated."""
+    """Skeleton, bone lengths (B,) and metaballs of one person. Sigmas are one standard deviation [m]; NaN or None: not estimated."""
 
     model: str
     skeleton: Skeleton
@@ -27,11 +27,14 @@ class BodyShape:
     metaballs: Metaballs
     length_sigma_m: np.ndarray  # (B,)
     radius_sigma_m: np.ndarray  # (M, 3) of Metaballs.radii_m
+    weight_sigma: np.ndarray | None = None  # (M,) of Metaballs.weight
 
     def __post_init__(self) -> None:
         b, m = len(self.skeleton.bones), len(self.metaballs.weight)
         for name, shape in dict(lengths_m=(b,), length_sigma_m=(b,), radius_sigma_m=(m, 3)).items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+        if self.weight_sigma is not None:
+            object.__setattr__(self, "weight_sigma", frozen(self.weight_sigma, (m,), name="weight_sigma"))
 
 
 def default_shape(model: BodyModel) -> BodyShape:
@@ -82,7 +85,8 @@ def write_body(path: Path, shape: BodyShape) -> None:
         lines += ["[[metaballs]]", f"bone = {_text(skeleton.bones[bone_index].name)}",
                   f"centre = {balls.centre[i].tolist()!r}  # in bone lengths, in the bone's axes",
                   f"radii_m = {balls.radii_m[i].tolist()!r}  # l of the field exp(-2 d), not the visible radius",
-                  f"sigma_m = {shape.radius_sigma_m[i].tolist()!r}", f"weight = {float(balls.weight[i])!r}", ""]
+                  f"sigma_m = {shape.radius_sigma_m[i].tolist()!r}", f"weight = {float(balls.weight[i])!r}",
+                  *([f"weight_sigma = {float(shape.weight_sigma[i])!r}"] if shape.weight_sigma is not None else []), ""]
     store.write_text(Path(path), "\n".join(lines))
 
 
@@ -117,7 +121,12 @@ def _shape(table: dict[str, Any]) -> BodyShape:
                           weight=np.array([t["weight"] for t in balls], dtype=float))
     return BodyShape(model=str(table["model"]), skeleton=skeleton, lengths_m=np.array([t["length_m"] for t in rows], dtype=float),
                      metaballs=metaballs, length_sigma_m=np.array([t["sigma_m"] for t in rows], dtype=float),
-                     radius_sigma_m=np.array([t["sigma_m"] for t in balls], dtype=float).reshape(-1, 3))
+                     radius_sigma_m=np.array([t["sigma_m"] for t in balls], dtype=float).reshape(-1, 3),
+                     weight_sigma=np.array([t["weight_sigma"] for t in balls], dtype=float) if _has_weight_sigmas(balls) else None)
+
+
+def _has_weight_sigmas(balls: list[dict[str, Any]]) -> bool:
+    return any("weight_sigma" in t for t in balls)
 
 
 def _dof(dof: Any) -> str:

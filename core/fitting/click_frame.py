@@ -66,7 +66,7 @@ def _to_points(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector:
             solution = solve(problem, solution.motion, solution.vector, steps=STEPS, scales=solution.scales)
         return solution
     for _ in range(ALTERNATIONS):
-        for free in ("radii", None):
+        for free in ("flesh", None):
             problem = fit.problem(_observe(fit, near, 1.0), free)
             solution = solve(problem, solution.motion, solution.vector, steps=ALTERNATION_STEPS, scales=solution.scales)
     return solution

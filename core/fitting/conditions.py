@@ -23,6 +23,7 @@ from .silhouettes import Silhouettes
 from .state import BodyState, ShapeParameters
 
 SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
+WEIGHT_SIGMA = 0.3  # of ln w: an isolated ball's weight and radius are seen as one, r = l √(½ ln 2w)
 NO_SHAPE = np.zeros(0, dtype=np.intp)
 
 
@@ -71,6 +72,7 @@ class Conditions:
         mean, s = self.parameters.vector(), self.settings
         sigma = np.full(len(mean), s.radius_sigma)
         of_lengths = self.parameters.layout.set("lengths")
+        sigma[self.parameters.layout.set("weights")] = WEIGHT_SIGMA
         mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], s.length_sigma)
         radii = self.parameters.template.metaballs.radii_m
         found: list[Observation] = [ShapePrior(mean=mean, sigma=sigma),

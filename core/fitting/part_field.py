@@ -4,7 +4,7 @@ A bone j whose balls give the gradient g_j at X moves under DOF k with the veloc
     ∂F/∂θ_k = −Σ_j g_j · (a_k × (X − o_k))    over the bones j that k turns                              (1)
     ∂F/∂ln L_a = −L_a y_a · Σ_j g_j           over the bones j that L_a shifts, and, in bone a's own axes,
                + Σ_{i ∈ a} (∂F_i/∂ln l_y − ∇_local F_i · c_i)                                            (2)
-    ∂F/∂ln l = 4 q² w exp(−2d)                                                                           (3)
+    ∂F/∂ln l = 4 q² w exp(−2d) ,   ∂F/∂ln w = w exp(−2d)                                                 (3)
 
 A part knows few of the parameters: derivatives are given for its own columns only.
 """
@@ -37,6 +37,7 @@ class Part:
     skeleton: Skeleton
     bone: int
     bone_index: np.ndarray  # (M,) of all balls
+    weights: bool = False  # whether the balls' weights are parameters too
 
     @cached_property
     def balls(self) -> np.ndarray:
@@ -81,7 +82,14 @@ class Part:
     def _all_columns(self) -> np.ndarray:
         D, B = len(self.skeleton.dofs), len(self.skeleton.bones)
         radii = D + B + 2 * self.balls[:, None] + np.arange(2)
-        return np.concatenate([self.dofs, D + self.lengths, radii.ravel()])
+        weights = D + B + 2 * len(self.bone_index) + self.balls if self.weights else self.balls[:0]
+        return np.concatenate([self.dofs, D + self.lengths, radii.ravel(), weights])
+
+    @cached_property
+    def of_radii(self) -> slice:
+        """Where the cross radii of its balls (2m) stand among its columns."""
+        first = len(self.dofs) + len(self.lengths)
+        return slice(first, first + 2 * len(self.balls))
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray]:
@@ -151,4 +159,5 @@ class PartField:
         for b, balls in part.bones:
             lengths[:, np.searchsorted(part.lengths, b)] += own[:, balls].sum(axis=1)  # (2)
         cross = 4 * self.terms[..., None] * q[..., CROSS] ** 2  # (3)
-        return np.concatenate([lengths, cross.reshape(len(q), -1)], axis=1)
+        weights = self.terms if part.weights else self.terms[:, :0]
+        return np.concatenate([lengths, cross.reshape(len(q), -1), weights], axis=1)

@@ -91,7 +91,7 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
     shape = default_shape(model) if settings.balls == "three" else one_ball_shape(default_shape(model))
     shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
-    parameters = ShapeParameters(shape)
+    parameters = ShapeParameters(shape, settings.weights)
     return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,
                       click=begin, priors=priors, clicked=clicked, tracks=tracks,
                       silhouettes=Silhouettes(given, model.surface, settings), empty=EmptyViews(given, parameters, settings),

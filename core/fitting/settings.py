@@ -13,6 +13,7 @@ class FitSettings:
     residual: str = knob("metric", "Surface residual: metric (root of the logarithm) or the paper's field difference.",
                          choices=("metric", "paper"))
     balls: str = knob("three", "Metaballs of a bone: three, or one ellipsoid for comparison.", choices=("three", "one"))
+    weights: bool = knob(False, "The balls' weights are parameters of the fit too: edges can be sharper or rounder.")
     robust: str = knob("geman-mcclure", "How gross points lose their weight.", choices=("geman-mcclure", "huber"))
     robust_width: float = knob(3.0, "Residual, in robust standard deviations, at which a point loses half its pull.", low=1.0, high=20.0)
     voxel_m: float = knob(0.008, "Points are averaged in voxels of this size.", unit="m", low=0.001, high=0.1)

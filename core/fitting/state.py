@@ -1,8 +1,8 @@
 """The state vector of the fit, [S_motion, S_skel] of the papers: who stands where, and the body that a vector means.
 
 One frame's motion (D,) [rad, m] is followed by the shape (S,), which all frames share: ln of the bone lengths (B,), then ln of the cross
-radii l_x and l_z of every ball (M, 2). Logarithms keep lengths positive and make their sigmas relative. A ball's centre and its radius
-along the bone scale with the bone.
+radii l_x and l_z of every ball (M, 2), and, where they are free, ln of the balls' weights w (M). Logarithms keep lengths positive and make
+their sigmas relative. A ball's centre and its radius along the bone scale with the bone.
 """
 
 from dataclasses import dataclass
@@ -30,6 +30,7 @@ class BodyState:
     balls: Metaballs
     motion: np.ndarray  # (D,)
     parts: tuple[Part, ...]  # B
+    weights: bool  # whether they are among the shape's parameters
     R: np.ndarray  # (B, 3, 3) bone frames
     head_m: np.ndarray  # (B, 3) bone heads in the world
     axes: np.ndarray  # (D, 3) axes of the DOFs in the world
@@ -42,7 +43,7 @@ class BodyState:
     @property
     def n_shape(self) -> int:
         """S."""
-        return len(self.lengths_m) + 2 * len(self.balls.weight)
+        return len(self.lengths_m) + (3 if self.weights else 2) * len(self.balls.weight)
 
     @cached_property
     def joints_m(self) -> np.ndarray:
@@ -70,8 +71,12 @@ class BodyState:
 
 
 def shape_vector(state: BodyState) -> np.ndarray:
-    """(S,) of a body: ln of lengths and cross radii."""
-    return np.log(np.concatenate([state.lengths_m, state.balls.radii_m[:, CROSS].ravel()]))
+    """(S,) of a body: ln of lengths and cross radii, and of weights where they are parameters."""
+    return _vector(state.lengths_m, state.balls, state.weights)
+
+
+def _vector(lengths_m: np.ndarray, balls: Metaballs, weights: bool) -> np.ndarray:
+    return np.log(np.concatenate([lengths_m, balls.radii_m[:, CROSS].ravel(), *([balls.weight] if weights else [])]))
 
 
 def free_bones(parameters: "ShapeParameters") -> np.ndarray:
@@ -82,27 +87,29 @@ def free_bones(parameters: "ShapeParameters") -> np.ndarray:
 
 
 class ShapeParameters:
-    """The owner of the shape vector (S,): names, sets ("lengths", "radii", "shape"), and the way from vectors to bodies and back."""
+    """The owner of the shape vector (S,): names, sets ("lengths", "radii", "weights", "flesh": both, "shape": all), and the way from
+    vectors to bodies and back. Weights are parameters only where that is wanted."""
 
-    def __init__(self, template: BodyShape) -> None:
-        self.template = template
+    def __init__(self, template: BodyShape, weights: bool = False) -> None:
+        self.template, self.weights = template, weights
         self.skeleton = template.skeleton
         self.n_lengths = len(template.lengths_m)
-        self.parts = tuple(Part(self.skeleton, b, template.metaballs.bone_index) for b in range(self.n_lengths))
-        self.layout = Layout(_names(template), _sets(self.n_lengths, len(template.metaballs.weight)))
+        self.parts = tuple(Part(self.skeleton, b, template.metaballs.bone_index, weights) for b in range(self.n_lengths))
+        self.layout = Layout(_names(template, weights), _sets(self.n_lengths, len(template.metaballs.weight), weights))
 
     def vector(self, shape: BodyShape | None = None) -> np.ndarray:
         """The shape vector (S,) of a body (default: the template)."""
         shape = self.template if shape is None else shape
-        return np.log(np.concatenate([shape.lengths_m, shape.metaballs.radii_m[:, CROSS].ravel()]))
+        return _vector(shape.lengths_m, shape.metaballs, self.weights)
 
     def body(self, vector: np.ndarray) -> tuple[np.ndarray, Metaballs]:
         """Lengths (B,) [m] and balls of a shape vector; what is not estimated comes from the template."""
         balls, old = self.template.metaballs, self.template.lengths_m
         lengths, radii = np.exp(vector[: self.n_lengths]), balls.radii_m.copy()
         radii[:, 1] *= (lengths / old)[balls.bone_index]
-        radii[:, CROSS] = np.exp(vector[self.n_lengths :]).reshape(-1, 2)
-        return lengths, Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=radii, weight=balls.weight)
+        radii[:, CROSS] = np.exp(vector[self.layout.set("radii")]).reshape(-1, 2)
+        weight = np.exp(vector[self.layout.set("weights")]) if self.weights else balls.weight
+        return lengths, Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=radii, weight=weight)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Indices (K,), (K,) of the parameters that a left and a right limb share by name."""
@@ -119,7 +126,8 @@ class ShapeParameters:
         """The body of a shape vector (S,) in T postures (T, D)."""
         lengths, balls = self.body(vector)
         forward = frames_and_axes(self.skeleton, lengths, motion)
-        return [BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=m, parts=self.parts, R=R, head_m=head, axes=axes)
+        return [BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=m, parts=self.parts, R=R, head_m=head, axes=axes,
+                          weights=self.weights)
                 for m, R, head, axes in zip(motion, *forward)]
 
     def shape(self, vector: np.ndarray, sigma: np.ndarray) -> BodyShape:
@@ -127,21 +135,23 @@ class ShapeParameters:
         lengths, balls = self.body(vector)
         n = self.n_lengths
         length_sigma, radius_sigma = sigma[:n] * lengths, np.empty_like(balls.radii_m)
-        radius_sigma[:, CROSS] = sigma[n:].reshape(-1, 2) * balls.radii_m[:, CROSS]
+        radius_sigma[:, CROSS] = sigma[self.layout.set("radii")].reshape(-1, 2) * balls.radii_m[:, CROSS]
         radius_sigma[:, 1] = sigma[balls.bone_index] * balls.radii_m[:, 1]
         return BodyShape(model=self.template.model, skeleton=self.skeleton, lengths_m=lengths, metaballs=balls,
-                         length_sigma_m=length_sigma, radius_sigma_m=radius_sigma)
+                         length_sigma_m=length_sigma, radius_sigma_m=radius_sigma,
+                         weight_sigma=sigma[self.layout.set("weights")] * balls.weight if self.weights else None)
 
 
-def _names(shape: BodyShape) -> list[str]:
+def _names(shape: BodyShape, weights: bool) -> list[str]:
     bones = shape.skeleton.bones
-    names, count = [f"length {bone.name}" for bone in bones], [0] * len(bones)
+    names, count, balls = [f"length {bone.name}" for bone in bones], [0] * len(bones), []
     for b in shape.metaballs.bone_index.tolist():
         count[b] += 1
-        names += [f"radius {bones[b].name} {count[b]} {axis}" for axis in "xz"]
-    return names
+        balls.append(f"{bones[b].name} {count[b]}")
+    return names + [f"radius {ball} {axis}" for ball in balls for axis in "xz"] + [f"weight {ball}" for ball in balls if weights]
 
 
-def _sets(n_lengths: int, n_balls: int) -> dict[str, list[int]]:
-    n = n_lengths + 2 * n_balls
-    return dict(lengths=list(range(n_lengths)), radii=list(range(n_lengths, n)), shape=list(range(n)))
+def _sets(n_lengths: int, n_balls: int, weights: bool) -> dict[str, range]:
+    n, last = n_lengths + 2 * n_balls, n_lengths + (3 if weights else 2) * n_balls
+    return dict(lengths=range(n_lengths), radii=range(n_lengths, n), weights=range(n, last), flesh=range(n_lengths, last),
+                shape=range(last))

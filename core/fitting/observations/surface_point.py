@@ -84,7 +84,7 @@ class SurfacePoints(FromBlocks):
             J = field.jacobian(shape)
             J *= slope[:, None]
             if shape:
-                J[:, -2 * len(field.part.balls) :] += value[:, None] * np.repeat(held.field.shares / 2, 2, axis=1)
+                J[:, field.part.of_radii] += value[:, None] * np.repeat(held.field.shares / 2, 2, axis=1)
             J /= self._unit(held, field)[:, None]
             yield held.rows, field.part.columns(shape), J
 

@@ -1,5 +1,6 @@
 """body.toml and model files: round trips, and what they refuse."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,19 @@ def test_body_comes_back_to_the_last_bit(model: str, tmp_path: Path) -> None:
         assert np.array_equal(a.R_rest, b.R_rest) and (a.parent, a.rotation_mode) == (b.parent, b.rotation_mode)
         assert np.allclose([d.limits for d in a.dofs], [d.limits for d in b.dofs])
     assert np.isnan(again.length_sigma_m).all()
+
+
+def test_weights_that_were_fitted_keep_their_sigmas(tmp_path: Path) -> None:
+    shape = default_shape(read_model("arm.R"))
+    write_body(tmp_path / "body.toml", shape)
+    assert read_body(tmp_path / "body.toml").weight_sigma is None
+    write_body(tmp_path / "body.toml", replace(shape, weight_sigma=0.01 * np.arange(6)))
+    again = read_body(tmp_path / "body.toml").weight_sigma
+    assert again is not None and np.array_equal(again, 0.01 * np.arange(6))
+    text = (tmp_path / "body.toml").read_text()
+    (tmp_path / "body.toml").write_text(text.replace("weight_sigma = 0.0\n", ""))
+    with pytest.raises(InputError, match="weight_sigma"):
+        read_body(tmp_path / "body.toml")
 
 
 @pytest.mark.parametrize(("old", "new"), [("tricap-body", "other"), ("version = 1", "version = 9"), ("head =", "heed ="),

@@ -5,6 +5,8 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
+from tricap.core.fitting.acceleration import Acceleration
+from tricap.core.fitting.block_band import NormalEquations
 from tricap.core.fitting.observations import (
     Apart,
     ClickedJoints,
@@ -17,6 +19,7 @@ from tricap.core.fitting.observations import (
     MotionPrior,
     ShapePrior,
     SilhouetteRays,
+    StepsFromFixed,
     SurfacePoints,
     Symmetry,
 )
@@ -28,8 +31,8 @@ STEP = 1e-6
 TOLERANCE = 2e-6  # relative to the largest entry of the Jacobian; central differences at 1e-6 measured 3e-8 at worst
 
 
-def _parameters(model: str) -> ShapeParameters:
-    return ShapeParameters(default_shape(read_model(model)))
+def _parameters(model: str, weights: bool = False) -> ShapeParameters:
+    return ShapeParameters(default_shape(read_model(model)), weights)
 
 
 def _motion(parameters: ShapeParameters, rng: np.random.Generator) -> np.ndarray:
@@ -82,10 +85,10 @@ def _rays(state, near, bone, sigma, rng):
 
 
 @pytest.mark.parametrize("model", ["arm.R", "leg.L", "full"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_jacobians_equal_differences(model: str, seed: int) -> None:
+@pytest.mark.parametrize(("seed", "weights"), [(0, False), (1, False), (2, True)])
+def test_jacobians_equal_differences(model: str, seed: int, weights: bool) -> None:
     rng = np.random.default_rng(seed)
-    parameters = _parameters(model)
+    parameters = _parameters(model, weights)
     vector = parameters.vector() + rng.normal(0, 0.1, len(parameters.layout))
     motion = _motion(parameters, rng)
     names = (*parameters.skeleton.dof_names, *parameters.layout.names)
@@ -128,6 +131,61 @@ def test_jacobian_of_a_step_between_frames_equals_differences(model: str) -> Non
         h[k] = STEP
         difference = (steps.residual(*states(x + h)) - steps.residual(*states(x - h))) / (2 * STEP)
         assert np.abs(J[:, k] - difference).max() / np.abs(J).max() < TOLERANCE, name
+
+
+@pytest.mark.parametrize("model", ["arm.R", "full"])
+@pytest.mark.parametrize("backwards", [False, True])
+def test_jacobian_of_a_step_from_a_fixed_frame_equals_differences(model: str, backwards: bool) -> None:
+    """The other frame's posture is fixed; its body is the same, so the shape moves both."""
+    rng = np.random.default_rng(4)
+    parameters = _parameters(model)
+    D, other = len(parameters.skeleton.dofs), _motion(parameters, rng)
+    x = np.concatenate([_motion(parameters, rng), parameters.vector()])
+    names = (*parameters.skeleton.dof_names, *parameters.layout.names)
+    steps = MaterialSteps(from_m=rng.normal(0, 0.3, (20, 3)), to_m=rng.normal(0, 0.3, (20, 3)),
+                          bone=np.arange(20) % len(parameters.skeleton.bones), sigma_m=rng.uniform(0.001, 0.005, 20))
+
+    def observed(x):
+        return StepsFromFixed(steps=steps, other=parameters.state(other, x[D:]), backwards=backwards), parameters.state(x[:D], x[D:])
+
+    def residual(x):
+        observation, state = observed(x)
+        return observation.residual(state)
+
+    observation, state = observed(x)
+    J = observation.jacobian(state)
+    for k, name in enumerate(names):
+        h = np.zeros(len(x))
+        h[k] = STEP
+        worst = np.abs(J[:, k] - (residual(x + h) - residual(x - h)) / (2 * STEP)).max() / np.abs(J).max()
+        assert worst < TOLERANCE, f"derivative to “{name}” is off by {worst:.1e}"
+    assert np.array_equal(observation.jacobian(state, shape=False), J[:, :D]) and np.abs(J[:, :D]).max() > 0
+
+
+def test_accelerations_equal_differences_of_their_cost() -> None:
+    """The gradient is −2 g, the second derivatives are twice the band; the times between frames differ."""
+    rng, T, D = np.random.default_rng(5), 6, 3
+    smooth = Acceleration(time_s=np.cumsum(rng.uniform(0.02, 0.06, T)), sigma=rng.uniform(1, 10, D))
+    motion, equations = rng.normal(0, 0.1, (T, D)), NormalEquations.empty(T, D, 0)
+    smooth.add_to(equations, motion)
+    band = np.zeros((T, D, T, D))
+    for t in range(T):
+        band[t, :, t] = equations.diagonal[t]
+        for blocks, ahead in ((equations.next1, 1), (equations.next2, 2)):
+            if t + ahead < T:
+                band[t + ahead, :, t], band[t, :, t + ahead] = blocks[t], blocks[t].T
+    for t in range(T):
+        for d in range(D):
+            h = np.zeros((T, D))
+            h[t, d] = 1e-3  # the cost is quadratic: differences are exact but for rounding
+            up, down = smooth.cost(motion + h), smooth.cost(motion - h)
+            assert abs((up - down) / 2e-3 + 2 * equations.g[t, d]) < 1e-6 * np.abs(equations.g).max(), f"frame {t}, DOF {d}"
+            moved = NormalEquations.empty(T, D, 0)
+            smooth.add_to(moved, motion + h)
+            assert np.allclose((equations.g - moved.g) / 1e-3, band[t, d], atol=1e-6 * np.abs(band).max()), f"frame {t}, DOF {d}"
+    few = NormalEquations.empty(2, D, 0)
+    smooth.add_to(few, motion[:2])
+    assert not few.diagonal.any() and smooth.cost(motion[:2]) == 0
 
 
 def test_the_derivative_test_notices_a_wrong_sign() -> None:
