@@ -8,7 +8,7 @@ A scene is bound to a take once it has views of its own. Without views, a take t
 Other parts of the add-on that keep something of take.toml in the scene add a function to `WRITERS` (scene → table) and `READERS`.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,14 @@ import numpy as np
 from ..core import store
 from ..core.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
+from ..core.images.fields import BOTH, Instants, instants
 from ..core.take import Take
-from ..core.take_file import Table, new_table, read_table, take_of_table, write_table
+from ..core.take_file import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import folders, properties, seeds
 from .scene import clips
 
 ENDING, RESULTS, VIEW_KEY = "_tricap", "results", "tricap_view"
+OTHER_LINES = "The footage is shown in other frames than Lines now asks for; press Reload Footage to show it so."
 WRITERS: list[Callable[[bpy.types.Scene, Table], None]] = []
 READERS: list[Callable[[bpy.types.Scene, Table], None]] = []
 _seen: set[str] = set()  # digests of what this session read from or wrote into take.toml
@@ -112,11 +114,52 @@ def write(scene: bpy.types.Scene, *, overwrite: bool = False) -> Path:
         InputError: the folder is gone or read-only, the scene's values cannot be, or somebody else changed the file (unless `overwrite`).
     """
     folder = existing_folder(scene)
+    if shows_other_lines(scene):
+        raise InputError(OTHER_LINES)
     if not overwrite and changed_outside(scene):
         raise InputError(f"{folder / 'take.toml'} was changed outside this file; press Reload Take to take that over, or Keep Mine.")
     write_table(folder, table(scene))
     remember(scene, folder)
     return folder
+
+
+def fields_of(scene: bpy.types.Scene) -> Instants:
+    """Where in the footage's images the scene's frames are."""
+    return instants(scene.tricap.interlaced, scene.tricap.first_field)
+
+
+def shows_other_lines(scene: bpy.types.Scene) -> bool:
+    """Whether the clips show whole images where fields are wanted, or the other way about: frames have other numbers then."""
+    wanted = _first_field(scene)
+    return any(view.clip is not None and view.clip.get(clips.FIELDS_KEY, "") != wanted for view in scene.tricap.views)
+
+
+def show_lines(scene: bpy.types.Scene) -> None:
+    """Show the footage as `interlaced` wants it, with every frame's number in take.toml, clicks and corrections changed to suit.
+
+    Raises:
+        InputError: take.toml cannot be written, or the fields' pictures cannot be made.
+    """
+    folder = existing_folder(scene)
+    shown = max(clips.frames_per_image(clip) for clip in clips_of(scene).values())
+    per_image = fields_of(scene).per_image
+    write_table(folder, renumbered(table(scene), per_image, shown))
+    open_take(scene, folder)
+    scene.frame_end = (scene.frame_end + 1) * per_image // shown - 1
+
+
+def _first_field(scene: bpy.types.Scene) -> str:
+    """The field that is first where both are measured, else ""."""
+    return str(scene.tricap.first_field) if scene.tricap.interlaced == BOTH else ""
+
+
+def files_of(folder: Path, entries: Sequence[Table], fields: Instants) -> dict[str, Path]:
+    """By view, the file by which Blender opens the footage of every entry of [[views]].
+
+    Raises:
+        InputError: footage is missing.
+    """
+    return {e["name"]: clips.first_file(folder, e.get("images"), e.get("movie"), e["name"], fields) for e in entries}
 
 
 def edit(scene: bpy.types.Scene, change: Callable[[Table], None]) -> None:
@@ -166,6 +209,8 @@ def table(scene: bpy.types.Scene) -> Table:
     props, old = scene.tricap, read_table(folder_of(scene))
     made = dict(old) or new_table([])
     made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": [view_entry(view) for view in props.views]}
+    said = props.first_field != "odd" or "first_field" in old  # odd need not be said
+    _put(made, "first_field", _first_field(scene) if said else "")
     _put(made, "reference_view", props.reference_view if props.reference_view in [view.name for view in props.views] else "")
     _put(made, "frames", None if props.all_frames else [props.first_frame, props.last_frame + 1])
     _put(made, "body", {**old.get("body", {}), "model": model_of(scene)} if model_of(scene) else None)
@@ -187,11 +232,12 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
         raise InputError(f"{folder} is not a take: there is no take.toml in it. Add footage to make one.")
     opened = take_of_table(folder, said)
     properties.check_settings(opened.settings, str(folder / "take.toml"))
-    files = {view.name: clips.first_file(folder, view.images, view.movie, view.name) for view in opened.views}
+    files = files_of(folder, said["views"], opened.instants)
     props = scene.tricap
     props.take = folders.for_user(folder)
+    props.fps, props.interlaced, props.first_field = said["fps"], opened.interlaced, opened.first_field
     show_views(scene, said["views"], files)
-    props.fps, props.interlaced, props.reference_view = opened.fps, opened.interlaced, said.get("reference_view", "")
+    props.reference_view = said.get("reference_view", "")
     props.all_frames = opened.frames is None
     if opened.frames:
         props.first_frame, props.last_frame = opened.frames[0], opened.frames[1] - 1
@@ -217,6 +263,7 @@ def show_views(scene: bpy.types.Scene, entries: list[Table], files: dict[str, Pa
     for entry in entries:
         view = props.views.add()
         view.clip = shown[entry["name"]]
+        view.clip[clips.FIELDS_KEY] = _first_field(scene)
         view.name = entry["name"]
         view.images, view.movie = entry.get("images", ""), entry.get("movie", "")
         view.offset_frames = entry.get("offset_frames", 0)

@@ -5,7 +5,8 @@ from typing import Any
 
 import bpy
 
-from ..core.images.fields import INTERLACE
+from ..core.images.fields import BOTH, INTERLACE
+from .scene.clips import frames_per_image
 
 TOUCHED: list[Callable[[], None]] = []  # told when a value of the panel was changed
 MODELS = (
@@ -20,7 +21,10 @@ MODELS = (
 )
 LINES = {"none": ("Progressive", "Every image is whole"),
          "odd": ("Odd Lines", "Interlaced video: keep lines 1, 3, 5 …"),
-         "even": ("Even Lines", "Interlaced video: keep lines 2, 4, 6 …")}
+         "even": ("Even Lines", "Interlaced video: keep lines 2, 4, 6 …"),
+         "both": ("Both Fields", "Interlaced video: odd and even lines are two instants, twice as many frames a second")}
+FIELDS = (("odd", "Odd Lines First", "Lines 1, 3, 5 … were exposed first"),
+          ("even", "Even Lines First", "Lines 2, 4, 6 … were exposed first"))
 
 
 def tell_touched(_: Any, __: Any) -> None:
@@ -37,7 +41,7 @@ def _renamed(view: Any, _: bpy.types.Context) -> None:
 
 def _shifted(view: Any, _: bpy.types.Context) -> None:
     if view.clip is not None:
-        view.clip.frame_start = -view.offset_frames
+        view.clip.frame_start = -frames_per_image(view.clip) * view.offset_frames
     tell_touched(view, _)
 
 
@@ -61,8 +65,9 @@ def annotations() -> dict[str, Any]:
         "view_index": props.IntProperty(name="View"),
         "fps": props.FloatProperty(name="Frame Rate", default=25.0, min=0.1, max=10_000.0, precision=3,
                                    description="Images per second of the footage", **told),
-        "interlaced": props.EnumProperty(name="Lines", items=[(name, *LINES[name]) for name in INTERLACE],
+        "interlaced": props.EnumProperty(name="Lines", items=[(name, *LINES[name]) for name in (*INTERLACE, BOTH)],
                                          description="Which lines of interlaced video are measured", **told),
+        "first_field": props.EnumProperty(name="First Field", items=FIELDS, description="Which field is the earlier one", **told),
         "reference_view": props.StringProperty(name="Reference View",
                                                description="The view that the others are compared with; empty: the middle one", **told),
         "all_frames": props.BoolProperty(name="All Frames", default=True, description="Measure all that the footage has", **told),

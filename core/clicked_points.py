@@ -55,13 +55,14 @@ def with_clicked(footage: Footage, images: list[SplineImage], seeds: Approximati
         InputError: see `clicked_point`.
     """
     take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
+    rows = take.rows_at(take.seeds.frame)
     points = [clicked_point(footage, f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface)]
     xyz = np.concatenate([p.xyz_m for p in points])
     K = np.concatenate([p.covariance_m2 for p in points])
     axis, depth = cameras[ref].R_cam_world[2], cameras[ref].to_camera(xyz)[:, 2]
-    xy = take.rows.from_frame(cameras[ref].project(xyz))
+    xy = rows.from_frame(cameras[ref].project(xyz))
     sigma = np.sqrt(np.einsum("i,nij,j->n", axis, K, axis))
     inside = images[ref].inside(xy, 0.0)
-    depth = settled_depths(images, cameras, ref, take.rows, xy[inside], depth[inside], sigma[inside], matching)
-    clicked = approximations_at_depth(cameras, ref, take.rows, xy[inside], depth)
+    depth = settled_depths(images, cameras, ref, rows, xy[inside], depth[inside], sigma[inside], matching)
+    clicked = approximations_at_depth(cameras, ref, rows, xy[inside], depth)
     return Approximations(**{f.name: np.concatenate([getattr(seeds, f.name), getattr(clicked, f.name)]) for f in fields(Approximations)})

@@ -19,6 +19,7 @@ from . import batch_command, calibrate_command, check_command, contour_command, 
 from .arguments import frame_range, overrides
 from .errors import InputError
 from .geometry.rig import read_rig
+from .images.fields import BOTH, INTERLACE
 from .progress import Cancelled, Monitor
 from .take import open_take, read_take
 from .take_file import footage_entry, make_take, new_table, take_of_table
@@ -74,7 +75,7 @@ def _new_command(commands: Any) -> None:
     new = commands.add_parser("new", help="make a take of movies or image folders")
     new.add_argument("take", type=Path, metavar="TAKE", help="the folder to make")
     new.add_argument("--views", nargs="+", required=True, metavar="NAME=FILE", help="movies or image folders, in the order of the cameras")
-    new.add_argument("--interlaced", choices=("none", "odd", "even"), default="none", help="which lines to keep of interlaced video")
+    new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="which lines to measure of interlaced video")
     new.add_argument("--fps", type=float, default=25.0, metavar="F", help="frames per second")
     new.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml to copy into the take")
     new.add_argument("--model", default=None, metavar="NAME", help="body model, such as arm.R")

@@ -87,7 +87,7 @@ def track_contour(
     contour: Contour | None = None
     for i, m in enumerate(job.measured):
         monitor.step("contours", i, len(job.measured))
-        grey = whole_rows(job.footage.read(m.frame)[view], job.footage.take.interlaced)
+        grey = job.footage.take.rows_at(m.frame).whole(job.footage.read(m.frame)[view])
         if contour is None:
             predicted = polygon if polygon is not None else _first(grey, camera.project(m.cloud.xyz_m), background, settings)
             if len(predicted) < 8:
@@ -98,19 +98,6 @@ def track_contour(
                 predicted = _renewed(predicted, _outline(grey, camera.project(m.cloud.xyz_m), settings))
         contour = relax_contour(predicted, grey, settings)
         yield m.frame, contour
-
-
-def whole_rows(image: np.ndarray, interlaced: str) -> np.ndarray:
-    """The frame with the rows of the other field, half a frame away in time, interpolated."""
-    if interlaced == "none":
-        return image
-    filled = image.copy()
-    kept = 0 if interlaced == "odd" else 1
-    other = np.arange(1 - kept, len(image), 2)
-    above, below = np.clip(other - 1, kept, None), other + 1
-    below = np.where(below < len(image), below, above)
-    filled[other] = 0.5 * (image[above] + image[below])
-    return filled
 
 
 def _first(grey: np.ndarray, points: np.ndarray, background: np.ndarray | None, settings: ContourSettings) -> np.ndarray:

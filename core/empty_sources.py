@@ -31,8 +31,8 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
         Cancelled: the user asked to stop.
     """
     chosen = np.unique(np.linspace(0, len(clouds) - 1, min(SAMPLES, len(clouds))).round().astype(int))
-    backgrounds = [still_background([s.read(clouds[i].frame + v.offset_frames) for i in chosen])
-                   for s, v in zip(footage.sequences, footage.take.views)]
+    backgrounds = [still_background([s.read(footage.number(k, clouds[i].frame)) for i in chosen])
+                   for k, s in enumerate(footage.sequences)]
     distances: list[list[np.ndarray]] = [[] for _ in backgrounds]
     if any(b is None for b in backgrounds):
         return []

@@ -76,7 +76,7 @@ def track_frames(
             if state.current is not None and images is None:
                 images = load_images(footage, state.current.frame, enhance)
             following = load_images(footage, m.frame, enhance)
-            tracked = _advance(view, state, images, following, m, i, monitor)
+            tracked = _advance(view.at(m.frame), state, images, following, m, i, monitor)
             done = tracked, _cut(view, tracked, following)
             _checkpoint(results, *done, key)
         else:
@@ -92,7 +92,7 @@ def tracking_view(footage: Footage, matching: MatchingSettings, tracking: Tracki
     return TrackingView(
         cameras=footage.rig.cameras,
         reference=footage.take.reference,
-        rows=footage.take.rows,
+        instants=footage.take.instants,
         matching=matching,
         tracking=tracking,
         limit_px=max(tracking.max_residual_px, limit_px),

@@ -67,19 +67,21 @@ class MeasuredFrame:
 def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
     """The measured rows (h', w) float32 of all views at one frame, of views that are late at the moment of the others.
 
+    What a late view showed before and after is asked of the same rows of the images before and after.
+
     Raises:
         InputError: see `Footage.read`.
     """
-    take = footage.take
+    grid, step = footage.take.rows_at(frame), footage.take.instants.per_image
 
     def neighbour(k: int, at: int) -> np.ndarray | None:
-        at += take.views[k].offset_frames
-        return take.rows.rows(footage.sequences[k].read(at)) if 0 <= at < footage.sequences[k].count else None
+        number = footage.number(k, at)
+        return grid.rows(footage.sequences[k].read(number)) if 0 <= number < footage.sequences[k].count else None
 
-    rows = [take.rows.rows(image) for image in footage.read(frame)]
-    for k, late in enumerate(footage.late_frames):
+    rows = [grid.rows(image) for image in footage.read(frame)]
+    for k, late in enumerate(footage.late_images):
         if late:
-            rows[k] = retimed(rows[k], neighbour(k, frame - 1), neighbour(k, frame + 1), late)
+            rows[k] = retimed(rows[k], neighbour(k, frame - step), neighbour(k, frame + step), late)
     return rows
 
 
@@ -90,7 +92,7 @@ def load_images(footage: Footage, frame: int, enhance: EnhanceSettings | None = 
         InputError: see `Footage.read`.
     """
     grey = measured_rows(footage, frame)
-    matched = enhanced(grey, enhance, row_step=footage.take.rows.step) if enhance is not None else grey
+    matched = enhanced(grey, enhance, row_step=footage.take.rows_at(frame).step) if enhance is not None else grey
     return FrameImages(grey=grey, spline=[SplineImage(g) for g in matched])
 
 
@@ -116,9 +118,9 @@ def measure_frames(
         ALGORITHM,
         repr((matching, growing, surface, enhance)),
         take.rig_path,
-        repr((take.interlaced, take.reference_view, _seed_table(footage))),
+        repr((take.interlaced, take.first_field, take.reference_view, _seed_table(footage))),
         repr([(v.name, v.offset_frames) for v in take.views]),
-        repr(footage.late_frames) if any(footage.late_frames) else "",
+        repr(footage.late_images) if any(footage.late_images) else "",
     )
     start = before = None
     for done, frame in enumerate(order):
@@ -140,7 +142,8 @@ def measure_frames(
 def _image_digests(footage: Footage, frame: int) -> list[str]:
     """What identifies the images of a frame: the content of image files; the size and date of a movie. With views put to the others'
     moment the frames before and after count as well."""
-    near = (frame - 1, frame, frame + 1) if any(footage.late_frames) else (frame,)
+    step = footage.take.instants.per_image
+    near = (frame - step, frame, frame + step) if any(footage.late_images) else (frame,)
     parts = []
     for path in (path for f in near if f in footage.frames or f == frame for path in footage.files(f)):
         try:
@@ -170,7 +173,7 @@ def _measure(
 ) -> MeasuredFrame:
     take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
     images = load_images(footage, frame, enhance)
-    grid = template_grid(images.spline[ref].shape, take.rows, growing.spacing_px)
+    grid = template_grid(images.spline[ref].shape, take.rows_at(frame), growing.spacing_px)
     if before is None:
         where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, monitor)
     else:
@@ -205,7 +208,7 @@ def first_seeds(
 ) -> tuple[fg.Foreground, Approximations]:
     """Where the person is in one frame, and the surface seeds there."""
     images = load_images(footage, frame, enhance)
-    grid = template_grid(images.spline[footage.take.reference].shape, footage.take.rows, growing.spacing_px)
+    grid = template_grid(images.spline[footage.take.reference].shape, footage.take.rows_at(frame), growing.spacing_px)
     return _first_foreground(footage, images, grid, matching, growing, frame, monitor)
 
 
@@ -245,8 +248,9 @@ def _first_foreground(
 
 
 def _furthest_frame(footage: Footage, frame: int) -> int:
-    """The frame of the take that differs most in time, whether it is to be measured or not."""
-    return max(footage_frames(footage.take, footage.sequences), key=lambda f: abs(f - frame))
+    """The frame of the take, on the same rows, that differs most in time, whether it is to be measured or not."""
+    step = footage.take.instants.per_image
+    return max((f for f in footage_frames(footage.take, footage.sequences) if (f - frame) % step == 0), key=lambda f: abs(f - frame))
 
 
 def _room_and_person(footage: Footage, images: FrameImages, seeds: Approximations, frame: int) -> tuple[np.ndarray, np.ndarray]:
@@ -259,7 +263,7 @@ def _room_and_person(footage: Footage, images: FrameImages, seeds: Approximation
     if other == frame or not len(seeds.depth_m):
         return np.zeros((0, 4)), seeds.depth_m
     later = load_images(footage, other).grey[ref]
-    xyz = camera.points_at_depth(footage.take.rows.to_frame(seeds.xy[:, ref]), seeds.depth_m)
+    xyz = camera.points_at_depth(footage.take.rows_at(frame).to_frame(seeds.xy[:, ref]), seeds.depth_m)
     still = fg.unchanged(images.grey[ref], later, seeds.xy[:, ref])
     planes = fg.background_planes(xyz[still], xyz, [c.centre_m for c in footage.rig.cameras])
     beside = ~fg.Foreground(depth_range_m=(0.0, np.inf), method="", planes=planes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
@@ -292,7 +296,7 @@ def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) ->
     if a is None:
         return None
     spacing, gh, gw, tried = (int(v) for v in a["grid"])
-    rows = footage.take.rows
+    rows = footage.take.rows_at(frame)
     values = {
         k.removeprefix("field_"): v.astype(np.float64) if v.dtype == np.float32 else v for k, v in a.items() if k.startswith("field_")
     }

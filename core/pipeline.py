@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +167,7 @@ def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:
         raise InputError(
             f"Frames {frames[0]}:{frames[1]} are not among the take's frames {footage.frames.start}:{footage.frames.stop}; choose others."
         )
-    return Footage(take=footage.take, rig=footage.rig, sequences=footage.sequences, frames=range(*frames))
+    return replace(footage, frames=range(*frames))
 
 
 def _account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -200,7 +200,7 @@ def measure(run: Run, monitor: Monitor) -> None:
     began, s = time.perf_counter(), run.settings
     _forget_other_clouds(run)
     done, room = [], None
-    if s["timing"].correct and not run.footage.late_frames:
+    if s["timing"].correct and not run.footage.late_images:
         run.footage, run.account["offsets"] = in_step(run.footage, monitor)
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):

@@ -55,10 +55,10 @@ def follow_points(
     Raises:
         InputError: a point has no place in space, or the images cannot be read.
     """
-    rows, view = footage.take.rows, tracking_view(footage, settings["matching"], settings["tracking"], 0.0)
+    view = tracking_view(footage, settings["matching"], settings["tracking"], 0.0)
 
     def read(frame: int) -> list[np.ndarray]:
-        return [rows.rows(image) for image in footage.read(frame)]
+        return [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
 
     ahead = track_key_points(read, range(first, footage.frames.stop), points, view, monitor)
     if first == footage.frames.start:

@@ -36,7 +36,8 @@ def _seen(footage: Footage) -> Any:
     views = [(v.name, v.offset_frames) for v in take.views]
     files = [[_name_and_size(path) for path in s.files()] for s in footage.sequences]
     rig = store.digest(take.rig_path)
-    return views, files, rig, take.interlaced, take.reference_view, footage.frames, _clicked(take.seeds), regions, measuring.ALGORITHM
+    rows = take.interlaced, take.first_field
+    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.seeds), regions, measuring.ALGORITHM
 
 
 def _followed(footage: Footage) -> Any:

@@ -3,29 +3,29 @@
 Joint and view names, and every key, are checked when the file is read; the images are not touched.
 """
 
-import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
 from .errors import InputError
 from .geometry.rig import Rig, read_rig
-from .images.fields import INTERLACE, RowGrid, row_grid
+from .images.fields import BOTH, INTERLACE, Instants, RowGrid, instants
 from .images.sequence import Sequence, open_sequence
 from .keypoint_sources import KeypointSource, keypoint_sources
 from .settings import nearest_name
+from .toml_values import check_keys, frame_pair, inside, is_number, is_pixel, table_of, tables_of
 from .values import frozen
 
 FORMAT, VERSION = "tricap-take", 1
 SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
-KEYS = ("format", "version", "fps", "interlaced", "rig", "reference_view", "frames", "views", "body", "seeds", "keyframes", "corrections",
-        "keypoints", "settings")
+KEYS = ("format", "version", "fps", "interlaced", "first_field", "rig", "reference_view", "frames", "views", "body", "seeds", "keyframes",
+        "corrections", "keypoints", "settings")
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
@@ -34,7 +34,7 @@ Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class View:
-    """One camera's footage: image files (a pattern) or a movie. Its image of take frame t is number t + offset_frames."""
+    """One camera's footage: image files (a pattern) or a movie. Image 0 of the take is its number `offset_frames`."""
 
     name: str
     images: str | None = None
@@ -70,13 +70,17 @@ class Correction:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Take:
-    """A recording. `folder` holds take.toml and the footage; `frames` is half-open, None means all."""
+    """A recording. `folder` holds take.toml and the footage; `frames` is half-open, None means all.
+
+    A frame of the take is an instant: an image, or one of its two fields where `interlaced` is "both".
+    """
 
     folder: Path
-    fps: float
+    fps: float  # instants per second
     views: tuple[View, ...]
     rig_path: Path
     interlaced: str = "none"
+    first_field: str = "odd"  # of "both"
     reference_view: str = ""
     frames: tuple[int, int] | None = None
     body_model: str | None = None
@@ -89,9 +93,21 @@ class Take:
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
-    def rows(self) -> RowGrid:
-        """The rows of the frame that are measured."""
-        return row_grid(self.interlaced)
+    def instants(self) -> Instants:
+        """Where in the images the take's frames are."""
+        return instants(self.interlaced, self.first_field)
+
+    def rows_at(self, frame: int) -> RowGrid:
+        """The rows of the image that show a frame of the take."""
+        return self.instants.rows(frame)
+
+    def single(self) -> "Take":
+        """This take with one frame an image: of both fields the first, which then has the clicks of both."""
+        if self.interlaced != BOTH:
+            return self
+        seeds, *keys = (replace(s, frame=self.instants.image(s.frame)) for s in (self.seeds, *self.keyframes))
+        frames = None if self.frames is None else (self.frames[0] // 2, (self.frames[1] + 1) // 2)
+        return replace(self, fps=self.fps / 2, interlaced=self.first_field, frames=frames, seeds=seeds, keyframes=tuple(keys))
 
     @property
     def reference(self) -> int:
@@ -107,7 +123,16 @@ class Footage:
     rig: Rig
     sequences: tuple[Sequence, ...]
     frames: range
-    late_frames: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
+    late_images: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
+
+    def number(self, view: int, frame: int) -> int:
+        """The number of the image in a view's sequence that shows a frame of the take."""
+        return self.take.instants.image(frame) + self.take.views[view].offset_frames
+
+    def single(self) -> "Footage":
+        """The footage with one frame an image, for what is asked of images and not of instants."""
+        take, per = self.take.single(), self.take.instants.per_image
+        return replace(self, take=take, frames=range(self.frames.start // per, -(-self.frames.stop // per)))
 
     def read(self, frame: int) -> list[np.ndarray]:
         """The grey images (h, w) float32 of all views at one frame of the take.
@@ -115,7 +140,7 @@ class Footage:
         Raises:
             InputError: an image is missing, damaged, or of another size than its camera.
         """
-        images = [s.read(frame + v.offset_frames) for s, v in zip(self.sequences, self.take.views)]
+        images = [s.read(self.number(k, frame)) for k, s in enumerate(self.sequences)]
         for image, camera, view in zip(images, self.rig.cameras, self.take.views):
             if image.shape[::-1] != camera.size_px:
                 raise InputError(
@@ -126,9 +151,7 @@ class Footage:
 
     def files(self, frame: int) -> list[Path]:
         """The files behind one frame, a movie standing for all of its frames."""
-        return [
-            f[frame + v.offset_frames] if len(f := s.files()) > 1 or s.count == 1 else f[0] for s, v in zip(self.sequences, self.take.views)
-        ]
+        return [f[self.number(k, frame)] if len(f := s.files()) > 1 or s.count == 1 else f[0] for k, s in enumerate(self.sequences)]
 
 
 def read_take(folder: Path) -> Take:
@@ -182,8 +205,9 @@ def footage_frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
     Raises:
         InputError: the views have no frames in common, or not those that the take names.
     """
-    counts = [s.count - v.offset_frames for s, v in zip(sequences, take.views)]
-    first = max(0, *(-v.offset_frames for v in take.views))
+    per = take.instants.per_image
+    counts = [per * (s.count - v.offset_frames) for s, v in zip(sequences, take.views)]
+    first = per * max(0, *(-v.offset_frames for v in take.views))
     if take.frames is None:
         if len(set(counts)) > 1:
             said = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
@@ -221,7 +245,7 @@ def _check_inside(footage: Footage, label: str, at: Clicks) -> None:
 
 
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
-    _known(table, KEYS, where)
+    check_keys(table, KEYS, where)
     if table.get("format") != FORMAT or table.get("version") != VERSION:
         says = f"it says {table.get('format')!r} and {table.get('version')!r}"
         raise InputError(f'{where} must say format = "{FORMAT}" and version = {VERSION}; {says}.')
@@ -231,31 +255,35 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     if reference not in names:
         raise InputError(f"`reference_view` of {where} is {reference!r}.{nearest_name(str(reference), names)}")
     interlaced = table.get("interlaced", "none")
-    if interlaced not in INTERLACE:
-        raise InputError(f"`interlaced` of {where} is {interlaced!r}; write one of: {', '.join(INTERLACE)}.")
+    if interlaced not in (*INTERLACE, BOTH):
+        raise InputError(f"`interlaced` of {where} is {interlaced!r}; write one of: {', '.join((*INTERLACE, BOTH))}.")
+    first_field = table.get("first_field", "odd")
+    if first_field not in ("odd", "even") or ("first_field" in table and interlaced != BOTH):
+        raise InputError(f'`first_field` of {where} is {first_field!r}; write "odd" or "even", and only beside interlaced = "both".')
     fps = table.get("fps")
-    if not _is_number(fps) or not 0.1 <= float(fps) <= 10_000:
+    if not is_number(fps) or not 0.1 <= float(fps) <= 10_000:
         raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
-    body = _table(table, "body", where)
-    _known(body, ("model", "locked", "limits"), f"[body] of {where}")
+    body = table_of(table, "body", where)
+    check_keys(body, ("model", "locked", "limits"), f"[body] of {where}")
     if not isinstance(body.get("model", ""), str):
         raise InputError(f"`model` under [body] of {where} is {body['model']!r}; write the name of a body model, such as \"arm.R\".")
     return Take(
         folder=folder,
-        fps=float(fps),
+        fps=float(fps) * instants(interlaced).per_image,
         views=views,
-        rig_path=_inside(folder, table.get("rig", "rig.toml"), where),
+        rig_path=inside(folder, table.get("rig", "rig.toml"), where),
         interlaced=interlaced,
+        first_field=first_field,
         reference_view=reference,
-        frames=_range(table.get("frames"), where),
+        frames=frame_pair(table.get("frames"), where),
         body_model=_model(folder, body.get("model"), where),
         locked=_locked(body.get("locked", []), where),
         limits=_limits(body.get("limits", {}), where),
-        seeds=_seeds(_table(table, "seeds", where), names, where),
-        keyframes=_keyframes(_list_of_tables(table, "keyframes", where), names, where),
-        corrections=tuple(_correction(c, names, where) for c in _list_of_tables(table, "corrections", where)),
-        keypoints=keypoint_sources(_list_of_tables(table, "keypoints", where), names, JOINTS, where),
-        settings=_settings(_table(table, "settings", where), where),
+        seeds=_seeds(table_of(table, "seeds", where), names, where),
+        keyframes=_keyframes(tables_of(table, "keyframes", where), names, where),
+        corrections=tuple(_correction(c, names, where) for c in tables_of(table, "corrections", where)),
+        keypoints=keypoint_sources(tables_of(table, "keypoints", where), names, JOINTS, where),
+        settings=_settings(table_of(table, "settings", where), where),
     )
 
 
@@ -265,7 +293,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
     views = []
     for entry in entries:
         label = f"view {entry.get('name')!r} of {where}"
-        _known(entry, ("name", "images", "movie", "offset_frames"), label)
+        check_keys(entry, ("name", "images", "movie", "offset_frames"), label)
         offset = entry.get("offset_frames", 0)
         if not isinstance(entry.get("name"), str) or not entry["name"] or not isinstance(offset, int):
             raise InputError(f"A {label} needs a name (text); `offset_frames` is a whole number.")
@@ -289,14 +317,14 @@ def _limits(table: Any, where: str) -> Mapping[str, tuple[float, float]]:
     if not isinstance(table, dict):
         raise InputError(f'[body.limits] of {where} must be a table, such as "knee.R flexion" = [0, 140].')
     for name, pair in table.items():
-        if not isinstance(pair, list) or len(pair) != 2 or not all(_is_number(v) for v in pair) or not pair[0] < pair[1]:
+        if not isinstance(pair, list) or len(pair) != 2 or not all(is_number(v) for v in pair) or not pair[0] < pair[1]:
             raise InputError(f"The limits of “{name}” in {where} are {pair!r}; write [lowest, highest] in degrees.")
     return {name: (float(low), float(high)) for name, (low, high) in table.items()}
 
 
 def _keyframes(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: str) -> tuple[Seeds, ...]:
     for table in tables:
-        _known(table, ("frame", "joints"), f"a [[keyframes]] of {where}")
+        check_keys(table, ("frame", "joints"), f"a [[keyframes]] of {where}")
     keyframes = tuple(_seeds(table, views, where) for table in tables)
     if len({k.frame for k in keyframes}) < len(keyframes):
         raise InputError(f"Two [[keyframes]] of {where} are for the same frame; write their joints into one.")
@@ -307,27 +335,27 @@ def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) ->
     kind, view, label = table.get("kind"), table.get("view"), f"a [[corrections]] of {where}"
     if kind not in CORRECTIONS:
         raise InputError(f"`kind` of {label} is {kind!r}; write one of: {', '.join(CORRECTIONS)}.")
-    _known(table, ("kind", "view", *CORRECTIONS[kind]), label)
+    check_keys(table, ("kind", "view", *CORRECTIONS[kind]), label)
     if view not in views:
         raise InputError(f"`view` of {label} is {view!r}.{nearest_name(str(view), views)}")
     frame = table.get("frame")
     if kind == "region":
-        frames, corners = _range(table.get("frames"), label), table.get("polygon")
+        frames, corners = frame_pair(table.get("frames"), label), table.get("polygon")
     else:
         frames, corners = (frame, frame + 1) if isinstance(frame, int) else None, [table.get("xy")]
     wanted = 3 if kind == "region" else 1
-    if not isinstance(corners, list) or len(corners) < wanted or not all(_is_pixel(xy) for xy in corners) or frames is None:
+    if not isinstance(corners, list) or len(corners) < wanted or not all(is_pixel(xy) for xy in corners) or frames is None:
         need = "frames = [first, one after the last] and a polygon of three or more" if kind == "region" else "a frame and xy, one"
         raise InputError(f"The correction “{kind}” of {where} needs {need} pixel coordinates [x, y].")
     return Correction(kind=kind, view=view, frames=range(*frames), xy_px=np.array(corners, dtype=np.float64))
 
 
 def _seeds(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Seeds:
-    _known(table, ("frame", "surface", "joints"), f"[seeds] of {where}")
+    check_keys(table, ("frame", "surface", "joints"), f"[seeds] of {where}")
     frame, surface, joints = table.get("frame", 0), table.get("surface", []), table.get("joints", {})
     if not isinstance(frame, int) or not isinstance(surface, list) or not isinstance(joints, dict):
         raise InputError(f"[seeds] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
-    _known(joints, JOINTS, f"[seeds.joints] of {where}")
+    check_keys(joints, JOINTS, f"[seeds.joints] of {where}")
     return Seeds(
         frame=frame,
         surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),
@@ -338,9 +366,9 @@ def _seeds(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Seed
 def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
     if not isinstance(at, dict):
         raise InputError(f"The {label} must name views and pixels, such as {{ {views[0]} = [312.0, 180.5] }}.")
-    _known(at, views, label)
+    check_keys(at, views, label)
     for view, xy in at.items():
-        if not _is_pixel(xy):
+        if not is_pixel(xy):
             raise InputError(f"The {label} in view {view} is {xy!r}; write two pixel coordinates [x, y].")
     return {view: np.array(xy, dtype=np.float64) for view, xy in at.items()}
 
@@ -352,48 +380,6 @@ def _settings(table: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str,
     return table
 
 
-def _range(value: Any, where: str) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, int) for v in value) or not 0 <= value[0] < value[1]:
-        raise InputError(f"`frames` of {where} is {value!r}; write [first, one after the last].")
-    return value[0], value[1]
-
-
 def _model(folder: Path, name: Any, where: str) -> str | None:
     """The name of one of our models, or the path of the take's own, a .toml file in its folder."""
-    return str(_inside(folder, name, where, "model")) if isinstance(name, str) and name.endswith(".toml") else name
-
-
-def _inside(folder: Path, name: Any, where: str, key: str = "rig") -> Path:
-    if not isinstance(name, str) or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InputError(f"`{key}` of {where} is {name!r}; it must be a file inside the take's folder. Copy it there.")
-    return folder / name
-
-
-def _table(table: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
-    value = table.get(key, {})
-    if not isinstance(value, dict):
-        raise InputError(f"[{key}] of {where} must be a table.")
-    return value
-
-
-def _list_of_tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
-    value = table.get(key, [])
-    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise InputError(f"`{key}` of {where} must be written as [[{key}]] tables.")
-    return value
-
-
-def _known(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
-    for key in table:
-        if key not in known:
-            raise InputError(f"{where} has an unknown key “{key}”.{nearest_name(str(key), known)}")
-
-
-def _is_pixel(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(_is_number(v) for v in value)
-
-
-def _is_number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return str(inside(folder, name, where, "model")) if isinstance(name, str) and name.endswith(".toml") else name

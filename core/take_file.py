@@ -18,7 +18,7 @@ from .take import FORMAT, VERSION, Take, take_of_text
 
 Link = tuple[Path, Path]  # where in the take's folder, and the footage that it stands for
 Table = dict[str, Any]
-DEFAULTS = {"interlaced": "none", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # a file may leave them out
+DEFAULTS = {"interlaced": "none", "first_field": "odd", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # a file may leave them out
 
 
 def new_table(views: Sequence[Table], *, fps: float = 25.0, interlaced: str = "none", model: str | None = None) -> Table:
@@ -65,6 +65,29 @@ def write_table(folder: Path, table: Table) -> bool:
         return False
     store.write_text(path, toml_text(table))
     return True
+
+
+def renumbered(table: Table, per_image: int, before: int) -> Table:
+    """A take's table whose images have `per_image` frames instead of `before`, with every frame's number changed to suit."""
+
+    def first(frame: int) -> int:
+        return frame * per_image // before
+
+    def span(frames: list[int]) -> list[int]:
+        return [first(frames[0]), -(-frames[1] * per_image // before)]
+
+    made = dict(table)
+    if "frames" in made:
+        made["frames"] = span(made["frames"])
+    if "seeds" in made:
+        made["seeds"] = {**made["seeds"], "frame": first(made["seeds"].get("frame", 0))}
+    if "keyframes" in made:
+        by_frame = {first(k["frame"]): {**k, "frame": first(k["frame"])} for k in reversed(made["keyframes"])}
+        made["keyframes"] = [by_frame[frame] for frame in sorted(by_frame)]
+    if "corrections" in made:
+        made["corrections"] = [{**c, **({"frame": first(c["frame"])} if "frame" in c else {"frames": span(c["frames"])})}
+                               for c in made["corrections"]]  # fmt: skip
+    return made
 
 
 def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:

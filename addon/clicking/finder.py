@@ -91,7 +91,7 @@ class Finder:
         nothing: tuple[Any, ...] = (None,) * len(self.cameras)
         try:
             images = self._load(question.frame)
-            rows, asked = self._footage.take.rows, question
+            rows, asked = self._footage.take.rows_at(question.frame), question
             found = propose(images, self.cameras, rows, asked.view, asked.xy_px, self._settings, asked.depth_range_m)
         except InputError as error:
             return Answer(question=question, proposals=nothing, problem=str(error))
@@ -104,7 +104,7 @@ class Finder:
         if frame not in self._images:
             while len(self._images) >= KEPT_FRAMES:
                 self._images.pop(next(iter(self._images)))
-            rows = self._footage.take.rows
+            rows = self._footage.take.rows_at(frame)
             self._images[frame] = [SplineImage(rows.rows(image)) for image in self._footage.read(frame)]
         return self._images[frame]
 

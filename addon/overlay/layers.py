@@ -103,7 +103,8 @@ def look(recording: "Recording", view: str, frame: int, xy_px: np.ndarray, reach
         places = dict(zip(views, points.xy_px[row]))
         if np.isfinite(points.residual_px[row]):
             words.append(f"rays miss by {points.residual_px[row]:.2f} px, correlation {points.correlation[row]:.2f}")
-            begun, end = patch_boxes(points, row, list(recording.cameras.values()), recording.reference, recording.rows, recording.patch_px)
+            begun, end = patch_boxes(points, row, list(recording.cameras.values()), recording.reference,
+                                     recording.rows_at(frame), recording.patch_px)
             start, found = dict(zip(views, begun)), dict(zip(views, end))
         else:
             words.append("its patches are not known: the cache was deleted, run again to see them")

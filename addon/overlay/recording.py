@@ -27,14 +27,14 @@ class Recording:
     out: Path
     cameras: dict[str, Camera]
     reference: int
-    rows: RowGrid
+    rows_at: Callable[[int], RowGrid]
     patch_px: int
     problem: str = ""
     _read: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
 
     def points(self, frame: int) -> FramePoints | None:
         """The points of a frame, if it has any."""
-        return self.kept(("points", frame), lambda: read_points(self.out, frame, list(self.cameras.values()), self.rows))
+        return self.kept(("points", frame), lambda: read_points(self.out, frame, list(self.cameras.values()), self.rows_at(frame)))
 
     def tracks(self) -> TrackHistory | None:
         """All trajectories, if there are any."""
@@ -121,5 +121,5 @@ def _open(scene: bpy.types.Scene) -> Recording:
     footage, run = open_take(read_take(folder)), store.read_json(out / "run.json")
     settings = run.get("settings", {}).get("matching", {}) if isinstance(run, dict) else {}
     cameras = {view.name: camera for view, camera in zip(footage.take.views, footage.rig.cameras)}
-    return Recording(out=out, cameras=cameras, reference=footage.take.reference, rows=footage.take.rows,
+    return Recording(out=out, cameras=cameras, reference=footage.take.reference, rows_at=footage.take.rows_at,
                      patch_px=int(settings.get("patch_px", 13)))

@@ -178,9 +178,10 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
     for view, camera, sequence in zip(take.views, footage.rig.cameras, footage.sequences):
         camera_object = cameras.add_camera(collection, camera)
         camera_object["tricap_interlaced"] = take.interlaced
-        files = sequence.files()
+        made = [folder / clips.FIELDS / view.name for folder in (take.folder, contents.out)]
+        files = clips.shown_files(sequence, take.instants, made[0] if made[0].is_dir() else made[1])
         clip = clips.clip_of_view(scene, view.name, files[0], camera)
-        clip.frame_start = -view.offset_frames
+        clip.frame_start = -take.instants.per_image * view.offset_frames
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
         if camera is reference:

@@ -1,16 +1,19 @@
 """Footage as Blender movie clips, with the camera's lens and distortion, so that undistorted footage fits the ideal camera."""
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 
 import bpy
 
 from ...core.errors import InputError
+from ...core.field_pictures import field_pictures
 from ...core.geometry.camera import Camera
-from ...core.images.sequence import open_sequence
+from ...core.images.fields import Instants
+from ...core.images.sequence import Sequence, open_sequence
 from .. import folders
 from . import axes
 
+FIELDS, FIELDS_KEY = "fields", "tricap_fields"  # folder of pictures of fields; of a clip that shows them, which field is first
 CLIP_KEY = "tricap_clip"  # custom property of a camera: the clip behind it
 
 
@@ -47,13 +50,27 @@ def clip_of_view(scene: bpy.types.Scene, name: str, first_file: Path, camera: Ca
     return own
 
 
-def first_file(folder: Path, images: str | None, movie: str | None, view: str) -> Path:
-    """The file by which Blender opens the footage of a view of the take in `folder`.
+def first_file(folder: Path, images: str | None, movie: str | None, view: str, fields: Instants) -> Path:
+    """The file by which Blender opens the footage of a view of the take in `folder`; of both fields the first one's picture.
 
     Raises:
-        InputError: the footage is missing.
+        InputError: the footage is missing, or there is no room for pictures of its fields.
     """
-    return open_sequence(folder, images=images, movie=movie, view=view).files()[0]
+    return shown_files(open_sequence(folder, images=images, movie=movie, view=view), fields, folder / FIELDS / view)[0]
+
+
+def shown_files(sequence: Sequence, fields: Instants, folder: Path) -> tuple[Path, ...]:
+    """The files that Blender shows of a sequence: its own, or pictures of both fields, made in `folder` if they are not there.
+
+    Raises:
+        InputError: the pictures cannot be made.
+    """
+    return sequence.files() if fields.per_image == 1 else field_pictures(sequence, fields, folder)
+
+
+def frames_per_image(clip: bpy.types.MovieClip) -> int:
+    """How many frames of a clip an image of the footage has: two where it shows fields."""
+    return 2 if clip.get(FIELDS_KEY) else 1
 
 
 def set_lens(clip: bpy.types.MovieClip, camera: Camera) -> None:
@@ -70,7 +87,7 @@ def set_lens(clip: bpy.types.MovieClip, camera: Camera) -> None:
         setattr(tracking, name, value)
 
 
-def clip_faults(clip: bpy.types.MovieClip, camera: Camera, files: Sequence[Path], label: str) -> list[str]:
+def clip_faults(clip: bpy.types.MovieClip, camera: Camera, files: Collection[Path], label: str) -> list[str]:
     """What keeps Blender from showing the footage as Tricap reads it, in sentences."""
     faults = []
     if tuple(clip.size) != camera.size_px:

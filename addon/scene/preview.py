@@ -43,7 +43,7 @@ def preview(contents: Contents, path: Path, frame: int | None = None) -> None:
     with _body_alone(scene):
         picture = _rendered(scene)
     reference = footage.take.reference
-    grey = footage.sequences[reference].read(frame + footage.take.views[reference].offset_frames)
+    grey = footage.sequences[reference].read(footage.number(reference, frame))
     behind = np.repeat(undistorted(grey, footage.rig.cameras[reference])[..., None], 3, axis=2)
     alone = _over(np.full(picture.shape[:2] + (3,), float(BACKGROUND)), picture, 1.0)
     over = _over(cv2.resize(behind, picture.shape[1::-1]), picture, OPACITY)

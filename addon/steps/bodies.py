@@ -7,6 +7,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import InputError
+from ...core.images.fields import BOTH
 from ...core.stages import CONCERNS
 from .. import project, properties, seeds
 from ..calibrate.panel import draw_calibrate
@@ -51,6 +52,8 @@ def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
     _mend_footage(layout, context, is_next)
     layout.prop(props, "fps")
     layout.prop(props, "interlaced")
+    if props.interlaced == BOTH:
+        layout.prop(props, "first_field")
     layout.prop(props, "all_frames")
     if not props.all_frames:
         pair = layout.column(align=True)
@@ -74,7 +77,7 @@ def _begin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 def _mend_footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
     """Buttons for what can have happened to the footage."""
     state, scene = watch.look(context.scene).states["footage"], context.scene
-    if any(view.clip is None for view in scene.tricap.views):
+    if any(view.clip is None for view in scene.tricap.views) or project.shows_other_lines(scene):
         primary(layout, "tricap.reload_footage", True, icon="FILE_REFRESH")
     elif "changed outside" in state.why:
         row = layout.row()

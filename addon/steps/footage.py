@@ -8,10 +8,10 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.footage_files import find_footage, name_views
+from ...core.images.fields import BOTH
 from ...core.images.sequence import open_sequence
 from ...core.take_file import footage_entry, link_footage, read_table, unlink_footage
 from .. import folders, project
-from ..scene import clips
 from . import watch
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -77,7 +77,7 @@ class AddFootage(Told, bpy.types.Operator):
         linked = link_footage(folder, [link for _, link in made])
         entries = [*old, *(entry for entry, _ in made)]
         try:
-            files = {e["name"]: clips.first_file(folder, e.get("images"), e.get("movie"), e["name"]) for e in entries}
+            files = project.files_of(folder, entries, project.fields_of(scene))
             project.show_views(scene, entries, files)
         except InputError:
             unlink_footage(linked)
@@ -186,7 +186,7 @@ class RemoveView(bpy.types.Operator):
 
 
 class ReloadFootage(Told, bpy.types.Operator):
-    """Make the movie clips again that were deleted, with the clicks that take.toml has of them"""
+    """Make the movie clips again that were deleted, with the clicks that take.toml has of them, or show both fields one by one"""
 
     bl_idname = "tricap.reload_footage"
     bl_label = "Reload Footage"
@@ -195,9 +195,12 @@ class ReloadFootage(Told, bpy.types.Operator):
     def do(self, context: bpy.types.Context) -> str:
         """Make them again."""
         scene, folder = context.scene, project.existing_folder(context.scene)
+        if project.shows_other_lines(scene):
+            project.show_lines(scene)
+            return "The footage is shown " + ("field by field." if scene.tricap.interlaced == BOTH else "image by image.")
         lost = [view.name for view in scene.tricap.views if view.clip is None]
         entries = [project.view_entry(view) for view in scene.tricap.views]
-        files = {e["name"]: clips.first_file(folder, e.get("images"), e.get("movie"), e["name"]) for e in entries}
+        files = project.files_of(folder, entries, project.fields_of(scene))
         project.show_views(scene, entries, files)
         project.show_clicks(scene, read_table(folder), lost)
         return f"{len(lost)} clips were made again."
@@ -246,7 +249,8 @@ def _spans(scene: bpy.types.Scene, folder: Path) -> list[tuple[int, int]]:
     def count(view: Any) -> int:
         return open_sequence(folder, images=view.images or None, movie=view.movie or None, view=view.name).count
 
-    return [(-view.offset_frames, count(view) - view.offset_frames) for view in scene.tricap.views]
+    per = project.fields_of(scene).per_image
+    return [(-per * view.offset_frames, per * (count(view) - view.offset_frames)) for view in scene.tricap.views]
 
 
 CLASSES = (AddFootage, OpenTake, ReloadTake, KeepMine, MoveView, RemoveView, ReloadFootage, CommonFrames)

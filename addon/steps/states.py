@@ -116,6 +116,8 @@ def _footage(scene: bpy.types.Scene, found: _Found) -> State:
         raise InputError("take.toml was changed outside this file: reload it, or keep what is here.")
     if len(props.views) < 2:
         return State(word="ready", why="Add the footage of a second camera.")
+    if project.shows_other_lines(scene):
+        raise InputError(project.OTHER_LINES)
     take = project.take(scene)
     found.sequences = tuple(_sequence(folder, view) for view in take.views)
     spans = [(-view.offset_frames, s.count - view.offset_frames) for view, s in zip(take.views, found.sequences)]

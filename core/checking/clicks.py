@@ -41,7 +41,7 @@ def _resting(footage: Footage) -> list[int]:
     other = max(footage.frames, key=lambda f: abs(f - frame))
     if not clicked or other == frame:
         return []
-    here, later = (take.rows.rows(footage.read(f)[take.reference]) for f in (frame, other))
-    xy = take.rows.from_frame(np.array([take.seeds.surface[i][name] for i in clicked]))
+    here, later = (take.rows_at(f).rows(footage.read(f)[take.reference]) for f in (frame, other))
+    xy = take.rows_at(frame).from_frame(np.array([take.seeds.surface[i][name] for i in clicked]))
     xy = np.clip(xy, 0, np.array(here.shape[::-1]) - 1)
     return [i for i, same in zip(clicked, unchanged(here, later, xy)) if same]

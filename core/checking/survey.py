@@ -42,7 +42,7 @@ def survey(footage: Footage, monitor: Monitor) -> Survey:
     before: list[np.ndarray] = []
     for t, frame in enumerate(frames):
         monitor.step("looking at the footage", t, len(frames))
-        pictures = [footage.take.rows.rows(image) for image in footage.read(frame)]
+        pictures = [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
         small = [_reduced(picture) for picture in pictures]
         for k, picture in enumerate(pictures):
             energy = float(np.abs(small[k] - before[k]).mean()) if before else np.nan

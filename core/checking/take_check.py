@@ -42,6 +42,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     Raises:
         InputError: an image cannot be read.
     """
+    footage = footage.single()
     names = tuple(v.name for v in footage.take.views)
     matching = from_table(MatchingSettings, footage.take.settings.get("matching", {}), "[matching]")
     film = Film(footage, survey(footage, monitor))
@@ -97,8 +98,8 @@ def first_look(footage: Footage, frame: int) -> list[Finding]:
     Raises:
         InputError: an image cannot be read.
     """
-    names = tuple(v.name for v in footage.take.views)
-    pairs = match_views([[footage.take.rows.rows(image) for image in footage.read(frame)]], footage.take.rows)
+    names, rows = tuple(v.name for v in footage.take.views), footage.take.rows_at(frame)
+    pairs = match_views([[rows.rows(image) for image in footage.read(frame)]], rows)
     return same_views(pairs, names) or rig_findings(pairs, footage.rig.cameras, names)
 
 

@@ -40,8 +40,8 @@ def texture_findings(footage: Footage, patch_px: int, max_sigma_px: float) -> tu
     """Limbs between clicked joints, or what moves, with too little texture in the reference view; and the median bound [px] of each."""
     take, ref = footage.take, footage.take.reference
     frame = take.seeds.frame if take.seeds.frame in footage.frames else footage.frames.start
-    grey = take.rows.rows(footage.read(frame)[ref])
-    bound = bound_px(grey, patch_px, take.rows.step)
+    grey = take.rows_at(frame).rows(footage.read(frame)[ref])
+    bound = bound_px(grey, patch_px, take.rows_at(frame).step)
     view = take.views[ref].name
     if not np.isfinite(bound).any() or np.mean(bound < max_sigma_px) < 1e-3:
         return [
@@ -79,7 +79,7 @@ def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
     t = np.linspace(*ALONG, SAMPLES)[:, None]
     bones = read_model(take.body_model).skeleton.bones
     return {
-        b.name: take.rows.from_frame(clicked[b.head_joint] * (1 - t) + clicked[b.tail_joint] * t)
+        b.name: take.rows_at(take.seeds.frame).from_frame(clicked[b.head_joint] * (1 - t) + clicked[b.tail_joint] * t)
         for b in bones
         if b.head_joint in clicked and b.tail_joint in clicked
     }
@@ -88,7 +88,7 @@ def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
 def _moving(footage: Footage, grey: np.ndarray, frame: int) -> Mapping[str, np.ndarray]:
     """Pixels (n, 2) of what moved until the frame furthest in time."""
     other = max(footage.frames, key=lambda f: abs(f - frame))
-    later = footage.take.rows.rows(footage.read(other)[footage.take.reference])
+    later = footage.take.rows_at(other).rows(footage.read(other)[footage.take.reference])
     difference = cv2.blur(np.abs((grey - np.median(grey)) - (later - np.median(later))), (9, 9))
     y, x = np.nonzero(difference > MOVES * max(1.0, noise_sigma(grey)))
     return {"what moves": np.stack([x, y], axis=1)[:: max(1, len(x) // 5000)]} if len(x) > 50 else {}

@@ -76,7 +76,7 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
     """The offset of every view against the reference view, in the order of the views; about a second per view.
 
     Views that have nothing in common with the reference are compared with a view that has. `offset_frames` of take.toml is in force: what
-    is found comes on top of it.
+    is found comes on top of it. Of interlaced footage one field is looked at (`Footage.single`).
 
     Raises:
         InputError: see `Footage.read`.
@@ -107,7 +107,7 @@ def in_step(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str, dict
     Raises:
         InputError: a view is late by more than can be interpolated.
     """
-    offsets = estimate_offsets(footage, monitor)
+    offsets = estimate_offsets(footage.single(), monitor)
     for o in offsets:
         if o.method in ("rays", "energy") and abs(o.late_frames) > LARGEST:
             raise InputError(
@@ -116,7 +116,7 @@ def in_step(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str, dict
             )
     late = tuple(round(o.late_frames, 4) if o.significant else 0.0 for o in offsets)
     sequences = tuple(Recent(s) if t else s for s, t in zip(footage.sequences, late))
-    return replace(footage, sequences=sequences, late_frames=late), {o.view: o.to_table() for o in offsets}
+    return replace(footage, sequences=sequences, late_images=late), {o.view: o.to_table() for o in offsets}
 
 
 class Film:
@@ -124,18 +124,18 @@ class Film:
 
     def __init__(self, footage: Footage, seen: Survey) -> None:
         self.footage, self.seen = footage, seen
-        self.rows, self.cameras = footage.take.rows, footage.rig.cameras
+        self.rows, self.cameras = footage.take.rows_at(0), footage.rig.cameras
         self._pictures: dict[tuple[int, int], np.ndarray] = {}
         self._features: dict[tuple[int, int], Features] = {}
 
     def holds(self, k: int, frame: int) -> bool:
         """Whether view k has an image of that frame of the take."""
-        return 0 <= frame + self.footage.take.views[k].offset_frames < self.footage.sequences[k].count
+        return 0 <= self.footage.number(k, frame) < self.footage.sequences[k].count
 
     def picture(self, k: int, frame: int) -> np.ndarray:
         """The measured rows (h, w) uint8 of view k."""
         if (k, frame) not in self._pictures:
-            image = self.footage.sequences[k].read(frame + self.footage.take.views[k].offset_frames)
+            image = self.footage.sequences[k].read(self.footage.number(k, frame))
             self._pictures[k, frame] = eight_bits(self.rows.rows(image))
         return self._pictures[k, frame]
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 INTERLACE = ("none", "odd", "even")
+BOTH = "both"  # fields, one after the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +31,50 @@ class RowGrid:
         """Coordinates (…, 2) in the rows' image of full-frame pixels (…, 2)."""
         return (np.asarray(xy, dtype=np.float64) - (0.0, self.offset)) / (1.0, self.step)
 
+    def whole(self, frame: np.ndarray) -> np.ndarray:
+        """The frame (h, w) with the rows that this grid does not have, of another instant, interpolated."""
+        if self.step == 1:
+            return frame
+        filled = frame.copy()
+        other = np.arange(1 - self.offset, len(frame), 2)
+        above, below = np.clip(other - 1, self.offset, None), other + 1
+        below = np.where(below < len(frame), below, above)
+        filled[other] = 0.5 * (frame[above] + frame[below])
+        return filled
+
     def covariance_to_frame(self, covariance: np.ndarray) -> np.ndarray:
         """Covariances (…, 2, 2) of coordinates in the rows' image, as of full-frame pixels."""
         scale = np.array([1.0, self.step])
         return covariance * scale[:, None] * scale[None, :]
+
+
+@dataclass(frozen=True, slots=True)
+class Instants:
+    """Which image, and which of its rows, show instant n of a recording: one instant an image, or two where both fields are measured."""
+
+    first: RowGrid = RowGrid()
+    second: RowGrid | None = None
+
+    @property
+    def per_image(self) -> int:
+        """Instants in an image, 1 or 2."""
+        return 1 if self.second is None else 2
+
+    def rows(self, instant: int) -> RowGrid:
+        """The rows that show it."""
+        return self.first if self.second is None or instant % 2 == 0 else self.second
+
+    def image(self, instant: int) -> int:
+        """Number of the image that shows it."""
+        return instant // self.per_image
+
+
+def instants(interlaced: str, first_field: str = "odd") -> Instants:
+    """The instants of footage of which one field is kept, or "both", of which `first_field` was exposed first."""
+    if interlaced != BOTH:
+        return Instants(row_grid(interlaced))
+    odd, even = row_grid("odd"), row_grid("even")
+    return Instants(odd, even) if first_field == "odd" else Instants(even, odd)
 
 
 def row_grid(interlaced: str) -> RowGrid:

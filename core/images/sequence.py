@@ -104,7 +104,7 @@ class Movie:
         _check_movie(path)
         self._path = path
         self._capture = _capture(path)
-        self._next = 0
+        self._next, self._last = 0, np.zeros(0)
         self._shown_ms: dict[int, float] = {}
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
         if count < 1:
@@ -128,15 +128,17 @@ class Movie:
         return (self._path,)
 
     def read(self, index: int) -> np.ndarray:
-        """Grey values (h, w) float32 of frame `index`.
+        """Grey values (h, w) float32 of frame `index`; the frame read last need not be decoded again.
 
         Raises:
             InputError: the movie ends before that frame.
         """
+        if index == self._next - 1 and len(self._last):
+            return grey(self._last)
         if index < self._next:
             self._capture.release()
             self._capture, self._next = _capture(self._path), 0
-        image = np.zeros(0)
+        image = self._last = np.zeros(0)
         while self._next <= index:
             ok = self._capture.grab() if self._next < index else None
             if ok is None:
@@ -148,6 +150,7 @@ class Movie:
                 )
             self._shown_ms[self._next] = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
             self._next += 1
+        self._last = image
         return grey(image)
 
     @property

@@ -26,7 +26,7 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
-from ..images.fields import row_grid
+from ..images.fields import BOTH, INTERLACE, instants
 from ..progress import Monitor
 from ..settings import knob
 from .figure import Part, arm_parts, joined, torso_parts, wall
@@ -54,7 +54,7 @@ class ArmTakeSettings:
     frames: int = knob(16, "Frames of the recording.", low=2, high=1000)
     fps: float = knob(25.0, "Frame rate.", unit="1/s", low=1.0, high=1000.0)
     width_px: int = knob(768, "Width of the pictures; the height is three quarters of it.", unit="px", low=96, high=4096)
-    interlaced: str = knob("odd", "Lines that take.toml keeps; the others are exposed half a frame later.", choices=("none", "odd", "even"))
+    interlaced: str = knob("odd", "Lines that take.toml keeps; the others are exposed half a frame later.", choices=(*INTERLACE, BOTH))
     noise: float = knob(1.0, "Multiplies the sensors' noise.", low=0.0, high=20.0)
     click_error_px: float = knob(4.0, "Clicks on the joints are wrong by up to this much, in x and in y.", unit="px", low=0.0, high=100.0)
     late_frames: float = knob(0.0, "View R is exposed this much later than the others.", unit="frames", low=-100.0, high=100.0)
@@ -95,7 +95,7 @@ def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor
     visible = []
     for frame in range(settings.frames):
         visible.append(_film_frame(folder, studio, frame, monitor))
-    store.write_bytes(folder / "truth.npz", _truth(studio, np.array(visible)))
+    store.write_bytes(folder / "truth.npz", _truth(studio, np.concatenate(visible)))
     store.write_text(folder / "take.toml", _take_toml(studio))
     monitor.step(STAGE, 1, 1)
 
@@ -172,18 +172,19 @@ def _clear(folder: Path) -> None:
 
 
 def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> np.ndarray:
-    """Write one frame of all views; return which vertices (V,) all of them see in the rows that are kept."""
-    settings, kept = studio.settings, row_grid(studio.settings.interlaced)
-    instants = [frame / settings.fps] + ([(frame + 0.5) / settings.fps] if kept.step == 2 else [])
-    bodies = [studio.body(time) for time in instants]
-    late = [studio.body(time + settings.late_frames / settings.fps) for time in instants] if settings.late_frames else bodies
-    scene = joined(bodies[0])
-    seen = np.ones(len(scene.vertices_m), dtype=bool)
+    """Write one image of all views; return which vertices (V,) all of them see, a row for each instant that is kept."""
+    settings, kept = studio.settings, instants(studio.settings.interlaced).first
+    moments = [frame / settings.fps] + ([(frame + 0.5) / settings.fps] if kept.step == 2 else [])
+    bodies = [studio.body(time) for time in moments]
+    late = [studio.body(time + settings.late_frames / settings.fps) for time in moments] if settings.late_frames else bodies
+    scenes = [joined(body) for body in bodies[: instants(settings.interlaced).per_image]]
+    seen = np.ones((len(scenes), len(scenes[0].vertices_m)), dtype=bool)
     for i, camera in enumerate(studio.rig.cameras):
         monitor.step(STAGE, frame * len(VIEWS) + i, settings.frames * len(VIEWS))
         sensor = SENSORS[camera.name]
         layers = [paint(camera, parts, studio.noise, studio.backdrops[i]) for parts in (late if camera.name == LATE else bodies)]
-        seen &= seen_vertices(camera, scene.vertices_m, scene.normals, layers[0])
+        for row, scene, layer in zip(seen, scenes, layers):
+            row &= seen_vertices(camera, scene.vertices_m, scene.normals, layer)
         picture = expose(layers[0], sensor)
         if kept.step == 2:
             picture[1 - kept.offset::2] = expose(layers[1], sensor)[1 - kept.offset::2]
@@ -197,7 +198,8 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
 
 
 def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
-    shape, time = studio.shape, np.arange(studio.settings.frames) / studio.settings.fps
+    shape, per = studio.shape, instants(studio.settings.interlaced).per_image
+    time = np.arange(per * studio.settings.frames) / (per * studio.settings.fps)
     motion, bodies = arm_motion(time), [studio.body(moment) for moment in time]
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     textured = np.concatenate([np.full(len(p.vertices_m), p.material.textured) for p in bodies[0]])

@@ -48,12 +48,12 @@ def track_key_points(
     Raises:
         InputError: a point is clicked in fewer than two views.
     """
-    steps = list(_follow(read, frames, _clicked(points, view), view, monitor))
+    steps = list(_follow(read, frames, _clicked(points, view.at(frames[0])), view, monitor))
     T, N, K = len(steps), len(points), len(view.cameras)
     xy, xyz, sigma = np.full((T, N, K, 2), np.nan), np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
     status = np.zeros((T, N), dtype=np.int8)
     for t, s in enumerate(steps):
-        xy[t, s.identity], xyz[t, s.identity] = view.rows.to_frame(s.xy), s.xyz_m
+        xy[t, s.identity], xyz[t, s.identity] = view.instants.rows(s.frame).to_frame(s.xy), s.xyz_m
         sigma[t, s.identity] = np.sqrt(np.trace(s.covariance_m2, axis1=1, axis2=2))
         status[t, s.identity], status[t, s.ended] = TrackStatus.MEASURED, s.reason
     return KeyPoints(frames=np.array(frames), xy_px=xy, xyz_m=xyz, sigma_m=sigma, status=status)
@@ -78,6 +78,7 @@ def _follow(
 ) -> Iterator[TrackedFrame]:
     grey = list(read(frames[0]))
     spline = [SplineImage(g) for g in grey]
+    view = view.at(frames[0])
     loose = replace(view, limit_px=max(view.limit_px, LARGEST_MISFIT_PX))
     current, before = _meeting(_first(grey, spline, clicks, frames[0], loose), view), None
     ref = view.reference
@@ -89,7 +90,7 @@ def _follow(
         next_grey = list(read(frame))
         next_spline = [SplineImage(g) for g in next_grey]
         pair = FramePair(grey=grey, spline=spline, next_grey=next_grey, next_spline=next_spline)
-        tracked = _meeting(track_step(loose, before, current, templates, pair, frame, monitor), view)
+        tracked = _meeting(track_step(loose, before, current, templates, pair, frame, monitor), view.at(frame))
         fresh = (tracked.key_shape == np.eye(2)).all(axis=(1, 2))
         new = cut_tiles(next_spline[ref], tracked.identity[fresh], tracked.xy[fresh, ref], *how)
         templates, before, current = templates.only(tracked.identity).with_tiles(new, *how), current, tracked

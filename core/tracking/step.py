@@ -24,7 +24,7 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.small_matrices import invert_spd
-from ..images.fields import RowGrid
+from ..images.fields import Instants, RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches, patch_offsets
 from ..progress import Monitor
@@ -49,10 +49,20 @@ class TrackingView:
 
     cameras: tuple[Camera, ...]
     reference: int
-    rows: RowGrid
+    instants: Instants
     matching: MatchingSettings
     tracking: TrackingSettings
     limit_px: float  # by which rays may miss
+    frame: int = 0  # that is looked at
+
+    def at(self, frame: int) -> "TrackingView":
+        """The same, to look at this frame."""
+        return replace(self, frame=frame)
+
+    @property
+    def rows(self) -> RowGrid:
+        """The rows of that frame."""
+        return self.instants.rows(self.frame)
 
     @property
     def half_patch(self) -> tuple[int, int]:
@@ -84,7 +94,11 @@ def track_step(
     frame: int,
     monitor: Monitor,
 ) -> TrackedFrame:
-    """Follow all points of `current` to `frame`, the second of the two frames of `images`; frames between may be missing."""
+    """Follow all points of `current` to `frame`, the second of the two frames of `images`; frames between may be missing.
+
+    Points are in rows' pixels of their own frame: a patch of one field is found in the other where its place in the full frame says.
+    """
+    view = view.at(frame)
     n = len(current.identity)
     predicted, known = predict(current, before, frame, view.tracking.neighbourhood_m)
     reason = np.full(n, TrackStatus.NOT_FOUND, dtype=np.int8)

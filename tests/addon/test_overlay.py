@@ -57,7 +57,7 @@ def run(scene: Any) -> Any:
 
 def test_the_run_is_read_once_and_again_when_it_changed(run: Any, scene: Any, small_run: SmallRun) -> None:
     recording = module("overlay.recording")
-    assert list(run.cameras) == ["L", "C", "R"] and run.reference == 1 and run.rows.step == 2
+    assert list(run.cameras) == ["L", "C", "R"] and run.reference == 1 and run.rows_at(0).step == 2
     assert run.points(3) is run.points(3) and recording.current(scene) is run
     write_frame_table(small_run.out / "frames.csv", run.table())
     assert recording.current(scene) is not run

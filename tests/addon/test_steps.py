@@ -422,3 +422,24 @@ def test_the_script_in_the_readme_runs(blender: ModuleType, words: Words, sample
     exec(script.replace('"/films', f'"{tmp_path}/films').replace('"/takes', f'"{tmp_path}/takes'), {})
     assert words().startswith("done done done done done empty")
     assert (tmp_path / "takes" / "jump_out" / "trajectories.npz").exists()
+
+
+def test_both_fields_are_shown_one_by_one(blender: ModuleType, why: Callable[[str], str], sample: Path, tmp_path: Path) -> None:
+    """Clips get twice the frames, clicks and frames other numbers; and back again."""
+    scene = opened(blender, sample, tmp_path)
+    project = importlib.import_module(f"{NAME}.project")
+    before, folder = read_table(tmp_path / "take"), tmp_path / "take"
+    scene.tricap.interlaced = "both"
+    assert "press Reload Footage" in why("footage")
+    with pytest.raises(project.InputError, match="press Reload Footage"):
+        project.write(scene)
+    assert read_table(folder) == before and blender.ops.tricap.reload_footage() == {"FINISHED"}
+    clip = scene.tricap.views["C"].clip
+    assert clip.frame_duration == 6 and tuple(clip.size) == (512, 384) and why("footage") == "3 views, 6 frames of 512×384 pixels."
+    said = read_table(folder)
+    assert said["interlaced"] == "both" and said["seeds"]["joints"] == before["seeds"]["joints"] and said["fps"] == before["fps"]
+    scene.tricap.views["C"].offset_frames = 1
+    assert clip.frame_start == -2
+    scene.tricap.views["C"].offset_frames, scene.tricap.interlaced = 0, "odd"
+    assert blender.ops.tricap.reload_footage() == {"FINISHED"} and scene.tricap.views["C"].clip.frame_duration == 3
+    assert read_table(folder) == {**before, "interlaced": "odd", "settings": QUICK}

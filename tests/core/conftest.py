@@ -102,10 +102,12 @@ def render(camera: Camera, bodies: Sequence[Body], *, noise: float = 0.0, seed: 
 def write_take(
     folder: Path, rig: Rig, frames: Sequence[Sequence[Body]], *, noise: float = 1.0, more: str = "", interlaced: str = "none"
 ) -> Path:
-    """A take whose frame t shows the bodies frames[t]; gives its folder."""
-    for i, bodies in enumerate(frames):
+    """A take whose frame t shows the bodies frames[t]; gives its folder. Of "both" fields the odd lines are exposed first."""
+    per = 2 if interlaced == "both" else 1
+    for i in range(len(frames) // per):
         for camera in rig.cameras:
-            picture = np.clip(np.rint(render(camera, bodies, noise=noise, seed=i)), 0, 255).astype(np.uint8)
+            taken = [render(camera, frames[per * i + n], noise=noise, seed=per * i + n) for n in range(per)]
+            picture = np.clip(np.rint(np.where(np.arange(len(taken[0]))[:, None] % 2, taken[-1], taken[0])), 0, 255).astype(np.uint8)
             path = folder / camera.name / f"{i:04d}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())

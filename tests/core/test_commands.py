@@ -243,11 +243,13 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
     writer.release()
     views = [f"L={take / 'L'}", f"C={tmp_path / 'centre é 1.avi'}", f"R={take / 'R'}"]
     made = tmp_path / "new é"
-    argv = ["new", str(made), "--views", *views, "--interlaced", "odd", "--fps", "50", "--rig", str(take / "rig.toml"), "--model", "arm.R"]
+    argv = ["new", str(made), "--views", *views, "--interlaced", "both", "--fps", "25", "--rig", str(take / "rig.toml"), "--model", "arm.R"]
     assert commands.main(argv) == 0
     opened = open_take(read_take(made))
-    assert opened.frames == range(4) and opened.take.fps == 50 and opened.take.interlaced == "odd" and opened.take.body_model == "arm.R"
-    assert len(opened.read(2)) == 3 and "a take of 3 views" in capfd.readouterr().out
+    assert opened.frames == range(8) and opened.take.fps == 50 and opened.take.interlaced == "both" and opened.take.body_model == "arm.R"
+    decoder = opened.sequences[1]._capture  # type: ignore[attr-defined]
+    assert len(opened.read(2)) == len(opened.read(3)) == 3  # the second field's image need not be decoded again
+    assert opened.sequences[1]._capture is decoder and "a take of 3 views" in capfd.readouterr().out
     assert commands.main(argv) == 2
     assert "is a take already" in capfd.readouterr().err
 

@@ -1,5 +1,6 @@
 """A view that is half a frame late, put to the moment of the others: pictures, clouds and tracks as good as those of a synchronous take."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,20 @@ def test_a_view_late_by_frames_is_told_to_be_shifted_first(tmp_path: Path) -> No
     make_arm_take(tmp_path / "take", ArmTakeSettings(width_px=320, frames=8, interlaced="none", late_frames=1.3))
     with pytest.raises(InputError, match=r"View R is .1.[23]\d frames late, too much to interpolate; add -1"):
         in_step(open_take(read_take(tmp_path / "take")), Monitor())
+
+
+@pytest.mark.parametrize(("interlaced", "second"), [("odd", 0), ("even", 1)])
+def test_each_field_is_put_to_its_moment_as_if_it_were_alone(tmp_path: Path, interlaced: str, second: int) -> None:
+    """What a late view showed before and after is asked of the same lines of the images before and after."""
+    make_arm_take(tmp_path / "take", ArmTakeSettings(width_px=192, frames=3, interlaced="both", late_frames=0.4))
+    both = open_take(read_take(tmp_path / "take"))
+    alone = open_take(replace(both.take, interlaced=interlaced, fps=25.0))
+    late = (0.0, 0.0, 0.4)
+    for image in range(3):
+        rows = measured_rows(replace(both, late_images=late), 2 * image + second)
+        expected = measured_rows(replace(alone, late_images=late), image)
+        assert all(np.array_equal(a, b) for a, b in zip(rows, expected))
+    assert not np.array_equal(rows[2], measured_rows(both, 4 + second)[2])
 
 
 @pytest.mark.slow

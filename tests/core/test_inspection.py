@@ -24,7 +24,7 @@ def run(plane_take: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Foo
 
 def test_points_lie_where_they_were_matched(run: tuple[Footage, Path]) -> None:
     footage, out = run
-    cameras, rows = footage.rig.cameras, footage.take.rows
+    cameras, rows = footage.rig.cameras, footage.take.rows_at(0)
     points = read_points(out, 2, cameras, rows)
     assert points is not None and len(points.xyz_m) > 300 and np.isfinite(points.residual_px).all()
     apart = np.linalg.norm(points.xy_px - np.stack([c.project(points.xyz_m) for c in cameras], axis=1), axis=2)
@@ -34,7 +34,7 @@ def test_points_lie_where_they_were_matched(run: tuple[Footage, Path]) -> None:
 
 def test_patches_show_the_same_texture_in_all_views(run: tuple[Footage, Path]) -> None:
     footage, out = run
-    cameras, rows = footage.rig.cameras, footage.take.rows
+    cameras, rows = footage.rig.cameras, footage.take.rows_at(0)
     points, images = read_points(out, 1, cameras, rows), footage.read(1)
     assert points is not None
     likeness = {"start": [], "found": []}  # type: ignore[var-annotated]
@@ -56,7 +56,7 @@ def _cut(image: np.ndarray, box: np.ndarray) -> np.ndarray:
 def test_without_the_cache_the_cloud_is_shown_alone(run: tuple[Footage, Path], tmp_path: Path) -> None:
     footage, out = run
     shutil.copytree(out / "clouds", tmp_path / "clouds")
-    cameras, rows = footage.rig.cameras, footage.take.rows
+    cameras, rows = footage.rig.cameras, footage.take.rows_at(0)
     points = read_points(tmp_path, 1, cameras, rows)
     assert points is not None and np.isnan(points.residual_px).all() and np.isnan(patch_boxes(points, 0, cameras, 1, rows, 13)[1]).all()
     assert np.allclose(points.xy_px[:, 1], cameras[1].project(points.xyz_m))

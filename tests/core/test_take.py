@@ -48,11 +48,27 @@ def test_everything_that_it_says(tmp_path: Path) -> None:
     assert (take.fps, take.interlaced, take.reference_view, take.reference, take.frames) == (30.0, "even", "L", 0, (2, 9))
     assert [(v.name, v.images, v.movie, v.offset_frames) for v in take.views] == [(v, f"{v}/*.png", None, 0) for v in "LCR"]
     assert take.rig_path == take.folder / "rig.toml" and take.body_model == "arm.R"
-    assert (take.rows.step, take.rows.offset) == (2, 1)
+    assert (take.rows_at(3).step, take.rows_at(3).offset) == (2, 1)
     assert take.seeds.frame == 3 and take.seeds.surface[0]["C"].tolist() == [3, 4.5]
     assert list(take.seeds.joints) == ["elbow.R"] and take.seeds.joints["elbow.R"]["R"].tolist() == [7, 8]
     assert take.settings == {"matching": {"patch_px": 17}}
     assert read_take(tmp_path / "take.toml").folder == take.folder
+
+
+def test_both_fields(footage: Path) -> None:
+    """Five images of 25 a second are ten frames of 50 a second; offsets count images, all other numbers frames."""
+    late = VIEWS.replace('"R/*.png"', '"R/*.png"\noffset_frames = 1')
+    take = rewrite(footage, dict(interlaced='"both"', first_field='"even"', frames="[3, 8]"), late, "[seeds]\nframe = 5\n")
+    assert (take.fps, take.frames, take.seeds.frame) == (50.0, (3, 8), 5)
+    assert [take.rows_at(n).offset for n in range(4)] == [1, 0, 1, 0]
+    opened = open_take(take)
+    assert [opened.number(0, n) for n in range(3, 8)] == [1, 2, 2, 3, 3] and [opened.number(2, n) for n in (3, 4)] == [2, 3]
+    assert [path.name for path in opened.files(7)] == ["0003.png", "0003.png", "0004.png"]
+    single = opened.single()
+    assert (single.take.interlaced, single.take.fps, single.take.seeds.frame, single.frames) == ("even", 25.0, 2, range(1, 4))
+    assert open_take(rewrite(footage, dict(interlaced='"both"'))).frames == range(10)
+    with pytest.raises(InputError, match=r"the footage has frames 0 to 8 \(half-open\)"):
+        open_take(rewrite(footage, dict(interlaced='"both"', frames="[0, 9]"), late))
 
 
 def test_corrections_and_keyframes(tmp_path: Path) -> None:
@@ -99,7 +115,9 @@ FAULTS = {
     "fps 0": (text(dict(fps="0.0")), "`fps` of .* is 0.0"),
     "fps NaN": (text(dict(fps="nan")), "`fps` of .* is nan"),
     "fps infinite": (text(dict(fps="inf")), "`fps` of .* is inf"),
-    "interlaced": (text(dict(interlaced='"od"')), "`interlaced` of .* is 'od'; write one of: none, odd, even"),
+    "interlaced": (text(dict(interlaced='"od"')), "`interlaced` of .* is 'od'; write one of: none, odd, even, both"),
+    "first_field": (text(dict(interlaced='"both"', first_field='"top"')), "`first_field` of .* is 'top'; write \"odd\" or \"even\""),
+    "first_field alone": (text(dict(interlaced='"odd"', first_field='"even"')), "only beside interlaced = \"both\""),
     "interlaced true": (text(dict(interlaced="true")), "`interlaced` of .* is True"),
     "reference view": (text(dict(reference_view='"M"')), "`reference_view` of .* is 'M'"),
     "frames a number": (text(dict(frames="3")), "`frames` of .* is 3; write"),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tricap.core.errors import InputError
-from tricap.core.take_file import new_table, read_table, take_of_table, toml_text, write_table
+from tricap.core.take_file import new_table, read_table, renumbered, take_of_table, toml_text, write_table
 
 FULL = {
     "format": "tricap-take", "version": 1, "fps": 29.97, "interlaced": "odd", "rig": "rig.toml", "reference_view": "C", "frames": [2, 40],
@@ -57,3 +57,15 @@ def test_no_file_is_an_empty_table_and_a_broken_one_is_told(tmp_path: Path) -> N
 def test_a_new_table_is_a_take(tmp_path: Path) -> None:
     take = take_of_table(tmp_path, new_table([{"name": n, "movie": f"{n}.mp4"} for n in "LCR"], fps=50.0, model="arm.R"))
     assert (take.fps, take.reference_view, take.body_model) == (50.0, "C", "arm.R")
+
+
+def test_frames_are_renumbered_when_an_image_becomes_two() -> None:
+    """Whole images to fields and back; where two frames become one, the earlier one's clicks stay."""
+    table = {"frames": [2, 40], "seeds": {"frame": 3}, "keyframes": [{"frame": 4, "joints": {}}, {"frame": 9, "joints": {}}],
+             "corrections": [{"kind": "trajectory", "frame": 5}, {"kind": "region", "frames": [1, 4]}], "fps": 25.0}  # fmt: skip
+    double = renumbered(table, 2, 1)
+    assert double == {"frames": [4, 80], "seeds": {"frame": 6}, "keyframes": [{"frame": 8, "joints": {}}, {"frame": 18, "joints": {}}],
+                      "corrections": [{"kind": "trajectory", "frame": 10}, {"kind": "region", "frames": [2, 8]}], "fps": 25.0}  # fmt: skip
+    assert renumbered(double, 1, 2) == table and renumbered({"fps": 25.0}, 2, 1) == {"fps": 25.0}
+    both = {"keyframes": [{"frame": 4, "joints": {"a": 1}}, {"frame": 5, "joints": {"a": 2}}], "frames": [3, 9]}
+    assert renumbered(both, 1, 2) == {"keyframes": [{"frame": 2, "joints": {"a": 1}}], "frames": [1, 5]}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tricap.core.images.fields import INTERLACE, row_grid
+from tricap.core.images.fields import BOTH, INTERLACE, instants, row_grid
 
 
 @pytest.mark.parametrize("interlaced", INTERLACE)
@@ -44,3 +44,24 @@ def test_covariances_scale_with_the_rows() -> None:
         grid = row_grid(interlaced)
         frame = grid.to_frame(noise)
         assert np.allclose(np.cov(frame.T), grid.covariance_to_frame(np.cov(noise.T)), rtol=1e-9)
+
+
+def test_both_fields_are_two_instants_of_an_image() -> None:
+    frame = np.arange(6.0)[:, None] * np.ones(3)
+    for first, expected in (("odd", [[0, 2, 4], [1, 3, 5]]), ("even", [[1, 3, 5], [0, 2, 4]])):
+        both = instants(BOTH, first)
+        assert [both.rows(n).rows(frame)[:, 0].tolist() for n in range(4)] == expected * 2
+        assert [both.image(n) for n in range(4)] == [0, 0, 1, 1] and both.per_image == 2
+    assert [instants("even").image(n) for n in range(3)] == [0, 1, 2] and instants("even").rows(1) == row_grid("even")
+
+
+@pytest.mark.parametrize("height", [11, 12])
+def test_rows_of_the_other_field_are_interpolated(height: int) -> None:
+    """A ramp is its own interpolation, but where an outermost row has one neighbour only."""
+    ramp = np.arange(float(height))[:, None] * np.ones(4)
+    for interlaced in ("odd", "even"):
+        woven = ramp.copy()
+        grid = row_grid(interlaced)
+        woven[1 - grid.offset :: 2] = 999.0
+        assert np.array_equal(grid.whole(woven)[1:-1], ramp[1:-1]) and np.abs(grid.whole(woven) - ramp).max() <= 1
+    assert row_grid("none").whole(ramp) is ramp

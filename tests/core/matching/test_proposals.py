@@ -70,7 +70,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Footage, Truth, list[
     folder = tmp_path_factory.mktemp("proposals") / "arm"
     make_arm_take(folder, ArmTakeSettings(frames=1))
     footage = open_take(read_take(folder))
-    return footage, read_truth(folder), [SplineImage(footage.take.rows.rows(image)) for image in footage.read(0)]
+    return footage, read_truth(folder), [SplineImage(footage.take.rows_at(0).rows(image)) for image in footage.read(0)]
 
 
 def cloth_points(truth: Truth, count: int) -> np.ndarray:
@@ -82,7 +82,7 @@ def cloth_points(truth: Truth, count: int) -> np.ndarray:
 @pytest.mark.parametrize("view", [0, 1])
 def test_a_clicked_point_of_the_cloth_is_proposed_where_it_is(arm: tuple[Footage, Truth, list[SplineImage]], view: int) -> None:
     footage, truth, images = arm
-    cameras, rows = footage.rig.cameras, footage.take.rows
+    cameras, rows = footage.rig.cameras, footage.take.rows_at(0)
     errors, asked = [], 0
     for X in cloth_points(truth, 40):
         found = propose(images, cameras, rows, view, cameras[view].project(X), MatchingSettings())
@@ -115,7 +115,7 @@ def test_a_joint_is_proposed_below_the_surface_that_is_seen(arm: tuple[Footage, 
     for name, depth in (("RightArm", 0.05), ("RightForeArm", 0.042)):
         joint = truth.joints_m[name][0]
         xy = cameras[1].project(joint)
-        surface = propose(images, cameras, footage.take.rows, 1, xy, MatchingSettings())
+        surface = propose(images, cameras, footage.take.rows_at(0), 1, xy, MatchingSettings())
         inside = below_surface(cameras, 1, xy, surface, depth)
         for k in (0, 2):
             before, after = (np.linalg.norm(p[k].xy_px - cameras[k].project(joint)) for p in (surface, inside))  # type: ignore[union-attr]
@@ -129,4 +129,4 @@ def test_nothing_is_proposed_without_texture(arm: tuple[Footage, Truth, list[Spl
     for X in cloth_points(truth, 5):
         xy = footage.rig.cameras[1].project(X)
         assert propose(flat, footage.rig.cameras, RowGrid(2, 0), 1, xy, MatchingSettings()) == (None, None, None)
-    assert propose(images, footage.rig.cameras, footage.take.rows, 1, np.array([1.0, 1.0]), MatchingSettings()) == (None, None, None)
+    assert propose(images, footage.rig.cameras, footage.take.rows_at(0), 1, np.array([1.0, 1.0]), MatchingSettings()) == (None, None, None)

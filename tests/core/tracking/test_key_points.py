@@ -10,7 +10,7 @@ import pytest
 from tricap.core.commands import main
 from tricap.core.errors import InputError
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.images.fields import RowGrid
+from tricap.core.images.fields import Instants
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
 from tricap.core.tracking.key_points import KeyPoints, distances, track_key_points
@@ -32,7 +32,7 @@ def follow(scenes: Any, off_px: float, views: tuple[str, ...] = ("L", "C", "R"),
         str(n): {c.name: c.project(truth[0, n]) + (c.name != "C") * off_px * random.uniform(-1, 1, 2) for c in seeing} for n in range(5)
     }
     view = TrackingView(
-        cameras=rig.cameras, reference=1, rows=RowGrid(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7
+        cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7
     )
     read = lambda i: [scenes.render(c, [bodies[i]], noise=1.5, seed=i) for c in rig.cameras]  # noqa: E731
     return track_key_points(read, range(FRAMES), clicks, view, Monitor()), truth

@@ -54,6 +54,23 @@ def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced:
     assert seen.sum(axis=0).max() == FRAMES
 
 
+def test_both_fields_follow_the_plane_at_twice_the_rate(tmp_path: Path, scenes: Any) -> None:
+    """Points of one field are found in the other, half a line away: no jitter from field to field."""
+    bodies = moving_plane(scenes, 4)
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0, interlaced="both")
+    measured = scenes.measure(take, tmp_path / "out")
+    assert [m.frame for m in measured] == list(range(4)) and [m.field.grid.rows.offset for m in measured] == [0, 1, 0, 1]
+    tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 50.0)
+    error, on_it = errors(bodies, tracks, 0.035)
+    whole = on_it & tracks.seen.all(axis=0)
+    assert whole.sum() > 50
+    across = error[:, whole, :2]
+    assert np.abs(across).max() < 1.0 * scenes.pixel_m
+    jitter = np.median(across[1::2], axis=(0, 1)) - np.median(across[::2], axis=(0, 1))
+    assert np.abs(jitter).max() < 0.05 * scenes.pixel_m  # half a line would be 0.5
+    assert np.array_equal(tracks.time_s, np.arange(4) / 50.0)
+
+
 def test_velocity_and_acceleration(tmp_path: Path, scenes: Any) -> None:
     """The mean over all points of velocity against the true one; its scatter is that of the positions."""
     bodies = moving_plane(scenes, 5)
