@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ from . import pipeline, store
 from .arguments import frame_range, overrides
 from .errors import InputError
 from .images.sequence import read_image
+from .inspection import body_outline
 from .progress import Monitor
 from .settings import nearest_name
-from .tracking.contour import Contour, ContourSettings, contour_of_mask, mask_of_points, predict_contour, relax_contour
+from .tracking.contour import Contour, ContourSettings, contour_of_mask, mask_of_points, predict_contour, relax_contour, resampled
 from .tracking.point_tables import read_polygon
 
 BACKGROUND_SIGMAS, CLOSING_PX = 4.0, 3
@@ -23,17 +25,30 @@ CLOSING_CELLS, ONE_PIECE = (2, 3, 4, 6), 0.9
 APART_PX, AGREEING = 8.0, 0.95  # a contour of which more than a twentieth is further from the measured outline begins anew
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Start:
+    """What the contour begins with; by default the outline of the measured surface."""
+
+    polygon: np.ndarray | None = None  # (V, 2) px of the first frame
+    background: np.ndarray | None = None  # (h, w) the view without the person
+    body: bool = False  # the projected skin of the fitted body
+
+
+MEASURED_SURFACE = Start()
+
+
 def add_command(commands: Any) -> None:
     """Join `contour` to the parser's commands."""
     about = "the outline of the person in one view, tracked through the frames"
     parser = commands.add_parser("contour", help=about, description=about[0].upper() + about[1:])
     parser.add_argument("take", type=Path, metavar="TAKE", help="folder with take.toml")
-    parser.add_argument("--view", required=True, metavar="NAME", help="the view, such as C")
+    parser.add_argument("--view", required=True, nargs="+", metavar="NAME", help="the view, such as C, or several")
     parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results; contours/NAME.csv is written")
     parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
     start = parser.add_mutually_exclusive_group()
     start.add_argument("--polygon", type=Path, metavar="FILE", help="CSV with x,y of the outline in the first frame")
     start.add_argument("--background", type=Path, metavar="FILE", help="image of the view without the person")
+    start.add_argument("--from-body", action="store_true", help="begin with the outline of the body that is fitted in OUT")
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
     parser.set_defaults(run=run, json=False)
 
@@ -45,25 +60,38 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: the arguments or the take need mending.
     """
     with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
-        polygon = read_polygon(args.polygon) if args.polygon else None
-        background = read_image(args.background) if args.background else None
-        return [write_contour(job, args.view, monitor, polygon, background)]
+        start = Start(
+            polygon=read_polygon(args.polygon) if args.polygon else None,
+            background=read_image(args.background) if args.background else None,
+            body=args.from_body,
+        )
+        return write_contours(job, args.view, monitor, start)
 
 
-def write_contour(
-    job: pipeline.Run, name: str, monitor: Monitor, polygon: np.ndarray | None = None, background: np.ndarray | None = None
-) -> str:
-    """Track the contour in the view of that name (measures and tracks first where that is needed): contours/NAME.csv; says what was found.
+def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
+    """Track the contour in the views of these names (measures and tracks first where that is needed): contours/NAME.csv of each.
+
+    Says what was found. A body that the contours begin with is that of the same frames and settings; with the contours it is stale.
 
     Raises:
         InputError: there is no such view, or nothing to start from.
     """
     names = [v.name for v in job.footage.take.views]
-    if name not in names:
-        raise InputError(f"{job.footage.take.folder} has no view “{name}”.{nearest_name(name, names)}")
+    for name in views:
+        if name not in names:
+            raise InputError(f"{job.footage.take.folder} has no view “{name}”.{nearest_name(name, names)}")
+    if len(views) > 1 and (start.polygon is not None or start.background is not None):
+        raise InputError("A polygon or a background is that of one view; give one --view with it.")
+    if start.body and not job.results.path("skin").is_dir():
+        folder = job.results.folder
+        raise InputError(f"{folder} holds no body with a skin that was fitted to these frames with these settings; run `tricap fit` first.")
     if job.trajectories is None:
         pipeline.track(job, monitor)
-    contours = dict(track_contour(job, names.index(name), ContourSettings(), polygon, background, monitor))
+    return [_write_contour(job, name, names.index(name), monitor, start) for name in views]
+
+
+def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
+    contours = dict(track_contour(job, view, monitor, start))
     path = job.results.path("contours", f"{name}.csv")
     store.write_text(path, _table(contours))
     job.account["stages"].pop("fit", None)  # the body is to be fitted again
@@ -72,44 +100,60 @@ def write_contour(
     return f"{path}: the outline in {len(contours)} frames, {100 * seen:.0f} % of its vertices on an edge."
 
 
-def track_contour(
-    job: pipeline.Run, view: int, settings: ContourSettings, polygon: np.ndarray | None, background: np.ndarray | None, monitor: Monitor
-) -> Iterator[tuple[int, Contour]]:
-    """(frame, contour) of one view; each predicted from the one before by the projected trajectories inside it.
+def track_contour(job: pipeline.Run, view: int, monitor: Monitor, start: Start) -> Iterator[tuple[int, Contour]]:
+    """(frame, contour) of one view; each predicted by the projected trajectories inside the last one that had any.
 
-    The first contour is the polygon, what differs from the background, or the outline of the measured surface.
+    A predicted contour that differs too much from the frame's own outline, of the measured surface or of the fitted body, gives way to it,
+    unless it began with a polygon.
 
     Raises:
         InputError: there is nothing to start from.
     """
-    camera, tracks = job.footage.rig.cameras[view], job.trajectories
+    camera, tracks, settings = job.footage.rig.cameras[view], job.trajectories, job.settings["contour"]
     assert tracks is not None
-    contour: Contour | None = None
+    base: Contour | None = None  # in frame number `last`
+    last = 0
     for i, m in enumerate(job.measured):
         monitor.step("contours", i, len(job.measured))
         grey = job.footage.take.rows_at(m.frame).whole(job.footage.read(m.frame)[view])
-        if contour is None:
-            predicted = polygon if polygon is not None else _first(grey, camera.project(m.cloud.xyz_m), background, settings)
+        own = np.zeros((0, 2))
+        if start.body:
+            own = _of_body(body_outline(job.results.folder, m.frame, camera), settings)
+        elif start.polygon is None and (base is not None or start.background is None):
+            own = _outline(grey, camera.project(m.cloud.xyz_m), settings)
+        if base is None:
+            predicted = _first(grey, own, start, settings)
             if len(predicted) < 8:
                 raise InputError(f"There is no outline to start from in frame {m.frame}; give one with --polygon.")
         else:
-            predicted = predict_contour(contour.xy_px, camera.project(tracks.xyz_m[i - 1]), camera.project(tracks.xyz_m[i]))
-            if polygon is None:
-                predicted = _renewed(predicted, _outline(grey, camera.project(m.cloud.xyz_m), settings))
+            carried = predict_contour(base.xy_px, camera.project(tracks.xyz_m[last]), camera.project(tracks.xyz_m[i]))
+            predicted = _renewed(carried, own)
         contour = relax_contour(predicted, grey, settings)
+        if base is None or tracks.seen[i].any():
+            base, last = contour, i
         yield m.frame, contour
 
 
-def _first(grey: np.ndarray, points: np.ndarray, background: np.ndarray | None, settings: ContourSettings) -> np.ndarray:
-    if background is None:
-        return _outline(grey, points, settings)
-    if background.shape != grey.shape:
+def _first(grey: np.ndarray, own: np.ndarray, start: Start, settings: ContourSettings) -> np.ndarray:
+    """The first contour: the polygon, or what differs from the background, or the frame's own outline."""
+    if start.polygon is not None:
+        return resampled(start.polygon, settings.spacing_px)
+    if start.background is None:
+        return own
+    if start.background.shape != grey.shape:
         raise InputError("The background image has another size than the view; take it with the same camera.")
-    difference = cv2.GaussianBlur(np.abs(grey - background).astype(np.float32), (0, 0), 1.5)
+    difference = cv2.GaussianBlur(np.abs(grey - start.background).astype(np.float32), (0, 0), 1.5)
     limit = max(float(np.median(difference)) * BACKGROUND_SIGMAS, 4.0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * CLOSING_PX + 1,) * 2)
     mask = cv2.morphologyEx((difference > limit).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     return contour_of_mask(mask, settings.spacing_px)
+
+
+def _of_body(outlines: list[np.ndarray], settings: ContourSettings) -> np.ndarray:
+    """The largest of the outlines of a body's skin; none where it has none."""
+    if not outlines:
+        return np.zeros((0, 2))
+    return resampled(max(outlines, key=lambda o: cv2.contourArea(o.astype(np.float32))), settings.spacing_px)
 
 
 def _outline(grey: np.ndarray, points: np.ndarray, settings: ContourSettings) -> np.ndarray:

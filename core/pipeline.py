@@ -44,6 +44,7 @@ from .settings import from_table, nearest_name, to_table
 from .stages import CONCERNS, DERIVED, STAGES, command_of, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
 from .take import Footage, open_take, read_take
+from .tracking.contour import ContourSettings
 from .tracking.settings import TrackingSettings, TrackStatus
 from .tracking.trajectories import Trajectories, assemble
 
@@ -54,6 +55,7 @@ SETTINGS: dict[str, type] = {
     "growing": GrowingSettings,
     "surface": SurfaceSettings,
     "tracking": TrackingSettings,
+    "contour": ContourSettings,
     "fitting": FitSettings,
     "skin": SkinSettings,
 }

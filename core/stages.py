@@ -60,6 +60,7 @@ CONCERNS: dict[str, Concern] = {
         files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
     ),
 }
+ASIDE = ("contour",)  # groups of knobs that concern no stage: what `tricap contour` writes concerns the fit by its content
 DERIVED = tuple(name for concern in CONCERNS.values() for name in concern.files)
 
 

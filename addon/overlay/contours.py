@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ...core import pipeline
-from ...core.contour_command import write_contour
+from ...core.contour_command import Start, write_contours
 from ...core.progress import Monitor
 from .. import project
 from ..jobs import JobOperator
@@ -23,12 +23,14 @@ class FollowContours(JobOperator, bpy.types.Operator):
     step = "tracks"
 
     view: bpy.props.StringProperty(name="View", description="Name of the view; empty: all of them")  # type: ignore[valid-type]
+    from_body: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="From the Fitted Body", description="Begin with the outline of the fitted body, not with that of the measured surface")
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], list[str]]:
         """Folders and settings as they are now; the project's take.toml is written."""
         take, out, overrides = project.chosen(context.scene, "", "")
-        view = self.view
-        return lambda monitor: follow(take, out, overrides, view, monitor)
+        view, start = self.view, Start(body=self.from_body)
+        return lambda monitor: follow(take, out, overrides, view, monitor, start)
 
     def finish(self, context: bpy.types.Context, result: list[str]) -> set[str]:
         """Show it, and tell what was found."""
@@ -40,11 +42,13 @@ class FollowContours(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def follow(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], view: str, monitor: Monitor) -> list[str]:
+def follow(
+    take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], view: str, monitor: Monitor, start: Start
+) -> list[str]:
     """The computation, free of bpy: what was found in every view."""
     with pipeline.open_run(take, out, overrides) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]
-        return [write_contour(run, name, monitor) for name in names]
+        return write_contours(run, names, monitor, start)
 
 
 CLASSES = (FollowContours,)

@@ -1,10 +1,13 @@
 """The sections “Overlays” and “Frames” in the Clip Editor's sidebar."""
 
+import dataclasses
+
 import bpy
 import numpy as np
 
 from ..clicking.panel import ClipPanel
 from ..panels import sentence
+from ..properties import stages
 from . import recording
 
 WORST = 12
@@ -38,6 +41,8 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
             self._draw_contour(column, context, run)
         column.prop(shown, "graph")
         layout.operator("tricap.look_closer", icon="VIEWZOOM")
+        if shown.contour:
+            _contour_knobs(layout, context)
         if recording.problem():
             sentence(layout, context, recording.problem(), "ERROR")
 
@@ -48,6 +53,15 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
             row = layout.row()
             row.enabled = not context.window_manager.tricap.running
             row.operator("tricap.follow_contours", icon="MOD_OUTLINE").view = view
+
+
+def _contour_knobs(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    header, inside = layout.panel("tricap_group_contour", default_closed=True)
+    header.label(text="Following the Outline")
+    if inside is not None:
+        inside.use_property_split, inside.use_property_decorate = True, False
+        for field in dataclasses.fields(stages()["contour"]):
+            inside.prop(context.scene.tricap.contour, field.name)
 
 
 class TRICAP_PT_frames(ClipPanel, bpy.types.Panel):

@@ -11,12 +11,16 @@ contrast (the likelihood of two Gaussians; c runs along the normal):
 
     c → min  n₁ log σ₁²(s < c) + n₂ log σ₂²(s > c)                                                        (3)
 
-At the end every vertex goes to the largest gradient within a pixel or two of (3), and its sigma is that of the vertex of the parabola
-through the three largest values:
+A vertex for which no c is significantly likelier than its own place stays: where there is no edge the predicted contour goes on as it is.
 
-    s = (g₋ − g₊) / 2 (g₋ − 2 g₀ + g₊) ,   σ_s = σ_g / (√2 |g₋ − 2 g₀ + g₊|)                                            (4)
+At the end every vertex goes to the largest gradient within a pixel or two of (3), the vertex of the parabola through the three largest
+values, and outwards by what a blurred edge of the width w = √(g₀ / |g₋ − 2 g₀ + g₊|) and the curvature κ seems too small:
 
-to which the scatter of the vertices about the snake is added.
+    s = (g₋ − g₊) / 2 (g₋ − 2 g₀ + g₊) + κ w² / 2 ,   σ_s = σ_g / (√2 |g₋ − 2 g₀ + g₊|)                                  (4)
+
+Texture on either side moves the largest gradient, too. With σ_t, its own gradient beyond the edge, both sides together:
+
+    σ² = σ_s² + σ_t² w² / (2 π g₀²) ,   not less than the scatter of the neighbouring vertices about a smooth curve                (5)
 
 Full-frame pixels; contours are closed, with vertices at equal distances.
 """
@@ -30,11 +34,15 @@ from ..settings import knob
 
 REACH_PX, RHO_PX = 40.0, 15.0  # of (1)
 LARGEST_FORCE_PX = 1.0
-ROUGHNESS_VERTICES = 8
+NEIGHBOURS = 8  # vertices either way over which scatter is taken
 LAST_PX = 2  # how far the largest gradient may lie from (3)
-LEAST_SIGMA_PX, UNSEEN_SIGMA_PX = 0.2, 3.0
+LEAST_SIGMA_PX, UNSEEN_SIGMA_PX = 0.025, 3.0  # the least: of interpolating the parabola
 IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6
 PROFILE_PX, LEAST_VARIANCE = 6, 4.0  # of (3): length of a profile beyond the search, and what noise has
+SIGNIFICANT = 20.0  # of (3), twice a difference of log likelihoods: by noise alone one vertex in a thousand has as much
+SIDES = (-5.0, -4.0, 4.0, 5.0)  # in units of the blur: where texture beside the edge is looked at
+SMOOTH = np.array([-2, 3, 6, 7, 6, 3, -2]) / 21  # the quadratic through seven vertices (Savitzky & Golay 1964); residuals have 2/3 σ²
+OWN_SHARE = 0.2  # of a vertex's own residual in its scatter; the rest is its neighbours'
 REGION_EVERY, REGION_PULL = 10, 0.7
 EDGE_SIGMAS = 5.0  # of the gradient's noise: less is no edge
 
@@ -115,14 +123,14 @@ def predict_contour(xy_px: np.ndarray, before_px: np.ndarray, after_px: np.ndarr
 
 
 def relax_contour(predicted_px: np.ndarray, grey: np.ndarray, settings: ContourSettings) -> Contour:
-    """Let a predicted contour (V, 2) find the edges of an image (h, w).  (2) to (4)"""
-    n = len(predicted_px)
-    start = resampled(predicted_px, settings.spacing_px, n)
+    """Let a predicted contour (V, 2) find the edges of an image (h, w).  (2) to (5)"""
+    start = resampled(predicted_px, settings.spacing_px)
     gradient = _gradient(grey, settings.blur_px)
     strength = np.hypot(*gradient)
-    energy = -((strength / max(float(np.percentile(strength, 99)), 1e-6)) ** 2)
+    edge = max(float(np.percentile(strength, 99)), EDGE_SIGMAS * gradient_noise(grey, settings.blur_px))
+    energy = -((strength / edge) ** 2)
     force = [-cv2.Sobel(energy, cv2.CV_32F, i, 1 - i, ksize=3, scale=1 / 8) * 4 for i in (1, 0)]
-    inverse = np.linalg.inv(_stiffness(n, settings))
+    inverse = np.linalg.inv(_stiffness(len(start), settings))
     v = np.zeros_like(start)
     for iteration in range(settings.iterations):
         if iteration % REGION_EVERY == 0:
@@ -138,7 +146,10 @@ def relax_contour(predicted_px: np.ndarray, grey: np.ndarray, settings: ContourS
 
 
 def _parting(grey: np.ndarray, xy: np.ndarray, normal: np.ndarray, search_px: float) -> np.ndarray:
-    """Where along its normal (V,) each vertex's grey values part best, from profiles through it and its neighbours.  (3)"""
+    """Where along its normal (V,) each vertex's grey values part best, from profiles through it and its neighbours.  (3)
+
+    Zero where they part nowhere significantly better than at the vertex.
+    """
     reach = round(search_px) + PROFILE_PX
     s = np.arange(-reach, reach + 1).astype(np.float64)
     values = _sample(grey.astype(np.float32), xy[:, None] + s[:, None] * normal[:, None])
@@ -153,7 +164,8 @@ def _parting(grey: np.ndarray, xy: np.ndarray, normal: np.ndarray, search_px: fl
 
     middle = range(PROFILE_PX, len(s) - PROFILE_PX)
     cost = np.stack([log_variance(slice(None, c)) + log_variance(slice(c + 1, None)) for c in middle], axis=1)
-    return s[PROFILE_PX : len(s) - PROFILE_PX][cost.argmin(axis=1)]
+    gain = cost[:, cost.shape[1] // 2] - cost.min(axis=1)
+    return np.where(gain > SIGNIFICANT, s[PROFILE_PX : len(s) - PROFILE_PX][cost.argmin(axis=1)], 0.0)
 
 
 def _stiffness(n: int, settings: ContourSettings) -> np.ndarray:
@@ -170,12 +182,11 @@ def _gradient(grey: np.ndarray, blur_px: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _on_edges(xy: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], grey: np.ndarray, settings: ContourSettings) -> Contour:
-    """Every vertex at the largest gradient along its normal, with sigma.  (3)"""
-    normal = outward_normals(xy)
-    snake, xy = xy, xy + np.clip(_parting(grey, xy, normal, 2.0), -1.0, 1.0)[:, None] * normal
+    """Every vertex at the largest gradient along its normal, with sigma.  (4), (5)"""
+    normal, bent = outward_normals(xy), _curvature(xy)
+    xy = xy + np.clip(_parting(grey, xy, normal, 2.0), -1.0, 1.0)[:, None] * normal
     s = np.arange(-LAST_PX - 1, LAST_PX + 2).astype(np.float64)
-    places = xy[:, None] + s[:, None] * normal[:, None]
-    across = np.abs(sum(_sample(g, places) * normal[:, None, i] for i, g in enumerate(gradient)))
+    across = np.abs(_across(gradient, xy, normal, s))
     best = across[:, 1:-1].argmax(axis=1) + 1
     rows = np.arange(len(xy))
     before, middle, after = (across[rows, best + d] for d in (-1, 0, 1))
@@ -183,24 +194,52 @@ def _on_edges(xy: np.ndarray, gradient: tuple[np.ndarray, np.ndarray], grey: np.
     noise = gradient_noise(grey, settings.blur_px)
     seen = (bend < 0) & (before <= middle) & (after <= middle) & (middle > EDGE_SIGMAS * noise)
     safe = np.where(seen, bend, -1.0)
-    offset = np.where(seen, s[best] + (before - after) / (2 * safe), 0.0)
+    width = np.minimum(np.sqrt(middle / -safe), 2 * settings.blur_px)
+    offset = np.where(seen, s[best] + (before - after) / (2 * safe) + bent * width**2 / 2, 0.0)
+    texture = _texture(_across(gradient, xy, normal, settings.blur_px * np.array(SIDES)), noise)
     moved = xy + offset[:, None] * normal
-    sigma = np.hypot(LEAST_SIGMA_PX, noise / (np.sqrt(2) * np.abs(safe)))
-    sigma = np.where(seen, np.hypot(sigma, _roughness(np.einsum("ni,ni->n", moved - snake, normal))), UNSEEN_SIGMA_PX)
-    return Contour(xy_px=moved, normal=outward_normals(moved), sigma_px=np.minimum(sigma, UNSEEN_SIGMA_PX), seen=seen)
+    normal = outward_normals(moved)
+    sigma = np.hypot(noise / (np.sqrt(2) * -safe), texture * width / (np.sqrt(2 * np.pi) * np.maximum(middle, noise)))
+    sigma = np.maximum(np.hypot(sigma, LEAST_SIGMA_PX), _roughness(moved, normal))
+    return Contour(xy_px=moved, normal=normal, sigma_px=np.where(seen, np.minimum(sigma, UNSEEN_SIGMA_PX), UNSEEN_SIGMA_PX), seen=seen)
 
 
-def _roughness(offset: np.ndarray) -> np.ndarray:
-    """Robust scatter (V,) of the vertices across the snake, over the neighbours on the contour: where other edges compete it is large."""
-    near = np.stack([np.roll(offset, d) for d in range(-ROUGHNESS_VERTICES, ROUGHNESS_VERTICES + 1)])
-    return 1.4826 * np.median(np.abs(near - np.median(near, axis=0)), axis=0)
+def _across(gradient: tuple[np.ndarray, np.ndarray], xy: np.ndarray, normal: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """The gradient along the normals (V, S) at the distances `s` (S,) from the vertices."""
+    places = xy[:, None] + s[:, None] * normal[:, None]
+    return np.asarray(sum(_sample(part, places) * normal[:, None, i] for i, part in enumerate(gradient)))
+
+
+def _curvature(xy: np.ndarray) -> np.ndarray:
+    """Curvature (V,) of a closed polygon [1/px], positive where it is convex, over two vertices either way."""
+    n = outward_normals(xy)
+    turn, step = (np.roll(a, -2, axis=0) - np.roll(a, 2, axis=0) for a in (n, xy))
+    return np.asarray(np.einsum("ni,ni->n", turn, step) / np.maximum(np.einsum("ni,ni->n", step, step), 1e-9))
+
+
+def _texture(beside: np.ndarray, noise: float) -> np.ndarray:
+    """σ_t (V,) of (5), both sides together, from the gradients (V, S) beside the edge, by their medians over the neighbours."""
+    variance = 2 * np.square(_typical(np.abs(beside))).mean(axis=1)
+    return np.sqrt(np.maximum(variance - 2 * noise**2, 0.0))
+
+
+def _roughness(xy: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Scatter (V,) of the vertices across a smooth curve, robust over the neighbours: where other edges compete it is large."""
+    smooth = sum(w * np.roll(xy, d, axis=0) for w, d in zip(SMOOTH, range(-3, 4)))
+    residual = np.einsum("ni,ni->n", xy - smooth, normal) / np.sqrt(2 / 3)
+    return np.sqrt((1 - OWN_SHARE) * _typical(np.abs(residual)) ** 2 + OWN_SHARE * residual**2)
+
+
+def _typical(size: np.ndarray) -> np.ndarray:
+    """Standard deviation of values of these sizes (V, ...) by their median over the neighbours on the contour."""
+    return 1.4826 * np.median([np.roll(size, d, axis=0) for d in range(-NEIGHBOURS, NEIGHBOURS + 1)], axis=0)
 
 
 def gradient_noise(grey: np.ndarray, blur_px: float) -> float:
     """Standard deviation of the blurred gradient by the image's own noise σ (Immerkær 1996): σ / (√(8 π) blur²)."""
     response = np.abs(cv2.filter2D(np.ascontiguousarray(grey, dtype=np.float32), cv2.CV_32F, IMMERKAER))
     sigma = max(0.3, 1.4826 * float(np.median(response)))
-    return sigma / (np.sqrt(8 * np.pi) * blur_px**2)
+    return float(sigma / (np.sqrt(8 * np.pi) * blur_px**2))
 
 
 def outward_normals(xy: np.ndarray) -> np.ndarray:

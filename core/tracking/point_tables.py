@@ -45,7 +45,7 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
         if name not in rows[0]:
             raise InputError(f"{path} has no column “{name}”; its first line must name the columns {', '.join(needed)}.")
     xy = np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
-    names = tuple(row["point"].strip() for row in rows)
+    names = tuple((row["point"] or "").strip() for row in rows)
     views = tuple((row["view"] or "").strip() if with_views else "" for row in rows)
     if "" in names or len(set(zip(names, views))) < len(names):
         raise InputError(f"{path} names a point twice or not at all; give every point its own name.")

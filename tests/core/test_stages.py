@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tricap.core import pipeline, store
-from tricap.core.stages import CONCERNS, STAGES, stage_keys, stage_of, still_good
+from tricap.core.stages import ASIDE, CONCERNS, STAGES, stage_keys, stage_of, still_good
 from tricap.core.take import Take, open_take
 from tricap.core.take_file import read_table, take_of_table
 
@@ -116,7 +116,12 @@ def test_keypoints_concern_the_fit(take: Path, tmp_path: Path) -> None:
 
 def test_every_group_of_knobs_concerns_one_stage() -> None:
     groups = [name for concern in CONCERNS.values() for name in concern.settings]
-    assert sorted(groups) == sorted(pipeline.SETTINGS) and stage_of("tracking") == "track"
+    assert sorted([*groups, *ASIDE]) == sorted(pipeline.SETTINGS) and stage_of("tracking") == "track"
+
+
+@pytest.mark.parametrize("group", ASIDE)
+def test_what_stands_aside_makes_nothing_stale(take: Path, group: str) -> None:
+    assert stale(take, {group: other_than_default(group)}) == []
 
 
 def test_a_run_keeps_what_is_still_good_and_removes_what_is_not(take: Path, tmp_path: Path) -> None:

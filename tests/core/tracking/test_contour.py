@@ -32,22 +32,44 @@ def circle(centre: tuple[float, float], radius: float, count: int = 90) -> np.nd
     return np.array(centre) + radius * np.stack([np.cos(a), np.sin(a)], axis=1)
 
 
-@pytest.mark.parametrize("noise", [1.0, 4.0])
-def test_a_rough_start_finds_the_outline(noise: float) -> None:
-    """A start 4 px too large and 2 px off. So clean an edge is found better than the least sigma says."""
-    z = []
-    for seed in range(6):
-        found = relax_contour(circle((121, 99), 54), disc((119.3, 100.6), 50, noise, seed), SETTINGS)
-        off = np.linalg.norm(found.xy_px - (119.3, 100.6), axis=1) - 50
-        assert found.seen.mean() > 0.95 and np.abs(off[found.seen]).max() < 1.2 and np.abs(np.median(off)) < 0.15
-        z.append(off[found.seen] / found.sigma_px[found.seen])
-    assert 0.1 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.3
+@pytest.mark.parametrize(("noise", "contrast", "texture"), [(1, 90, 10), (2, 40, 5), (4, 90, 10), (4, 40, 5), (8, 90, 10)])
+@pytest.mark.parametrize("radius", [20.0, 50.0])
+def test_a_rough_start_finds_the_outline(noise: float, contrast: float, texture: float, radius: float) -> None:
+    """A start 4 px too large and 2 px off: found without bias, with honest sigmas. Over 40 discs z is 0.91 to 1.18."""
+    z, away = [], []
+    for seed in range(20):
+        image = textured_disc((119.3, 100.6), radius, noise, contrast, texture, seed)
+        found = relax_contour(circle((121, 99), radius + 4, round(radius * 1.7)), image, SETTINGS)
+        off = (np.linalg.norm(found.xy_px - (119.3, 100.6), axis=1) - radius)[found.seen]
+        assert found.seen.mean() > 0.95 and np.abs(off).max() < 1.2
+        z.append(off / found.sigma_px[found.seen])
+        away.append(off)
+    assert np.abs(np.median(np.concatenate(away))) < 0.03
+    assert 0.8 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.25
 
 
-def test_no_edge_is_said() -> None:
-    flat = np.full((200, 240), 90, np.float32) + np.random.default_rng(0).standard_normal((200, 240)).astype(np.float32)
-    found = relax_contour(circle((120, 100), 50), flat, SETTINGS)
-    assert found.seen.mean() < 0.1 and (found.sigma_px[~found.seen] == 3.0).all()
+def textured_disc(centre: tuple[float, float], radius: float, noise: float, contrast: float, texture: float, seed: int) -> np.ndarray:
+    """A disc before a ground, each with a random texture of its own (that of the ground half as strong), and noise (grey values)."""
+    y, x = np.mgrid[0:200, 0:240].astype(float)
+    random = np.random.default_rng(seed)
+    wave = [cv2.GaussianBlur(random.standard_normal(x.shape), (0, 0), blur) * 2 * np.sqrt(np.pi) * blur for blur in (3.0, 4.0)]
+    inside = np.clip(radius - np.hypot(x - centre[0], y - centre[1]) + 0.5, 0, 1)
+    grey = 60 + texture / 2 * wave[1] + inside * (contrast + texture * wave[0] - texture / 2 * wave[1])
+    return (cv2.GaussianBlur(grey, (0, 0), 0.6) + noise * random.standard_normal(x.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("image", ["black", "noise"])
+def test_without_an_edge_the_contour_stays(image: str) -> None:
+    """Ten frames of nothing: said so in every one, and the contour neither shrinks nor wanders."""
+    random, start = np.random.default_rng(0), circle((120, 100), 50)
+    xy = start
+    for _ in range(10):
+        flat = np.full((200, 240), 20, np.float32) + (image == "noise") * random.standard_normal((200, 240)).astype(np.float32)
+        found = relax_contour(xy, flat, SETTINGS)
+        assert found.seen.mean() < 0.1 and (found.sigma_px[~found.seen] == 3.0).all()
+        xy = found.xy_px
+    away = np.abs(np.linalg.norm(xy - (120, 100), axis=1) - 50)
+    assert away.max() < (0.2 if image == "black" else 3.0) and np.median(away) < 0.3
 
 
 def test_points_inside_carry_the_contour() -> None:

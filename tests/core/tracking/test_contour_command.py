@@ -2,12 +2,91 @@
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tricap.core.commands import main
+from tricap.core.contour_command import Start, track_contour
+from tricap.core.errors import InputError
+from tricap.core.images.fields import RowGrid
+from tricap.core.motion.ply import write_mesh
+from tricap.core.progress import Monitor
+from tricap.core.tracking.contour import Contour, ContourSettings
+
+HALF_M = (0.2, 0.15)
+
+
+def outline_of(scenes: Any, body: Any) -> np.ndarray:
+    """What camera C sees of the outline of a rectangle (1600, 2)."""
+    corners = np.array([[-0.2, -0.15, 0], [0.2, -0.15, 0], [0.2, 0.15, 0], [-0.2, 0.15, 0]])
+    own = np.concatenate([np.linspace(a, b, 400) for a, b in zip(corners, np.roll(corners, -1, axis=0))])
+    return np.asarray(scenes.three_cameras().cameras[1].project(own @ body.R.T + body.t))
+
+
+def apart(scenes: Any, contour: np.ndarray, body: Any) -> np.ndarray:
+    """Distances (V,) of vertices from the outline of a rectangle."""
+    return np.linalg.norm(contour[:, None] - outline_of(scenes, body), axis=2).min(axis=1)
+
+
+class Recorded:
+    """Six frames of a rectangle that goes 4 px a frame to the right; camera C was black in some, and no point was tracked in them."""
+
+    def __init__(self, scenes: Any, folder: Path, black: tuple[int, ...] = ()) -> None:
+        self.bodies = [scenes.Body(half_m=HALF_M).moved(np.eye(3), [4 * scenes.pixel_m * (i - 3), 0.0, 0.0]) for i in range(6)]
+        rig = scenes.three_cameras()
+        x, y = np.meshgrid(np.linspace(-0.18, 0.18, 12), np.linspace(-0.13, 0.13, 9))
+        on_it = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+        xyz = np.stack([on_it @ b.R.T + b.t for b in self.bodies])
+        xyz[list(black)] = np.nan
+        images = {i: scenes.render(rig.cameras[1], [b] if i not in black else [], noise=1.0, background=90.0 * (i not in black), seed=i)
+                  for i, b in enumerate(self.bodies)}  # fmt: skip
+        for i, b in enumerate(self.bodies):
+            corners = np.array([[-0.2, -0.15, 0], [0.2, -0.15, 0], [0.2, 0.15, 0], [-0.2, 0.15, 0]]) @ b.R.T + b.t
+            write_mesh(folder / "skin" / f"{i:04d}.ply", corners, np.array([[0, 1, 2, 3]]))
+        take = SimpleNamespace(rows_at=lambda frame: RowGrid())
+        self.job: Any = SimpleNamespace(
+            footage=SimpleNamespace(rig=rig, take=take, read=lambda i: [None, images[i], None]),
+            trajectories=SimpleNamespace(xyz_m=xyz, seen=np.isfinite(xyz[..., 0])),
+            measured=[SimpleNamespace(frame=i, cloud=SimpleNamespace(xyz_m=x)) for i, x in enumerate(xyz)],
+            results=SimpleNamespace(folder=folder),
+            settings={"contour": ContourSettings()},
+        )
+
+    def contours(self, start: Start) -> list[Contour]:
+        return [c for _, c in track_contour(self.job, 1, Monitor(), start)]
+
+
+def test_four_corners_are_a_polygon(tmp_path: Path, scenes: Any) -> None:
+    recorded = Recorded(scenes, tmp_path)
+    found = recorded.contours(Start(polygon=outline_of(scenes, recorded.bodies[0])[::400] + (2.0, -1.0)))
+    assert len(found[0].xy_px) == pytest.approx(2 * (0.4 + 0.3) / scenes.pixel_m / 4.0, abs=3)
+    assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 and c.seen.mean() > 0.6 for c, b in zip(found, recorded.bodies))
+
+
+@pytest.mark.parametrize("black", [(3,), (2, 3)])
+def test_a_black_frame_carries_the_contour_through(tmp_path: Path, scenes: Any, black: tuple[int, ...]) -> None:
+    """It stays as it was, says that nothing was seen, and goes on where the points went meanwhile, 12 px for two black frames."""
+    recorded = Recorded(scenes, tmp_path, black)
+    found = recorded.contours(Start(polygon=outline_of(scenes, recorded.bodies[0])[::400]))
+    for i in black:
+        assert not found[i].seen.any() and (found[i].sigma_px == 3.0).all()
+        assert np.median(apart(scenes, found[i].xy_px, recorded.bodies[black[0] - 1])) < 0.7
+    assert np.median(apart(scenes, found[-1].xy_px, recorded.bodies[-1])) < 0.7 and found[-1].seen.mean() > 0.6
+
+
+def test_from_the_fitted_body(tmp_path: Path, scenes: Any) -> None:
+    """The skin's outline is there where nothing was measured and no point tracked; without a skin it is said so."""
+    recorded = Recorded(scenes, tmp_path)
+    for m in recorded.job.measured:
+        m.cloud.xyz_m = np.zeros((0, 3))
+    recorded.job.trajectories.xyz_m[:] = np.nan
+    found = recorded.contours(Start(body=True))
+    assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 for c, b in zip(found, recorded.bodies))
+    with pytest.raises(InputError, match="no outline"):
+        recorded.contours(Start())
 
 
 @pytest.mark.slow
@@ -17,13 +96,18 @@ def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
     assert main(["contour", str(take), "--view", "C", "--out", str(tmp_path / "out"), "--quiet"]) == 0
     rows = list(csv.DictReader((tmp_path / "out" / "contours" / "C.csv").open(encoding="utf-8")))
-    camera = scenes.three_cameras().cameras[1]
     for i, body in enumerate(bodies):
-        corners = np.array([[-0.2, -0.15, 0], [0.2, -0.15, 0], [0.2, 0.15, 0], [-0.2, 0.15, 0]])
-        own = np.concatenate([np.linspace(a, b, 400) for a, b in zip(corners, np.roll(corners, -1, axis=0))])
-        true = camera.project(own @ body.R.T + body.t)
         found = np.array([[float(r["x"]), float(r["y"])] for r in rows if int(r["frame"]) == i])
-        assert np.median(np.linalg.norm(found[:, None] - true, axis=2).min(axis=1)) < 1.5
+        assert np.median(apart(scenes, found, body)) < 1.5
+    out = ["--out", str(tmp_path / "out"), "--quiet"]
+    assert main(["contour", str(take), "--view", "L", "R", *out, "--set", "contour.spacing_px=8"]) == 0
+    coarse = [len((tmp_path / "out" / "contours" / f"{view}.csv").read_text().splitlines()) for view in "LR"]
+    assert max(coarse) < 0.7 * len(rows)
     capsys.readouterr()
     assert main(["contour", str(take), "--view", "X", "--out", str(tmp_path / "none"), "--quiet"]) == 2
     assert "“X”" in capsys.readouterr().err
+    assert main(["contour", str(take), "--view", "C", "--from-body", *out]) == 2
+    assert "tricap fit" in capsys.readouterr().err
+    (tmp_path / "p.csv").write_text("x,y\n1,2\n3,4\n5,1\n")
+    assert main(["contour", str(take), "--view", "C", "L", "--polygon", str(tmp_path / "p.csv"), *out]) == 2
+    assert "one --view" in capsys.readouterr().err

@@ -120,5 +120,8 @@ def test_tables_that_are_none(tmp_path: Path) -> None:
             read_polygon(path)
         with pytest.raises(InputError):
             read_points(path)
+    path.write_text("x,y,point\n1,2\n", encoding="utf-8")
+    with pytest.raises(InputError, match="not at all"):
+        read_points(path)
     path.write_text("x,y\n1,2\n3,4\n5,6\n", encoding="utf-8")
     assert read_polygon(path).tolist() == [[1, 2], [3, 4], [5, 6]]
