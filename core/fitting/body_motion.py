@@ -15,8 +15,8 @@ STATUSES = (FITTED, PARTIAL, BRIDGED, SUSPECT)
 class BodyMotion:
     """T frames of D DOFs and J joints.
 
-    status, the most serious that holds: "bridged": no points, the whole posture is predicted; "suspect": the residuals are far larger, or
-    the points far fewer, than in the other frames; "partial": a limb had too few points and rests on prediction; "fitted".
+    status, the most serious that holds: "bridged": nothing is seen, the whole posture is predicted; "suspect": the residuals are far
+    larger, or what is seen far less, than in the other frames; "partial": a limb is hardly seen and rests on prediction; "fitted".
     """
 
     frames: np.ndarray  # (T,) the take's frame numbers
@@ -28,7 +28,7 @@ class BodyMotion:
     joints_m: np.ndarray  # (T, J, 3) world
     joint_sigma_m: np.ndarray  # (T, J) mean standard deviation of a coordinate
     status: tuple[str, ...]  # T
-    sigma0: np.ndarray  # (T,) robust standard deviation of the points' unit-weight residuals; NaN without points
+    sigma0: np.ndarray  # (T,) robust standard deviation of unit-weight residuals: of points, or else outlines; NaN without
 
     def __post_init__(self) -> None:
         t, d, j = len(self.frames), len(self.dof_names), len(self.joint_names)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from scipy.stats import qmc
 
 from ..errors import InputError
 from ..progress import Monitor
@@ -19,7 +20,8 @@ REACH_M = 0.20  # points further than this from the clicked limb's surface are n
 WIDE = 1.5  # the gate, as long as the radii are the model's
 POSE_STEPS, STEPS = 15, 25
 SUSPICIOUS = 3.0  # sigma0 of a posture behind the limb or beside it
-ALTERNATIONS, ALTERNATION_STEPS = 6, 5
+ALTERNATIONS, ALTERNATION_STEPS = 8, 5
+OTHERS_AROUND, AROUND_RAD, AROUND_M = 6, float(np.radians(20.0)), 0.05  # of new starts: six found the true arm in all of 20 trials
 MOST_OTHERS = 12  # of the starts for limbs that nobody clicked, those that explain most points
 DEPTH_SHIFT_M = 0.04  # clicks from a short base are least certain along the view
 
@@ -28,7 +30,7 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     """Motion (1, D) and shape: the best supported of several starts about the clicked posture.
 
     Raises:
-        InputError: no measured points lie near the clicked joints.
+        InputError: neither measured points nor outlines lie near the clicked joints, and there are no keypoints.
     """
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.settings.length_sigma)
     best, best_support = None, -1.0
@@ -36,28 +38,53 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     for i, motion in enumerate(starts):
         monitor.step("fit the click frame", i, len(starts))
         solution = fit_posture_and_shape(fit, points, motion, clicked.vector)
-        support = fit.support(points, solution.motion[0], solution.vector)
+        support = fit.support(fit.click, points, solution.motion[0], solution.vector)
         if support > best_support:
             best, best_support = solution, support
-    if best is None or best_support < fit.settings.min_points:
-        raise InputError(f"Frame {points.frame} has no measured points near the clicked joints; check the clicks and the rig, "
-                         "or click in a frame where the limb was measured.")
+    if best is None or (best_support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
+        raise InputError(f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
+                         "rig, or click in a frame where the limb was measured.")
     return best
 
 
 def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
-    """From a motion (D,) and shape (S,) to the points; when the residuals stay suspiciously large, again by way of the clicks alone."""
-    solution = _to_points(fit, points, motion, vector)
-    if solution.scales.points < SUSPICIOUS:
-        return solution
+    """From a motion (D,) and shape (S,) to the points and outlines.
+
+    When the residuals stay suspiciously large, again from the posture of the clicks and from others around it; the best supported is kept.
+    """
+    best = _to_surface(fit, points, motion, vector)
+    if _plausible(best):
+        return best
+    best_support = fit.support(fit.click, points, best.motion[0], best.vector)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.settings.length_sigma)
-    again = _to_points(fit, points, clicked.motion[0], clicked.vector)
-    better = fit.support(points, again.motion[0], again.vector) > fit.support(points, solution.motion[0], solution.vector)
-    return again if better else solution
+    for start in _around(fit, clicked.motion[0]):
+        solution = _to_surface(fit, points, start, clicked.vector)
+        support = fit.support(fit.click, points, solution.motion[0], solution.vector)
+        if support > best_support:
+            best, best_support = solution, support
+        if _plausible(best):
+            break
+    return best
 
 
-def _to_points(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
-    """First the posture, then posture and shape, together or in turns as published."""
+def _plausible(solution: Solution) -> bool:
+    return max(solution.scales.points, solution.scales.contours) < SUSPICIOUS
+
+
+def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
+    """The posture (D,) and others evenly around it (K, D), always the same ones, within the joints' limits; what is held stays."""
+    skeleton = fit.model.skeleton
+    spread = np.full(len(motion), AROUND_RAD)
+    spread[skeleton.layout.set("base")] = AROUND_M
+    spread[skeleton.held] = 0.0
+    low, high = np.array([dof.limits for dof in skeleton.dofs]).T
+    moved = motion + spread * (2 * qmc.Halton(len(motion), scramble=False).random(OTHERS_AROUND + 1)[1:] - 1)  # its first is a corner
+    within = np.where(spread > 0, np.clip(moved, np.minimum(low, motion), np.maximum(high, motion)), motion)
+    return np.concatenate([motion[None], within])
+
+
+def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
+    """First the posture, then posture and shape, together or in turns as published: each holds the other."""
     near = crop(points, fit.parameters.state(motion, vector), REACH_M)
     solution = solve(fit.problem(_observe(fit, near, WIDE)), motion[None], vector, steps=POSE_STEPS)
     if fit.settings.method == "joint":
@@ -66,8 +93,8 @@ def _to_points(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector:
             solution = solve(problem, solution.motion, solution.vector, steps=STEPS, scales=solution.scales)
         return solution
     for _ in range(ALTERNATIONS):
-        for free in ("flesh", None):
-            problem = fit.problem(_observe(fit, near, 1.0), free)
+        for free in ("shape", None):
+            problem = fit.problem(_observe(fit, near, 1.0), free, hold_motion=free is not None)
             solution = solve(problem, solution.motion, solution.vector, steps=ALTERNATION_STEPS, scales=solution.scales)
     return solution
 
@@ -84,7 +111,7 @@ def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) ->
 def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> list[np.ndarray]:
     others = other_postures(fit.parameters, fit.clicks, motion)
     if len(others) > MOST_OTHERS:
-        support = [fit.support(points, other, vector) for other in others]
+        support = [fit.support(fit.click, points, other, vector) for other in others]
         others = [others[i] for i in np.argsort(support)[::-1][:MOST_OTHERS]]
     starts = [motion, *others]
     view = np.mean([camera.R_cam_world[2] for camera in fit.cameras], axis=0)
@@ -96,4 +123,4 @@ def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np
 
 
 def _observe(fit: Conditions, points: CloudPoints, wide: float) -> Callable[[int, BodyState], list[Observation]]:
-    return lambda t, state: [fit.surface(points, state, wide), *fit.joints(fit.click), *fit.beliefs(state)]
+    return lambda t, state: [*fit.seen_surface(fit.click, points, state, wide), *fit.joints(fit.click), *fit.beliefs(state)]

@@ -14,7 +14,7 @@ from .cloud_points import CloudPoints
 from .empty_views import EmptyViews
 from .joint_tracks import JointTracks
 from .limbs_apart import LimbsApart
-from .observations import ClickedJoints, EqualRadii, Observation, ShapePrior, SurfacePoints, Symmetry
+from .observations import ClickedJoints, EqualRadii, Observation, ShapePrior, SilhouetteRays, SurfacePoints, Symmetry
 from .problem import Problem
 from .robust import robust_weights
 from .segmentation import HeldSegments, segment
@@ -24,6 +24,7 @@ from .state import BodyState, ShapeParameters
 
 SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
 WEIGHT_SIGMA = 0.3  # of ln w: an isolated ball's weight and radius are seen as one, r = l √(½ ln 2w)
+POINTS_OF_RAY = 3  # a limb of 25 cm shows some 300 points (of one voxel each), and 40 rays a view
 NO_SHAPE = np.zeros(0, dtype=np.intp)
 
 
@@ -67,6 +68,19 @@ class Conditions:
                               crowding=(own + share * model) / (own + model), form=s.residual)
         return found.scaled(state)
 
+    def seen_surface(self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0,
+                     held: HeldSegments | None = None) -> list[Observation]:
+        """What the views show of the body's surface in frame index `t`: measured points, and outlines."""
+        return [self.surface(points, state, wide, held), *self.silhouettes.observe(t, state, held, wide)]
+
+    def evidence(self, t: int, points: CloudPoints, state: BodyState) -> np.ndarray:
+        """How many points each bone (B,) has, and what stands for points: rays of outlines, and a keypoint at its end, which is enough."""
+        b, ends = len(state.lengths_m), [self.model.skeleton.joint_names.index(bone.tail_joint) for bone in self.model.skeleton.bones]
+        counts = np.bincount(self.surface(points, state).bone, minlength=b)
+        for rays in self.silhouettes.observe(t, state):
+            counts += POINTS_OF_RAY * np.bincount(rays.bone, minlength=b)
+        return np.asarray(counts + np.where(np.isin(ends, self.tracks.joints(t)), self.settings.min_points, 0))
+
     def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
         """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the model is known."""
         mean, s = self.parameters.vector(), self.settings
@@ -81,14 +95,15 @@ class Conditions:
         return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma)] if len(left) else found
 
     def problem(self, observe: Callable[[int, BodyState], list[Observation]], free: str | None = None,
-                smoothness: Acceleration | None = None) -> Problem:
-        """An adjustment in which the shape parameters of the set `free` may change."""
+                smoothness: Acceleration | None = None, *, hold_motion: bool = False) -> Problem:
+        """An adjustment in which the shape parameters of the set `free` may change, and the motion unless it is held."""
         shape = self.parameters.layout.set(free) if free else NO_SHAPE
+        held = np.arange(len(self.model.skeleton.dofs)) if hold_motion else self.model.skeleton.held
         return Problem(parameters=self.parameters, observe=observe, of_shape=self.of_shape(), free_shape=shape, smoothness=smoothness,
-                       held=self.model.skeleton.held, robust=self.settings.robust, robust_width=self.settings.robust_width)
+                       held=held, robust=self.settings.robust, robust_width=self.settings.robust_width)
 
-    def support(self, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
-        """How many points a body explains: the sum of their weights at a fixed width."""
+    def support(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
+        """How many points and rays of frame index `t` a body explains: the sum of their weights at a fixed width."""
         state = self.parameters.state(motion, vector)
-        found = self.surface(points, state)
-        return float(robust_weights(found.residual(state) * found.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", 3.0).sum())
+        found: list[SurfacePoints | SilhouetteRays] = [self.surface(points, state), *self.silhouettes.observe(t, state)]
+        return sum(float(robust_weights(o.residual(state) * o.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", 3.0).sum()) for o in found)

@@ -1,9 +1,9 @@
 """Frame after frame, forwards and backwards from the click frame, with the shape held (D'Apuzzo et al. 1999, §3.3).
 
 Each frame starts from the prediction 2θ_i − θ_{i−1}, which is also a weak observation; tracked points tie it to its neighbour. A frame
-that explains far fewer points than its neighbour is tried again from the neighbour's posture; one without points keeps the prediction, and
-the next is tried from both. A limb without points (hidden behind another) comes to rest in its prediction, and is looked for in a wider
-and wider gate, so that it is found where it comes out.
+that explains far less than its neighbour is tried again from the neighbour's posture; one without points, outlines, clicks and keypoints
+keeps the prediction, and the next is tried from both. A limb that nothing shows (hidden behind another) comes to rest in its prediction,
+and is looked for in a wider and wider gate, so that it is found where it comes out.
 """
 
 from dataclasses import replace
@@ -38,7 +38,7 @@ def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first
     known = np.ones(motion.shape, dtype=bool)
     for direction in (1, -1):
         support, seen = None, [fit.click]
-        unseen = _unseen(fit, points[fit.click], first.motion[0], first.vector, np.zeros(len(fit.model.skeleton.bones)))
+        unseen = _unseen(fit, fit.click, points[fit.click], first.motion[0], first.vector, np.zeros(len(fit.model.skeleton.bones)))
         for t in range(fit.click + direction, T if direction > 0 else -1, direction):
             monitor.step("fit frame after frame", done, T)
             before = fit.parameters.state(motion[t - direction], first.vector)
@@ -51,7 +51,7 @@ def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first
             if found is not None:
                 support = found
                 seen.append(t)
-                unseen = _unseen(fit, near, motion[t], first.vector, unseen)
+                unseen = _unseen(fit, t, near, motion[t], first.vector, unseen)
                 known[t] = _slowing(fit, unseen) == 1
             done += 1
     states = fit.parameters.states(motion, first.vector)
@@ -63,10 +63,9 @@ def _some(points: CloudPoints) -> CloudPoints:
     return points.take(np.arange(0, len(points.xyz_m), 1 + (len(points.xyz_m) - 1) // MOST_POINTS)) if len(points.xyz_m) else points
 
 
-def _unseen(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """For how many frames each bone (B,) had too few points; 0 for those whose posture the model believes firmly."""
-    bones = fit.surface(points, fit.parameters.state(motion, vector)).bone
-    few = np.bincount(bones, minlength=len(before)) < fit.settings.min_points / 2
+def _unseen(fit: Conditions, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """For how many frames each bone (B,) was not seen well enough; 0 for those whose posture the model believes firmly."""
+    few = fit.evidence(t, points, fit.parameters.state(motion, vector)) < fit.settings.min_points / 2
     return np.where(few & free_bones(fit.parameters), before + 1, 0)
 
 
@@ -100,20 +99,21 @@ def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, di
 
 def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[StepsFromFixed], predictions: list[np.ndarray], first: Solution,
                   last_support: float | None, wide: np.ndarray) -> tuple[np.ndarray, float | None]:
-    """The posture (D,) of frame index `i` and its support; None if the frame has too few points, and the posture is the prediction."""
+    """The posture (D,) of frame index `i` and its support; None if the frame shows too little, and the posture is the prediction."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
     sigma[skeleton.layout.set("base")] = s.prediction_sigma_m
-    best, best_support = predictions[0], 0.0
+    best, best_support = predictions[0], -1.0
 
     def adjusted(start: np.ndarray) -> tuple[np.ndarray, float]:
         prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
-            return [fit.surface(points, state, wide, held), *fit.joints(i), *fit.empty.observe(i), *moved, prior, *fit.beliefs(state)]
+            return [*fit.seen_surface(i, points, state, wide, held), *fit.joints(i), *fit.empty.observe(i), *moved, prior,
+                    *fit.beliefs(state)]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
-        return solution.motion[0], fit.support(points, solution.motion[0], first.vector)
+        return solution.motion[0], fit.support(i, points, solution.motion[0], first.vector)
 
     for start in predictions:
         posture, support = adjusted(start)
@@ -125,4 +125,4 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
         posture, support = adjusted(start)
         if support > best_support + s.min_points / 4:
             best, best_support = posture, support
-    return (predictions[0], None) if best_support < s.min_points else (best, best_support)
+    return (best, best_support) if best_support >= s.min_points or fit.joints(i) else (predictions[0], None)

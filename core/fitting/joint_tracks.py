@@ -61,6 +61,10 @@ class JointTracks:
                 places[j] = intersection([camera for camera, _ in views], np.array([xy for _, xy in views]))
         return places
 
+    def joints(self, t: int) -> list[int]:
+        """The joints that have a keypoint in frame index `t`."""
+        return sorted({int(j) for _, joint, rows in self._rows(t) for j in joint[rows]})
+
     def best_frame(self) -> int:
         """The frame index in which most joints are located."""
         return int(np.argmax([np.isfinite(self.located(t)).all(axis=1).sum() for t in range(len(self._frames))]))

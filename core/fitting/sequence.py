@@ -4,6 +4,9 @@
 2. At that frame the cloud gives posture and radii (`click_frame`).
 3. With that shape held, frame after frame forwards and backwards (`frame_to_frame`).
 4. One adjustment over the whole sequence: the shape once, a posture per frame, tied over time by tracked points and weak accelerations.
+   Frames whose residuals stay suspicious begin once more from between their neighbours.
+
+Points, outlines and keypoints are each enough alone.
 
 A body is not made of metaballs. What it differs, it differs in every frame, so forty frames tell no more of the shape than one does: in
 step 4 what is known of the shape beforehand (radii from the model, bone lengths from the click frame) weighs as much against the points
@@ -69,6 +72,7 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
     sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
     problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, clicked_lengths(fit, points[fit.click], first))
     solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
+    solution = _begun_anew(fit, points, given.time_s, solution, problem, monitor)
     return _result(fit, points, given.time_s, solution, problem)
 
 
@@ -119,8 +123,8 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
     held = HeldSegments()
 
     def observe(t: int, state: BodyState) -> list[Observation]:
-        return [fit.surface(points[t], state, held=held), *fit.joints(t), *fit.silhouettes.observe(t, state, held),
-                *fit.empty.observe(t), *priors, *fit.limbs.observe(state)]
+        return [*fit.seen_surface(t, points[t], state, held=held), *fit.joints(t), *fit.empty.observe(t), *priors,
+                *fit.limbs.observe(state)]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
     return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),
@@ -129,32 +133,62 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
 
 def _shared_weight(points: list[CloudPoints], settings: FitSettings) -> float:
     """By how much T frames tell less of the shape than T times one frame: 1 for noise of the points alone, T for the model's error."""
-    own = float(np.median(np.concatenate([p.sigma_m for p in points]))) ** 2 + 1e-12
+    sigmas = np.concatenate([p.sigma_m for p in points])
+    own = (float(np.median(sigmas)) if len(sigmas) else 0.0) ** 2 + 1e-12
     model, frames = settings.model_sigma_m**2, min(float(len(points)), settings.shared_frames)
     return (own + frames * model) / (own + model)
+
+
+def _begun_anew(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem,
+                monitor: Monitor) -> Solution:
+    """The solution, or that from where frames with suspicious residuals stand between the others, if it explains more of those frames."""
+    sigma0 = np.array([_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
+    strange = np.flatnonzero(_strange(sigma0))
+    good = np.setdiff1d(np.flatnonzero(np.isfinite(sigma0)), strange)
+    if not len(strange) or not len(good) or not fit.settings.sequence_steps:
+        return solution
+    start = solution.motion.copy()
+    start[strange] = np.stack([np.interp(time_s[strange], time_s[good], column) for column in start[good].T], axis=1)
+    again = solve(problem, start, solution.vector, steps=fit.settings.sequence_steps, scales=solution.scales, monitor=monitor,
+                  stage="adjust the sequence")
+    more = sum(fit.support(t, points[t], again.motion[t], again.vector) - fit.support(t, points[t], solution.motion[t], solution.vector)
+               for t in strange.tolist())
+    return again if more > 0 else solution
+
+
+def _sigma0(fit: Conditions, t: int, points: CloudPoints, solution: Solution) -> float:
+    """The robust scale of a frame's points, without points that of its outlines; NaN without either."""
+    state = fit.parameters.state(solution.motion[t], solution.vector)
+    residuals = [r for o in fit.seen_surface(t, points, state) if len(r := o.residual(state))]
+    return robust_scale(residuals[0]) if residuals else np.nan
+
+
+def _strange(sigma0: np.ndarray) -> np.ndarray:
+    """Which frames (T,) have suspicious residuals."""
+    usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
+    return np.asarray(np.nan_to_num(sigma0) > SUSPICIOUS * usual)
 
 
 def _result(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem) -> BodyFit:
     parameters, skeleton = fit.parameters, fit.model.skeleton
     pose, mixed, shape = _covariance(fit, points, problem, solution)
     T, J = len(points), len(skeleton.joint_names)
-    joints, joint_sigma, sigma0 = np.empty((T, J, 3)), np.empty((T, J)), np.full(T, np.nan)
-    counts, outline = np.zeros((T, len(skeleton.bones)), dtype=np.int64), [np.zeros(0)]
+    joints, joint_sigma = np.empty((T, J, 3)), np.empty((T, J))
+    sigma0 = np.array([_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
+    counts, outline = np.zeros((2, T, len(skeleton.bones)), dtype=np.int64), [np.zeros(0)]
     for t in range(T):
         state = parameters.state(solution.motion[t], solution.vector)
         joints[t], A = state.joint_jacobian
         K = np.block([[pose[t], mixed[t]], [mixed[t].T, shape]])
         joint_sigma[t] = np.sqrt(np.einsum("jia,ab,jib->j", A, K, A, optimize=True) / 3)
-        found = fit.surface(points[t], state)
-        counts[t] = np.bincount(found.bone, minlength=len(skeleton.bones))
-        if len(found.bone):
-            sigma0[t] = robust_scale(found.residual(state))
+        counts[0, t] = np.bincount(fit.surface(points[t], state).bone, minlength=len(skeleton.bones))
+        counts[1, t] = fit.evidence(t, points[t], state)
         outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
     motion = BodyMotion(frames=np.array([p.frame for p in points]), time_s=time_s, dof_names=skeleton.dof_names, values=solution.motion,
                         covariance=pose, joint_names=skeleton.joint_names, joints_m=joints, joint_sigma_m=joint_sigma,
-                        status=_statuses(fit, counts, sigma0), sigma0=sigma0)
+                        status=_statuses(fit, counts[1], sigma0), sigma0=sigma0)
     return BodyFit(shape=parameters.shape(solution.vector, np.sqrt(np.diag(shape))), motion=motion, iterations=solution.iterations,
-                   converged=solution.converged, points=counts, outline_m=np.concatenate(outline))
+                   converged=solution.converged, points=counts[0], outline_m=np.concatenate(outline))
 
 
 def _covariance(fit: Conditions, points: list[CloudPoints], problem: Problem,
@@ -182,8 +216,7 @@ def _wider(settings: FitSettings, own_m: float) -> float:
 
 def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
     enough = counts[:, free_bones(fit.parameters)] >= fit.settings.min_points
-    usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
     total = counts.sum(axis=1)
     few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))
-    strange = few | (np.nan_to_num(sigma0) > SUSPICIOUS * usual)
+    strange = few | _strange(sigma0)
     return tuple(BRIDGED if not e.any() else SUSPECT if s else PARTIAL if not e.all() else FITTED for e, s in zip(enough, strange))

@@ -41,8 +41,9 @@ class Silhouettes:
         self._frames = given.frames
         self._rays: dict[int, Rays | None] = {}
 
-    def observe(self, t: int, state: BodyState, held: HeldSegments | None = None) -> list[SilhouetteRays]:
-        """The rays of frame index `t` that touch a limb of the body near its state; none without contours."""
+    def observe(self, t: int, state: BodyState, held: HeldSegments | None = None,
+                wide: np.ndarray | float = 1.0) -> list[SilhouetteRays]:
+        """The rays of frame index `t` that touch a limb of the body near its state; `wide` (B,) or for all multiplies the gate."""
         if t not in self._rays:
             self._rays[t] = self._of_frame(t, state)
         rays = self._rays[t]
@@ -50,7 +51,7 @@ class Silhouettes:
             return []
 
         def find() -> tuple[np.ndarray, np.ndarray]:
-            return touched(rays, state, self._surface, self._settings.gate_m)
+            return touched(rays, state, self._surface, self._settings.gate_m * wide)
 
         rows, bone = find() if held is None else held.get(("rays", t), state, find)
         if not len(rows):
@@ -83,8 +84,9 @@ def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: 
                 angle=sigma_px[keep] / camera.focal_px)
 
 
-def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (K,) of the rays that touch a limb, and its bone (K,). `surface` (B, 2) as in `segmentation.segment`."""
+def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (K,) of the rays that touch a limb, and its bone (K,). `surface` (B, 2) and `gate_m` as in `segmentation.segment`."""
+    gate = np.broadcast_to(gate_m, (len(state.lengths_m),))
     n = len(rays.direction)
     nearest, owner, own = np.full(n, np.inf), np.zeros(n, dtype=np.intp), np.zeros(n, dtype=bool)
     for b in np.unique(state.balls.bone_index).tolist():
@@ -93,7 +95,7 @@ def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: float) ->
         closer = gap < nearest
         nearest[closer], owner[closer] = gap[closer], b
         own[closer] = ((along >= surface[b, 0]) & (along <= surface[b, 1]) & facing)[closer]
-    rows = np.flatnonzero(own & (np.abs(nearest) < gate_m))
+    rows = np.flatnonzero(own & (np.abs(nearest) < gate[owner]))
     return rows, owner[rows]
 
 

@@ -142,3 +142,27 @@ def test_a_hidden_arm_stays_outside_of_the_trunk() -> None:
     freed = parameters.state(solve(problem, motion[None], parameters.vector(), steps=20).motion[0], parameters.vector())
     before, after = (max(np.max(o.residual(state), initial=0.0) for o in limbs.observe(state)) for state in (inside, freed))
     assert before > 3 and after < 1.0  # a centimetre
+
+
+def test_outlines_and_clicks_alone_are_enough(make_scene, other_person) -> None:
+    scene = make_scene(frames=8, seed=5, shape=other_person("arm.R", np.random.default_rng(5)))
+    blind = [SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
+             for c in scene.clouds]
+    fit = fit_sequence(_given(scene, clouds=blind, contours=outlines(scene)), SETTINGS)
+    errors = np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2)
+    assert set(fit.motion.status) == {"fitted"} and fit.converged and np.isfinite(fit.motion.sigma0).all()
+    assert errors.mean() < 3e-3, errors.mean(axis=0)  # three persons: 0.5, 1.5, 0.8 mm
+    with pytest.raises(InputError, match="no measured points"):
+        fit_sequence(_given(scene, clouds=blind), SETTINGS)
+
+
+def test_keypoints_alone_are_enough(make_scene) -> None:
+    scene = make_scene(frames=6, seed=3)
+    blind = [SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
+             for c in scene.clouds]
+    names, frame, X = scene.shape.skeleton.joint_names, np.repeat(np.arange(6), 3), scene.joints_m.reshape(-1, 3)
+    keypoints = [JointPlaces(view=c.name, frame=frame, joint=names * 6, place=c.project(X), sigma=np.full(18, 4.0))
+                 for c in scene.rig.cameras]
+    fit = fit_sequence(_given(scene, clicks={}, keypoints=keypoints, clouds=blind), SETTINGS)
+    assert set(fit.motion.status) == {"fitted"} and np.isnan(fit.motion.sigma0).all()
+    assert np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2).max() < 8e-3

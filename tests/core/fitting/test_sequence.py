@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from tricap.core.errors import InputError
+from tricap.core.fitting import click_frame
 from tricap.core.fitting.click_frame import fit_posture_and_shape
 from tricap.core.fitting.cloud_points import thinned
 from tricap.core.fitting.inverse_kinematics import inverse_kinematics
-from tricap.core.fitting.sequence import FitInput, FitSettings, conditions, fit_sequence
+from tricap.core.fitting.problem import Scales
+from tricap.core.fitting.sequence import FitInput, FitSettings, _begun_anew, conditions, fit_sequence
+from tricap.core.fitting.solver import Solution, solve
 from tricap.core.progress import Cancelled, Monitor
 
 KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
@@ -210,6 +213,51 @@ def test_paper_mode_fits_too(make_scene) -> None:
     settings = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.002, method="alternating", residual="paper",
                            robust="huber", robust_width=1.345)
     assert _joint_errors(scene, _fit(scene, settings)).mean() < 5e-3
+
+
+def test_pose_and_shape_hold_each_other_when_they_alternate(make_scene, monkeypatch) -> None:
+    scene, calls = make_scene(seed=10), []
+
+    def noted(problem, motion, vector, **options):
+        solution = solve(problem, motion, vector, **options)
+        calls.append((problem, not np.array_equal(solution.motion, motion), not np.array_equal(solution.vector, vector)))
+        return solution
+
+    monkeypatch.setattr(click_frame, "solve", noted)
+    _fit(scene, FitSettings(model_sigma_m=0.0, voxel_m=0.002, method="alternating"))
+    moved = [(pose, shape) for _, pose, shape in calls]
+    assert (True, True) not in moved and (True, False) in moved and (False, True) in moved
+
+
+def test_a_start_behind_the_limb_begins_anew_around_the_clicks(make_scene) -> None:
+    scene = make_scene(seed=1, points=400)
+    fit = conditions(_given(scene), KNOWN)
+    points = thinned(scene.clouds[0], KNOWN.voxel_m)
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, KNOWN.length_sigma)
+    around = click_frame._around(fit, clicked.motion[0])
+    assert np.array_equal(around, click_frame._around(fit, clicked.motion[0])) and np.array_equal(around[0], clicked.motion[0])
+    assert len(np.unique(np.round(around, 6), axis=0)) == len(around) == click_frame.OTHERS_AROUND + 1
+    assert np.abs(around[:, 3:] - clicked.motion[0, 3:]).max() <= click_frame.AROUND_RAD + 1e-9
+    wrong = clicked.motion[0] + np.array([0, 0.2, 0, 1.0, -0.9, -1.1, 0.9, -0.7])  # alone this ends 66 mm off, with 3.6 times the residuals
+    solution = fit_posture_and_shape(fit, points, wrong, clicked.vector)
+    X = fit.parameters.state(solution.motion[0], solution.vector).joint_jacobian[0]
+    assert np.linalg.norm(X - scene.joints_m[0], axis=1).max() < 0.012
+
+
+def test_a_frame_that_went_wrong_begins_anew_between_its_neighbours(make_scene) -> None:
+    scene = make_scene(frames=7, seed=4)
+    fit = conditions(_given(scene), UNKNOWN)
+    points = [thinned(c, UNKNOWN.voxel_m) for c in scene.clouds]
+    vector = fit.parameters.vector(scene.shape)
+    problem = fit.problem(lambda t, state: [*fit.seen_surface(t, points[t], state), *fit.beliefs(state)])
+    lost = scene.motion.copy()
+    lost[3, 1] += 0.03  # behind the limb's surface
+    lost[3, 3:5] += 0.2
+    solution = Solution(motion=lost, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
+    again = _begun_anew(fit, points, scene.time_s, solution, problem, Monitor())
+    assert np.degrees(np.abs(again.motion[3, 3:5] - scene.motion[3, 3:5])).max() < 3.0
+    good = Solution(motion=scene.motion, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
+    assert _begun_anew(fit, points, scene.time_s, good, problem, Monitor()) is good
 
 
 def _empty(frame: int) -> SimpleNamespace:
