@@ -233,22 +233,27 @@ def _trial(observations: BarObservations, tree: list[Pair], network: Network) ->
 
 
 def trial_part(observations: BarObservations, tree: list[Pair]) -> BarObservations:
-    """Labelled positions on which all pairs of the tree agree as far as they see them, at most `BARS_PER_TRIAL`."""
-    C = len(observations.names)
-    known = np.zeros((len(observations.xy_px), C), dtype=bool)
-    flipped = np.zeros_like(known)
-    root = tree[0].i
-    for pair in tree:
-        if pair.i == root:
-            known[pair.positions, root] = True
-        follows = known[pair.positions, pair.i]
-        at = pair.positions[follows]
-        known[at, pair.j] = True
-        flipped[at, pair.j] = flipped[at, pair.i] ^ pair.swapped[follows]
+    """Labelled positions on which the pairs of the tree agree: `BARS_PER_TRIAL` that all cameras see, or what each pair sees besides.
+
+    The order of the ends is told along the tree from any camera that sees a position, so cameras need not have one position in common.
+    """
+    N, C = len(observations.xy_px), len(observations.names)
+    joined_to = np.tile(np.arange(C), (N, 1))  # the first camera of the chain by which a position is seen
+    flipped = np.zeros((N, C), dtype=bool)
+    for pair in tree:  # parents come before their children
+        joined_to[pair.positions, pair.j] = joined_to[pair.positions, pair.i]
+        flipped[pair.positions, pair.j] = flipped[pair.positions, pair.i] ^ pair.swapped
+    size = (joined_to[:, :, None] == np.arange(C)).sum(axis=1)  # (N, C) cameras in the chain of each
+    known = joined_to == size.argmax(axis=1)[:, None]
     xy = np.where(flipped[..., None, None], observations.xy_px[:, :, ::-1], observations.xy_px)
     xy = np.where(known[..., None, None], xy, np.nan)
-    order = np.argsort(-known.sum(axis=1), kind="stable")
-    enough = order[: max(BARS_PER_TRIAL, int((known.sum(axis=1) == C).sum()))]
-    some = np.sort(enough[np.unique(np.linspace(0, len(enough) - 1, BARS_PER_TRIAL).astype(int))])
-    some = some[known[some].sum(axis=1) >= 2]
+    some = _spread(np.flatnonzero(known.all(axis=1)), BARS_PER_TRIAL)
+    if len(some) < BARS_PER_TRIAL:
+        each = -(-BARS_PER_TRIAL // len(tree))
+        some = np.unique(np.concatenate([some, *(_spread(np.flatnonzero(known[:, p.i] & known[:, p.j]), each) for p in tree)]))
     return observations.changed(xy[some], observations.frames[some])
+
+
+def _spread(positions: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of the positions, evenly over the time."""
+    return positions[np.unique(np.linspace(0, len(positions) - 1, count).astype(int))] if len(positions) else positions
