@@ -17,8 +17,8 @@ from .calibration.observations import BarObservations
 from .calibration.pictures import pictures
 from .calibration.quality import Quality, assess
 from .calibration.self_calibration import Calibration, calibrate
-from .calibration.target_tracks import BarTrack, track_bar
-from .calibration.targets import Targets, TargetStatus, find_targets
+from .calibration.target_tracks import BarTrack, moved_targets, track_bar
+from .calibration.targets import Targets, find_targets
 from .calibration.world_choice import WorldChoice, frame_of_bar
 from .errors import InputError
 from .geometry.rig import Rig
@@ -134,7 +134,7 @@ def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note |
             raise InputError(f"The mask has {footage.mask.shape[1]}×{footage.mask.shape[0]} pixels, view {name} {size[0]}×{size[1]}.")
         targets = find_targets(rows.rows(image), None if footage.mask is None else rows.rows(footage.mask))
         found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
-        whole += int((targets.status == TargetStatus.OK).sum() >= 2)
+        whole += int(moved_targets(found[-2:]) >= 2)
         if note is not None:
             note(name, len(found), whole)
     monitor.step(f"targets {name}", footage.count, footage.count)
@@ -159,7 +159,7 @@ def _check_view(footage: BarFootage, view: int, track: BarTrack, width_px: int) 
     way = np.ptp(track.xy_px[complete], axis=0).max()
     if complete.sum() > 3 and (track.still or way < MIN_WAY * width_px):
         raise InputError(
-            f"The bar stands still in view {name} in {footage.folder} (it moves {way:.1f} px); "
+            f"The bar stands still in view {name} in {footage.folder} (it moves {way:.1f} px), or only lamps and reflections are seen there; "
             "wave it through the whole volume, in all directions."
         )
 

@@ -19,7 +19,7 @@ from .targets import Targets, TargetStatus
 
 MOST_SPOTS = 6
 STILL_PX, STILL_PART = 1.5, 0.5  # a spot within STILL_PX in more than this part of the frames stands still
-MIN_STILL_FRAMES = 8
+MIN_STILL_FRAMES, FRAMES_ASKED = 8, 80  # so many frames tell what stands still, however long the sequence is
 EXPECTED_WAY = 0.05  # of the image width, from frame to frame
 JUMP, NOTHING = 6.0, 8.0  # costs
 LIKE_AREAS, LARGE = 1.0, 1.0  # weights of (1)
@@ -54,17 +54,25 @@ def track_bar(frames: Sequence[Targets], width_px: float) -> BarTrack:
     return BarTrack(xy_px=_with_singles(track, xy, width_px), spots=spots, still=still)
 
 
+def moved_targets(frames: Sequence[Targets]) -> int:
+    """How many targets of the last of the frames were not at their place in the one before."""
+    xy = frames[-1].xy_px[frames[-1].status == TargetStatus.OK]
+    if len(frames) < 2 or not len(frames[-2].xy_px):
+        return len(xy)
+    return int((np.linalg.norm(xy[:, None] - frames[-2].xy_px[None], axis=2).min(axis=1) >= STILL_PX).sum())
+
+
 def _moving(frames: Sequence[Targets], usable: list[np.ndarray]) -> list[np.ndarray]:
     """Indices of the spots that do not stand still in most frames."""
     if len(frames) < MIN_STILL_FRAMES:
         return usable
     points = np.concatenate([t.xy_px[u] for t, u in zip(frames, usable)])
     counts = np.zeros(len(points), dtype=int)
-    for t, u in zip(frames, usable):
-        if len(u):
-            distance = np.linalg.norm(points[:, None] - t.xy_px[u][None], axis=2)
-            counts += (distance < STILL_PX).any(axis=1)
-    stands = np.split(counts > STILL_PART * len(frames), np.cumsum([len(u) for u in usable])[:-1])
+    asked = np.unique(np.linspace(0, len(frames) - 1, FRAMES_ASKED).astype(int))
+    for xy in (frames[n].xy_px[usable[n]] for n in asked):
+        if len(xy):
+            counts += ((points[:, None] - xy[None]) ** 2).sum(axis=2).min(axis=1) < STILL_PX**2
+    stands = np.split(counts > STILL_PART * len(asked), np.cumsum([len(u) for u in usable])[:-1])
     return [u[~s] for u, s in zip(usable, stands)]
 
 

@@ -20,10 +20,11 @@ from ..values import frozen
 
 MIN_CONTRAST = 30.0  # grey values between a target's peak and the background
 RELATIVE_THRESHOLD = 0.5  # of a blob's own contrast, where its outline is
+HIGHER_THRESHOLDS = (0.65, 0.8, 0.9)  # of what is not compact there: targets that a bright bar joins
 BRIGHTNESS = 0.35  # a target has at least this part of the contrast of the brightest blob
 MIN_AREA, MAX_AREA_PART = 4, 0.02  # pixels; part of the image
 MIN_FILL, MAX_ELONGATION = 0.72, 3.5
-MOST_BLOBS = 64
+MOST_BLOBS, MOST_PARTS = 64, 8
 WINDOW_SIDES = (9, 13, 19, 27, 39, 57, 83, 121)
 ITERATIONS, CONVERGED_PX = 16, 1e-3
 SETTLED = 5  # iterations after which the target's outline is known
@@ -92,23 +93,38 @@ def find_blobs(image: np.ndarray) -> Blobs:
         by_area = 1 + np.argsort(-statistics[1:count, cv2.CC_STAT_AREA])[: 4 * MOST_BLOBS]
         for n in by_area[statistics[by_area, cv2.CC_STAT_AREA] <= MAX_AREA_PART * image.size]:
             x, y, w, h, _ = statistics[n]
-            row = _outlined(image[y : y + h, x : x + w], labels[y : y + h, x : x + w] == n, background)
-            if row is not None and row[4] >= BRIGHTNESS * highest:
-                rows.append((row[0] + x, row[1] + y, *row[2:]))
+            for row in _outlines(image[y : y + h, x : x + w], labels[y : y + h, x : x + w] == n, background):
+                if row[4] >= BRIGHTNESS * highest:
+                    rows.append((row[0] + x, row[1] + y, *row[2:]))
     table = np.array(sorted(rows, key=lambda r: -r[4] * r[5])[:MOST_BLOBS], dtype=np.float64).reshape(-1, 6)
     return Blobs(xy_px=table[:, :2], width_px=table[:, 2:4], area_px=table[:, 5], contrast=table[:, 4], background=background)
 
 
-def _outlined(grey: np.ndarray, inside: np.ndarray, background: float) -> tuple[float, ...] | None:
-    """Centroid x y, widths along x and y, contrast and area within the half-contrast outline; None if it is not compact.  (1)"""
+def _outlines(grey: np.ndarray, inside: np.ndarray, background: float) -> list[tuple[float, ...]]:
+    """What is compact within a bright area: itself, or at a higher threshold the parts into which it falls."""
+    whole = _outlined(grey, inside, background, RELATIVE_THRESHOLD)
+    if whole is not None:
+        return [whole]
+    contrast, best = float(grey[inside].max()) - background, list[tuple[float, ...]]()
+    for threshold in HIGHER_THRESHOLDS:
+        count, parts = cv2.connectedComponents((inside & (grey > background + threshold * contrast)).astype(np.uint8), connectivity=4)
+        found = [_outlined(grey, parts == n, background, threshold) for n in range(1, min(count, MOST_PARTS + 1))]
+        compact = [row for row in found if row is not None]
+        if len(compact) > max(1, len(best)):
+            best = compact
+    return best
+
+
+def _outlined(grey: np.ndarray, inside: np.ndarray, background: float, threshold: float) -> tuple[float, ...] | None:
+    """Centroid x y, widths along x and y, contrast and area within the outline at that part of the contrast; None if not compact.  (1)"""
     peak = np.sort(grey[inside])[-min(5, int(inside.sum())) :].mean()
     contrast = float(peak) - background
-    core = inside & (grey > background + RELATIVE_THRESHOLD * contrast)
+    core = inside & (grey > background + threshold * contrast)
     area = int(core.sum())
     if area < MIN_AREA:
         return None
     y, x = np.nonzero(core)
-    weight = grey[core].astype(np.float64) - background - RELATIVE_THRESHOLD * contrast
+    weight = grey[core].astype(np.float64) - background - threshold * contrast
     spread = np.cov(np.stack([x, y]).astype(np.float64), ddof=0) + np.eye(2) / 12
     small, large = np.sqrt(np.linalg.eigvalsh(spread))
     if large > MAX_ELONGATION * small or area < MIN_FILL * 4 * np.pi * small * large:

@@ -71,6 +71,20 @@ def test_what_is_no_disc_is_said() -> None:
     assert len(find_targets(np.random.default_rng(0).normal(20, 3, (200, 300)).astype(np.float32)).xy_px) == 0
 
 
+@pytest.mark.parametrize(("bar", "least"), [(60.0, 0.9), (110.0, 0.9)])
+def test_a_bright_bar_hides_no_target(bar: float, least: float) -> None:
+    waved = waved_bar(benchmark_cameras(), 12, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    rng, look = np.random.default_rng(0), BarPictures(radius_m=0.015, bar=bar, reflections=0)
+    off, places = [], 0
+    for n in range(12):
+        targets = find_targets(picture(waved, n, 1, look, rng).astype(np.float32))
+        true = waved.xy_px[n, 1][np.isfinite(waved.xy_px[n, 1]).all(axis=1)]
+        places += len(true)
+        off += [np.linalg.norm(true - xy, axis=1).min() for xy in targets.xy_px[targets.status == TargetStatus.OK]]
+    assert len(off) >= least * places and np.median(off) < 0.02
+    assert max(off) < 0.3, "the bar itself is no target"
+
+
 def spots(*xy: tuple[float, float], area: float = 80.0) -> Targets:
     n = len(xy)
     points = np.array(xy, dtype=float).reshape(n, 2)
@@ -89,6 +103,16 @@ def test_tracks_leave_out_reflections_and_keep_the_order() -> None:
     assert (np.linalg.norm(np.diff(ends, axis=0), axis=2) < 40).all()
     assert np.isfinite(track.xy_px[5]).all(axis=1).sum() == 1
     assert not (np.nanmin(np.abs(track.xy_px - [600.0, 50.0]).sum(axis=2)) < 1)
+
+
+def test_reflections_alone_are_no_bar(tmp_path: Path) -> None:
+    waved = waved_bar(benchmark_cameras(), 12, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
+    hidden = replace(waved, xy_px=np.full_like(waved.xy_px, np.nan))
+    write_bar_folder(tmp_path / "bar", hidden, BarPictures(bar=14.0, reflections=4))
+    counts: list[int] = []
+    with pytest.raises(InputError, match="or only lamps and reflections are seen there"):
+        measure_bar(open_bar(tmp_path / "bar"), 0.5, Monitor(), lambda name, frames, whole: counts.append(whole))
+    assert max(counts) <= 1  # what stands still is not counted; the first image has none before it
 
 
 @pytest.fixture(scope="module")
