@@ -159,8 +159,8 @@ def _check_view(footage: BarFootage, view: int, track: BarTrack, width_px: int) 
     way = np.ptp(track.xy_px[complete], axis=0).max()
     if complete.sum() > 3 and (track.still or way < MIN_WAY * width_px):
         raise InputError(
-            f"The bar stands still in view {name} in {footage.folder} (it moves {way:.1f} px), or only lamps and reflections are seen there; "
-            "wave it through the whole volume, in all directions."
+            f"The bar stands still in view {name} in {footage.folder} (it moves {way:.1f} px), "
+            "or only lamps and reflections are seen there; wave it through the whole volume, in all directions."
         )
 
 

@@ -88,24 +88,26 @@ def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera
     """One camera of the scene.
 
     Raises:
-        InputError: it is no perspective camera, or its sensor is fitted to the height.
+        InputError: it is no perspective camera, or its clip's lens model is not ours.
     """
     data = camera_object.data
-    if data.type != "PERSP" or data.sensor_fit == "VERTICAL":
-        raise InputError(f"{camera_object.name} is no perspective camera with the sensor fitted to its width; set both in its properties.")
+    if data.type != "PERSP":
+        raise InputError(f"{camera_object.name} is no perspective camera; set its type in its properties.")
     clip = clip_behind(camera_object)
     own = camera_object.get("tricap_size_px")
     size = tuple(int(v) for v in (own or (clip.size if clip else (scene.render.resolution_x, scene.render.resolution_y))))
     aspect = clip.tracking.camera.pixel_aspect if clip else scene.render.pixel_aspect_y / scene.render.pixel_aspect_x
     w, h = size
-    fx = data.lens * w / data.sensor_width
-    cx, cy = axes.pixel_from_uv(np.array([0.5 - data.shift_x, 0.5 - data.shift_y * w / h / aspect]), (w, h))
+    upright = data.sensor_fit == "VERTICAL" or (data.sensor_fit == "AUTO" and h * aspect > w)
+    fitted = h * aspect if upright else w  # of the image, in pixels of its rows, on the sensor's side; shifts are parts of it
+    fx = data.lens * fitted / (data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width)
+    cx, cy = axes.pixel_from_uv(np.array([0.5 - data.shift_x * fitted / w, 0.5 - data.shift_y * fitted / h / aspect]), (w, h))
     R, t = axes.camera_from_world(np.array(camera_object.matrix_world))
     name = str(camera_object.get("tricap_view", camera_object.name))
     matrix = np.array([[fx, 0, cx], [0, fx / aspect, cy], [0, 0, 1]])
     read = Camera(name=name, size_px=(w, h), matrix=matrix, distortions=_distortions(clip), R_cam_world=R, t_cam_world_m=t)
     exact = camera_object.get(EXACT)
-    return _exact_camera(read, np.array(exact)) if exact is not None and _unchanged(read, np.array(exact)) else read
+    return _exact_camera(read, np.array(exact)) if exact is not None and _unchanged(read, np.array(exact), clip is not None) else read
 
 
 def _distortions(clip: bpy.types.MovieClip | None) -> np.ndarray:
@@ -114,6 +116,8 @@ def _distortions(clip: bpy.types.MovieClip | None) -> np.ndarray:
         return np.zeros(5)
     lens = clip.tracking.camera
     if lens.distortion_model == "BROWN":
+        if lens.brown_k4:
+            raise InputError(f"The lens of the clip {clip.name} has a K4, which has no counterpart here; set it to 0 and solve again.")
         return np.array([lens.brown_k1, lens.brown_k2, -lens.brown_p2, lens.brown_p1, lens.brown_k3])
     if lens.distortion_model == "POLYNOMIAL":
         return np.array([lens.k1, lens.k2, 0.0, 0.0, lens.k3])
@@ -138,13 +142,13 @@ def _exact_camera(read: Camera, values: np.ndarray) -> Camera:
     )
 
 
-def _unchanged(read: Camera, values: np.ndarray) -> bool:
-    """Whether Blender's values are still those of the calibrated camera, as far as single precision can say."""
+def _unchanged(read: Camera, values: np.ndarray, has_lens: bool) -> bool:
+    """Whether Blender's values are still the calibrated camera's, as far as single precision can say; `has_lens`: a clip is behind it."""
     exact = _exact_camera(read, values)
     fx = exact.matrix[0, 0] * (1 + exact.affinity[0])
     expected = np.array([fx, exact.matrix[1, 1], *exact.matrix[:2, 2], *exact.R_cam_world.ravel(), *exact.t_cam_world_m])
     got = np.array([read.matrix[0, 0], read.matrix[1, 1], *read.matrix[:2, 2], *read.R_cam_world.ravel(), *read.t_cam_world_m])
     pixels = SAME * max(read.size_px) * 4
     scale = np.array([fx * SAME * 4, fx * SAME * 4, pixels, pixels, *[SAME] * 9, *[SAME * (1 + np.abs(exact.t_cam_world_m).max()) * 4] * 3])
-    distorted = np.any(read.distortions) and np.abs(read.distortions - exact.distortions).max() > 1e-6
+    distorted = has_lens and np.abs(read.distortions - exact.distortions).max() > SAME * max(1.0, np.abs(exact.distortions).max())
     return bool((np.abs(expected - got) <= scale).all() and not distorted)

@@ -65,14 +65,19 @@ class Calibrate(JobOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, result: Done) -> set[str]:
         """Build the cameras and tell the verdict."""
+        views = [view.name for view in context.scene.tricap.views] if project.bound(context.scene) else []
+        strangers = [name for name in views if name not in result.footage.names]
+        if views and not strangers:
+            use_rig(context.scene, result.result.rig)
         files = {name: list(s.files()) for name, s in zip(result.footage.names, result.footage.sequences)}
         tracks = dict(zip(result.footage.names, result.measured.tracks))
         build_cameras(context.scene, result.result.rig, files, tracks, result.result.bar)
         verdict, props = result.result.verdict, context.scene.tricap_calibrate
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)
-        if project.bound(context.scene):
-            use_rig(context.scene, result.result.rig)
+        if strangers:
+            self.report({"WARNING"}, f"The project keeps its cameras, for its view {strangers[0]} has no footage of that name in "
+                        f"{result.footage.folder}; rename the view or the footage, and load {result.written}.")
         return {"FINISHED"}
 
 

@@ -90,6 +90,40 @@ def test_an_own_camera_of_blender(blender, empty, tmp_path: Path) -> None:
     assert read.project(np.array([1.0, 0.5, 0.0])) == pytest.approx([959.5 + 2666.667 / 5, 539.5 - 2666.667 / 10], abs=1e-3)
 
 
+@pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
+@pytest.mark.parametrize("size", [(1920, 1080, 1.0), (1080, 1920, 1.0), (768, 720, 1.25)], ids=["wide", "upright", "PAL"])
+def test_every_sensor_fit_is_read_as_blender_projects(blender, empty, tmp_path: Path, fit: str, size: tuple[int, int, float]) -> None:
+    """Against Blender's own projection matrix, with shifted lens, upright images and pixels that are no squares."""
+    width, height, aspect = size
+    data = empty.data.cameras.new("mine")
+    data.lens, data.sensor_width, data.sensor_height, data.sensor_fit, data.shift_x, data.shift_y = 40.0, 30.0, 20.0, fit, 0.07, -0.11
+    camera = empty.data.objects.new("mine", data)
+    empty.context.scene.collection.objects.link(camera)
+    render = empty.context.scene.render
+    render.resolution_x, render.resolution_y, render.pixel_aspect_x, render.pixel_aspect_y = width, height, 1.0, aspect
+    empty.context.view_layer.update()
+    empty.ops.tricap.export_rig(filepath=str(tmp_path / "out.toml"))
+    point = np.array([0.3, -0.2, -4.0])
+    matrix = camera.calc_matrix_camera(empty.context.evaluated_depsgraph_get(), x=width, y=height, scale_x=1.0, scale_y=aspect)
+    clip = np.array(matrix) @ [*point, 1.0]
+    u, v = (clip[:2] / clip[3] + 1) / 2
+    assert read_rig(tmp_path / "out.toml")["mine"].project(point) == pytest.approx([u * width - 0.5, (1 - v) * height - 0.5], abs=2e-3)
+
+
+def test_a_lens_that_was_cleared_or_cannot_be_read_is_noticed(blender, empty, bar: Path, tmp_path: Path) -> None:
+    empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)
+    lens = empty.data.movieclips["Bar C"].tracking.camera
+    empty.ops.tricap.export_rig(filepath=str(tmp_path / "kept.toml"))
+    assert abs(read_rig(tmp_path / "kept.toml")["C"].distortions[0]) > 0.1
+    lens.brown_k1 = lens.brown_k2 = lens.brown_k3 = lens.brown_p1 = lens.brown_p2 = 0.0
+    empty.ops.tricap.export_rig(filepath=str(tmp_path / "cleared.toml"))
+    assert not read_rig(tmp_path / "cleared.toml")["C"].distortions.any()
+    lens.brown_k4 = 0.1
+    with pytest.raises(RuntimeError, match="K4"):
+        empty.ops.tricap.export_rig(filepath=str(tmp_path / "k4.toml"))
+    assert not (tmp_path / "k4.toml").exists()
+
+
 FLOOR = {"World origin": [0.2, 0.5, 2.5], "World X": [0.45, 0.5, 2.6], "World Y": [0.1, 0.5, 2.9]}  # in the frame of the true cameras
 
 

@@ -1,5 +1,7 @@
 """From image points alone to the bound: starts, blunders, mixed-up ends, gaps, small lenses; and when the data cannot do it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,20 @@ def test_a_simple_lens_gets_the_small_model() -> None:
 def test_random_rigs_converge(noise: BarNoise) -> None:
     ratios = [ratio(drawn(seed, 200, noise), 0.1, labelled=not noise.unlabelled) for seed in range(2, 5)]
     assert max(ratios) < WORST_RATIO, ratios
+
+
+@pytest.mark.parametrize("seen_by", ["neighbours", "any two"])
+def test_cameras_need_no_position_in_common(seen_by: str) -> None:
+    """Four cameras; every position of the bar is seen by two of them only."""
+    for seed in range(3):
+        cameras = (*benchmark_cameras(), replace(random_cameras(np.random.default_rng(seed), "triangle")[2], name="D"))
+        noise = BarNoise(sigma_px=0.1, gross=0.02, missing=0.0, unlabelled=True)
+        waved = waved_bar(cameras, 300, np.random.default_rng(seed), noise)
+        rng, hidden = np.random.default_rng(seed + 100), np.ones((300, 4), dtype=bool)
+        for n in range(300):
+            hidden[n, [n % 3, n % 3 + 1] if seen_by == "neighbours" else rng.choice(4, 2, replace=False)] = False
+        waved = replace(waved, xy_px=np.where(hidden[:, :, None, None], np.nan, waved.xy_px))
+        assert ratio(waved, 0.1, labelled=False) < WORST_RATIO
 
 
 @pytest.mark.slow
