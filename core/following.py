@@ -62,7 +62,11 @@ def track_frames(
     monitor: Monitor,
     enhance: EnhanceSettings | None = None,
 ) -> Iterator[TrackedFrame]:
-    """Follow the surface through the frames (in the order of time), in which rays were allowed to miss by `limit_px`."""
+    """Follow the surface through the frames (in the order of time), in which rays were allowed to miss by `limit_px`.
+
+    Frames that were tracked before are not tracked again for other knobs of the filters.
+    """
+    tracking = tracking.of_the_step
     view = tracking_view(footage, matching, tracking, limit_px)
     none = no_templates(view.matching, view.rows.step)
     state = _State(before=None, current=None, templates=none, waiting=nobody(len(view.cameras)), born=0)

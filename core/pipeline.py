@@ -200,7 +200,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         Cancelled: the frames measured so far are kept.
     """
     began, s = time.perf_counter(), run.settings
-    _forget_other_clouds(run)
+    run.results.keep_clouds(run.footage.frames)
     done, room = [], None
     if s["timing"].correct and not run.footage.late_images:
         run.footage, run.account["offsets"] = in_step(run.footage, monitor)
@@ -387,13 +387,6 @@ def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
     write_joints(run.results.path("joints.csv"), body.motion)
     write_motion(run.results.path("motion.csv"), body.motion, body.shape.skeleton)
     write_body(run.results.path("body.toml"), body.shape)
-
-
-def _forget_other_clouds(run: Run) -> None:
-    """Remove clouds of frames that this run does not have."""
-    for path in run.results.path("clouds").glob("*.ply"):
-        if not path.stem.isdigit() or int(path.stem) not in run.footage.frames:
-            path.unlink()
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:

@@ -103,6 +103,12 @@ class Results:
                 said = f"Cannot remove {path}: {error.strerror or error}. Close what uses it, or choose another folder."
                 raise InputError(said) from error
 
+    def keep_clouds(self, frames: range) -> None:
+        """Remove the clouds of all other frames."""
+        for path in self.path("clouds").glob("*.ply"):
+            if not path.stem.isdigit() or int(path.stem) not in frames:
+                path.unlink()
+
     def write_cloud(self, cloud: PointCloud) -> None:
         """clouds/NNNN.ply"""
         write_cloud(

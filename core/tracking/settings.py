@@ -1,11 +1,13 @@
 """Settings of tracking, and what can become of a trajectory."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import Any
 
 from ..settings import knob
 
 UNIFORMITY = ("rigid", "voxels", "off")
+AFTERWARDS = ("max_speed", "max_acceleration", "uniformity", "max_sigma_ratio", "min_length", "smooth_frames")  # knobs of the filters alone
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,6 +59,12 @@ class TrackingSettings:
     smooth_frames: int = knob(
         7, "Frames over which smoothed velocities and accelerations are taken (odd; 0: as they are).", unit="frames", low=0, high=99
     )
+
+    @property
+    def of_the_step(self) -> "TrackingSettings":
+        """The same but for the knobs that are asked after tracking, which have their defaults: what a checkpoint depends on."""
+        defaults: dict[str, Any] = {f.name: f.default for f in fields(self) if f.name in AFTERWARDS}
+        return replace(self, **defaults)
 
 
 class TrackStatus(IntEnum):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tricap.core.progress import Cancelled, Monitor
+from tricap.core.tracking.settings import AFTERWARDS
 from tricap.core.tracking.step import TrackedFrame
 
 
@@ -55,6 +56,26 @@ def test_what_changes_is_tracked_again(plane_take: Path, tmp_path: Path, scenes:
     assert not np.array_equal(again[0].xyz_m[:50], first[0].xyz_m[:50])
     for a, b in zip(first, scenes.track(plane_take, tmp_path / "out", measured)):
         same(a, b)
+
+
+def test_filters_ask_for_no_new_tracking(plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other knobs of the filters: every checkpoint is used again, and the result is that of a fresh run. A knob of the step tracks anew."""
+    other = {"tracking": {"max_speed": 8.0, "max_acceleration": 90.0, "uniformity": "voxels", "max_sigma_ratio": 2.0, "min_length": 3,
+                          "smooth_frames": 5}}  # fmt: skip
+    assert set(other["tracking"]) == set(AFTERWARDS)
+    measured = scenes.measure(plane_take, tmp_path / "out")
+    scenes.track(plane_take, tmp_path / "out", measured)
+    fresh = scenes.track(plane_take, tmp_path / "fresh", measured, other)
+
+    def no_tracking(*_: Any) -> None:
+        raise AssertionError("tracked again")
+
+    monkeypatch.setattr("tricap.core.following.track_step", no_tracking)
+    for a, b in zip(fresh, scenes.track(plane_take, tmp_path / "out", measured, other), strict=True):
+        same(a, b)
+    for name, value in (("max_deviation_mm", 3.0), ("neighbourhood_m", 0.2)):  # the filters ask for them, and the step does, too
+        with pytest.raises(AssertionError, match="tracked again"):
+            scenes.track(plane_take, tmp_path / "out", measured, {"tracking": {name: value}})
 
 
 def test_frames_without_a_surface(tmp_path: Path, scenes: Any) -> None:
