@@ -88,9 +88,8 @@ def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:
     unknown = [name for name in names if name not in rig.index]
     if unknown:
         raise InputError(f"The target has no bone “{unknown[0]}”; choose another in the mapping.")
-    steering = found.steering
-    controls = {*steering.follows, *steering.follows.values()} if steering is not None else set()
-    return replace(edited, steering=steering if controls.issuperset(names) else None)
+    steering = edited.steering or found.steering
+    return replace(edited, steering=steering and steering.of_controls(edited.bones, edited.twist))
 
 
 def transfer(source: Motion, source_map: RigMap, target: Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor

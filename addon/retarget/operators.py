@@ -1,4 +1,4 @@
-"""bpy.ops.tricap.retarget(), .retarget_find_map(), .retarget_save_map(), .retarget_preview(), .retarget_end_preview()"""
+"""bpy.ops.tricap.retarget(), .retarget_preview(), .retarget_end_preview()"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.mapping import RigMap, write_map
+from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.resample import resampled
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings
 from ...core.motion.retarget.rig import Motion
@@ -55,7 +55,8 @@ class Retarget(JobOperator, bpy.types.Operator):
         moving = None if self.file else armature_of(self.source, props.source, "source", needed=not props.file)
         if moving is not None:
             apply.check_distinct(moving, self._target)
-        edited = properties.edited_map(props) if not self.map and props.target == self._target else None
+        edited = properties.edited_map(props, self._target) if not self.map else None
+        self._unused = properties.other_lines(props, self._target) if not self.map else ""
         self._goal = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None, edited)
         goal, scene = self._goal, context.scene
         fps, start = scene.render.fps / scene.render.fps_base, scene.frame_start
@@ -74,8 +75,9 @@ class Retarget(JobOperator, bpy.types.Operator):
         outcome = apply.apply(self._target, result.source, result.source_map, self._goal, result.result, self._name, props.tolerance_deg)
         if props.strip:
             push_to_strip(self._target, outcome.written.action)
-        props.last = "\n".join([str(outcome.figures), *outcome.notes])
-        for note in outcome.notes:
+        notes = [*filter(None, [self._unused]), *outcome.notes]
+        props.last = "\n".join([str(outcome.figures), *notes])
+        for note in notes:
             self.report({"INFO"}, note)
         self.report({"INFO"}, f"{self._target.name}: {outcome.figures}")
         return {"FINISHED"}
@@ -100,57 +102,6 @@ def armature_of(name: str, chosen: bpy.types.Object | None, which: str, *, neede
     return found
 
 
-class FindMap(bpy.types.Operator):
-    """Recognise the target's bones by their names and the rig's shape, and show the mapping for editing"""
-
-    bl_idname = "tricap.retarget_find_map"
-    bl_label = "Recognise"
-    bl_options = {"UNDO"}
-
-    file: bpy.props.StringProperty(name="Mapping", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                   description="Read the mapping from this file instead")
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Fill the editor."""
-        props = context.scene.tricap_retarget
-        try:
-            rig = read_rig(armature_of("", props.target, "target"))
-            rig_map = apply.map_of(rig, Path(bpy.path.abspath(self.file)) if self.file else None, steer=True)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        properties.fill_rows(props, rig_map)
-        for line in (*rig_map.missing, *rig_map.notes):
-            self.report({"INFO"}, line)
-        return {"FINISHED"}
-
-
-class SaveMap(bpy.types.Operator):
-    """Save the mapping as a file that can be edited, shared and used again"""
-
-    bl_idname = "tricap.retarget_save_map"
-    bl_label = "Save Mapping"
-
-    filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the file."""
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Write it."""
-        rig_map = properties.edited_map(context.scene.tricap_retarget)
-        try:
-            if rig_map is None:
-                raise InputError("There is no mapping to save; recognise the target first.")
-            write_map(Path(bpy.path.abspath(self.filepath)), rig_map, Path(self.filepath).stem)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
-
-
 class Preview(bpy.types.Operator):
     """Let the target follow the source live, by constraints; feet are pinned only by Retarget"""
 
@@ -164,7 +115,7 @@ class Preview(bpy.types.Operator):
         try:
             source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
             apply.check_distinct(source, target)
-            source_rig, goal = read_rig(source), apply.read_target(target, edited=properties.edited_map(props))
+            source_rig, goal = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
             count = preview.add_preview(source, source_rig, apply.map_of(source_rig), target, goal.rig, goal.rig_map)
         except InputError as error:
             self.report({"ERROR"}, str(error))
@@ -189,4 +140,4 @@ class EndPreview(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (Retarget, FindMap, SaveMap, Preview, EndPreview)
+CLASSES = (Retarget, Preview, EndPreview)

@@ -1,11 +1,13 @@
 """The section “Onto a Character” of the panel. draw() only draws."""
 
 import dataclasses
+from typing import Any
 
 import bpy
 
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.retarget import RetargetSettings
+from . import properties
 
 
 class TRICAP_UL_map(bpy.types.UIList):
@@ -16,6 +18,27 @@ class TRICAP_UL_map(bpy.types.UIList):
         row = layout.row(align=True)
         row.prop(item, "role", text="", emboss=False)
         row.prop(item, "bones", text="", emboss=False)
+        if item.twist:  # shown and edited below the list
+            row.label(text="", icon="CON_ROTLIKE")
+
+
+def _draw_map(layout: bpy.types.UILayout, props: Any) -> None:
+    """The mapping's lines, which can be edited, and what was not found."""
+    row = layout.row()
+    row.template_list("TRICAP_UL_map", "", props, "rows", props, "row", rows=6)
+    buttons = row.column(align=True)
+    buttons.operator("tricap.retarget_add_line", icon="ADD", text="")
+    buttons.operator("tricap.retarget_remove_line", icon="REMOVE", text="")
+    if 0 <= props.row < len(props.rows):
+        layout.prop(props.rows[props.row], "twist")
+    buttons = layout.row(align=True)
+    buttons.operator("tricap.retarget_find_map", icon="VIEWZOOM")
+    buttons.operator("tricap.retarget_load_map", icon="FILE_FOLDER", text="Load")
+    buttons.operator("tricap.retarget_save_map", icon="FILE_TICK", text="Save")
+    if props.target is not None and (said := properties.other_lines(props, props.target)):
+        layout.label(text=said, icon="ERROR")
+    for line in props.missing.splitlines():
+        layout.label(text=line, icon="INFO")
 
 
 def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -29,12 +52,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     header, body = layout.panel("tricap_retarget_map", default_closed=True)
     header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (found by itself)")
     if body is not None:
-        body.template_list("TRICAP_UL_map", "", props, "rows", props, "row", rows=6)
-        buttons = body.row(align=True)
-        buttons.operator("tricap.retarget_find_map", icon="VIEWZOOM")
-        buttons.operator("tricap.retarget_save_map", icon="FILE_TICK", text="Save")
-        for line in props.missing.splitlines():
-            body.label(text=line, icon="INFO")
+        _draw_map(body, props)
     for title, group, settings in (("Motion", props.settings, RetargetSettings), ("Feet", props.feet, FeetSettings)):
         header, body = layout.panel(f"tricap_retarget_{title}", default_closed=True)
         header.label(text=title)

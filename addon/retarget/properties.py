@@ -1,13 +1,16 @@
 """What the panel of retargeting remembers, in the scene: `scene.tricap_retarget`."""
 
+import json
 from typing import Any
 
 import bpy
 
+from ...core.errors import InputError
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.retarget.roles import ROLES
+from ...core.motion.retarget.steering import Steering
 from ..properties import group_class
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -45,28 +48,50 @@ class Retargeting(bpy.types.PropertyGroup):
     feet: bpy.props.PointerProperty(type=Feet)  # type: ignore[valid-type]
     rows: bpy.props.CollectionProperty(type=MapRow)  # type: ignore[valid-type]
     row: bpy.props.IntProperty()  # type: ignore[valid-type]
+    rows_of: bpy.props.PointerProperty(type=bpy.types.Object)  # type: ignore[valid-type]  # the armature whose bones the lines name
+    steering: bpy.props.StringProperty()  # type: ignore[valid-type]  # JSON: how the lines' controls steer the rig
     missing: bpy.props.StringProperty()  # type: ignore[valid-type]
     last: bpy.props.StringProperty()  # type: ignore[valid-type]
 
 
-def fill_rows(props: Any, rig_map: RigMap) -> None:
-    """Show a mapping in the editor."""
+def fill_rows(props: Any, rig_map: RigMap, target: bpy.types.Object) -> None:
+    """Show the mapping of a target in the editor."""
     props.rows.clear()
     for role, chain in rig_map.bones.items():
         row = props.rows.add()
         row.role, row.bones, row.twist = role, ", ".join(chain), ", ".join(rig_map.twist.get(role, ()))
+    props.rows_of, props.row = target, 0
+    props.steering = json.dumps(rig_map.steering.table()) if rig_map.steering is not None else ""
     props.missing = "\n".join((*rig_map.missing, *rig_map.notes))
 
 
-def edited_map(props: Any) -> RigMap | None:
-    """The mapping in the editor; None if it is empty."""
+def edited_map(props: Any, target: bpy.types.Object | None) -> RigMap | None:
+    """The mapping in the editor; None if it is empty or another armature's.
+
+    Raises:
+        InputError: a part has two lines.
+    """
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
 
-    if not props.rows:
+    if not props.rows or props.rows_of != target:
         return None
-    return RigMap(bones={row.role: names(row.bones) for row in props.rows if names(row.bones)},
-                  twist={row.role: names(row.twist) for row in props.rows if names(row.twist)}, origin="the panel")
+    roles = [row.role for row in props.rows]
+    for role in roles:
+        if roles.count(role) > 1:
+            raise InputError(f"The mapping has {roles.count(role)} lines for “{role}”; remove all but one.")
+    bones = {row.role: names(row.bones) for row in props.rows if names(row.bones)}
+    twist = {row.role: names(row.twist) for row in props.rows if names(row.twist)}
+    steering = Steering(**json.loads(props.steering)) if props.steering else None
+    return RigMap(bones=bones, twist=twist, origin="the panel", steering=steering and steering.of_controls(bones, twist))
+
+
+def other_lines(props: Any, target: bpy.types.Object) -> str:
+    """A sentence if the editor's lines are another armature's."""
+    if not props.rows or props.rows_of == target:
+        return ""
+    whose = f"“{props.rows_of.name}”" if props.rows_of is not None else "a rig that is gone"
+    return f"the mapping's lines are those of {whose} and were not used; recognise “{target.name}” to edit its own"
 
 
 CLASSES = (MapRow, Settings, Feet, Retargeting)

@@ -3,13 +3,13 @@
 import bpy
 
 from .. import jobs
-from . import operators, panel, properties
+from . import map_operators, operators, panel, properties
 
 
 def register() -> None:
     """Register everything, in order."""
     properties.register()
-    for cls in (*operators.CLASSES, *panel.CLASSES):
+    for cls in (*operators.CLASSES, *map_operators.CLASSES, *panel.CLASSES):
         bpy.utils.register_class(cls)
 
 
@@ -17,6 +17,6 @@ def unregister() -> None:
     """Stop a running job and take everything away again, in reverse order."""
     jobs.stop_current()
     jobs.stop_watching()
-    for cls in reversed((*operators.CLASSES, *panel.CLASSES)):
+    for cls in reversed((*operators.CLASSES, *map_operators.CLASSES, *panel.CLASSES)):
         bpy.utils.unregister_class(cls)
     properties.unregister()

@@ -113,8 +113,7 @@ def write_map(path: Path, rig_map: RigMap, name: str) -> None:
     steering = rig_map.steering
     store.write_json(path, {"name": name, "bones": {r: list(c) for r, c in rig_map.bones.items()},
                             "twist": {r: list(c) for r, c in rig_map.twist.items()}}
-                     | ({"steering": {part: {k: v if isinstance(v, str) else dict(v) for k, v in getattr(steering, part).items()}
-                                      for part in ("follows", "properties", "skin")}} if steering is not None else {}))
+                     | ({"steering": steering.table()} if steering is not None else {}))
 
 
 def apply_preset(rig: Rig, preset: Preset) -> RigMap:

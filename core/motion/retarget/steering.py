@@ -6,6 +6,7 @@ helpers lie between them in the rig. Those controls alone, hung on each other as
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,16 @@ class Steering:
     follows: Mapping[str, str]  # by control, the one that it follows; a control that is not named follows nothing
     properties: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by bone: custom properties and their values
     skin: Mapping[str, str] = field(default_factory=dict)  # by control, the bone whose weights the skin has in its place
+
+    def table(self) -> dict[str, dict[str, Any]]:
+        """As plain values, in the form of a mapping's file."""
+        return {"follows": dict(self.follows), "skin": dict(self.skin),
+                "properties": {bone: dict(values) for bone, values in self.properties.items()}}
+
+    def of_controls(self, *chains: Mapping[str, tuple[str, ...]]) -> "Steering | None":
+        """This, as long as `chains` (bones by role) name nothing else than its controls."""
+        named = {name for table in chains for chain in table.values() for name in chain}
+        return self if {*self.follows, *self.follows.values()} >= named else None
 
 
 def controls_of(rig: Rig, steering: Steering, chains: Mapping[str, tuple[str, ...]]) -> Rig:

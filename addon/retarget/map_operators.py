@@ -1,0 +1,137 @@
+"""The mapping's editor: bpy.ops.tricap.retarget_find_map(), .retarget_load_map(filepath="…"), .retarget_save_map(filepath="…"),
+.retarget_add_line(), .retarget_remove_line()"""
+
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.motion.retarget.mapping import write_map
+from ...core.motion.retarget.roles import ROLES
+from . import apply, properties
+from .operators import armature_of
+from .read import read_rig
+
+
+def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Path | None) -> set[str]:
+    """Fill the editor with the target's mapping: found, or from a file."""
+    props = context.scene.tricap_retarget
+    try:
+        target = armature_of("", props.target, "target")
+        rig_map = apply.map_of(read_rig(target), file, steer=True)
+    except InputError as error:
+        operator.report({"ERROR"}, str(error))
+        return {"CANCELLED"}
+    properties.fill_rows(props, rig_map, target)
+    for line in (*rig_map.missing, *rig_map.notes):
+        operator.report({"INFO"}, line)
+    return {"FINISHED"}
+
+
+class FindMap(bpy.types.Operator):
+    """Recognise the target's bones by their names and the rig's shape, and show the mapping for editing"""
+
+    bl_idname = "tricap.retarget_find_map"
+    bl_label = "Recognise"
+    bl_options = {"UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Fill the editor."""
+        return show_map(self, context, None)
+
+
+class LoadMap(bpy.types.Operator):
+    """Read the target's mapping from a file, and show it for editing"""
+
+    bl_idname = "tricap.retarget_load_map"
+    bl_label = "Load Mapping"
+    bl_options = {"UNDO"}
+
+    filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
+    filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the file."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Fill the editor."""
+        return show_map(self, context, Path(bpy.path.abspath(self.filepath)))
+
+
+class SaveMap(bpy.types.Operator):
+    """Save the mapping as a file that can be edited, shared and used again"""
+
+    bl_idname = "tricap.retarget_save_map"
+    bl_label = "Save Mapping"
+
+    filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the file."""
+        self.filepath = self.filepath or "mapping.json"
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Write it."""
+        props = context.scene.tricap_retarget
+        try:
+            rig_map = properties.edited_map(props, props.rows_of)
+            if rig_map is None:
+                raise InputError("There is no mapping to save; recognise the target first.")
+            write_map(Path(bpy.path.abspath(self.filepath)), rig_map, Path(self.filepath).stem)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class AddLine(bpy.types.Operator):
+    """Add a line to the mapping, for the next part of the body that has none"""
+
+    bl_idname = "tricap.retarget_add_line"
+    bl_label = "Add Line"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """A mapping needs a target."""
+        return context.scene.tricap_retarget.target is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Add it and select it."""
+        props = context.scene.tricap_retarget
+        if props.rows_of != props.target:
+            props.rows.clear()
+            props.missing = props.steering = ""
+            props.rows_of = props.target
+        taken = {row.role for row in props.rows}
+        props.rows.add().role = next((role for role in ROLES if role not in taken), ROLES[0])
+        props.row = len(props.rows) - 1
+        return {"FINISHED"}
+
+
+class RemoveLine(bpy.types.Operator):
+    """Take the selected line out of the mapping: the part is left to its parent"""
+
+    bl_idname = "tricap.retarget_remove_line"
+    bl_label = "Remove Line"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There must be one."""
+        props = context.scene.tricap_retarget
+        return 0 <= props.row < len(props.rows)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove it and select the one before."""
+        props = context.scene.tricap_retarget
+        props.rows.remove(props.row)
+        props.row = max(0, min(props.row, len(props.rows) - 1))
+        return {"FINISHED"}
+
+
+CLASSES = (FindMap, LoadMap, SaveMap, AddLine, RemoveLine)

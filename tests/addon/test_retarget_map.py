@@ -1,0 +1,76 @@
+"""The mapping's editor in a Blender with the extension: lines, files, steering, and whose lines they are."""
+
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from tricap.addon.retarget.build import build_armature
+from tricap.core.motion.retarget.mapping import read_preset
+from tricap.core.motion.retarget.rig import Rig
+
+from ..core.motion.persons import flail, person, squat
+
+
+@pytest.fixture
+def props(blender: ModuleType) -> Any:
+    """The panel, with a source that squats and a target."""
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    props = blender.context.scene.tricap_retarget
+    props.source, props.target = build_armature(squat(person(), frames=4), "Source"), armature(person(), "Target")
+    return props
+
+
+def armature(rig: Rig, name: str) -> Any:
+    return build_armature(flail(rig, frames=3, reach=0.1), name)
+
+
+def steered() -> dict[str, Any]:
+    """A mapping of a person whose bones are controls that follow each other."""
+    rig = person()
+    follows = {name: rig.names[p] for name, p in zip(rig.names, rig.parents) if p >= 0}
+    return {"name": "controls", "bones": {name: name for name in rig.names},
+            "steering": {"follows": follows, "properties": {"hips": {"IK_FK": 1.0}}, "skin": {"foot.L": "foot.R"}}}
+
+
+def test_a_saved_mapping_keeps_its_steering(blender: ModuleType, props: Any, tmp_path: Path) -> None:
+    ops = blender.ops.tricap
+    (tmp_path / "a.json").write_text(json.dumps(steered()))
+    assert ops.retarget_load_map(filepath=str(tmp_path / "a.json")) == {"FINISHED"}
+    assert ops.retarget_save_map(filepath=str(tmp_path / "b.json")) == {"FINISHED"}
+    found = read_preset(tmp_path / "b.json").steering
+    assert found is not None and found.table() == steered()["steering"]
+    props.rows[[row.role for row in props.rows].index("head")].bones = "elsewhere"  # no control
+    ops.retarget_save_map(filepath=str(tmp_path / "b.json"))
+    assert read_preset(tmp_path / "b.json").steering is None
+    assert ops.retarget_find_map() == {"FINISHED"} and not props.steering
+    with pytest.raises(RuntimeError, match="Cannot read"):
+        ops.retarget_load_map(filepath=str(tmp_path / "nowhere.json"))
+
+
+def test_lines_are_added_and_removed(blender: ModuleType, props: Any, tmp_path: Path) -> None:
+    ops = blender.ops.tricap
+    assert not ops.retarget_remove_line.poll()
+    assert ops.retarget_add_line() == ops.retarget_add_line() == {"FINISHED"}
+    assert [row.role for row in props.rows] == ["hips", "spine"] and props.row == 1
+    props.rows[0].bones, props.rows[1].bones, props.rows[1].twist = "hips", "spine, neck", "head"
+    ops.retarget_save_map(filepath=str(tmp_path / "a.json"))
+    saved = json.loads((tmp_path / "a.json").read_text())
+    assert saved["bones"] == {"hips": ["hips"], "spine": ["spine", "neck"]} and saved["twist"] == {"spine": ["head"]}
+    props.rows[1].role = "hips"
+    with pytest.raises(RuntimeError, match="2 lines for “hips”"):
+        ops.retarget()
+    ops.retarget_remove_line()
+    assert [row.role for row in props.rows] == ["hips"] and props.row == 0 and ops.retarget() == {"FINISHED"}
+
+
+def test_lines_of_another_target_are_not_used(blender: ModuleType, props: Any) -> None:
+    ops = blender.ops.tricap
+    ops.retarget_find_map()
+    props.target = armature(person(names={role: f"Bip001 {role}" for role in person().names}), "Other")
+    assert ops.retarget() == {"FINISHED"}
+    assert "lines are those of “Target” and were not used" in props.last and props.target.animation_data.action.name == "Source on Other"
+    ops.retarget_add_line()
+    assert props.rows_of == props.target and len(props.rows) == 1
