@@ -19,6 +19,7 @@ from .tracking.point_tables import ChosenPoints, read_points, write_planar
 from .tracking.settings import TrackingSettings, TrackStatus
 
 LOOSE = MatchingSettings(min_correlation=0.7, max_sigma_px=0.4)  # faces: weak texture, and they deform
+WAIT_FRAMES = 100  # nothing moves a point that waits but its own return
 
 
 def add_command(commands: Any) -> None:
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError("--set of track2d knows the groups matching and tracking.")
     matching = from_table(MatchingSettings, {"min_correlation": LOOSE.min_correlation, "max_sigma_px": LOOSE.max_sigma_px,
                                              **tables.get("matching", {})}, "[matching]")  # fmt: skip
-    tracking = from_table(TrackingSettings, tables.get("tracking", {}), "[tracking]")
+    tracking = from_table(TrackingSettings, {"wait_frames": WAIT_FRAMES, **tables.get("tracking", {})}, "[tracking]")
     points, sequence = read_points(args.points), open_footage(args.sequence)
     frames = range(*(frame_range(args.frames) or (0, sequence.count)))
     if not frames or frames[0] < 0 or frames[-1] >= sequence.count:

@@ -1,7 +1,11 @@
 """Key points: points that a user chose, followed as single trajectories in the images and in space.
 
 Unlike the surface's points they have no neighbours and no measured surface that would speak for them: only what the views say to each other
-counts, temporal against spatial matching and the rays' residuals (step.py). A point that is lost ends.
+counts, temporal against spatial matching and the rays' residuals (step.py). A frame in which no point is found is left out, as long as
+few are; a point that is lost alone waits: where it should be by its own motion its key template is looked for, and from there the other
+views.
+
+A round marker looks the same however it is turned, so that matching finds no other point of it than its middle: that one is meant there.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..calibration.targets import TargetStatus, find_targets
 from ..errors import InputError
 from ..geometry.intersection import forward_intersection
 from ..images.sampling import SplineImage
@@ -16,13 +21,14 @@ from ..matching.least_squares import match_patches, patch_offsets
 from ..progress import Monitor
 from .search import search_box
 from .settings import TrackStatus
-from .step import MODEL_SIGMA_PX, FramePair, TrackingView, intersect, track_step
-from .templates import Tiles, atlas, cut_tiles, no_templates
-from .tracked import TrackedFrame, born
+from .step import MODEL_SIGMA_PX, TEMPLATE_SIGMA_PX, FramePair, TrackingView, intersect, match_spatially, track_step
+from .templates import Templates, Tiles, atlas, cut_tiles, no_templates
+from .tracked import TrackedFrame, born, joined, nothing, rows_of
 
 CLICK_SIGMA_PX, CLICK_REACH_PX = 2.0, 6.0
 SLOPES = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))  # of the surface about a point: up to 35° either way
 LARGEST_MISFIT_PX, MISFITS = 4.0, 2.5  # rays may miss by so much, and by so many of their median in the frame
+RETAKEN_CORRELATION = 0.9  # of a lost point with its template: more than in tracking, for nothing else speaks for it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -46,9 +52,12 @@ def track_key_points(
     meet; in the other views matching finds it.
 
     Raises:
-        InputError: a point is clicked in fewer than two views.
+        InputError: a point is clicked in fewer than two views, or has no marker where it must have one.
     """
-    steps = list(_follow(read, frames, _clicked(points, view.at(frames[0])), view, monitor))
+    clicks = _clicked(points, view.at(frames[0]))
+    if view.tracking.markers:
+        clicks = _on_markers(read(frames[0]), clicks, tuple(points), view)
+    steps = list(_follow(read, frames, clicks, view, monitor))
     T, N, K = len(steps), len(points), len(view.cameras)
     xy, xyz, sigma = np.full((T, N, K, 2), np.nan), np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
     status = np.zeros((T, N), dtype=np.int8)
@@ -73,29 +82,107 @@ def _clicked(points: Mapping[str, Mapping[str, np.ndarray]], view: TrackingView)
     return view.rows.from_frame(xy)
 
 
+def _on_markers(grey: Sequence[np.ndarray], clicks: np.ndarray, names: tuple[str, ...], view: TrackingView) -> np.ndarray:
+    """The clicks (N, K, 2), each in the middle of the nearest bright round target within reach; a view may lack one, the reference not.
+
+    Raises:
+        InputError: there is no target near a click in the reference view.
+    """
+    middles = clicks.copy()
+    for k, image in enumerate(grey):
+        found = find_targets(np.asarray(image, dtype=np.float32))
+        xy = found.xy_px[found.status == TargetStatus.OK]
+        away = np.linalg.norm((clicks[:, None, k] - xy) * (1.0, view.rows.step), axis=2)
+        for n, name in enumerate(names):
+            if len(xy) and away[n].min() <= CLICK_REACH_PX:
+                middles[n, k] = xy[away[n].argmin()]
+            elif k == view.reference:
+                where = f"“{name}” in view {view.cameras[k].name}"
+                raise InputError(f"No bright round marker lies near the click on {where}; click its middle.")
+    return middles
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Lost:
+    """N lost points as they were last seen, in each one's own frame."""
+
+    points: TrackedFrame
+    velocity_m: np.ndarray  # (N, 3) per frame; zero where not known
+    last: np.ndarray  # (N,) the frame
+
+    def after(self, current: TrackedFrame, before: TrackedFrame | None, tracked: TrackedFrame, wait_frames: int) -> "_Lost":
+        """Those that wait when `current` has become `tracked`: with the newly lost, without the regained and those that waited too long."""
+        gone = np.isin(current.identity, tracked.ended[tracked.reason != TrackStatus.LEFT_IMAGE])
+        points = joined(self.points, current.select(gone))
+        velocity, last = np.zeros((len(points.identity), 3)), np.full(len(points.identity), current.frame)
+        at = rows_of(self.points.identity, points.identity)
+        velocity[at >= 0], last[at >= 0] = self.velocity_m[at[at >= 0]], self.last[at[at >= 0]]
+        if before is not None:
+            now, then = rows_of(current.identity, points.identity), rows_of(before.identity, points.identity)
+            new = (at < 0) & (then >= 0)
+            velocity[new] = (current.xyz_m[now[new]] - before.xyz_m[then[new]]) / abs(current.frame - before.frame)
+        keep = ~np.isin(points.identity, tracked.identity) & (abs(tracked.frame - last) < wait_frames)
+        return _Lost(points=points.select(keep), velocity_m=velocity[keep], last=last[keep])
+
+    def retaken(
+        self, view: TrackingView, templates: Templates, grey: Sequence[np.ndarray], spline: Sequence[SplineImage]
+    ) -> TrackedFrame:
+        """Those that are seen again in the frame of the view, about where their motion takes them."""
+        ahead = np.abs(view.frame - self.last)[:, None]
+        p, ref = replace(self.points, xyz_m=self.points.xyz_m + ahead * self.velocity_m), view.reference
+        if not len(p.identity):
+            return p
+        centre = np.stack([view.rows.from_frame(camera.project(p.xyz_m)) for camera in view.cameras], axis=1)
+        picture, tiles = atlas(templates.only(p.identity).tiles)
+        box = np.full(len(p.identity), 2.0 * view.tracking.box_px)
+        start, best = search_box(picture, grey[ref], tiles, centre[:, ref], box, view.matching.patch_px, view.rows.step)
+        start = np.where((best >= view.tracking.min_correlation)[:, None], start, np.nan)
+        key = templates.match(p.identity, spline[ref], start, p.key_shape)
+        status = np.full(p.xy.shape[:2], TrackStatus.MEASURED, dtype=np.int8)
+        least = max(RETAKEN_CORRELATION, view.tracking.drift_correlation)
+        status[~(key.ok & (key.correlation >= least)), ref] = TrackStatus.NOT_FOUND
+        shift = np.nan_to_num(key.xy - centre[:, ref])
+        at = [centre[:, k] + np.einsum("nij,nj->ni", p.shape[:, k], shift) for k in range(len(view.cameras))]
+        at = [key.xy if k == ref else _searched(spline[ref], grey[k], key.xy, at[k], p.shape[:, k], view) for k in range(len(at))]
+        spatial = match_spatially(view, p, at, spline, status)
+        xy, covariance, shape = np.stack(at, axis=1), np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2, (*status.shape, 1, 1)), p.shape.copy()
+        for k, s in zip(view.others, spatial):
+            xy[:, k], covariance[:, k], shape[:, k] = s.xy, s.covariance, s.shape
+        found, verdict = intersect(view, replace(p, key_shape=key.shape, drift=key.covariance), xy, covariance, shape, status)
+        return replace(found.select(verdict == TrackStatus.MEASURED), frame=view.frame)
+
+
 def _follow(
     read: Callable[[int], Sequence[np.ndarray]], frames: range, clicks: np.ndarray, view: TrackingView, monitor: Monitor
 ) -> Iterator[TrackedFrame]:
-    grey = list(read(frames[0]))
-    spline = [SplineImage(g) for g in grey]
     view = view.at(frames[0])
+    grey, spline = _prepared(read(frames[0]))
     loose = replace(view, limit_px=max(view.limit_px, LARGEST_MISFIT_PX))
     current, before = _meeting(_first(grey, spline, clicks, frames[0], loose), view), None
     ref = view.reference
     how = view.matching, view.rows.step
     templates = no_templates(*how).with_tiles(cut_tiles(spline[ref], current.identity, current.xy[:, ref], *how), *how)
+    lost = _Lost(points=nothing(frames[0], len(view.cameras)), velocity_m=np.zeros((0, 3)), last=np.zeros(0, np.int64))
     yield current
     for i, frame in enumerate(frames[1:]):
         monitor.step("tracks", i, len(frames) - 1)
-        next_grey = list(read(frame))
-        next_spline = [SplineImage(g) for g in next_grey]
+        next_grey, next_spline = _prepared(read(frame))
         pair = FramePair(grey=grey, spline=spline, next_grey=next_grey, next_spline=next_spline)
-        tracked = _meeting(track_step(loose, before, current, templates, pair, frame, monitor), view.at(frame))
+        tracked = track_step(loose, before, current, templates, pair, frame, monitor)
+        regained = lost.retaken(loose.at(frame), templates, next_grey, next_spline)
+        tracked = _meeting(joined(tracked, regained), view.at(frame))
+        yield tracked
+        if len(current.identity) and not len(tracked.identity) and abs(frame - current.frame) <= view.tracking.bridge_frames:
+            continue  # it is the frame that is missing
+        lost = lost.after(current, before, tracked, view.tracking.wait_frames)
         fresh = (tracked.key_shape == np.eye(2)).all(axis=(1, 2))
         new = cut_tiles(next_spline[ref], tracked.identity[fresh], tracked.xy[fresh, ref], *how)
-        templates, before, current = templates.only(tracked.identity).with_tiles(new, *how), current, tracked
-        grey, spline = next_grey, next_spline
-        yield tracked
+        templates = templates.only(np.concatenate([tracked.identity, lost.points.identity])).with_tiles(new, *how)
+        before, current, grey, spline = current, tracked, next_grey, next_spline
+
+
+def _prepared(images: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[SplineImage]]:
+    return list(images), [SplineImage(g) for g in images]
 
 
 def _meeting(points: TrackedFrame, view: TrackingView) -> TrackedFrame:

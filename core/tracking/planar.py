@@ -5,7 +5,8 @@ frame i, and must come back to where it was,
 
     |p − bwd(fwd(p))| ≤ max(0.5 px, 3 σ)                                                                  (1)
 
-Else the point is lost. A lost point waits where it was last seen, and its key template is looked for there in every frame that follows.
+Else the point is lost. A lost point waits where it was last seen, and its key template is looked for there in the frames that follow, as
+many as it may wait for.
 """
 
 from collections.abc import Callable, Iterator
@@ -47,6 +48,7 @@ class _Points:
     drift: np.ndarray
     key_drift: np.ndarray
     seen: np.ndarray  # (N,) else it waits
+    since: np.ndarray  # (N,) frames since it was seen
     correlation: np.ndarray
     reason: np.ndarray
 
@@ -94,6 +96,7 @@ def _follow(
         drift=none,
         key_drift=none,
         seen=image.inside(xy, 0.0),
+        since=np.zeros(n, dtype=np.int64),
         correlation=np.ones(n),
         reason=np.full(n, TrackStatus.LEFT_IMAGE, dtype=np.int8),
     )
@@ -141,7 +144,7 @@ def _step(
             result = _with(result, rest, good, points, there.xy + held.shift, held.key_shape, np.where(renewed, 0.0, held.drift),
                            key_drift, there.correlation, why)  # fmt: skip
             fresh.extend(rest[held.renewed & good])
-    waiting = np.flatnonzero(~points.seen & (points.reason != TrackStatus.LEFT_IMAGE))
+    waiting = np.flatnonzero(~points.seen & (points.reason != TrackStatus.LEFT_IMAGE) & (points.since < tracking.wait_frames))
     if len(waiting):
         box = np.full(len(waiting), float(tracking.box_px))
         grey, tiles = atlas(templates.tiles.select(waiting))
@@ -151,7 +154,7 @@ def _step(
         good = key.ok & (key.correlation >= max(RETAKEN_CORRELATION, tracking.drift_correlation))
         result = _with(result, waiting, good, points, key.xy, key.shape, key.covariance, points.key_drift[waiting], key.correlation,
                        points.reason[waiting])  # fmt: skip
-    return result, np.array(fresh, dtype=np.int64)
+    return replace(result, since=np.where(result.seen, 0, points.since + 1)), np.array(fresh, dtype=np.int64)
 
 
 def _returns(
@@ -192,4 +195,4 @@ def _with(
     values["speed"][at[~before.seen[at]]] = np.nan
     values["seen"][at] = True
     values["reason"][rows[~good]] = why[~good]
-    return _Points(**values)
+    return replace(result, **values)

@@ -39,8 +39,13 @@ class TrackingSettings:
         3, "So many frames may be missing or black before all trajectories end (0: none).", unit="frames", low=0, high=100
     )
     wait_frames: int = knob(
-        5, "So many frames a lost point is looked for where its neighbours take it (0: it ends at once).", unit="frames", low=0, high=100
+        5,
+        "So many frames a lost point is looked for where its neighbours or its own motion take it (0: none).",
+        unit="frames",
+        low=0,
+        high=100,
     )
+    markers: bool = knob(False, "Points that you choose are bright round markers, and their middles are meant.")
     max_speed: float = knob(10.0, "Trajectories faster than this are cut.", unit="m/s", low=0.1, high=100.0)
     max_acceleration: float = knob(150.0, "Trajectories that accelerate more than this are cut.", unit="m/s²", low=1.0, high=10_000.0)
     uniformity: str = knob(
@@ -62,8 +67,8 @@ class TrackingSettings:
 
     @property
     def of_the_step(self) -> "TrackingSettings":
-        """The same but for the knobs that are asked after tracking, which have their defaults: what a checkpoint depends on."""
-        defaults: dict[str, Any] = {f.name: f.default for f in fields(self) if f.name in AFTERWARDS}
+        """The same but for the knobs that no step of the surface's points asks, which have their defaults: what a checkpoint depends on."""
+        defaults: dict[str, Any] = {f.name: f.default for f in fields(self) if f.name in (*AFTERWARDS, "markers")}
         return replace(self, **defaults)
 
 

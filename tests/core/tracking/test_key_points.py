@@ -1,6 +1,7 @@
 """Key points on a turning plane: places, distances and sigmas against the truth; clicks that are wrong or too few."""
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,15 @@ from tricap.core.tracking.step import TrackingView
 FRAMES = 8
 
 
-def follow(scenes: Any, off_px: float, views: tuple[str, ...] = ("L", "C", "R"), tilt: float = 0.25) -> tuple[KeyPoints, np.ndarray]:
+def follow(
+    scenes: Any,
+    off_px: float,
+    views: tuple[str, ...] = ("L", "C", "R"),
+    tilt: float = 0.25,
+    shown: Callable[[int, str, np.ndarray], np.ndarray] = lambda frame, view, image: image,
+    **settings: Any,
+) -> tuple[KeyPoints, np.ndarray]:
+    """Five points of a turning plane; `shown` makes of the pictures what the cameras gave."""
     rig = scenes.three_cameras()
     plane = scenes.Body(half_m=(0.24, 0.18), R=rotation_from_vector(np.array([0.1, tilt, 0.0])))
     bodies = [plane.moved(rotation_from_vector(np.array([0.0, 0.01, 0.03]) * i), [0.008 * i, -0.003 * i, 0.002 * i]) for i in range(FRAMES)]
@@ -32,9 +41,10 @@ def follow(scenes: Any, off_px: float, views: tuple[str, ...] = ("L", "C", "R"),
         str(n): {c.name: c.project(truth[0, n]) + (c.name != "C") * off_px * random.uniform(-1, 1, 2) for c in seeing} for n in range(5)
     }
     view = TrackingView(
-        cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7
-    )
-    read = lambda i: [scenes.render(c, [bodies[i]], noise=1.5, seed=i) for c in rig.cameras]  # noqa: E731
+        cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(**settings),
+        limit_px=0.7,
+    )  # fmt: skip
+    read = lambda i: [shown(i, c.name, scenes.render(c, [bodies[i]], noise=1.5, seed=i)) for c in rig.cameras]  # noqa: E731
     return track_key_points(read, range(FRAMES), clicks, view, Monitor()), truth
 
 
@@ -55,6 +65,64 @@ def test_a_steep_surface(scenes: Any) -> None:
     """At 45° a patch is wider in one view than in the other by a third, and a point is still found from rough clicks."""
     points, _ = follow(scenes, 2.5, tilt=0.8)
     assert (points.status[0] == TrackStatus.MEASURED).all()
+
+
+@pytest.mark.parametrize("missing", [(3,), (3, 4, 5)])
+def test_black_frames_are_bridged(scenes: Any, missing: tuple[int, ...]) -> None:
+    """The reference view is black: the points say so and go on after it; where nothing may be bridged or waited for, they end."""
+
+    def black(frame: int, view: str, image: np.ndarray) -> np.ndarray:
+        return image * np.float32(frame not in missing or view != "C")
+
+    points, truth = follow(scenes, 0.0, shown=black)
+    seen = points.status == TrackStatus.MEASURED
+    assert not seen[list(missing)].any() and np.delete(seen, missing, axis=0).all()
+    assert (points.status[missing[0]] > TrackStatus.MEASURED).all()
+    assert np.nanmax(np.abs(points.xyz_m - truth)[..., :2]) < 0.5 * scenes.pixel_m
+    ended, _ = follow(scenes, 0.0, shown=black, bridge_frames=len(missing) - 1, wait_frames=0)
+    assert (ended.status[missing[-1] + 1 :] != TrackStatus.MEASURED).all()
+
+
+def test_a_hidden_point_waits(scenes: Any) -> None:
+    """Something passes before the point in the middle for two frames: it goes on under its name in its place, or ends without waiting."""
+
+    def hidden(frame: int, view: str, image: np.ndarray) -> np.ndarray:
+        if frame in (3, 4) and view == "C":
+            image = image.copy()
+            image[62:84, 97:119] = 60 + 40 * np.random.default_rng(frame).standard_normal((22, 22))
+        return image
+
+    points, truth = follow(scenes, 0.0, shown=hidden)
+    seen = points.status == TrackStatus.MEASURED
+    assert not seen[3:5, 4].any() and seen[5:, 4].all() and seen[:, :4].all()
+    assert np.nanmax(np.abs(points.xyz_m - truth)[..., :2]) < 0.5 * scenes.pixel_m
+    ended, _ = follow(scenes, 0.0, shown=hidden, wait_frames=2)
+    assert not (ended.status[3:, 4] == TrackStatus.MEASURED).any() and (ended.status[:, :4] == TrackStatus.MEASURED).all()
+
+
+def test_retroreflective_markers(scenes: Any) -> None:
+    """Two bright blobs before the dark, clicked roughly: their middles are followed to 0.1 mm across and 0.5 mm along the line of sight."""
+    rig = scenes.three_cameras()
+    truth = np.array([[[-0.1 + 0.012 * i, 0.02 * np.sin(i / 2), 2.1 + 0.004 * i], [0.05, -0.08 + 0.01 * i, 2.2]] for i in range(10)])
+
+    def picture(camera: Any, i: int) -> np.ndarray:
+        y, x = np.mgrid[0 : camera.size_px[1], 0 : camera.size_px[0]].astype(float)
+        light = sum(240 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 1.6**2)) for u, v in camera.project(truth[i]))
+        noise = 2 * np.random.default_rng([i, ord(camera.name)]).standard_normal(x.shape)
+        return np.asarray(np.minimum(30 + light, 255) + noise, dtype=np.float32)
+
+    clicks = {name: {c.name: c.project(truth[0, n]) + (1.0, -0.8) for c in rig.cameras} for n, name in enumerate(("wrist", "elbow"))}
+    settings = TrackingSettings(markers=True)
+    view = TrackingView(cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=settings, limit_px=0.7)
+    read = lambda i: [picture(c, i) for c in rig.cameras]  # noqa: E731
+    points = track_key_points(read, range(10), clicks, view, Monitor())
+    assert (points.status == TrackStatus.MEASURED).all()
+    error = np.abs(points.xyz_m - truth)
+    assert error[..., :2].max() < 1e-4 and error[..., 2].max() < 5e-4
+    z = np.linalg.norm(points.xyz_m - truth, axis=2) / points.sigma_m
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.8  # twenty points
+    with pytest.raises(InputError, match="No bright round marker.*“knee” in view C"):
+        track_key_points(read, range(10), {"knee": {c.name: c.project(np.array([0.1, 0.1, 2.1])) for c in rig.cameras}}, view, Monitor())
 
 
 def test_one_click_is_not_enough(scenes: Any) -> None:

@@ -74,6 +74,8 @@ def test_a_hidden_point_is_taken_up_again() -> None:
     hidden = (POINTS[:, 0] < 100) & (POINTS[:, 1] < 70)
     assert (tracks.status[3:6, hidden] > TrackStatus.MEASURED).all() and np.isnan(tracks.xy_px[3:6, hidden]).all()
     assert (tracks.status[7:, hidden] == TrackStatus.MEASURED).mean() > 0.7
+    ended = follow(frames, wait_frames=2)
+    assert (ended.status[4:, hidden & (tracks.status[3] > TrackStatus.MEASURED)] > TrackStatus.MEASURED).all()
     far = (POINTS[:, 0] > 120) | (POINTS[:, 1] > 95)
     assert (tracks.status[:, far] == TrackStatus.MEASURED).all()
     assert np.nanmax(np.linalg.norm(tracks.xy_px - truth, axis=2)) < 0.5
