@@ -57,7 +57,8 @@ def _convert(args: argparse.Namespace) -> list[str]:
     written = write_as(args.out, rig, args.format) if args.format else [args.out]
     if not args.format:
         write_rig(args.out, rig)
-    return [f"{', '.join(map(str, written))}: {len(rig.cameras)} cameras ({', '.join(c.name for c in rig.cameras)}) from {args.source}."]
+    lines = [f"{', '.join(map(str, written))}: {len(rig.cameras)} cameras ({', '.join(c.name for c in rig.cameras)}) from {args.source}."]
+    return [*lines, f"The scale of {args.source}: {rig.metadata['scale']}."] if "scale" in rig.metadata else lines
 
 
 def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:

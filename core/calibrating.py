@@ -215,7 +215,8 @@ def calibrate_rig(
         "floor": world.on_floor,
     }
     cameras = calibration.network.cameras(observations.names, observations.size_px)
-    return CalibratedRig(rig=Rig(cameras=cameras, metadata=metadata), calibration=calibration, quality=quality, verdict=judged)
+    rig = Rig(cameras=cameras, metadata=metadata, sigmas=account.camera_sigmas(calibration))
+    return CalibratedRig(rig=rig, calibration=calibration, quality=quality, verdict=judged)
 
 
 def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:

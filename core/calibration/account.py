@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.camera_derivatives import INTERIOR
+from ..geometry.camera_derivatives import EXTERIOR, INTERIOR
 from .quality import Lengths, Quality
 from .self_calibration import Calibration
 from .verdict import Verdict, positions_used
@@ -34,6 +34,9 @@ def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dic
         "direction_scatter": quality.scatter.tolist(),
         "mirrored_sum_of_squares": _finite(quality.mirror),
         "box_m": quality.box_m.tolist(),
+        "volume_visited": quality.visited,
+        "volume_seen_by_two": quality.seen_by_two,
+        "bars_rejected": quality.rejected,
         "decisions": list(calibration.decisions),
         "correlations": [list(entry) for entry in quality.correlations],
         "cameras": {name: _camera_figures(calibration, quality, c) for c, name in enumerate(observations.names)},
@@ -64,6 +67,21 @@ def parameters(calibration: Calibration, camera: int) -> list[tuple[str, float, 
     ]
 
 
+def exterior_sigmas(calibration: Calibration, camera: int) -> dict[str, float]:
+    """Sigmas of a camera's pose about its own axes, in the free network: turn x … [rad], shift x … [m]."""
+    p = len(calibration.unknowns.columns)
+    sigma = np.sqrt(np.maximum(np.diag(calibration.covariance)[camera * p : (camera + 1) * p], 0.0))
+    return {name: float(value) for name, value in zip(EXTERIOR, sigma[-len(EXTERIOR) :])}
+
+
+def camera_sigmas(calibration: Calibration) -> dict[str, dict[str, float]]:
+    """Sigmas of all unknowns of the adjustment, by camera; those that were left out have none."""
+    return {
+        name: {n: sigma for n, _, sigma in parameters(calibration, c) if sigma} | exterior_sigmas(calibration, c)
+        for c, name in enumerate(calibration.observations.names)
+    }
+
+
 def _camera_figures(calibration: Calibration, quality: Quality, c: int) -> dict[str, Any]:
     return {
         "rms_px": float(quality.rms_px[c]),
@@ -72,6 +90,7 @@ def _camera_figures(calibration: Calibration, quality: Quality, c: int) -> dict[
         "image_points": int(calibration.observations.seen[:, c].sum()),
         "image_points_used": int(calibration.used[:, c].sum()),
         "bars_shared": {name: int(n) for name, n in zip(calibration.observations.names, quality.shared[c])},
+        "pose_sigma": exterior_sigmas(calibration, c),
         "parameters": {
             name: {"value": value, "sigma": sigma, "significance": abs(value) / sigma if sigma else None}
             for name, value, sigma in parameters(calibration, c)
@@ -92,6 +111,9 @@ def page(calibration: Calibration, quality: Quality, verdict: Verdict) -> str:
         f"of a bar's length {1e3 * quality.predicted.length_rms_m:.3f} mm.",
         _length_line("Bars left out of the adjustment", quality.held_out),
         _length_line("Bars of the adjustment", quality.used_lengths),
+        f"{quality.rejected} bars that two cameras saw whole were rejected as blunders and are in neither figure.",
+        f"Two cameras at least see {100 * quality.seen_by_two:.0f} % of the volume; "
+        f"the bar came through {100 * quality.visited:.0f} % of it.",
         f"Scatter of the bar's directions {quality.scatter.round(3).tolist()} (smallest: 0.05 is good, 0 fails); "
         f"a mirrored rig fits {quality.mirror:.3g} times worse.",
         *(f"{decision[0].upper()}{decision[1:]}." for decision in calibration.decisions),
@@ -118,4 +140,6 @@ def _camera_lines(calibration: Calibration, quality: Quality, c: int) -> list[st
     ]
     for parameter, value, sigma in parameters(calibration, c):
         lines.append(f"    {parameter:3} {value:12.6g}" + (f" ± {sigma:.2g}" if sigma else "   (left out)"))
-    return [*lines, ""]
+    sigmas = np.array(list(exterior_sigmas(calibration, c).values()))
+    turn, shift = (", ".join(f"{v:.2g}" for v in part) for part in (np.degrees(sigmas[:3]), 1e3 * sigmas[3:]))
+    return [*lines, f"    its pose about its own axes: ± {turn}° turned, ± {shift} mm shifted", ""]

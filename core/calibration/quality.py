@@ -22,6 +22,7 @@ from .self_calibration import Calibration
 
 FOLDS = 5
 CELLS = (8, 6)
+VOLUME_CELLS = 4  # along each side of the box
 GRID = 9
 MIRROR_POSITIONS = 80
 HIGH_CORRELATION = 0.95
@@ -68,6 +69,9 @@ class Quality:
     depth_ratio: np.ndarray  # (C,) largest by smallest depth of the bar's ends
     rms_px: np.ndarray  # (C,) of image coordinates
     shared: np.ndarray  # (C, C) bars that two cameras see whole
+    visited: float  # part of the box's cells through which an end of the bar came
+    seen_by_two: float  # part of the box that two cameras see; the predicted error is that of this part
+    rejected: int  # positions that two cameras saw whole and of which an end was taken for a blunder
     mirror: float  # sum of squares of the mirrored solution by that of this one
     correlations: tuple[tuple[str, str, str, float], ...]  # camera, unknown, unknown, correlation beyond HIGH_CORRELATION
 
@@ -93,9 +97,15 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     square = np.sum(np.where(used[..., None], calibration.residual_px, 0.0) ** 2, axis=(0, 2, 3))
     depth = [cameras[c].to_camera(network.ends_m[used[:, c]])[:, 2] for c in range(len(cameras))]
     both = used.all(axis=2).astype(int)
+    tests = test_bars(box, network.length_m)
+    predicted = predicted_error(cameras, calibration.every_unknown, calibration.considered, tests)
+    whole = (used.sum(axis=1) >= 2).all(axis=1)
     quality = Quality(
-        predicted=predicted_error(cameras, calibration.every_unknown, calibration.considered, test_bars(box, network.length_m)),
+        predicted=predicted,
         box_m=box,
+        visited=_visited(network.ends_m[whole].reshape(-1, 3), box),
+        seen_by_two=len(predicted.xyz_m) / (2 * len(tests)),
+        rejected=int(((observations.complete.sum(axis=1) >= 2) & ~whole).sum()),
         used_lengths=_lengths(calibration, cameras, np.ones(len(used), dtype=bool)),
         held_out=held_out,
         scatter=values,
@@ -114,6 +124,11 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
 def _scatter(network: Network, used: np.ndarray) -> np.ndarray:
     d = network.direction[(used.sum(axis=1) >= 2).all(axis=1)]
     return d.T @ d / max(len(d), 1)
+
+
+def _visited(ends_m: np.ndarray, box_m: np.ndarray) -> float:
+    cells, _ = np.histogramdd(ends_m, bins=VOLUME_CELLS, range=list(zip(*box_m)))
+    return float((cells > 0).mean())
 
 
 def test_bars(box_m: np.ndarray, length_m: float) -> np.ndarray:

@@ -86,6 +86,8 @@ def judge(calibration: Calibration, quality: Quality) -> Verdict:
         f"{word}: the cameras place points within {_mm(error)} (RMS) in the {size} m in which the bar was waved, {distance:.1f} m away; "
         f"the length of bars left out is right within {_mm(tested.rms_m)}."
     )
+    if not calibration.converged:
+        light, sentence = "red", f"The adjustment did not settle, so its figures may be too good. {sentence}"
     return Verdict(light=light, sentence=sentence, advice=advice(calibration, quality))
 
 

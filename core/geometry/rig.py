@@ -22,10 +22,14 @@ UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Rig:
-    """Calibrated cameras, found by name. `metadata` is what the calibration said of itself."""
+    """Calibrated cameras, found by name. `metadata` is what the calibration said of itself, `sigmas` what of each camera's unknowns:
+
+    standard deviations by camera and unknown (f, cx, cy in px; k1 …; turn [rad] and shift [m] about the camera's own axes).
+    """
 
     cameras: tuple[Camera, ...]
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    sigmas: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Camera:
         for camera in self.cameras:
@@ -59,7 +63,16 @@ def read_rig(path: Path) -> Rig:
     names = [c.name for c in cameras]
     if len(set(names)) < len(names):
         raise InputError(f"The rig {path} names two cameras alike ({', '.join(names)}); give each its own name.")
-    return Rig(cameras=cameras, metadata=metadata)
+    tables = [entry for key, entry in table.items() if key.startswith("cam")]
+    sigmas = {c.name: _sigmas(entry["sigma"], c.name, path) for c, entry in zip(cameras, tables) if "sigma" in entry}
+    return Rig(cameras=cameras, metadata=metadata, sigmas=sigmas)
+
+
+def _sigmas(table: Any, name: str, path: Path) -> dict[str, float]:
+    numbers = table.values() if isinstance(table, dict) else [None]
+    if not all(isinstance(v, (int, float)) and math.isfinite(v) and v >= 0 for v in numbers):
+        raise InputError(f"“sigma” of camera “{name}” of the rig {path} must be a table of standard deviations, such as {{f = 0.12}}.")
+    return {key: float(value) for key, value in table.items()}
 
 
 def write_rig(path: Path, rig: Rig) -> None:
@@ -77,14 +90,20 @@ def write_rig(path: Path, rig: Rig) -> None:
         ]
         if np.any(camera.affinity):
             lines.append(f"affinity = {_numbers(camera.affinity)}")
+        if camera.name in rig.sigmas:
+            lines.append(f"sigma = {{ {', '.join(f'{_key(k)} = {_number(v)}' for k, v in rig.sigmas[camera.name].items())} }}")
         lines.append("")
     lines += ["[metadata]", 'unit = "m"']
     lines += [
-        f"{k if re.fullmatch('[A-Za-z0-9_-]+', k) else _text(k)} = {_value(v)}"
+        f"{_key(k)} = {_value(v)}"
         for k, v in rig.metadata.items()
         if k != "unit" and isinstance(v, (str, int, float))
     ]
     store.write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def _key(text: str) -> str:
+    return text if re.fullmatch("[A-Za-z0-9_-]+", text) else _text(text)
 
 
 def _value(value: str | int | float) -> str:

@@ -24,11 +24,20 @@ def read_any(path: Path) -> Rig:
     """Read another tool's calibration, told apart by the file's or folder's content.
 
     Raises:
-        InputError: it is missing, of no known kind, or damaged.
+        InputError: it is missing, of no known kind, or damaged, or two of its cameras have one name.
     """
     path = Path(path)
     if not path.exists():
         raise InputError(f"The calibration {path} is missing; check the path.")
+    rig = _read(path)
+    names = [camera.name for camera in rig.cameras]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{path} names two cameras “{twice}”; give each its own name there.")
+    return rig
+
+
+def _read(path: Path) -> Rig:
     folder, ending = path if path.is_dir() else path.parent, path.suffix.lower()
     if ending == ".toml":
         return toml_files.read(path)

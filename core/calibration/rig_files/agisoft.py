@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.camera_derivatives import camera_of, interior_of
 from ...geometry.rig import Rig
-from .reading import make_camera, numbers, text_of
+from .reading import NO_UNIT, make_camera, numbers, text_of
 
 
 def read(path: Path) -> Rig:
@@ -34,7 +34,8 @@ def read(path: Path) -> Rig:
     except Xml.ParseError as error:
         raise InputError(f"{path} is not an XML file: {error}.") from error
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
-    scale = float(numbers((root.findtext(".//chunk/transform/scale") or "1").split(), (1,), f"The chunk's scale in {path}")[0])
+    scaled = root.findtext(".//chunk/transform/scale")
+    scale = float(numbers((scaled or "1").split(), (1,), f"The chunk's scale in {path}")[0])
     cameras = []
     for element in root.iter("camera"):
         transform = element.findtext("transform")
@@ -46,7 +47,7 @@ def read(path: Path) -> Rig:
         cameras.append(_camera(path, str(element.get("label") or element.get("id")), sensor, transform, scale))
     if not cameras:
         raise InputError(f"{path} holds no aligned camera; align the cameras in Metashape and export them as Agisoft XML.")
-    return Rig(cameras=tuple(cameras))
+    return Rig(cameras=tuple(cameras), metadata={} if scaled else {"scale": NO_UNIT})
 
 
 def _camera(path: Path, name: str, sensor: Xml.Element, transform: str, scale: float) -> Camera:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ... import store
 from ...errors import InputError
 from ...geometry.rig import Rig
-from .reading import make_camera, numbers, text_of
+from .reading import NO_UNIT, make_camera, numbers, text_of
 from .refit import plain
 
 # Parameters of each model: which of fx fy cx cy k1 k2 p1 p2 k3 they are, in order; "f" is both fx and fy.
@@ -36,17 +36,21 @@ def read(path: Path) -> Rig:
     interior = {}
     for line in _lines(folder / "cameras.txt"):
         interior[line[0]] = _interior(line, folder)
-    cameras = []
+    cameras, names = [], list[Path]()
     for line in _image_lines(folder / "images.txt"):
         values = numbers(line[1:8], (7,), f"Image {line[0]} in {folder / 'images.txt'}")
         if line[8] not in interior:
             raise InputError(f"Image {line[0]} in {folder / 'images.txt'} names camera {line[8]}, which cameras.txt lacks.")
         size, matrix, distortions = interior[line[8]]
         R = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix()
-        cameras.append(make_camera(Path(" ".join(line[9:])).stem, size, matrix, distortions, R, values[4:]))
+        image = Path(" ".join(line[9:]))
+        names.append(image.parent / image.stem)
+        cameras.append((size, matrix, distortions, R, values[4:]))
     if not cameras:
         raise InputError(f"{folder / 'images.txt'} holds no posed image; export the finished model as text.")
-    return Rig(cameras=tuple(cameras))
+    alike = len({name.name for name in names}) < len(names)  # such as cam1/0001.png and cam2/0001.png: the folders tell them apart
+    named = ["_".join(name.parts) if alike else name.name for name in names]
+    return Rig(cameras=tuple(make_camera(name, *camera) for name, camera in zip(named, cameras)), metadata={"scale": NO_UNIT})
 
 
 def _lines(path: Path) -> list[list[str]]:

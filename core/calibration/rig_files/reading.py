@@ -10,6 +10,7 @@ from ...errors import InputError
 from ...geometry.camera import Camera
 
 LARGEST_FILE = 50_000_000
+NO_UNIT = "the file has no unit, so its lengths were taken as metres"
 
 
 def text_of(path: Path) -> str:

@@ -34,10 +34,12 @@ def read(path: Path) -> Rig:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a TOML file: {error}.") from error
     metadata = table.get("metadata", {})
-    unit_m = UNITS_M.get(str(metadata.get("unit", "m")) if isinstance(metadata, dict) else "m", 1.0)
+    unit = str(metadata.get("unit", "m")) if isinstance(metadata, dict) else "m"
+    if unit not in UNITS_M:
+        raise InputError(f"{path} is in an unknown unit “{unit}”; write one of {', '.join(UNITS_M)} under [metadata].")
     entries = table["cameras"] if isinstance(table.get("cameras"), dict) else table
     cameras = [
-        _camera(key, entry, path, unit_m)
+        _camera(key, entry, path, UNITS_M[unit])
         for key, entry in entries.items()
         if isinstance(entry, dict) and "matrix" in entry and entry.get("rotation") is not None
     ]

@@ -10,7 +10,7 @@ from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_
 from tricap.core.calibration.rig_files.openptv import image
 from tricap.core.errors import InputError
 from tricap.core.geometry.camera import Camera
-from tricap.core.geometry.rig import Rig, read_rig
+from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.synthetic.bar import bar_ends, benchmark_cameras
 
 ENDING = {"agisoft": "rig.xml", "opencv": "rig.yml"}
@@ -277,3 +277,23 @@ def test_the_command_converts(tmp_path: Path) -> None:
     assert main(["calibrate", "--import", str(tmp_path / "rig.toml"), "--export", "colmap", "--out", str(out), "--quiet"]) == 0
     assert (out / "images.txt").exists()
     assert main(["calibrate", "--import", str(tmp_path / "none.toml"), "--out", str(out), "--quiet"]) == 2
+
+
+def test_images_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) -> None:
+    write_as(tmp_path, Rig(cameras=benchmark_cameras()), "colmap")
+    text = (tmp_path / "images.txt").read_text()
+    for name in "LCR":
+        text = text.replace(f" {name}.png", f" cam{name}/0001.png").replace(f" {name}\n", f" cam{name}/0001.png\n")
+    (tmp_path / "images.txt").write_text(text)
+    rig = read_any(tmp_path)
+    assert [c.name for c in rig.cameras] == ["camL_0001", "camC_0001", "camR_0001"] and "no unit" in rig.metadata["scale"]
+    (tmp_path / "images.txt").write_text(text.replace("camL", "camC"))
+    with pytest.raises(InputError, match="two cameras"):
+        read_any(tmp_path)
+
+
+def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.toml", Rig(cameras=benchmark_cameras()))
+    (tmp_path / "rig.toml").write_text((tmp_path / "rig.toml").read_text().replace('unit = "m"', 'unit = "inch"'))
+    with pytest.raises(InputError, match="unknown unit “inch”"):
+        read_any(tmp_path / "rig.toml")

@@ -1,5 +1,6 @@
 """Targets in images: accuracy against drawn discs, speed, what is no target, and the whole way from pictures to a rig."""
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -131,6 +132,9 @@ def test_from_pictures_to_a_rig(bar_folder, tmp_path: Path) -> None:
     from tricap.core.geometry.rig import read_rig
 
     rig = read_rig(out)
+    assert set(rig.sigmas) == set("LCR") and 0 < rig.sigmas["C"]["f"] < 5 and 0 < rig.sigmas["C"]["shift z"] < 0.01
+    said = json.loads((tmp_path / "report" / "calibration.json").read_text())
+    assert 0.2 < said["volume_visited"] <= 1 and 0.9 < said["volume_seen_by_two"] <= 1 and said["bars_rejected"] <= 3
     estimated = [rig[c.name] for c in waved.cameras]
     assert error_m(waved.cameras, estimated, waved.ends_m.reshape(-1, 3)) < 0.5e-3
 

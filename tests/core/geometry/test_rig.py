@@ -119,3 +119,13 @@ def test_files_that_are_no_rig(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is not a TOML file"):
         read_rig(tmp_path / "rig.toml")
+
+
+def test_sigmas_are_kept_and_checked(tmp_path: Path) -> None:
+    rig = some_rig()
+    sigmas = {"L": {"f": 0.125, "turn x": 1e-5}, rig.cameras[2].name: {"k1": 2e-4}}
+    write_rig(tmp_path / "rig.toml", Rig(cameras=rig.cameras, sigmas=sigmas))
+    assert read_rig(tmp_path / "rig.toml").sigmas == sigmas
+    for wrong in ("3", "{ f = nan }", "{ f = -1.0 }", '{ f = "1" }'):
+        with pytest.raises(InputError, match="“sigma” of camera “L”"):
+            read(tmp_path, text({"sigma": wrong}))
