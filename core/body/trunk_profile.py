@@ -36,18 +36,27 @@ def smoothed(balls: Metaballs, skeleton: Skeleton, lengths_m: np.ndarray, chain:
     X, bone = _outline(R, head, lengths_m, chain, visible_radii_m, stations)
     mine = np.flatnonzero(np.isin(balls.bone_index, chain))
     active = skeleton.neighbours[bone][:, balls.bone_index] & np.isin(balls.bone_index, chain)
+    return with_radii_for(balls, mine, lengths_m, R, head, X, active, np.full(len(X), VISIBLE), np.ones(len(X)))
+
+
+def with_radii_for(balls: Metaballs, mine: np.ndarray, lengths_m: np.ndarray, R: np.ndarray, head: np.ndarray, xyz_m: np.ndarray,
+                   active: np.ndarray, root: np.ndarray, weight: np.ndarray, free: float = FREE) -> Metaballs:
+    """The balls with the cross radii of `mine` (K,) such that √(−½ ln F) is `root` (N,) at points (N, 3), with weights (N,).
+
+    `active` (N, M) as in `metaballs.field`. ln l keeps its value ± `free`; Gauss-Newton steps of 0.2 at most.
+    """
     start = np.log(balls.radii_m[mine][:, [0, 2]])
-    x = start.copy()
+    x, held = start.copy(), (weight.sum() / start.size) * (TOLERANCE / free) ** 2
     for _ in range(STEPS):
         radii = balls.radii_m.copy()
         radii[np.ix_(mine, np.array([0, 2]))] = np.exp(x)
         balls = replace(balls, radii_m=radii)
-        F, _, dF, _ = field_and_derivatives(balls, lengths_m, R, head, X, active)
+        F, _, dF, _ = field_and_derivatives(balls, lengths_m, R, head, xyz_m, active)
         F = np.maximum(F, 1e-6)
-        root = np.sqrt(np.maximum(-0.5 * np.log(np.minimum(F, 0.99)), 0.03))
-        J = (-0.25 / (F * root))[:, None] * dF[:, mine][..., [0, 2]].reshape(len(F), -1)
-        N = J.T @ J + np.eye(x.size) * (len(F) / x.size) * (TOLERANCE / FREE) ** 2
-        g = J.T @ (root - VISIBLE) + (len(F) / x.size) * (TOLERANCE / FREE) ** 2 * (x - start).ravel()
+        found = np.sqrt(np.maximum(-0.5 * np.log(np.minimum(F, 0.99)), 0.03))
+        J = (-0.25 / (F * found))[:, None] * dF[:, mine][..., [0, 2]].reshape(len(F), -1)
+        N = (J.T * weight) @ J + np.eye(x.size) * held
+        g = J.T @ (weight * (found - root)) + held * (x - start).ravel()
         x = x - np.clip(np.linalg.solve(N, g), -0.2, 0.2).reshape(x.shape)
     return balls
 

@@ -4,8 +4,7 @@ import numpy as np
 
 from ..body.skeleton import Skeleton
 from .observations import Apart
-from .segmentation import RADIUS_OF_SUM
-from .state import CROSS, BodyState
+from .state import BodyState
 
 FRACTIONS = (0.65, 1.0)  # of a limb's bone: nearer its head it grows out of the others
 SOFT = 0.8  # flesh gives way: of the limb's radius
@@ -45,7 +44,6 @@ class LimbsApart:
 def _radii(state: BodyState) -> np.ndarray:
     """Smallest and largest visible radius (B, 2) of every bone, 0 where it has no balls."""
     radii = np.zeros((len(state.lengths_m), 2))
-    for b in np.unique(state.balls.bone_index):
-        across = RADIUS_OF_SUM * state.balls.radii_m[state.balls.bone_index == b][:, CROSS]
-        radii[b] = across.min(), across.max()
+    for b, profile in state.profiles.items():
+        radii[b] = profile.radii_m.min(), profile.radii_m.max()
     return radii

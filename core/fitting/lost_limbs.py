@@ -16,7 +16,7 @@ from .segmentation import from_bone
 from .state import BodyState, free_bones
 
 ROUNDS = ((400, 150.0, 0.03, 4), (60, 25.0, 0.02, 2), (60, 10.0, 0.015, 1))  # postures, spread [°], width [m] of weights, best kept
-BEYOND_M = 0.05  # points so far beyond a limb's reach, or so near to another bone, are none of its
+BEYOND_M = 0.05  # points so far beyond a limb's reach, or so near to another part or bone, are none of its
 
 
 def lost_limbs(fit: Conditions, counts: np.ndarray) -> list[np.ndarray]:
@@ -72,7 +72,7 @@ def _unexplained(fit: Conditions, points: CloudPoints, state: BodyState, limb: n
     for b in set(range(len(state.lengths_m))) - hanging:
         rows = np.flatnonzero(near)
         if b in fleshy:
-            near[rows] = from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] > fit.settings.gate_m
+            near[rows] = from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] > max(fit.settings.gate_m, BEYOND_M)
         else:
             w, axis = points.xyz_m[rows] - state.head_m[b], state.R[b][:, 1]
             along = np.clip(w @ axis, 0.0, state.lengths_m[b] + BEYOND_M)

@@ -1,9 +1,9 @@
 """Which limb does a measured point belong to? (D'Apuzzo et al. 1999, §3.3: the closest limb in the posture so far.)
 
-Closest is the limb with the smallest distance from the bone's segment, minus the limb's radius there (a fat trunk must not swallow the
-points of a thin arm). A point is nobody's when it is further from that surface than a gate, when it lies along the bone where the surface
-is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the hand), or when its normal
-points into the limb.
+Closest is the limb with the smallest distance from the bone's segment, minus the limb's radius there (`body.bone_profile`; a fat trunk must
+not swallow the points of a thin arm). A point is nobody's when it is further from that surface than a gate, when it lies along the bone
+where the surface is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the hand), or
+when its normal points into the limb.
 """
 
 from collections.abc import Callable, Hashable
@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..body.metaballs import STATIONS
 from .cloud_points import CloudPoints
 from .state import CROSS, BodyState
 
-RADIUS_OF_SUM = 1 / 1.534  # limb radius / l of three balls a segment
 HARDLY_M = 0.004
 FACING = 0.6  # least cosine between a point's normal and the limb's
 
@@ -48,7 +46,7 @@ class HeldSegments:
     def get(self, key: Hashable, state: BodyState, find: Callable[[], Any]) -> Any:
         """What was found for `key` when the body was where it is now, within `HARDLY_M`; else what `find` finds now."""
         tails = state.head_m + state.lengths_m[:, None] * state.R[:, :, 1]
-        now = np.concatenate([state.head_m, tails, state.balls.radii_m])
+        now = np.concatenate([state.head_m.ravel(), tails.ravel(), *(profile.radii_m.ravel() for profile in state.profiles.values())])
         if key not in self._held or np.abs(self._held[key][0] - now).max() > HARDLY_M:
             self._held[key] = (now, find())
         return self._held[key][1]
@@ -65,7 +63,7 @@ def crop(points: CloudPoints, state: BodyState, reach_m: float) -> CloudPoints:
 def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> list[tuple[int, np.ndarray]]:
     """For each bone with balls the points (K,) in a sphere that holds all within its `reach_m` (B,) of its surface."""
     bones = np.unique(state.balls.bone_index)
-    widest = np.array([RADIUS_OF_SUM * state.balls.radii_m[state.balls.bone_index == b][:, CROSS].max() for b in bones])
+    widest = np.array([state.profiles[b].radii_m.max() for b in bones.tolist()])
     half = state.lengths_m[bones] / 2
     middle = state.head_m[bones] + half[:, None] * state.R[bones, :, 1]
     origin = middle.mean(axis=0)
@@ -82,17 +80,11 @@ def from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: in
     along, across = local[:, 1] / length, local[:, CROSS]
     beyond = local[:, 1] - np.clip(local[:, 1], 0.0, length)
     distance = np.hypot(np.hypot(across[:, 0], across[:, 1]), beyond)
-    mine = np.flatnonzero(state.balls.bone_index == bone)
-    radii = RADIUS_OF_SUM * state.balls.radii_m[mine][:, CROSS]
-    if len(mine) != len(STATIONS):
-        order = np.argsort(state.balls.centre[mine, 1])
-        mine, radii = mine[order], radii[order]
-    stations = state.balls.centre[mine, 1]
-    a, b = np.interp(along, stations, radii[:, 0]), np.interp(along, stations, radii[:, 1])
-    outward = across / np.stack([a, b], axis=1)
+    axes = state.profiles[bone].across(along, across)
+    outward = across / axes
     stretch = np.linalg.norm(outward, axis=1)
     radius = np.linalg.norm(across, axis=1) / np.maximum(stretch, 1e-9)  # of the ellipse in the point's direction
-    outward /= np.stack([a, b], axis=1)
+    outward /= axes
     normal = (normals @ state.R[bone])[:, CROSS]
     size = np.linalg.norm(normal, axis=1) * np.linalg.norm(outward, axis=1)
     return distance - radius, along, np.einsum("ni,ni->n", normal, outward) >= FACING * size

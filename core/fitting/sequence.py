@@ -5,6 +5,7 @@
 3. With that shape held, frame after frame forwards and backwards (`frame_to_frame`).
 4. One adjustment over the whole sequence: the shape once, a posture per frame, tied over time by tracked points and weak accelerations.
    Frames whose residuals stay suspicious begin once more from between their neighbours.
+5. Where the complete model is asked for: it is made from that body (`body.complete`), and step 4 is done again with its radii.
 
 Points, outlines and keypoints are each enough alone.
 
@@ -18,6 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..body.complete import complete_shape
 from ..body.model_file import read_model, with_limits
 from ..body.shape import default_shape, one_ball_shape, scaled_shape
 from ..progress import Monitor
@@ -47,6 +49,7 @@ __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
 
 SUSPICIOUS = 3.0  # times the usual sigma0
 ERRORS_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
+MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that give the simplified body's surface
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
@@ -70,10 +73,23 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
         tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
     motion, points, known = follow(fit, points, given.time_s, first, tracks, monitor)
     sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
-    problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, clicked_lengths(fit, points[fit.click], first))
+    lengths = clicked_lengths(fit, points[fit.click], first)
+    problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths)
     solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
     solution = _begun_anew(fit, points, given.time_s, solution, problem, monitor)
+    if settings.balls == "complete":
+        fit = _completed(fit, solution)
+        problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths)
+        solution = solve(problem, solution.motion, fit.parameters.vector(), steps=settings.sequence_steps, scales=solution.scales,
+                         monitor=monitor, stage="refine the complete model")
     return _result(fit, points, given.time_s, solution, problem)
+
+
+def _completed(fit: Conditions, solution: Solution) -> Conditions:
+    """The same conditions for the complete model of the body that was found."""
+    vector = solution.vector
+    shape = complete_shape(fit.parameters.shape(vector, np.full(len(vector), np.nan)))
+    return replace(fit, parameters=ShapeParameters(shape, fit.settings.weights), settings=replace(fit.settings, radius_sigma=MUSCLE_SIGMA))
 
 
 def conditions(given: FitInput, settings: FitSettings) -> Conditions:
@@ -93,7 +109,7 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     known = np.where(np.isfinite(places[begin]), places[begin], known) if begin in places else known
     clicks = enough(known, names, [*([clicked[begin]] if begin in clicked else []), *tracks.observe(begin)])
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
-    shape = default_shape(model) if settings.balls == "three" else one_ball_shape(default_shape(model))
+    shape = one_ball_shape(default_shape(model)) if settings.balls == "one" else default_shape(model)
     shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
     parameters = ShapeParameters(shape, settings.weights)
     return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,

@@ -12,7 +12,8 @@ class FitSettings:
     method: str = knob("joint", "At the click frame: pose and radii together, or in turns as published.", choices=("joint", "alternating"))
     residual: str = knob("metric", "Surface residual: metric (root of the logarithm) or the paper's field difference.",
                          choices=("metric", "paper"))
-    balls: str = knob("three", "Metaballs of a bone: three, or one ellipsoid for comparison.", choices=("three", "one"))
+    balls: str = knob("three", "Metaballs of a bone: three; one, to compare; complete: three, then refined in an anatomical arrangement.",
+                      choices=("three", "one", "complete"))
     weights: bool = knob(False, "The balls' weights are parameters of the fit too: edges can be sharper or rounder.")
     robust: str = knob("geman-mcclure", "How gross points lose their weight.", choices=("geman-mcclure", "huber"))
     robust_width: float = knob(3.0, "Residual, in robust standard deviations, at which a point loses half its pull.", low=1.0, high=20.0)

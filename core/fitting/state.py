@@ -5,11 +5,13 @@ radii l_x and l_z of every ball (M, 2), and, where they are free, ln of the ball
 their sigmas relative. A ball's centre and its radius along the bone scale with the bone.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
+from ..body.bone_profile import BoneProfile, bone_profiles, chain_neighbours
 from ..body.metaballs import Metaballs
 from ..body.shape import BodyShape
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
@@ -34,6 +36,12 @@ class BodyState:
     R: np.ndarray  # (B, 3, 3) bone frames
     head_m: np.ndarray  # (B, 3) bone heads in the world
     axes: np.ndarray  # (D, 3) axes of the DOFs in the world
+    find_profiles: Callable[[], Mapping[int, BoneProfile]]
+
+    @property
+    def profiles(self) -> Mapping[int, BoneProfile]:
+        """How thick the body is about each bone that has balls, by the bone's index."""
+        return self.find_profiles()
 
     @property
     def n_motion(self) -> int:
@@ -95,6 +103,8 @@ class ShapeParameters:
         self.skeleton = template.skeleton
         self.n_lengths = len(template.lengths_m)
         self.parts = tuple(Part(self.skeleton, b, template.metaballs.bone_index, weights) for b in range(self.n_lengths))
+        self.counted = chain_neighbours(template)
+        self._profiles: tuple[bytes, dict[int, BoneProfile]] = (b"", {})
         self.layout = Layout(_names(template, weights), _sets(self.n_lengths, len(template.metaballs.weight), weights))
 
     def vector(self, shape: BodyShape | None = None) -> np.ndarray:
@@ -122,12 +132,20 @@ class ShapeParameters:
         """The body of a shape vector (S,) in the posture of a motion vector (D,)."""
         return self.states(np.asarray(motion)[None], vector)[0]
 
+    def profiles(self, vector: np.ndarray) -> dict[int, BoneProfile]:
+        """The profiles of the bones of a shape vector (S,); the last ones are kept."""
+        key = vector.tobytes()
+        if self._profiles[0] != key:
+            lengths, balls = self.body(vector)
+            self._profiles = key, bone_profiles(self.skeleton, lengths, balls, self.counted)
+        return self._profiles[1]
+
     def states(self, motion: np.ndarray, vector: np.ndarray) -> list[BodyState]:
         """The body of a shape vector (S,) in T postures (T, D)."""
         lengths, balls = self.body(vector)
-        forward = frames_and_axes(self.skeleton, lengths, motion)
+        forward, vector = frames_and_axes(self.skeleton, lengths, motion), np.array(vector)
         return [BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=m, parts=self.parts, R=R, head_m=head, axes=axes,
-                          weights=self.weights)
+                          weights=self.weights, find_profiles=partial(self.profiles, vector))
                 for m, R, head, axes in zip(motion, *forward)]
 
     def shape(self, vector: np.ndarray, sigma: np.ndarray) -> BodyShape:

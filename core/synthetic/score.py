@@ -85,12 +85,13 @@ class ShapeScore:
     """The fitted person against the true one."""
 
     lengths_mm: dict[str, float]  # error of each bone's length
-    radius_bias: float  # mean and rms of l_fit/l_true − 1 of the metaballs' cross radii
+    radius_bias: float  # mean and rms of l_fit/l_true − 1 of the metaballs' cross radii; NaN: the bodies have other balls
     radius_rms: float
 
     def __str__(self) -> str:
         lengths = ", ".join(f"{name} {value:+.1f} mm" for name, value in self.lengths_mm.items())
-        return f"lengths {lengths}; cross radii {self.radius_bias:+.1%}, {self.radius_rms:.1%} rms"
+        radii = f"; cross radii {self.radius_bias:+.1%}, {self.radius_rms:.1%} rms" if self.radius_rms == self.radius_rms else ""
+        return f"lengths {lengths}{radii}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -291,7 +292,7 @@ def _score_shape(truth: Truth, path: Path) -> ShapeScore | None:
     lengths = {bone.name: float(length - truth.lengths_m[bone.name]) * 1e3
                for bone, length in zip(shape.skeleton.bones, shape.lengths_m) if bone.name in truth.lengths_m}
     if shape.metaballs.radii_m.shape != truth.radii_m.shape:
-        raise InputError(f"{path} has {len(shape.metaballs.weight)} metaballs, the true body {len(truth.radii_m)}; fit the same model.")
+        return ShapeScore(lengths_mm=lengths, radius_bias=float("nan"), radius_rms=float("nan"))
     ratio = (shape.metaballs.radii_m / truth.radii_m)[:, [0, 2]] - 1
     return ShapeScore(lengths_mm=lengths, radius_bias=float(ratio.mean()), radius_rms=float(np.sqrt((ratio**2).mean())))
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tricap.core.body import metaballs as core_metaballs
+from tricap.core.body.complete import complete_shape
 from tricap.core.body.model_file import model_names, read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
@@ -117,10 +118,12 @@ def curves(body: object) -> list[tuple[str, int, object]]:
     return [(curve.data_path, curve.array_index, curve.keyframe_points) for curve in bag.fcurves]
 
 
-def test_the_metaballs_surface_is_the_fitted_one(empty: ModuleType) -> None:
+@pytest.mark.parametrize("balls", ["three", "complete"])
+def test_the_metaballs_surface_is_the_fitted_one(empty: ModuleType, balls: str) -> None:
     from tricap.addon.scene import metaballs
 
     shape = default_shape(read_model("arm.R"))
+    shape = shape if balls == "three" else complete_shape(shape)
     motion = np.zeros((2, len(shape.skeleton.dof_names)))
     motion[1, :3] = 0.3, -0.2, 1.1
     motion[1, shape.skeleton.layout["elbow.R flexion"]] = np.radians(70)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tricap.core.body.complete import complete_shape
 from tricap.core.body.metaballs import Metaballs
 from tricap.core.body.shape import BodyShape, write_body
 from tricap.core.body.skeleton import joint_positions
@@ -113,6 +114,12 @@ def test_joints_angles_and_shape(take: Path, tmp_path: Path) -> None:
     assert flexion.rms_deg == pytest.approx(np.sqrt(10)) and flexion.motion_rms_deg == pytest.approx(1.0)
     assert score.hinges["elbow.R"].motion_rms_deg == pytest.approx(1.0, abs=0.01)
     assert score.shape is not None and score.shape.radius_bias == pytest.approx(0.1) and score.shape.lengths_mm["forearm.R"] == 0
+
+
+def test_a_body_of_other_balls_has_lengths_to_compare_only(take: Path, tmp_path: Path) -> None:
+    put_fit(tmp_path, arm_motion(np.arange(FRAMES) / 25), complete_shape(arm_shape()))
+    found = score_run(take, tmp_path).shape
+    assert found is not None and found.lengths_mm["forearm.R"] == 0 and np.isnan(found.radius_rms) and "radii" not in str(found)
 
 
 def test_skin(take: Path, truth: Truth, tmp_path: Path) -> None:

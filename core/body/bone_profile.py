@@ -1,0 +1,76 @@
+"""How thick a body is about each of its bones: where the summed field of the bone and its neighbours in the chain is at the threshold.
+
+The radii of single balls do not tell: a limb's follows from the sum, and stout bones that follow each other add to it as much as their own
+balls. Limbs that branch off (a shoulder beside the chest) are not counted.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .metaballs import STATIONS, THRESHOLD, Metaballs
+from .shape import BodyShape
+from .skeleton import Skeleton, bone_frames
+from .skin_parts import body_parts
+
+ALONG = 5  # places along a bone, from its first ball to its last
+SIDES = np.array([[1.0, 0, 0], [0, 0, 1.0], [-1.0, 0, 0], [0, 0, -1.0]])  # in the bone's axes: x, z, −x, −z
+HALVINGS = 14
+FARTHEST = 1.25  # seen radius / largest l across of balls that add up
+LEAST_M = 0.003  # where the balls do not reach around the axis
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BoneProfile:
+    """Fractions along a bone (K,), and the radii there (K, 4) [m] towards x, z, −x and −z of its axes. Beyond the ends they go on."""
+
+    stations: np.ndarray
+    radii_m: np.ndarray
+
+    def across(self, along: np.ndarray, across_m: np.ndarray) -> np.ndarray:
+        """Half axes (N, 2) of the quarter ellipse that holds a point at fractions (N,) and places across the bone (N, 2) in x and z."""
+        axes = []
+        for i in (0, 1):
+            ahead, behind = (np.interp(along, self.stations, self.radii_m[:, i + k]) for k in (0, 2))
+            axes.append(np.where(across_m[:, i] >= 0, ahead, behind))
+        return np.stack(axes, axis=1)
+
+
+def chain_neighbours(shape: BodyShape) -> np.ndarray:
+    """Whether the balls of bone j count for the profile of bone i (B, B): they meet, and one leads on from the other."""
+    together = np.zeros_like(shape.skeleton.neighbours)
+    for part in body_parts(shape):
+        together[np.ix_(part.bones, part.bones)] = True
+    return together & shape.skeleton.neighbours
+
+
+def bone_profiles(skeleton: Skeleton, lengths_m: np.ndarray, balls: Metaballs, counted: np.ndarray) -> dict[int, BoneProfile]:
+    """The profiles of all bones that have balls, in the rest pose. `counted` (B, B) as from `chain_neighbours`."""
+    R, head = bone_frames(skeleton, lengths_m, np.zeros(len(skeleton.dofs)))
+    centres = head[balls.bone_index] + np.einsum("mij,mj->mi", R[balls.bone_index], balls.centres_m(lengths_m))
+    scaled = R[balls.bone_index].transpose(0, 2, 1) / balls.radii_m[:, :, None]  # world to units of l
+    found = {}
+    for b in np.unique(balls.bone_index).tolist():
+        fractions = balls.centre[balls.bone_index == b, 1]
+        stations = np.linspace(min(STATIONS[0], fractions.min()), max(STATIONS[-1], fractions.max()), ALONG)
+        origin = np.repeat(head[b] + (stations * lengths_m[b])[:, None] * R[b, :, 1], len(SIDES), axis=0)
+        used = counted[b, balls.bone_index]
+        M = scaled[used]
+        o = np.einsum("mij,nmj->nmi", M, origin[:, None] - centres[used])
+        u = np.einsum("mij,nj->nmi", M, np.tile(SIDES @ R[b].T, (ALONG, 1)))
+        aside = np.linalg.norm(balls.centres_m(lengths_m)[used][:, [0, 2]], axis=1)
+        reach = float((FARTHEST * balls.radii_m[used][:, [0, 2]].max(axis=1) + aside).max())
+        radii = _where_seen(o, u, balls.weight[used], reach)
+        found[b] = BoneProfile(stations=stations, radii_m=np.maximum(radii, LEAST_M).reshape(ALONG, len(SIDES)))
+    return found
+
+
+def _where_seen(o: np.ndarray, u: np.ndarray, weight: np.ndarray, reach_m: float) -> np.ndarray:
+    """The radii (N,) at which rays o + ρ u (N, m, 3), in units of each ball's l, leave the surface; 0 where they begin outside."""
+    a, b, c = (np.einsum("nmi,nmi->nm", p, q) for p, q in ((u, u), (o, u), (o, o)))
+    low, high = np.zeros(len(o)), np.full(len(o), reach_m)
+    for _ in range(HALVINGS):
+        middle = ((low + high) / 2)[:, None]
+        inside = np.exp(-2 * (c + middle * (2 * b + middle * a))) @ weight >= THRESHOLD
+        low, high = np.where(inside, middle[:, 0], low), np.where(inside, high, middle[:, 0])
+    return (low + high) / 2
