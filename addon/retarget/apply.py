@@ -9,17 +9,17 @@ import numpy as np
 
 from ...core.errors import InputError
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.mapping import Preset, RigMap, apply_preset, find_map, read_preset
+from ...core.motion.retarget.mapping import RigMap, apply_preset, find_map, read_preset
 from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.steering import controls_of
 from ...core.motion.retarget.turns import angle_of, transposed
 from ...core.progress import Monitor
+from .programs import presets
 from .read import read_motion, read_rig, with_soles
 from .write import Written, write_action
 
-PRESETS = Path(__file__).resolve().parent.parent / "presets"
 LOW = 0.1  # a rig whose feet are farther than this part of its height from its origin has its floor under its feet instead
 SAMPLES = 9
 BENT_DEG = 0.5
@@ -44,15 +44,6 @@ class Outcome:
     notes: tuple[str, ...]
 
 
-def presets() -> list[Preset]:
-    """The mappings that come with Tricap.
-
-    Raises:
-        InputError: one of them was edited and is damaged.
-    """
-    return [read_preset(path) for path in sorted(PRESETS.glob("*.json"))]
-
-
 def map_of(rig: Rig, map_file: Path | None = None, *, steer: bool = False) -> RigMap:
     """The mapping from a file, or as found; of a rig with controls, the controls if it is to be steered, else the bones that follow.
 
@@ -61,7 +52,7 @@ def map_of(rig: Rig, map_file: Path | None = None, *, steer: bool = False) -> Ri
     """
     if map_file is not None:
         return apply_preset(rig, read_preset(map_file))
-    return find_map(rig, [preset for preset in presets() if steer or preset.steering is None])
+    return find_map(rig, presets(steering=steer))
 
 
 def read_target(armature_object: bpy.types.Object, map_file: Path | None = None, edited: RigMap | None = None) -> Target:

@@ -9,6 +9,7 @@ from ...core import store
 from ...core.errors import InputError
 from ...core.progress import Monitor
 from ...core.settings import from_table
+from .programs import PROGRAMS
 
 FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
 
@@ -32,10 +33,10 @@ def add_commands(subparsers: Any) -> None:
     parser.set_defaults(run=retarget)
     about = "write a run's motion or points in another format"
     parser = subparsers.add_parser("export", help=about, description=about.capitalize())
-    parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion file")
+    parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--out", dest="file", metavar="FILE", type=Path, required=True, help="the file to write (for ply: a folder)")
-    parser.add_argument("--preset", choices=("plain", "mixamo", "unreal", "unity", "maya", "opensim"), default="plain",
+    parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain",
                         help="names, units and axes for a program")
     parser.set_defaults(run=export)
 
@@ -92,8 +93,8 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: what is asked for is not in OUT, or the input needs mending.
         Cancelled: the monitor was cancelled.
     """
-    from .export import export_file
+    from .export import BY_BLENDER, IN_BLENDER, export_file
 
-    if args.format in ("fbx", "glb", "usd", "abc"):
+    if args.format in BY_BLENDER or args.out.suffix.lower() in IN_BLENDER and not args.out.is_dir():
         _need_blender("export")
     return [f"{args.file}: {export_file(args.out, args.format, args.file, args.preset, monitor)}"]

@@ -11,9 +11,8 @@ from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
 from ...core.progress import Monitor
 from . import files
+from .export import IN_BLENDER
 from .read import action_frames, read_motion, read_rig
-
-IN_BLENDER = (".blend", ".fbx", ".glb", ".gltf", ".vrm")
 
 
 def open_source(path: Path, monitor: Monitor) -> Motion:

@@ -6,21 +6,29 @@ from pathlib import Path
 import bpy
 
 from ...core.errors import InputError
+from ...core.motion.retarget.rig import Motion
+from ...core.motion.sources import read_motion_source
 from ...core.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
-from ..retarget.export import PROGRAMS, export_file
+from ..retarget.by_blender import export_motion
+from ..retarget.export import BY_BLENDER, export_file
+from ..retarget.programs import PROGRAMS
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 KINDS = (("bvh", "BVH", "The skeleton's motion, for nearly every animation program"),
          ("trc", "TRC", "The joints as points, for OpenSim"),
          ("c3d", "C3D", "The joints as points, for biomechanics"),
          ("csv", "CSV", "The joints as a table with their sigmas"),
+         ("fbx", "FBX", "The skeleton with the skin, for game engines and animation programs"),
+         ("glb", "glTF", "The skeleton with the skin, for game engines and the web"),
+         ("usd", "USD", "The skeleton with the skin, for film pipelines"),
+         ("abc", "Alembic", "The moving skin alone"),
          ("ply", "PLY", "The skin of every frame, into a folder"))
 
 
 class Export(JobOperator, bpy.types.Operator):
-    """Write the motion for another program. For FBX, glTF, USD and Alembic use Blender's own File > Export on the rig"""
+    """Write the motion for another program"""
 
     bl_idname = "tricap.export"
     bl_label = "Export"
@@ -41,17 +49,23 @@ class Export(JobOperator, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], str]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], str | Motion]:
         """Which results, and which file."""
         if not self.filepath:
             raise InputError("Choose the file to write.")
         out, file, kind, preset = folders.output_folder(self.out, context.scene), folders.absolute(self.filepath), self.kind, self.preset
-        return lambda monitor: f"{file}: {export_file(out, kind, file, preset, monitor)}"
+        self._out, self._file = out, file
+        if kind in BY_BLENDER:
+            return lambda monitor: read_motion_source(out)
+        return lambda monitor: export_file(out, kind, file, preset, monitor)
 
-    def finish(self, context: bpy.types.Context, result: str) -> set[str]:
-        """Tell what was written."""
-        context.scene.tricap_retarget.last = f"Exported {result}"
-        self.report({"INFO"}, result)
+    def finish(self, context: bpy.types.Context, result: str | Motion) -> set[str]:
+        """Tell what was written; what Blender's exporters write is written here."""
+        if isinstance(result, Motion):
+            result = export_motion(self.kind, self._out, self._file, PROGRAMS[self.preset], result)
+        said = f"{self._file}: {result}"
+        context.scene.tricap_retarget.last = f"Exported {said}"
+        self.report({"INFO"}, said)
         return {"FINISHED"}
 
 

@@ -130,8 +130,8 @@ class _Number:
         return np.frombuffer(data, f"{self.order}u2")
 
 
-def read_c3d(path: Path, *, axes: str = "Z up") -> Markers:
-    """Read the points; their residuals become sigmas.
+def read_c3d(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
+    """Read the points, in the file's unit unless `unit` says otherwise; their residuals become sigmas.
 
     Raises:
         InputError: it cannot be read, is no C3D file, or is shorter than its header says.
@@ -146,12 +146,12 @@ def read_c3d(path: Path, *, axes: str = "Z up") -> Markers:
     if len(data) < 2 * BLOCK or data[1] != 0x50 or data[0] < 2:
         raise InputError(f"{path} is not a C3D file.")
     try:
-        return _read(data, path, rotation)
+        return _read(data, path, rotation, unit)
     except (struct.error, IndexError, ValueError, KeyError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is a damaged C3D file ({error}); export it again.") from error
 
 
-def _read(data: bytes, path: Path, rotation: np.ndarray) -> Markers:
+def _read(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Markers:
     at = (data[0] - 1) * BLOCK
     number = _Number(order=">" if data[at + 3] == MIPS else "<", dec=data[at + 3] == DEC)
     table = _read_parameters(data, at, number, path)
@@ -167,11 +167,11 @@ def _read(data: bytes, path: Path, rotation: np.ndarray) -> Markers:
         raise InputError(f"{path} promises {t} frames of {n} points but is too short for them; export it again.")
     rows = np.frombuffer(data, np.uint8, t * stride, begin).reshape(t, stride)[:, :size * 4 * n].tobytes()
     raw = (number.floats(rows) if scale < 0 else np.frombuffer(rows, f"{number.order}i2")).astype(np.float64).reshape(t, n, 4)
-    unit = metres_per(table.get(("POINT", "UNITS"), "mm") or "mm", path)
-    xyz = raw[..., :3] * (1.0 if scale < 0 else scale) * unit
+    per_unit = metres_per(unit or table.get(("POINT", "UNITS"), "mm") or "mm", path)
+    xyz = raw[..., :3] * (1.0 if scale < 0 else scale) * per_unit
     known = (raw[..., 3] >= 0) & np.isfinite(xyz).all(axis=2)
     residual = np.clip(np.nan_to_num(raw[..., 3]), 0, MOST_WORD).astype(np.int64) & 0xFF
-    sigma = np.where(known & (residual > 0), residual * abs(scale) * unit, np.nan)
+    sigma = np.where(known & (residual > 0), residual * abs(scale) * per_unit, np.nan)
     xyz[~known] = np.nan
     return Markers(names=_labels(table, n), fps=fps, frames=first + _offset(table) + np.arange(t), xyz_m=xyz @ rotation, sigma_m=sigma)
 

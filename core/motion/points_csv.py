@@ -3,27 +3,29 @@ NAME x, NAME y, NAME z, …"""
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from .. import store
 from ..errors import InputError
-from .markers import Markers, check_size
+from .markers import Markers, axes_of, check_size, metres_per
 from .tables import read_joints
 
 LARGEST_BYTES = 1 << 30
 DEFAULT_FPS = 25.0
 
 
-def write_points_csv(path: Path, markers: Markers) -> None:
-    """Write points like joints.csv, in metres, Z up; unknown ones have no row.
+def write_points_csv(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "m") -> None:
+    """Write points like joints.csv; unknown ones have no row. joints.csv itself has metres and Z up.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: axes or unit are not known, or the file cannot be written.
     """
+    per_unit = metres_per(unit, path)
     rows = ["frame,time_s,joint,x,y,z,sigma"]
-    for frame, places, sigmas in zip(markers.frames, markers.xyz_m, markers.sigma_m):
+    for frame, places, sigmas in zip(markers.frames, markers.xyz_m @ axes_of(axes).T / per_unit, markers.sigma_m / per_unit):
         for name, X, sigma in zip(markers.names, places, sigmas):
             if np.isfinite(X).all():
                 text = io.StringIO()
@@ -33,12 +35,19 @@ def write_points_csv(path: Path, markers: Markers) -> None:
     store.write_text(Path(path), "\n".join(rows) + "\n")
 
 
-def read_points_csv(path: Path) -> Markers:
-    """Read points in metres, Z up.
+def read_points_csv(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
+    """Read points, in metres unless `unit` says otherwise.
 
     Raises:
-        InputError: it cannot be read, or its columns are none of the two kinds.
+        InputError: it cannot be read, its columns are none of the two kinds, or axes or unit are not known.
     """
+    rotation, per_unit = axes_of(axes), metres_per(unit or "m", path)
+    found = _read(path)
+    return replace(found, xyz_m=found.xyz_m @ rotation * per_unit, sigma_m=found.sigma_m * per_unit)
+
+
+def _read(path: Path) -> Markers:
+    """Points as they stand in the file."""
     try:
         if Path(path).stat().st_size > LARGEST_BYTES:
             raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")

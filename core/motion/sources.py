@@ -9,6 +9,7 @@ from ..body.skeleton import bone_frames
 from ..errors import InputError
 from .bvh import read_bvh
 from .c3d import read_c3d
+from .markers import metres_per
 from .points_csv import rate, read_points_csv
 from .retarget.points import motion_from_points
 from .retarget.rig import Motion, Rig
@@ -19,11 +20,17 @@ from .trc import read_trc
 FILES = (".bvh", ".trc", ".c3d", ".csv")
 
 
-def read_motion_source(path: Path) -> Motion:
+UP = {".trc": {"": "OpenSim", "Y": "OpenSim", "Z": "Z up"}, ".c3d": {"": "Z up", "Y": "Y up", "Z": "Z up"},
+      ".csv": {"": "Z up", "Y": "Y up", "Z": "Z up"}}  # axes of points by the axis that is up
+
+
+def read_motion_source(path: Path, *, up: str = "", unit: str = "") -> Motion:
     """The motion in a run's folder or a file; frame numbers are the file's own, a BVH file's begin at 1 as in Blender.
 
+    `up`: "Y" or "Z", `unit`: "m", "cm", … of a file that does not say so itself; empty: as is the custom of its kind.
+
     Raises:
-        InputError: it cannot be read, or holds no motion.
+        InputError: it cannot be read, holds no motion, or the unit is not known.
     """
     path = Path(path)
     if path.is_dir():
@@ -32,11 +39,11 @@ def read_motion_source(path: Path) -> Motion:
         raise InputError(f"There is no motion {path}; check its name.")
     kind = path.suffix.lower()
     if kind == ".bvh":
-        motion = read_bvh(path)
+        motion = read_bvh(path, unit_m=metres_per(unit, path) if unit else None, up=up or None)
         return Motion(rig=motion.rig, fps=motion.fps, frames=motion.frames + 1, R=motion.R, head_m=motion.head_m)
     if kind in (".trc", ".c3d", ".csv"):
         read = {".trc": read_trc, ".c3d": read_c3d, ".csv": read_points_csv}[kind]
-        return motion_from_points(read(path))
+        return motion_from_points(read(path, axes=UP[kind][up], unit=unit))
     raise InputError(f"{path.name} is no motion that can be read; give a run's folder or one of {', '.join(FILES)}.")
 
 

@@ -31,8 +31,8 @@ def write_trc(path: Path, markers: Markers, *, axes: str = "OpenSim", unit: str 
     store.write_text(Path(path), "\n".join(lines) + "\n")
 
 
-def read_trc(path: Path, *, axes: str = "OpenSim") -> Markers:
-    """Read points.
+def read_trc(path: Path, *, axes: str = "OpenSim", unit: str = "") -> Markers:
+    """Read points, in the file's unit unless `unit` says otherwise.
 
     Raises:
         InputError: it cannot be read, is no TRC file, or is shorter than its header says.
@@ -54,7 +54,7 @@ def read_trc(path: Path, *, axes: str = "OpenSim") -> Markers:
     if len(rows) < t:
         raise InputError(f"{path} promises {t} frames and holds {len(rows)}; export it again.")
     table = np.array([_row(row, n, path) for row in rows[:t]])
-    xyz = table[:, 1:].reshape(t, n, 3) * metres_per(header["Units"], path) @ rotation
+    xyz = table[:, 1:].reshape(t, n, 3) * metres_per(unit or header["Units"], path) @ rotation
     return Markers(names=tuple(names), fps=_rate(header["DataRate"], path), frames=table[:, 0], xyz_m=xyz, sigma_m=np.full((t, n), np.nan))
 
 

@@ -1,0 +1,154 @@
+"""FBX, glTF, USD and Alembic by Blender's exporters, with options that were checked by reading the files back
+(tests/addon/test_retarget_export.py).
+
+Everything is exported from a scene of its own, which is gone afterwards: the open file stays as it was. Units: an FBX file in centimetres
+has centimetres in its armature and says so, since a scaled armature object is what users of game engines complain of; USD and Alembic are
+scaled by their exporters; glTF knows metres alone. Axes: FBX and USD as the program wants them, glTF and Alembic know Y up alone.
+"""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import bpy
+from mathutils import Matrix
+
+from ...core.body.shape import read_body
+from ...core.errors import InputError
+from ...core.motion.markers import metres_per
+from ...core.motion.retarget.rig import Motion
+from ..scene import skin
+from .apply import set_range
+from .build import build_armature, loose_bones
+from .programs import Program, bone_names
+
+FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # where Blender's Y points to in a file with these axes
+UP = {"Y up": "Y", "Z up": "Z", "OpenSim": "Y"}
+MADE = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "collections")
+
+
+def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Motion) -> str:
+    """Write a motion as an armature, with the skin of the run that it comes from; a sentence about what was written.
+
+    Raises:
+        InputError: the format cannot show the motion, or the file cannot be written.
+    """
+    loose = loose_bones(motion)
+    if loose:
+        raise InputError(f"{len(loose)} bones of the motion shift against their parents (“{loose[0]}”), which {kind} cannot show; use bvh.")
+    if kind == "abc" and not out.is_dir():
+        raise InputError("Alembic holds meshes, and this motion has none; choose fbx, glb or usd.")
+    unit_m = metres_per(program.unit or "m", "the preset") if kind == "fbx" else 1.0
+    with scene_of_its_own() as scene:
+        scene.unit_settings.scale_length = unit_m
+        armature_object = build_armature(scaled(motion, 1.0 / unit_m), file.stem)
+        if out.is_dir():
+            skin_object = skin.add_skin(scene.collection, armature_object, read_body(out / "body.toml"))
+            skin_object.data.transform(Matrix.Scale(1.0 / unit_m, 4))
+        _write(kind, file, program, armature_object, bone_names(motion.rig, program))
+    return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
+
+
+def export_opened(kind: str, file: Path, program: Program, motion: Motion) -> str:
+    """Write the one moving armature of the open file, whose motion was read, with the meshes that it moves; lengths stay in metres.
+
+    Raises:
+        InputError: the format cannot show it, or the file cannot be written.
+    """
+    armature_object = next(o for o in bpy.data.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action)
+    skins = [o for o in bpy.data.objects if o.type == "MESH" and armature_object in (m.object for m in o.modifiers if m.type == "ARMATURE")]
+    if kind == "abc" and not skins:
+        raise InputError("Alembic holds meshes, and this motion has none; choose fbx, glb or usd.")
+    with scene_of_its_own() as scene:
+        for thing in (armature_object, *skins):
+            scene.collection.objects.link(thing)
+        set_range(scene, motion)
+        _write(kind, file, program, armature_object, bone_names(motion.rig, program))
+    return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
+
+
+def scaled(motion: Motion, factor: float) -> Motion:
+    """The motion in another unit."""
+    rig = replace(motion.rig, head_m=factor * motion.rig.head_m, tail_m=factor * motion.rig.tail_m, sole_m={})
+    return replace(motion, rig=rig, head_m=factor * motion.head_m)
+
+
+@contextmanager
+def scene_of_its_own() -> Iterator[bpy.types.Scene]:
+    """A new scene in the window. Afterwards the scene before is back, and whatever was made meanwhile is gone."""
+    window, before = bpy.context.window, {kind: set(getattr(bpy.data, kind)) for kind in MADE}
+    former = window.scene
+    scene = bpy.data.scenes.new("Tricap export")
+    window.scene = scene
+    try:
+        yield scene
+    finally:
+        window.scene = former
+        bpy.data.batch_remove([thing for kind in MADE for thing in getattr(bpy.data, kind) if thing not in before[kind]])
+
+
+def _write(kind: str, file: Path, program: Program, armature_object: bpy.types.Object, names: dict[str, str]) -> None:
+    for name, new in names.items():
+        armature_object.data.bones[name].name = new  # vertex groups and curves follow
+    scene = bpy.context.scene
+    scene.frame_set(scene.frame_start)
+    write_whole(file, lambda part: EXPORTERS[kind](part, program))
+
+
+def write_whole(file: Path, export: Callable[[str], Any]) -> None:
+    """Let an exporter write beside `file` and move the result over, so that it is there in full or not at all.
+
+    Raises:
+        InputError: the exporter failed.
+    """
+    file = Path(file).resolve()
+    part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        export(str(part))
+        if not part.is_file():
+            raise InputError(f"Blender wrote nothing to {file}; choose another folder.")
+        os.replace(part, file)
+    except (OSError, RuntimeError, shutil.Error) as error:
+        raise InputError(f"Cannot write {file}: {str(error).strip()[:200]}") from error
+    finally:
+        if part.exists():
+            part.unlink()
+
+
+def _fbx(path: str, program: Program) -> None:
+    axes = program.axes or "Y up"
+    bpy.ops.export_scene.fbx(filepath=path, object_types={"ARMATURE", "MESH"}, axis_forward=FORWARD[axes], axis_up=UP[axes],
+                             apply_unit_scale=True, apply_scale_options="FBX_SCALE_UNITS", add_leaf_bones=False, primary_bone_axis="Y",
+                             secondary_bone_axis="X", bake_anim=True, bake_anim_use_all_bones=True, bake_anim_use_nla_strips=False,
+                             bake_anim_use_all_actions=False, bake_anim_force_startend_keying=True, bake_anim_step=1.0,
+                             bake_anim_simplify_factor=0.0)
+
+
+def _glb(path: str, program: Program) -> None:
+    bpy.ops.export_scene.gltf(filepath=path, export_format="GLB", use_active_scene=True, export_yup=True, export_animations=True,
+                              export_animation_mode="ACTIVE_ACTIONS", export_nla_strips_merged_animation_name="Motion",
+                              export_force_sampling=True, export_frame_range=True,
+                              export_optimize_animation_size=False, export_rest_position_armature=True, export_def_bones=False,
+                              export_apply=False)
+
+
+def _usd(path: str, program: Program) -> None:
+    axes = program.axes or "Z up"
+    unit = {"cm": "CENTIMETERS"}.get(program.unit, "METERS")
+    bpy.ops.wm.usd_export(filepath=path, export_animation=True, export_armatures=True, export_meshes=True, only_deform_bones=False,
+                          convert_orientation=axes != "Z up", export_global_forward_selection=FORWARD[axes].replace("-", "NEGATIVE_"),
+                          export_global_up_selection=UP[axes], convert_scene_units=unit)
+
+
+def _abc(path: str, program: Program) -> None:
+    scene = bpy.context.scene
+    bpy.ops.wm.alembic_export(filepath=path, as_background_job=False, start=scene.frame_start, end=scene.frame_end,
+                              global_scale=1.0 / metres_per(program.unit or "m", "the preset"))
+
+
+EXPORTERS: dict[str, Callable[[str, Program], None]] = {"fbx": _fbx, "glb": _glb, "usd": _usd, "abc": _abc}

@@ -1,0 +1,75 @@
+"""What other programs want of a file: names of bones, unit, axes, and the order of rotations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...core.motion.retarget.mapping import Preset, find_map, read_preset
+from ...core.motion.retarget.points import joint_of
+from ...core.motion.retarget.rig import Rig
+
+PRESETS = Path(__file__).resolve().parent.parent / "presets"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Program:
+    """`names`: a file in presets/, with `prefix` before them, or the file's own; `unit` and `axes` (of core.motion.markers): empty for the
+    format's own; `bvh_order`: in which BVH's rotation channels stand."""
+
+    names: str = ""
+    prefix: str | None = None
+    unit: str = ""
+    axes: str = ""
+    bvh_order: str = "ZXY"
+
+
+PROGRAMS = {
+    "plain": Program(),
+    "mixamo": Program(names="mixamo", unit="cm", axes="Y up"),
+    "unreal": Program(names="unreal", unit="cm", axes="Z up"),
+    "unity": Program(names="unity", unit="m", axes="Y up"),
+    "maya": Program(names="mixamo", prefix="", unit="cm", axes="Y up", bvh_order="ZYX"),  # HumanIK's names; a colon is a name space
+    "motionbuilder": Program(names="mixamo", prefix="", unit="cm", axes="Y up", bvh_order="ZYX"),  # its own order: x turns first
+    "opensim": Program(axes="OpenSim"),
+}
+
+
+def presets(steering: bool = False) -> list[Preset]:
+    """The mappings that come with Tricap; with `steering` also those of rigs with controls.
+
+    Raises:
+        InputError: one of them was edited and is damaged.
+    """
+    return [preset for preset in map(read_preset, sorted(PRESETS.glob("*.json"))) if steering or preset.steering is None]
+
+
+def bone_names(rig: Rig, program: Program) -> dict[str, str]:
+    """Names of a program by the rig's own; bones that the program has no name for keep theirs."""
+    if not program.names:
+        return {}
+    wanted_by_role, prefix = _wanted(program)
+    given: dict[str, str] = {}
+    for role, chain in find_map(rig, presets()).bones.items():
+        wanted = wanted_by_role.get(role, ())
+        for bone, name in zip(chain, wanted if len(wanted) >= len(chain) else wanted[:1]):
+            given[bone] = prefix + name
+    kept = {name for name in rig.names if name not in given}
+    return {bone: name for bone, name in given.items() if name not in kept}
+
+
+def joint_names(joints: Sequence[str], program: Program) -> tuple[str, ...]:
+    """The joints by the names of the bones that begin at them; joints at which none begins keep theirs."""
+    if not program.names:
+        return tuple(joints)
+    wanted, prefix = _wanted(program)
+    named: list[str] = []
+    for joint in joints:
+        names = wanted.get(joint_of(joint), ())
+        name = prefix + names[0] if names else joint
+        named.append(joint if name in named or name in joints else name)
+    return tuple(named)
+
+
+def _wanted(program: Program) -> tuple[dict[str, tuple[str, ...]], str]:
+    preset = read_preset(PRESETS / f"{program.names}.json")
+    return dict(preset.bones), preset.prefixes[0] if program.prefix is None else program.prefix

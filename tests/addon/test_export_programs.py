@@ -1,0 +1,175 @@
+"""Presets for other programs: names, units and axes in the files themselves, and skins, by readers that are not ours."""
+
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.__main__ import main
+from tricap.addon.retarget.build import build_armature
+from tricap.addon.retarget.export import export_file, points_of
+from tricap.core.motion.bvh import read_bvh
+from tricap.core.motion.c3d import read_c3d
+from tricap.core.motion.markers import AXES
+from tricap.core.motion.points_csv import read_points_csv
+from tricap.core.motion.sources import from_run, read_motion_source
+from tricap.core.motion.trc import read_trc
+from tricap.core.progress import Monitor
+
+from ..core.motion.persons import person, squat
+from .conftest import SmallRun
+
+PLACE_M = 1e-4  # promised: 0.1 mm
+FBX = {"plain": (1, 100.0), "mixamo": (1, 1.0), "motionbuilder": (1, 1.0), "unreal": (2, 1.0), "unity": (1, 100.0), "opensim": (1, 100.0)}
+
+
+def imported(bpy: ModuleType, file: Path, fps: float) -> None:
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene = bpy.context.scene
+    scene.render.fps, scene.render.fps_base = 30, 30 / fps
+    {".fbx": lambda f: bpy.ops.import_scene.fbx(filepath=f), ".glb": lambda f: bpy.ops.import_scene.gltf(filepath=f),
+     ".usd": lambda f: bpy.ops.wm.usd_import(filepath=f), ".usda": lambda f: bpy.ops.wm.usd_import(filepath=f),
+     ".abc": lambda f: bpy.ops.wm.alembic_import(filepath=f, as_background_job=False)}[file.suffix](str(file))
+
+
+def skinned(bpy: ModuleType) -> tuple[Any, Any]:
+    """The armature and the mesh that hangs on it."""
+    skin = next(o for o in bpy.data.objects if o.type == "MESH" and any(m.type == "ARMATURE" for m in o.modifiers))
+    return next(m.object for m in skin.modifiers if m.type == "ARMATURE"), skin
+
+
+def heads(bpy: ModuleType, armature: Any, count: int) -> np.ndarray:
+    """Heads (T, B, 3) in the order of `from_run`'s bones of an arm, at the keys: Blender's reader of FBX rounds the frame rate."""
+    first, last = armature.animation_data.action.frame_range
+    found = []
+    for frame in np.linspace(first, last, count):
+        bpy.context.scene.frame_set(int(frame + 1e-4), subframe=max(float(frame - int(frame + 1e-4)), 0.0))
+        found.append([armature.matrix_world @ bone.head for bone in sorted(armature.pose.bones, key=lambda b: len(b.parent_recursive))])
+    return np.array(found)
+
+
+def fbx_header(file: Path) -> tuple[int, float]:
+    """Up axis and centimetres per unit, as the file says."""
+    from io_scene_fbx import parse_fbx
+
+    root, _ = parse_fbx.parse(str(file))
+    said = next(e for e in root.elems if e.id == b"GlobalSettings")
+    rows = {p.props[0]: p.props[-1] for part in said.elems for p in part.elems}
+    return rows[b"UpAxis"], rows[b"UnitScaleFactor"]
+
+
+@pytest.mark.parametrize("preset", FBX)
+def test_fbx_by_preset(empty: ModuleType, small_run: SmallRun, tmp_path: Path, preset: str) -> None:
+    file, source = tmp_path / "a.fbx", from_run(small_run.out)
+    export_file(small_run.out, "fbx", file, preset, Monitor())
+    assert fbx_header(file) == pytest.approx(FBX[preset])
+    imported(empty, file, source.fps)
+    armature, skin = skinned(empty)
+    assert np.abs(heads(empty, armature, 6) - source.head_m).max() < PLACE_M
+    assert {g.name for g in skin.vertex_groups} == set(armature.data.bones.keys())
+    height = float(np.ptp(np.array([skin.matrix_world @ v.co for v in skin.data.vertices])[:, 2]))
+    assert 0.1 < height < 1.5, "the skin is as large as the arm"
+
+
+@pytest.mark.parametrize(("preset", "hand"), [("plain", "forearm.R"), ("mixamo", "mixamorig:RightForeArm"), ("unreal", "lowerarm_r"),
+                                              ("maya", "RightForeArm")])
+def test_glb_keeps_its_skin_under_other_names(empty: ModuleType, small_run: SmallRun, tmp_path: Path, preset: str, hand: str) -> None:
+    source = from_run(small_run.out)
+    export_file(small_run.out, "glb", tmp_path / "a.glb", preset, Monitor())
+    imported(empty, tmp_path / "a.glb", source.fps)
+    armature, skin = skinned(empty)
+    assert hand in armature.data.bones and hand in skin.vertex_groups and len(empty.data.actions) == 1
+    assert np.abs(heads(empty, armature, 6) - source.head_m).max() < PLACE_M
+
+
+@pytest.mark.parametrize(("preset", "up", "unit"), [("plain", "Z", 1.0), ("maya", "Y", 0.01), ("unity", "Y", 1.0), ("unreal", "Z", 0.01)])
+def test_usd_by_preset(empty: ModuleType, small_run: SmallRun, tmp_path: Path, preset: str, up: str, unit: float) -> None:
+    file, source = tmp_path / "a.usda", from_run(small_run.out)
+    export_file(small_run.out, "usd", file, preset, Monitor())
+    said = file.read_text()
+    assert f'upAxis = "{up}"' in said and float(re.search(r"metersPerUnit = ([\d.]+)", said)[1]) == unit  # type: ignore[index]
+    imported(empty, file, source.fps)
+    armature, _ = skinned(empty)
+    assert np.abs(heads(empty, armature, 6) - source.head_m).max() < PLACE_M
+
+
+@pytest.mark.parametrize(("preset", "unit"), [("plain", 1.0), ("mixamo", 0.01), ("maya", 0.01)])
+def test_alembic_comes_back(empty: ModuleType, small_run: SmallRun, tmp_path: Path, preset: str, unit: float) -> None:
+    file, source = tmp_path / "a.abc", from_run(small_run.out)
+    export_file(small_run.out, "glb", tmp_path / "a.glb", "plain", Monitor())
+    imported(empty, tmp_path / "a.glb", source.fps)
+    wanted = [extent(empty, int(source.frames[0]) + k) for k in range(6)]
+    export_file(small_run.out, "abc", file, preset, Monitor())
+    imported(empty, file, source.fps)
+    found = [extent(empty, int(source.frames[0]) + k) for k in range(6)]
+    assert np.ptp([e[0] for e in wanted], axis=0).max() > 0.05
+    np.testing.assert_allclose(unit * np.array(found), wanted, atol=PLACE_M)
+
+
+def extent(bpy: ModuleType, frame: int) -> np.ndarray:
+    """Bounds (2, 3) in the world of the one mesh as it is deformed."""
+    bpy.context.scene.frame_set(frame)
+    graph = bpy.context.evaluated_depsgraph_get()
+    meshes = [o for o in bpy.data.objects if o.type == "MESH" and len(o.data.vertices) > 100]
+    skin = meshes[0].evaluated_get(graph)
+    places = np.array([skin.matrix_world @ v.co for v in skin.data.vertices])
+    return np.array([places.min(axis=0), places.max(axis=0)])
+
+
+@pytest.mark.parametrize(("preset", "unit", "axes", "elbow"), [
+    ("unreal", "cm", "Z up", "lowerarm_r"), ("maya", "cm", "Y up", "RightForeArm"), ("unity", "m", "Y up", "RightLowerArm"),
+    ("opensim", "", "OpenSim", "elbow.R")])
+def test_points_by_preset(small_run: SmallRun, tmp_path: Path, preset: str, unit: str, axes: str, elbow: str) -> None:
+    wanted = points_of(small_run.out)
+    for kind, own, read in (("trc", "m", read_trc), ("c3d", "mm", read_c3d), ("csv", "m", read_points_csv)):
+        file = tmp_path / f"a.{kind}"
+        export_file(small_run.out, kind, file, preset, Monitor())
+        found = read(file, axes=axes, unit=unit or own)  # type: ignore[operator]
+        assert found.names[1] == elbow and len(set(found.names)) == len(wanted.names), found.names
+        np.testing.assert_allclose(found.xyz_m, wanted.xyz_m, atol=2e-6)
+    text = (tmp_path / "a.trc").read_text().splitlines()[2].split("\t")
+    assert text[4] == (unit or "m")
+    first = np.array([float(x) for x in (tmp_path / "a.csv").read_text().splitlines()[1].split(",")[3:6]])
+    np.testing.assert_allclose(first, AXES[axes] @ wanted.xyz_m[0, 0] * {"cm": 100.0}.get(unit, 1.0), atol=2e-4)
+
+
+def test_bvh_as_motionbuilder_turns(small_run: SmallRun, tmp_path: Path) -> None:
+    export_file(small_run.out, "bvh", tmp_path / "a.bvh", "motionbuilder", Monitor())
+    said = (tmp_path / "a.bvh").read_text()
+    assert "ROOT RightArm" in said and "Xposition Yposition Zposition Zrotation Yrotation Xrotation" in said
+    source, found = from_run(small_run.out), read_bvh(tmp_path / "a.bvh", unit_m=0.01)
+    np.testing.assert_allclose(found.head_m, source.head_m, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["bvh", "csv", "glb", "fbx"])
+def test_a_blend_file_goes_out(empty: ModuleType, tmp_path: Path, kind: str) -> None:
+    source = squat(person(), frames=8)
+    build_armature(source, "Mover")
+    empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    file = tmp_path / f"out.{kind}"
+    assert main(["export", str(tmp_path / "a.blend"), "--format", kind, "--out", str(file), "--preset", "mixamo", "--quiet"]) == 0
+    if kind in ("glb", "fbx"):
+        imported(empty, file, source.fps)
+        armature = next(o for o in empty.data.objects if o.type == "ARMATURE")
+        knee = armature.pose.bones["mixamorig:LeftLeg"]
+        empty.context.scene.frame_set(round(armature.animation_data.action.frame_range[0]) + 4)
+        np.testing.assert_allclose(armature.matrix_world @ knee.head, source.head_m[4, source.rig.index["shin.L"]], atol=PLACE_M)
+    elif kind == "bvh":
+        np.testing.assert_allclose(read_motion_source(file).head_m[:, 0], source.head_m[:, 0], atol=1e-5)
+
+
+def test_the_panel_exports_and_leaves_the_scene(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    mine = build_armature(squat(person(), frames=4), "a")
+    kinds = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "collections")
+    before = {kind: list(getattr(blender.data, kind).keys()) for kind in kinds}
+    for kind in ("glb", "fbx", "usd", "abc"):
+        file = tmp_path / f"a.{kind}"
+        assert blender.ops.tricap.export(kind=kind, preset="unreal", out=str(small_run.out), filepath=str(file)) == {"FINISHED"}
+        assert file.stat().st_size > 1000
+    assert {kind: list(getattr(blender.data, kind).keys()) for kind in kinds} == before
+    assert blender.context.scene.name == before["scenes"][0] and mine.name in blender.context.scene.objects
+    assert blender.context.scene.tricap_retarget.last.startswith("Exported ")
