@@ -16,8 +16,9 @@ from .measuring import FrameImages, MeasuredFrame, load_images
 from .progress import Monitor
 from .results import Results
 from .take import Footage
+from .tracking.published import STEPS
 from .tracking.settings import TrackingSettings
-from .tracking.step import FramePair, TrackingView, track_step
+from .tracking.step import FramePair, TrackingView
 from .tracking.surface import on_surface, regenerate, start_tracks
 from .tracking.templates import Templates, Tiles, cut_tiles, no_templates
 from .tracking.tracked import TrackedFrame, joined, nothing
@@ -100,6 +101,7 @@ def tracking_view(footage: Footage, matching: MatchingSettings, tracking: Tracki
         matching=matching,
         tracking=tracking,
         limit_px=max(tracking.max_residual_px, limit_px),
+        dt_s=1 / footage.take.fps,
     )
 
 
@@ -115,12 +117,13 @@ def _advance(
     if state.current is None or images is None:
         return start_tracks(m.field, m.cloud, view)
     pair = FramePair(grey=images.grey, spline=images.spline, next_grey=following.grey, next_spline=following.spline)
-    tracked = track_step(view, state.before, state.current, state.templates, pair, m.frame, monitor)
+    tracked = STEPS[view.tracking.scheme](view, state.before, state.current, state.templates, pair, m.frame, monitor)
     if len(tracked.identity) < DROPOUT * len(state.current.identity) and m.frame - state.current.frame <= view.tracking.bridge_frames:
         return nothing(m.frame, len(view.cameras))
-    waiting = state.waiting.carried(state.current, tracked, view.tracking)
-    regained = on_surface(waiting.retaken(view, state.templates, following.spline), m.field, m.cloud, view)
-    tracked = joined(on_surface(tracked, m.field, m.cloud, view), regained)
+    if view.tracking.scheme == "space":
+        waiting = state.waiting.carried(state.current, tracked, view.tracking)
+        regained = on_surface(waiting.retaken(view, state.templates, following.spline), m.field, m.cloud, view)
+        tracked = joined(on_surface(tracked, m.field, m.cloud, view), regained)
     every = view.tracking.regenerate_every
     return regenerate(tracked, m.field, m.cloud, view, state.born) if every and index % every == 0 else tracked
 

@@ -19,9 +19,10 @@ from ..geometry.intersection import forward_intersection
 from ..images.sampling import SplineImage
 from ..matching.least_squares import match_patches, patch_offsets
 from ..progress import Monitor
+from .published import STEPS
 from .search import search_box
 from .settings import TrackStatus
-from .step import MODEL_SIGMA_PX, TEMPLATE_SIGMA_PX, FramePair, TrackingView, intersect, match_spatially, track_step
+from .step import MODEL_SIGMA_PX, TEMPLATE_SIGMA_PX, FramePair, TrackingView, intersect, match_spatially
 from .templates import Templates, Tiles, atlas, cut_tiles, no_templates
 from .tracked import TrackedFrame, born, joined, nothing, rows_of
 
@@ -168,7 +169,7 @@ def _follow(
         monitor.step("tracks", i, len(frames) - 1)
         next_grey, next_spline = _prepared(read(frame))
         pair = FramePair(grey=grey, spline=spline, next_grey=next_grey, next_spline=next_spline)
-        tracked = track_step(loose, before, current, templates, pair, frame, monitor)
+        tracked = STEPS[view.tracking.scheme](loose, before, current, templates, pair, frame, monitor)
         regained = lost.retaken(loose.at(frame), templates, next_grey, next_spline)
         tracked = _meeting(joined(tracked, regained), view.at(frame))
         yield tracked

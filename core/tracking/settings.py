@@ -6,6 +6,7 @@ from typing import Any
 
 from ..settings import knob
 
+SCHEMES = ("space", "published")
 UNIFORMITY = ("rigid", "voxels", "off")
 AFTERWARDS = ("max_speed", "max_acceleration", "uniformity", "max_sigma_ratio", "min_length", "smooth_frames")  # knobs of the filters alone
 
@@ -14,10 +15,22 @@ AFTERWARDS = ("max_speed", "max_acceleration", "uniformity", "max_sigma_ratio", 
 class TrackingSettings:
     """How points are followed from frame to frame, and which trajectories are kept."""
 
+    scheme: str = knob(
+        "space",
+        "The step: predicted and controlled in space, or as published, each image for itself, without control of drift.",
+        choices=SCHEMES,
+    )
+    prediction_acceleration: float = knob(
+        30.0,
+        "Scheme “published”: acceleration that the box about a predicted position allows for; the second try has twice the box.",
+        unit="m/s²",
+        low=0.0,
+        high=1000.0,
+    )
     spacing_px: int = knob(8, "Distance between tracked points in the reference image.", unit="px", low=1, high=64)
     box_px: int = knob(
         12,
-        "Half size of the box that is searched about the predicted position; the second try has twice as much.",
+        "Scheme “space”: half size of the box searched where no motion is known, then twice as much; two fifths, then all of it else.",
         unit="px",
         low=2,
         high=64,

@@ -54,6 +54,7 @@ class TrackingView:
     tracking: TrackingSettings
     limit_px: float  # by which rays may miss
     frame: int = 0  # that is looked at
+    dt_s: float = 0.04  # from one frame to the next
 
     def at(self, frame: int) -> "TrackingView":
         """The same, to look at this frame."""
@@ -173,7 +174,7 @@ def _attempt(
         )
         mark(status[:, k], ~images.next_spline[k].inside(centre, 1.0), TrackStatus.LEFT_IMAGE)
         mark(status[:, k], correlation < view.tracking.min_correlation, TrackStatus.NOT_FOUND)
-    temporal = _temporal(view, points, start, images, status)
+    temporal = match_temporally(view, points, start, images, status)
     points, temporal = control(view, points, temporal, templates, images.next_spline[view.reference], status[:, view.reference])
     spatial = match_spatially(view, points, [m.xy for m in temporal], images.next_spline, status)
     scale = scale or disagreement(view, temporal, spatial, status)
@@ -186,7 +187,7 @@ def mark(status: np.ndarray, bad: np.ndarray, why: TrackStatus) -> None:
     status[bad & (status == TrackStatus.MEASURED)] = why
 
 
-def _temporal(view: TrackingView, points: TrackedFrame, start: np.ndarray, images: FramePair, status: np.ndarray) -> list[Matches]:
+def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray, images: FramePair, status: np.ndarray) -> list[Matches]:
     """The patch of frame i found in frame i + 1, per view.  (3)"""
     eye = np.tile(np.eye(2), (len(start), 1, 1))
     matches = []
@@ -277,12 +278,13 @@ def _verify(
     shape = points.shape.copy()
     for k, s in zip(view.others, spatial):
         mark(status[:, k], ~(_distance2(temporal[k], s) <= scale**2 * CHI2), TrackStatus.NOT_VERIFIED)
-        xy[:, k], covariance[:, k] = _weighted_mean(temporal[k], s, status[:, k] == TrackStatus.MEASURED)
+        xy[:, k], covariance[:, k] = weighted_mean(temporal[k], s, status[:, k] == TrackStatus.MEASURED)
         shape[:, k] = s.shape
     return xy, covariance, shape
 
 
-def _weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 2) and covariances of both weighted by their covariances for these rows (a mask), of `a` alone for the others."""
     xy, K = a.xy.copy(), a.covariance.copy()
     gain = K[rows] @ invert_spd(K[rows] + b.covariance[rows] + np.eye(2) * 1e-8)
     xy[rows] += np.einsum("nij,nj->ni", gain, (b.xy - a.xy)[rows])

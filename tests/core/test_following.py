@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tricap.core.progress import Cancelled, Monitor
+from tricap.core.tracking.published import STEPS
 from tricap.core.tracking.settings import AFTERWARDS
 from tricap.core.tracking.step import TrackedFrame
 
@@ -70,7 +71,7 @@ def test_filters_ask_for_no_new_tracking(plane_take: Path, tmp_path: Path, scene
     def no_tracking(*_: Any) -> None:
         raise AssertionError("tracked again")
 
-    monkeypatch.setattr("tricap.core.following.track_step", no_tracking)
+    monkeypatch.setitem(STEPS, "space", no_tracking)
     for a, b in zip(fresh, scenes.track(plane_take, tmp_path / "out", measured, other), strict=True):
         same(a, b)
     for name, value in (("max_deviation_mm", 3.0), ("neighbourhood_m", 0.2)):  # the filters ask for them, and the step does, too
