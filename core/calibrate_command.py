@@ -23,7 +23,9 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the rig to write, such as rig.toml")
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
     parser.add_argument("--interlaced", choices=("none", "odd", "even"), default="none", help="which lines to keep of interlaced video")
-    parser.add_argument("--mask", type=Path, metavar="FILE", help="image that is black where no target can be")
+    parser.add_argument("--mask", type=Path, metavar="PATH",
+                        help="image that is black where no target can be, or a folder of them named like the cameras")
+    parser.add_argument("--target-diameter", type=float, metavar="M", help="diameter of the bar's targets in metres, if known")
     parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar lies on the floor, which becomes z = 0")
     parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar is held level")
     parser.add_argument("--points", type=Path, metavar="FILE",
@@ -68,7 +70,7 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
     world = _world(args)
     footage = open_bar(args.bar, args.interlaced, args.mask)
-    measured = measure_bar(footage, args.bar_length, monitor)
+    measured = measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter)
     result = calibrate_rig(measured.observations, monitor, focal_px=args.focal_px, world=world)
     written = [args.out]
     if args.report:

@@ -40,7 +40,7 @@ class BarFootage:
     names: tuple[str, ...]
     sequences: tuple[Sequence, ...]
     interlaced: str = "none"
-    mask: np.ndarray | None = None  # (h, w) False where no target can be
+    masks: tuple[np.ndarray | None, ...] = ()  # of each view (h, w), False where no target can be; empty: none
 
     @property
     def count(self) -> int:
@@ -57,10 +57,12 @@ class MeasuredBar:
 
 
 def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None) -> BarFootage:
-    """Open the sequences in BARDIR: one folder of images, or one movie, per camera. `mask` is an image, black where no target can be.
+    """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
+
+    `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one.
 
     Raises:
-        InputError: the folder is missing, holds fewer than two views, or views of different length.
+        InputError: the folder is missing, holds fewer than two views, or views of different length; a mask belongs to no camera.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -87,23 +89,41 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None) -
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"The views in {folder} have different numbers of frames ({said}); trim them to the same instants.")
-    shown = None if mask is None else read_image(mask) > 0
-    return BarFootage(folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, mask=shown)
+    masks = () if mask is None else _masks(Path(mask), names)
+    return BarFootage(folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, masks=masks)
 
 
-def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor, note: Note | None = None) -> MeasuredBar:
+def _masks(path: Path, names: list[str]) -> tuple[np.ndarray | None, ...]:
+    if not path.is_dir():
+        shown = read_image(path) > 0
+        return (shown,) * len(names)
+    found = {file.stem: file for file in sorted(path.iterdir()) if file.suffix.lower() in IMAGE_ENDINGS}
+    strangers = [name for name in found if name not in names]
+    if strangers or not found:
+        what = f"the mask {found[strangers[0]].name}, and there is no camera of that name" if strangers else "no image"
+        raise InputError(f"{path} holds {what}; name the masks as the cameras: {', '.join(names)}.")
+    return tuple(read_image(found[name]) > 0 if name in found else None for name in names)
+
+
+def measure_bar(
+    footage: BarFootage, length_m: float, monitor: Monitor, note: Note | None = None, diameter_m: float | None = None
+) -> MeasuredBar:
     """Find, measure and follow the bar's targets in all images; `note` hears how many images of a view showed two targets so far.
 
+    With the targets' diameter, pairs of spots that are too small for their distance, such as reflections, take no part.
+
     Raises:
-        InputError: the length cannot be, images cannot be read, or the bar is not seen well enough to calibrate with.
+        InputError: the length or the diameter cannot be, images cannot be read, or the bar is not seen well enough to calibrate with.
     """
     if not (math.isfinite(length_m) and 0 < length_m < LONGEST_BAR_M):
         raise InputError(
             f"The bar's length is given as {length_m:g} m; give the distance between the middles of its two targets in metres, such as 0.6."
         )
+    if diameter_m is not None and not 0 < diameter_m < length_m:
+        raise InputError(f"The targets' diameter is given as {diameter_m:g} m; it must lie between 0 and the bar's length, {length_m:g} m.")
     tracks, sizes = [], []
     for view in range(len(footage.names)):
-        track, size = _measure_view(footage, view, monitor, note)
+        track, size = _measure_view(footage, view, monitor, note, (diameter_m or 0.0) / length_m)
         _check_view(footage, view, track, size[0])
         tracks.append(track)
         sizes.append(size)
@@ -119,9 +139,12 @@ def measure_bar(footage: BarFootage, length_m: float, monitor: Monitor, note: No
     return MeasuredBar(tracks=tuple(tracks), observations=observations)
 
 
-def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note | None) -> tuple[BarTrack, tuple[int, int]]:
-    """The bar's track in one view, and the size of its images."""
+def _measure_view(
+    footage: BarFootage, view: int, monitor: Monitor, note: Note | None, diameter: float
+) -> tuple[BarTrack, tuple[int, int]]:
+    """The bar's track in one view, and the size of its images; `diameter` of the targets as a part of the bar's length, 0: unknown."""
     name, sequence, rows = footage.names[view], footage.sequences[view], row_grid(footage.interlaced)
+    mask = footage.masks[view] if footage.masks else None
     found: list[Targets] = []
     size, whole = (0, 0), 0
     for n in range(footage.count):
@@ -130,15 +153,18 @@ def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note |
         if n and image.shape[::-1] != size:
             raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
         size = (image.shape[1], image.shape[0])
-        if footage.mask is not None and footage.mask.shape != image.shape:
-            raise InputError(f"The mask has {footage.mask.shape[1]}×{footage.mask.shape[0]} pixels, view {name} {size[0]}×{size[1]}.")
-        targets = find_targets(rows.rows(image), None if footage.mask is None else rows.rows(footage.mask))
+        if mask is not None and mask.shape != image.shape:
+            raise InputError(
+                f"The mask of view {name} has {mask.shape[1]}×{mask.shape[0]} pixels, its images {size[0]}×{size[1]}; give a folder with a "
+                "mask for each camera, as large as its images."
+            )
+        targets = find_targets(rows.rows(image), None if mask is None else rows.rows(mask))
         found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
         whole += int(moved_targets(found[-2:]) >= 2)
         if note is not None:
             note(name, len(found), whole)
     monitor.step(f"targets {name}", footage.count, footage.count)
-    return track_bar(found, float(size[0])), size
+    return track_bar(found, float(size[0]), diameter / np.sqrt(rows.step)), size
 
 
 def _in_frame(targets: Targets, xy_px: np.ndarray) -> Targets:

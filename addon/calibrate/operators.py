@@ -57,11 +57,17 @@ class Calibrate(JobOperator, bpy.types.Operator):
         out = folders.absolute(self.out) if self.out else folder.parent / "rig.toml"
         folders.check_writable(out.parent)
         # Blender keeps single precision; what was typed is the shortest decimal that is stored alike.
-        length, interlaced = float(f"{self.length_m or props.length_m:.7g}"), props.interlaced
+        length, diameter = (float(f"{value:.7g}") for value in (self.length_m or props.length_m, props.diameter_m))
+        mask, interlaced = folders.absolute(props.mask) if props.mask else None, props.interlaced
         focal = props.focal_px if props.focal_px > 0 else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level))
         live.begin()
-        return lambda monitor: compute(folder, length, interlaced, focal, world, out, monitor)
+
+        def read_and_calibrate(monitor: Monitor) -> Done:
+            footage = open_bar(folder, interlaced, mask)
+            return compute(footage, measure_bar(footage, length, monitor, live.note, diameter or None), focal, world, out, monitor)
+
+        return read_and_calibrate
 
     def finish(self, context: bpy.types.Context, result: Done) -> set[str]:
         """Build the cameras and tell the verdict."""
@@ -93,11 +99,8 @@ def frame_numbers(text: str) -> tuple[int, ...]:
         raise InputError(f"“{text}” is no list of frames; write frame numbers, such as 0, 40, 80.") from error
 
 
-def compute(folder: Path, length_m: float, interlaced: str, focal_px: float | None, world: WorldChoice, out: Path, monitor: Monitor
-            ) -> Done:
-    """The computation, free of bpy: from footage to rig.toml and its report beside it."""
-    footage = open_bar(folder, interlaced)
-    measured = measure_bar(footage, length_m, monitor, live.note)
+def compute(footage: BarFootage, measured: MeasuredBar, focal_px: float | None, world: WorldChoice, out: Path, monitor: Monitor) -> Done:
+    """The computation, free of bpy: from the measured bar to rig.toml and its report beside it."""
     result = calibrate_rig(measured.observations, monitor, focal_px=focal_px, world=world)
     write_report(out.parent / f"{out.stem}_report", result)
     write_rig(out, result.rig)

@@ -15,6 +15,8 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     layout.prop(props, "length_m")
     layout.prop(props, "interlaced")
     layout.prop(props, "focal_px")
+    layout.prop(props, "diameter_m")
+    layout.prop(props, "mask")
     layout.prop(props, "floor", placeholder="frames: 0, 40, 80")
     layout.prop(props, "level", placeholder="frames: 12, 57")
     row = layout.row()

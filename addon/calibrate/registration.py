@@ -20,6 +20,11 @@ class TricapCalibrate(bpy.types.PropertyGroup):
                                               ("even", "Even", "Keep the 2nd, 4th, … line")])
     focal_px: bpy.props.FloatProperty(name="Rough Focal Length [px]", default=0.0, min=0.0,  # type: ignore[valid-type]
                                       description="In pixels, if it is known; 0: it is found")
+    diameter_m: bpy.props.FloatProperty(name="Target Diameter", default=0.0, min=0.0, soft_max=0.2, unit="LENGTH",  # type: ignore[valid-type]
+                                        precision=4, description="Of the bar's targets, if it is known; 0: unknown")
+    mask: bpy.props.StringProperty(name="Mask", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
+                                   description="Image that is black where no target can be, such as lamps, or a folder of such "
+                                   "images named like the cameras. Empty: none")
     floor: bpy.props.StringProperty(name="Bar on Floor", description="Frames in which the bar lies on the floor, such as 0, 40, 80; "  # type: ignore[valid-type]
                                     "the floor becomes z = 0. Empty: up is where the cameras' tops are")
     level: bpy.props.StringProperty(name="Bar Level", description="Frames in which the bar is held level, such as 12, 57")  # type: ignore[valid-type]

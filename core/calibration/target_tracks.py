@@ -21,6 +21,7 @@ MOST_SPOTS = 6
 STILL_PX, STILL_PART = 1.5, 0.5  # a spot within STILL_PX in more than this part of the frames stands still
 MIN_STILL_FRAMES, FRAMES_ASKED = 8, 80  # so many frames tell what stands still, however long the sequence is
 EXPECTED_WAY = 0.05  # of the image width, from frame to frame
+SMALLEST_WIDTH = 0.6  # of the targets' expected width
 JUMP, NOTHING = 6.0, 8.0  # costs
 LIKE_AREAS, LARGE = 1.0, 1.0  # weights of (1)
 GATE = 0.03  # of the image width: a single target lies this near to where it is expected
@@ -40,8 +41,11 @@ class BarTrack:
         object.__setattr__(self, "spots", frozen(self.spots, (len(self.xy_px),), np.int64, "spots"))
 
 
-def track_bar(frames: Sequence[Targets], width_px: float) -> BarTrack:
-    """Follow the bar's two targets through the frames of one view."""
+def track_bar(frames: Sequence[Targets], width_px: float, diameter: float = 0.0) -> BarTrack:
+    """Follow the bar's two targets through the frames of one view.
+
+    `diameter` of the targets as a part of the bar's length: what is foreshortened is the bar, so no true pair is smaller for its distance.
+    """
     spots = np.array([len(t.xy_px) for t in frames])
     usable = [np.flatnonzero(t.status == TargetStatus.OK) for t in frames]
     moving = _moving(frames, usable)
@@ -50,7 +54,7 @@ def track_bar(frames: Sequence[Targets], width_px: float) -> BarTrack:
     chosen = usable if still else moving
     xy = [t.xy_px[c[:MOST_SPOTS]] for t, c in zip(frames, chosen)]
     area = [t.area_px[c[:MOST_SPOTS]] for t, c in zip(frames, chosen)]
-    track = _in_one_order(_best_sequence(xy, area, width_px))
+    track = _in_one_order(_best_sequence(xy, area, width_px, diameter))
     return BarTrack(xy_px=_with_singles(track, xy, width_px), spots=spots, still=still)
 
 
@@ -76,9 +80,9 @@ def _moving(frames: Sequence[Targets], usable: list[np.ndarray]) -> list[np.ndar
     return [u[~s] for u, s in zip(usable, stands)]
 
 
-def _best_sequence(xy: list[np.ndarray], area: list[np.ndarray], width_px: float) -> np.ndarray:
+def _best_sequence(xy: list[np.ndarray], area: list[np.ndarray], width_px: float, diameter: float) -> np.ndarray:
     """The cheapest ordered pairs (T, 2, 2), NaN where there is none.  (1), (2)"""
-    states = [list(permutations(range(len(points)), 2)) for points in xy]
+    states = [_pairs(points, size, diameter) for points, size in zip(xy, area)]
     total = np.zeros(1)
     back: list[np.ndarray] = []
     before = np.zeros((0, 2, 2))
@@ -98,6 +102,16 @@ def _best_sequence(xy: list[np.ndarray], area: list[np.ndarray], width_px: float
             track[n] = xy[n][list(states[n][state])]
         state = int(back[n][state])
     return track
+
+
+def _pairs(xy: np.ndarray, area: np.ndarray, diameter: float) -> list[tuple[int, int]]:
+    """Ordered pairs of spots that are not too small for their distance, for targets of that part of the bar's length."""
+    width = 2 * np.sqrt(area / np.pi)
+    return [
+        (i, j)
+        for i, j in permutations(range(len(xy)), 2)
+        if min(width[i], width[j]) >= SMALLEST_WIDTH * diameter * np.linalg.norm(xy[i] - xy[j])
+    ]
 
 
 def _in_one_order(track: np.ndarray) -> np.ndarray:

@@ -106,6 +106,36 @@ def test_tracks_leave_out_reflections_and_keep_the_order() -> None:
     assert not (np.nanmin(np.abs(track.xy_px - [600.0, 50.0]).sum(axis=2)) < 1)
 
 
+def test_with_their_diameter_known_small_reflections_are_left_out() -> None:
+    """Two small reflections that wander quietly beside one end of a bar that leaps: without the diameter they are the likelier pair."""
+    frames = []
+    for t in range(30):
+        leap = 150 * (t % 2)
+        bar, small = [(100.0 + leap, 200.0), (400.0 - leap, 420.0 - leap)], [(500.0 + 4 * t, 60.0), (500.0 + 4 * t, 360.0)]
+        area = np.array([80.0, 80.0, 30.0, 30.0])
+        frames.append(replace(spots(*bar, *small), area_px=area))
+    alone, known = track_bar(frames, 768.0), track_bar(frames, 768.0, diameter=0.05)
+    assert np.nanmin(alone.xy_px[..., 0]) > 450 > np.nanmax(known.xy_px[..., 0])
+    with pytest.raises(InputError, match="diameter is given as 0.6 m"):
+        measure_bar(None, 0.5, Monitor(), diameter_m=0.6)
+
+
+def test_a_mask_for_each_camera(bar_folder, tmp_path: Path) -> None:
+    folder, waved = bar_folder
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    shown = np.full(waved.cameras[0].size_px[::-1], 255, np.uint8)
+    shown[:, :384] = 0
+    cv2.imwrite(str(masks / "C.png"), shown)
+    footage = open_bar(folder, mask=masks)
+    assert [m is not None for m in footage.masks] == [name == "C" for name in footage.names]
+    seen = measure_bar(footage, 0.5, Monitor()).observations.xy_px
+    assert np.nanmin(seen[:, footage.names.index("C"), :, 0]) > 384 > np.nanmin(seen[:, footage.names.index("L"), :, 0])
+    cv2.imwrite(str(masks / "X.png"), shown)
+    with pytest.raises(InputError, match="the mask X.png, and there is no camera of that name"):
+        open_bar(folder, mask=masks)
+
+
 def test_reflections_alone_are_no_bar(tmp_path: Path) -> None:
     waved = waved_bar(benchmark_cameras(), 12, np.random.default_rng(5), BarNoise(sigma_px=0.0, gross=0.0, missing=0.0))
     hidden = replace(waved, xy_px=np.full_like(waved.xy_px, np.nan))
