@@ -242,9 +242,11 @@ class JobOperator:
                 ended = self.finish(context, job.result)
             except InputError as mistake:
                 error = mistake
+            except Exception as bug:  # the edge of the job: whatever happens is told, and the panel hears that the job has ended
+                error, job.trace = bug, traceback.format_exc()
         if error is not None:
             self._tell(job, error)
-        failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else str(error)
+        failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else _sentence(error)
         for listener in ENDED:
             listener(context, job.step, failed)
         return ended
@@ -256,7 +258,7 @@ class JobOperator:
             self.report({"WARNING"}, f"{error} {self.last_words}".strip())  # type: ignore[attr-defined]
         else:
             log.error("A Tricap job failed.\n%s", job.trace)
-            self.report({"ERROR"}, BUG.format(error=f"{type(error).__name__}: {error}"))  # type: ignore[attr-defined]
+            self.report({"ERROR"}, _sentence(error))  # type: ignore[attr-defined]
 
     def _show(self, context: bpy.types.Context) -> None:
         job = self.job
@@ -280,6 +282,10 @@ class JobOperator:
         if context.workspace is not None:
             context.workspace.status_text_set(None)
         redraw(context)
+
+
+def _sentence(error: BaseException) -> str:
+    return str(error) if isinstance(error, InputError) else BUG.format(error=f"{type(error).__name__}: {error}")
 
 
 def redraw(context: bpy.types.Context) -> None:

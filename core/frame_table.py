@@ -101,7 +101,7 @@ def read_frame_table(path: Path) -> FrameTable:
         )
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}; run the take again.") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise InputError(f"{path} is damaged; run the take again.") from error
 
 

@@ -23,6 +23,10 @@ from .motion.ply import read_ply
 from .tracking.settings import TrackStatus
 
 SAME_M = 2e-6  # a PLY file has single precision
+CHECKPOINT = {  # of a frame's surface: what is shown of it
+    "cloud_xyz_m": ("f", "N3"), "grid": ("iu", "4"), "field_xy": ("f", "NK2"), "field_shape": ("f", "NK22"), "field_cell": ("iu", "N"),
+    "field_residual_px": ("f", "N"), "field_correlation": ("f", "N"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -101,14 +105,15 @@ def _add_matches(values: dict[str, np.ndarray], path: Path, xyz: np.ndarray, row
     """Put in what the checkpoint knows of the same points; the user's corrections may have left fewer than it has."""
     try:
         saved, _ = store.load(path)
+        store.check_layout(path, saved, **CHECKPOINT)
         found = saved["cloud_xyz_m"].astype(np.float32)
         order = np.lexsort(found.T[::-1])
         mine = np.searchsorted(_key(found[order]), _key(xyz.astype(np.float32)))
         row = order[np.minimum(mine, len(order) - 1)] if len(order) else np.zeros(len(xyz), dtype=np.int64)
-        spacing, _, width = (int(v) for v in saved["grid"][:3])
-    except (InputError, KeyError):  # deleted, damaged or of another version: the cloud alone is shown
+        spacing, _, width, _ = (int(v) for v in saved["grid"])
+    except InputError:  # deleted, damaged or of another version: the cloud alone is shown
         return
-    if not len(order) or saved["field_xy"].shape[1] != values["xy_px"].shape[1]:
+    if not len(order) or saved["field_xy"].shape[1] != values["xy_px"].shape[1] or min(spacing, width) < 1:
         return
     known = np.flatnonzero(np.abs(found[row] - xyz).max(axis=1) < SAME_M)
     row = row[known]
@@ -154,6 +159,9 @@ def read_tracks(out: Path) -> TrackHistory | None:
     if not path.is_file():
         return None
     arrays, _ = store.load(path)
+    store.check_layout(path, arrays, frames=("iu", "T"), xyz_m=("f", "TN3"), status=("iu", "TN"))
+    if not np.isin(arrays["status"], list(TrackStatus)).all() or (np.diff(arrays["frames"].astype(np.int64)) < 1).any():
+        raise InputError(f"{path} is damaged: frames or states that cannot be; run the tracking again.")
     return TrackHistory(frames=arrays["frames"], xyz_m=arrays["xyz_m"].astype(np.float64), status=arrays["status"])
 
 
@@ -193,7 +201,9 @@ def read_contours(path: Path) -> dict[int, tuple[np.ndarray, np.ndarray]]:
             (int(r["frame"]), float(r["x"]), float(r["y"]), int(r["on_edge"]))
             for r in csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8")))
         ]
-    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise InputError(f"{path} is damaged; run `tricap contour` again.") from error
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    if not np.isfinite(table).all() or (np.abs(table) > 1e9).any():
+        raise InputError(f"{path} is damaged; run `tricap contour` again.")
     return {int(f): (table[table[:, 0] == f, 1:3], table[table[:, 0] == f, 3] > 0) for f in np.unique(table[:, 0])}

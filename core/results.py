@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from . import store
+from . import run_json, store
 from .errors import InputError
 from .lock import NAME, locked
 from .motion.ply import write_cloud
+from .run_json import FORMAT, VERSION
 from .surface.cloud import PointCloud
 from .tracking.trajectories import Filtered
 
-FORMAT, VERSION = "tricap-run", 1
 OURS = (  # what a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report",
     "body.blend",
@@ -128,12 +128,7 @@ class Results:
             InputError: it is damaged, or of a newer version.
         """
         path = self.path("run.json")
-        if not path.exists():
-            return {}
-        run = store.read_json(path)
-        if not isinstance(run, dict) or run.get("format") != FORMAT or run.get("version") != VERSION:
-            raise InputError(f"{path} was not written by this version of Tricap; choose another folder, or --restart.")
-        return run
+        return run_json.read_run(path) if path.exists() else {}
 
     def write_run(self, run: Mapping[str, Any]) -> None:
         """run.json"""

@@ -1,7 +1,8 @@
 """What each stage depends on, said once: the run removes and the panel calls stale exactly what a change concerns.
 
 The key of a stage is a digest of all that its result depends on, the stages before it included. run.json carries the key with which each
-stage was done; a stage is stale when its key now is another. Footage counts by names and sizes: checkpoints look at its content.
+stage was done; a stage is stale when its key now is another. Footage counts by names, sizes and when its files
+were written (an export of the same size is another one); checkpoints look at its content.
 """
 
 import json
@@ -34,7 +35,7 @@ def _seen(footage: Footage) -> Any:
     take = footage.take
     regions = [c for c in _corrections(take) if c[0] == "region"]
     views = [(v.name, v.offset_frames) for v in take.views]
-    files = [[_name_and_size(path) for path in s.files()] for s in footage.sequences]
+    files = [[_stamp(path) for path in s.files()] for s in footage.sequences]
     rig = store.digest(take.rig_path)
     rows = take.interlaced, take.first_field
     return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.seeds), regions, measuring.ALGORITHM
@@ -105,12 +106,14 @@ def still_good(run: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any
     return {name: entry for name, entry in stages.items() if entry.get("key") == keys.get(name, "")}
 
 
-def _name_and_size(path: Path) -> tuple[str, int]:
-    return path.name, path.stat().st_size
+def _stamp(path: Path) -> tuple[str, int, int]:
+    """Name, size, and when it was written, in whole seconds: some file systems keep no less."""
+    state = path.stat()
+    return path.name, state.st_size, state.st_mtime_ns // 1_000_000_000
 
 
 def _keypoints(take: Take) -> Any:
-    return [(repr(s), [_name_and_size(path) for path in sorted(take.folder.glob(s.files))]) for s in take.keypoints]
+    return [(repr(s), [_stamp(path) for path in sorted(take.folder.glob(s.files))]) for s in take.keypoints]
 
 
 def _clicked(seeds: Seeds) -> Any:

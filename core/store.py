@@ -122,6 +122,25 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays, header
 
 
+def check_layout(path: Path, arrays: Mapping[str, np.ndarray], **layout: tuple[str, str]) -> None:
+    """Each array is there, of one of the kinds (numpy's letters), and has the sides, as in `frames=("iu", "T"), xyz_m=("f", "TN3")`:
+    a digit is a length, a letter the same length wherever it stands.
+
+    Raises:
+        InputError: one is missing or of another layout.
+    """
+    lengths: dict[str, int] = {}
+    for name, (kinds, sides) in layout.items():
+        array = arrays.get(name)
+        if array is None:
+            raise InputError(f"{path} holds no {name}; run the stage that writes it again.")
+        fits = array.dtype.kind in kinds and array.ndim == len(sides)
+        for side, length in zip(sides, array.shape):
+            fits = fits and length == (int(side) if side.isdecimal() else lengths.setdefault(side, length))
+        if not fits:
+            raise InputError(f"{path} is damaged: {name} has the shape {array.shape} of {array.dtype}; run the stage that writes it again.")
+
+
 def _refuse_bomb(path: Path) -> None:
     """A small archive may not unpack to gigabytes."""
     with zipfile.ZipFile(path) as archive:

@@ -18,16 +18,20 @@ from tricap.core.checking.run_check import check_run
 from tricap.core.errors import InputError
 from tricap.core.geometry.rig import read_rig, write_rig
 from tricap.core.images.sequence import open_sequence
+from tricap.core.inspection import read_contours, read_tracks
 from tricap.core.motion import bvh, c3d, keypoints_json, points_csv, tables, trc
 from tricap.core.motion.markers import Markers
 from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
 from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.motion.retarget.vrm import read_humanoid
+from tricap.core.pipeline import Run
 from tricap.core.progress import Monitor
 from tricap.core.results import Results
+from tricap.core.stages import still_good
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.take import read_take
 from tricap.core.tracking.point_tables import read_points, read_polygon
+from tricap.core.tracking.settings import TrackStatus
 
 __all__ = ["FAULTY", "READERS", "InputError"]
 Make = Callable[[Path], list[Path]]
@@ -35,6 +39,9 @@ Read = Callable[[Path], Any]
 HERE = Path(__file__).resolve().parent
 RIG = arm_rig(96)
 FRAMES = ",".join(("frame", *frame_table.COLUMNS, "fit")) + "\n0" + len(frame_table.COLUMNS) * ",1" + ",fitted\n"
+CONTOURS = "frame,vertex,x,y,normal_x,normal_y,sigma,on_edge\n"
+CONTOURS += "".join(f"{i // 4},{i % 4},{3 * i}.5,7.25,0,1,0.2,1\n" for i in range(12))
+KEYS = dict.fromkeys(("measure", "track", "fit"), "k")
 TAKE = """format = "tricap-take"
 version = 1
 fps = 25.0
@@ -128,13 +135,36 @@ def cloud(folder: Path) -> list[Path]:
 
 def run_folder(folder: Path) -> list[Path]:
     results = Results(folder)
-    results.write_run({"take": str(folder / "nowhere"), "frames": [0, 2], "stages": {"measure": {"residual_px": 0.1}}, "inputs": {},
-                       "warnings": []})  # fmt: skip
+    results.write_run({"take": str(folder / "nowhere"), "frames": [0, 2], "inputs": {}, "warnings": [],
+                       "settings": {"skin": {"rays": 24}, "matching": {"patch_px": 13}},
+                       "stages": {"measure": {"key": "k", "frames": 2, "points_per_frame": 20.0, "residual_px": 0.1,
+                                              "sigma_mm": 1.0}}})  # fmt: skip
     cloud(folder)
     (folder / "clouds").mkdir(exist_ok=True)
     (folder / "a.ply").rename(folder / "clouds" / "0000.ply")
     (folder / "b.ply").rename(folder / "clouds" / "0001.ply")
     return [folder / "run.json", folder / "clouds" / "0000.ply"]
+
+
+def done(folder: Path) -> None:
+    """What a new run keeps of an earlier one, said in a line."""
+    account = {"stages": still_good(Results(folder).read_run(), KEYS)}
+    str(Run(footage=None, settings={}, results=None, keys=KEYS, account=account))  # type: ignore[arg-type]
+
+
+def tracked(path: Path) -> None:
+    xyz = np.random.default_rng(2).uniform(-1, 1, (5, 3, 3)).astype(np.float32)
+    given = {"frames": np.arange(5, dtype=np.int32), "xyz_m": xyz, "status": np.ones((5, 3), np.int8), "reason": np.ones(3, np.int8)}
+    store.save(path, given, {"format": "tricap-trajectories_raw", "version": 1, "fps": 25.0})
+
+
+def looked_at(folder: Path) -> None:
+    """What the overlays ask of the trajectories."""
+    history = read_tracks(folder)
+    assert history is not None
+    for frame in (0, 4):
+        history.tails(RIG.cameras[0], frame, 3, history.kept)
+        [TrackStatus(int(status)).words for status in history.at(RIG.cameras[0], frame)[1]]
 
 
 def body(path: Path) -> None:
@@ -218,6 +248,9 @@ READERS: dict[str, tuple[Make, Read]] = {
     "checkpoint": (lambda f: (checkpoint(f), [f / "cache" / "surface" / "0000.npz"])[1],
                    lambda f: Results(f).load_checkpoint("surface", "0000", "k")),
     "run.json": (run_folder, lambda f: Results(f).read_run()),
+    "what a run keeps": (run_folder, done),
+    "trajectories": (written("trajectories_raw.npz", tracked), looked_at),
+    "contours": (text("C.csv", CONTOURS), lambda f: read_contours(f / "C.csv")),
     "check of a run": (run_folder, lambda f: check_run(f, Monitor())),
     "trc": (written("a.trc", lambda p: trc.write_trc(p, points())), lambda f: trc.read_trc(f / "a.trc")),
     "c3d": (written("a.c3d", lambda p: c3d.write_c3d(p, points())), lambda f: c3d.read_c3d(f / "a.c3d")),

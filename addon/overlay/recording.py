@@ -8,12 +8,14 @@ from typing import Any
 
 import bpy
 
-from ...core import store
 from ...core.errors import InputError
 from ...core.frame_table import FrameTable, read_frame_table
 from ...core.geometry.camera import Camera
 from ...core.images.fields import RowGrid
 from ...core.inspection import FramePoints, TrackHistory, body_outline, read_contours, read_points, read_tracks
+from ...core.matching.least_squares import MatchingSettings
+from ...core.run_json import read_run
+from ...core.settings import from_table
 from ...core.take import open_take, read_take
 from .. import folders, project
 
@@ -118,8 +120,9 @@ def _open(scene: bpy.types.Scene) -> Recording:
     folder, out = project.folder_of(scene), folders.output_folder("", scene)
     if not (out / "run.json").is_file():
         raise InputError("Nothing was measured yet.")
-    footage, run = open_take(read_take(folder)), store.read_json(out / "run.json")
-    settings = run.get("settings", {}).get("matching", {}) if isinstance(run, dict) else {}
+    footage, run = open_take(read_take(folder)), read_run(out / "run.json")
+    matching = run.get("settings", {}).get("matching", {})
+    patch = from_table(MatchingSettings, {name: v for name, v in matching.items() if name == "patch_px"}, "[matching] of run.json")
     cameras = {view.name: camera for view, camera in zip(footage.take.views, footage.rig.cameras)}
     return Recording(out=out, cameras=cameras, reference=footage.take.reference, rows_at=footage.take.rows_at,
-                     patch_px=int(settings.get("patch_px", 13)))
+                     patch_px=patch.patch_px)

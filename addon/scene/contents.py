@@ -18,6 +18,7 @@ from ...core.errors import InputError
 from ...core.motion.ply import Ply, read_ply
 from ...core.motion.tables import MotionTable, read_motion
 from ...core.progress import Monitor
+from ...core.run_json import read_run
 from ...core.settings import from_table
 from ...core.take import Footage, open_take, read_take
 
@@ -71,9 +72,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     out = Path(out)
     if not (out / "run.json").is_file():
         raise InputError(f"{out} holds no results of Tricap (no run.json); choose the output folder of a run.")
-    run = store.read_json(out / "run.json")
-    if not isinstance(run, dict):
-        raise InputError(f"{out / 'run.json'} is not a report of Tricap; run the take again.")
+    run = read_run(out / "run.json")
     warnings: list[str] = []
     footage = _footage(run, out, warnings)
     clouds = _clouds(out / "clouds", monitor, warnings)
@@ -89,10 +88,9 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
 
 def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage | None:
     try:
-        folder = run.get("take")
-        if not isinstance(folder, str):
+        if "take" not in run:
             raise InputError(f"{out / 'run.json'} does not say which take was run.")
-        return open_take(read_take(Path(folder)))
+        return open_take(read_take(Path(run["take"])))
     except InputError as error:
         warnings.append(f"No cameras and footage in the scene, and {DEFAULT_FPS:g} frames per second: {error}")
         return None
@@ -120,8 +118,7 @@ def _skins(run: Mapping[str, Any], folder: Path, monitor: Monitor, warnings: lis
         vertices.append(read_ply(files[frame]).xyz_m.astype("<f4"))
         if len(vertices[-1]) != len(vertices[0]):
             raise InputError(f"{files[frame]} has {len(vertices[-1])} points, the skins before {len(vertices[0])}; run the fit again.")
-    table = run.get("settings", {}).get("skin", {}) if isinstance(run.get("settings"), dict) else {}
-    settings = from_table(SkinSettings, table, "[skin] of run.json")
+    settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     return FrameSkins(frames=np.array(sorted(files)), vertices_m=np.stack(vertices), settings=settings)
 
 
@@ -141,7 +138,5 @@ def _motion(path: Path, shape: BodyShape | None, warnings: list[str]) -> MotionT
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     arrays, _ = store.load(path)
-    missing = [name for name in ("frames", "xyz_m", "velocity_m_s", "sigma_m") if name not in arrays]
-    if missing:
-        raise InputError(f"{path} holds no {missing[0]}; run the tracking again.")
+    store.check_layout(path, arrays, frames=("iu", "T"), xyz_m=("f", "TN3"), velocity_m_s=("f", "TN3"), sigma_m=("f", "TN"))
     return arrays

@@ -11,7 +11,6 @@ from typing import Any
 
 import bpy
 
-from ...core import store
 from ...core.body.model_file import read_model
 from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
 from ...core.clicked_points import clicked_depth
@@ -19,6 +18,7 @@ from ...core.errors import InputError
 from ...core.geometry.rig import read_rig
 from ...core.images.sequence import Sequence, open_sequence
 from ...core.pipeline import settings_of
+from ...core.run_json import read_run
 from ...core.stages import stage_keys
 from ...core.take import Footage, Take, footage_frames, open_take
 from .. import folders, project
@@ -65,6 +65,7 @@ class _Found:
     footage: Footage | None = None
     keys: Mapping[str, str] | None = None
     run: Mapping[str, Any] | None = None
+    problem: str = ""  # why there is no `run` though there is a run.json
     out: Path | None = None
 
 
@@ -80,7 +81,7 @@ def compute(scene: bpy.types.Scene) -> Look:
         states[step] = _or_failed(look, scene, found)
     found.out = _or_none(lambda: folders.output_folder("", scene))
     found.keys = _or_none(lambda: _keys(found))
-    found.run = _run_json(found.out)
+    _look_into_run(found)
     for step in STAGE:
         states[step] = _stage(step, states, found)
     states["rig"] = _rig(scene, states, found)
@@ -172,6 +173,8 @@ def _stage(step: str, states: Mapping[str, State], found: _Found) -> State:
         return State(word="empty", why="Comes after footage and cameras.")
     if step == "body" and found.take is not None and found.take.body_model is None:
         return State(word="empty", why="No body is wanted (step 3).")
+    if found.problem:
+        return State(word="failed", why=found.problem) if step == "surface" else State(word="empty", why="Comes after the surface.")
     stage = STAGE[step]
     entry = (found.run or {}).get("stages", {}).get(stage)
     if entry is None or found.out is None or not (found.out / WRITES[step]).exists() and "not_done" not in entry:
@@ -252,12 +255,12 @@ def _keys(found: _Found) -> Mapping[str, str] | None:
     return stage_keys(found.footage, settings_of(found.take.settings, {}, "The panel"), found.out)
 
 
-def _run_json(out: Path | None) -> Mapping[str, Any] | None:
-    path = out / "run.json" if out is not None else None
-    if path is None or not path.exists():
-        return None
-    said = _or_none(lambda: store.read_json(path))
-    return said if isinstance(said, dict) else None
+def _look_into_run(found: _Found) -> None:
+    try:
+        path = found.out / "run.json" if found.out is not None else None
+        found.run = read_run(path) if path is not None and path.exists() else None
+    except InputError as error:
+        found.problem = str(error)
 
 
 def _sequence(folder: Path, view: Any) -> Sequence:

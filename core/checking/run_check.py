@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..motion.ply import read_ply
 from ..motion.tables import MotionTable, read_joints, read_motion
 from ..progress import Monitor
-from ..results import FORMAT
+from ..run_json import read_run
 from .findings import Checked, Finding, doubtful, wrong
 
 MOST_FRAMES = 10_000_000
@@ -29,8 +29,8 @@ def check_run(folder: Path, monitor: Monitor) -> Checked:
     findings: list[Finding] = []
     figures: dict[str, Any] = {}
     try:
-        run = store.read_json(folder / "run.json")
-        _refuse_other(run, folder)
+        run = read_run(folder / "run.json")
+        _refuse_parts(run, folder)
         findings += [*_warnings(run), *_complete(run, folder), *_same_inputs(run, folder), *_rays(run)]
         if (folder / "clouds").is_dir():
             findings += _clouds(run, folder, figures, monitor)
@@ -41,16 +41,9 @@ def check_run(folder: Path, monitor: Monitor) -> Checked:
     return Checked(subject=str(folder), kind="result", findings=tuple(findings), figures=figures)
 
 
-def _refuse_other(run: Any, folder: Path) -> None:
-    tables = {"stages": dict, "inputs": dict, "warnings": list, "frames": list}
-    if not isinstance(run, dict) or run.get("format") != FORMAT or any(not isinstance(run.get(k), kind) for k, kind in tables.items()):
-        raise InputError(f"{folder / 'run.json'} is not that of a run of Tricap; run again.")
-    whole = [f for f in run["frames"] if isinstance(f, int)]
-    if (
-        len(whole) != 2
-        or not 0 <= whole[1] - whole[0] <= MOST_FRAMES
-        or any(not isinstance(figures, dict) for figures in run["stages"].values())
-    ):
+def _refuse_parts(run: Mapping[str, Any], folder: Path) -> None:
+    lacking = [name for name in ("stages", "inputs", "warnings", "frames") if name not in run]
+    if lacking or run["frames"][1] - run["frames"][0] > MOST_FRAMES:
         raise InputError(f"{folder / 'run.json'} is damaged; run again.")
 
 

@@ -91,7 +91,7 @@ def small_run(tmp_path: Path) -> SmallRun:
     write_take(take, rig)
     shape, motion, sigma = arm()
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
-    store.write_json(out / "run.json", {"take": str(take)})
+    store.write_json(out / "run.json", {"format": "tricap-run", "version": 1, "take": str(take)})
     write_result(out, shape, np.array(FRAMES), motion, sigma)
     for frame, posture in zip(FRAMES, motion):
         skin = body_skin(shape, posture)

@@ -124,6 +124,34 @@ def test_wrong_input_is_one_sentence(jobs: ModuleType, blender: ModuleType, tmp_
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
+def test_a_bug_in_the_scene_is_told_too_and_the_panel_hears_of_the_end(
+    jobs: ModuleType, blender: ModuleType, caplog: pytest.LogCaptureFixture
+) -> None:
+    class BrokenEnd(jobs.JobOperator, blender.types.Operator):
+        bl_idname = "tricap.broken_end"
+        bl_label = "Broken End"
+        step = "surface"
+
+        def snapshot(self, context: object) -> object:
+            return lambda monitor: {}
+
+        def finish(self, context: object, result: dict[str, int]) -> set[str]:
+            return {"FINISHED"} if result["nothing"] else {"CANCELLED"}
+
+    heard: list[tuple[str, str]] = []
+    listener = lambda context, step, failed: heard.append((step, failed))  # noqa: E731
+    blender.utils.register_class(BrokenEnd)
+    jobs.ENDED.append(listener)
+    try:
+        with pytest.raises(RuntimeError, match="Tricap made a mistake .KeyError"):
+            blender.ops.tricap.broken_end()
+    finally:
+        jobs.ENDED.remove(listener)
+        blender.utils.unregister_class(BrokenEnd)
+    assert 'result["nothing"]' in caplog.text and [step for step, _ in heard] == ["surface"]
+    assert heard[0][1].startswith("Tricap made a mistake (KeyError")
+
+
 def test_a_bug_is_told_with_its_traceback(jobs: ModuleType, blender: ModuleType, caplog: pytest.LogCaptureFixture) -> None:
     class Broken(jobs.JobOperator, blender.types.Operator):
         bl_idname = "tricap.broken"

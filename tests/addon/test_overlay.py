@@ -79,6 +79,14 @@ def test_a_damaged_file_is_told_and_the_rest_is_shown(run: Any, small_run: Small
     assert run.points(3) is None and run.points(4) is not None
 
 
+def test_a_run_json_that_no_run_wrote(scene: Any, small_run: SmallRun) -> None:
+    recording, sound = module("overlay.recording"), {"format": "tricap-run", "version": 1}
+    for said in ({"settings": []}, {"settings": {"matching": {"patch_px": "wide"}}}, {"stages": [1]}):
+        store.write_json(small_run.out / "run.json", sound | said)
+        recording.forget()
+        assert recording.current(scene) is None and "run.json" in recording.problem()
+
+
 def test_points_are_coloured_by_sigma(run: Any, small_run: SmallRun) -> None:
     layers = module("overlay.layers")
     found = layers.sigmas(run, "L", 3, 2.0)

@@ -42,15 +42,16 @@ def test_exact_skins_that_cannot_be(empty: ModuleType, small_run: SmallRun, tmp_
     wanted = SceneOptions(exact_skin=True)
     with pytest.raises(InputError, match="give the Blender file a name"):
         build_scene(small_run.out, options=wanted)
-    store.write_json(small_run.out / "run.json", {"take": str(small_run.take), "settings": {"skin": {"rays": 24}}})
+    said = {"format": "tricap-run", "version": 1, "take": str(small_run.take)}
+    store.write_json(small_run.out / "run.json", {**said, "settings": {"skin": {"rays": 24}}})
     report = build_scene(small_run.out, tmp_path / "a.blend", options=wanted)
     assert any("run's skins have" in warning for warning in report.warnings) and not (tmp_path / "a.pc2").exists()
-    store.write_json(small_run.out / "run.json", {"take": str(small_run.take), "settings": {"skin": {"rays": "many"}}})
+    store.write_json(small_run.out / "run.json", {**said, "settings": {"skin": {"rays": "many"}}})
     with pytest.raises(InputError, match="rays"):
         build_scene(small_run.out, tmp_path / "a.blend", options=wanted)
     for path in (small_run.out / "skin").iterdir():
         path.unlink()
-    store.write_json(small_run.out / "run.json", {"take": str(small_run.take)})
+    store.write_json(small_run.out / "run.json", said)
     assert any("holds no skins" in warning for warning in build_scene(small_run.out, tmp_path / "a.blend", options=wanted).warnings)
 
 

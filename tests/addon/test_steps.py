@@ -152,9 +152,26 @@ def test_changes_make_the_right_steps_stale_and_only_those(blender: ModuleType, 
     assert words().split()[3:7] == ["done", "done", "done", "done"]
 
 
+@pytest.mark.parametrize("text", ['{"stages": []}', '{"stages": [1]}', '{"settings": []}', '{"stages": {"measure": {"key": 1}}}'])
+def test_a_run_json_that_no_run_wrote(
+    blender: ModuleType, words: Words, why: Any, sample: Path, results: Path, tmp_path: Path, text: str
+) -> None:
+    (tmp_path / "out").mkdir()
+    opened(blender, sample, tmp_path)
+    (tmp_path / "out" / "run.json").write_text(text[:1] + '"format": "tricap-run", "version": 1, ' + text[1:])
+    assert words() == "done done done failed empty empty empty empty" and "remove the file and run again" in why("surface")
+    with pytest.raises(RuntimeError, match="run.json is damaged"):
+        blender.ops.tricap.measure()
+
+
 def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any, tmp_path: Path, words: Words) -> None:
     run = (tmp_path / "out" / "run.json").stat().st_mtime_ns
     assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "run.json").stat().st_mtime_ns == run
+    image = tmp_path / "take" / "C" / "0001.png"
+    written = image.stat().st_mtime_ns
+    os.utime(image, ns=(written, written + 3_000_000_000))  # exported anew
+    assert words().split()[3:7] == ["stale", "stale", "stale", "stale"]
+    os.utime(image, ns=(written, written))
     (tmp_path / "out" / "motion.csv").unlink()
     assert words().split()[5] == "ready"
     assert blender.ops.tricap.run() == {"FINISHED"} and (tmp_path / "out" / "motion.csv").exists()

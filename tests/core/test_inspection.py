@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import pipeline
+from tricap.core import pipeline, store
 from tricap.core.errors import InputError
 from tricap.core.inspection import body_outline, patch_boxes, read_contours, read_points, read_tracks
 from tricap.core.motion.ply import write_mesh
@@ -87,14 +87,29 @@ def test_the_outline_of_a_ball_is_a_circle(run: tuple[Footage, Path], tmp_path: 
     assert body_outline(tmp_path, 5, camera) == []
 
 
+@pytest.mark.parametrize(("name", "array"), [
+    ("frames", None), ("frames", np.arange(3)), ("frames", np.array([0, 2, 2, 3])), ("xyz_m", np.zeros((4, 5))), ("status", None),
+    ("xyz_m", np.zeros((4, 6, 3))), ("status", np.full((4, 5), 99, np.int8)), ("status", np.zeros((4, 5), np.float32)),
+])  # fmt: skip
+def test_trajectories_that_no_run_wrote(tmp_path: Path, name: str, array: np.ndarray | None) -> None:
+    arrays = {"frames": np.arange(4), "xyz_m": np.zeros((4, 5, 3)), "status": np.ones((4, 5), np.int8)}
+    store.save(tmp_path / "trajectories_raw.npz", arrays, {})
+    assert read_tracks(tmp_path) is not None
+    store.save(tmp_path / "trajectories_raw.npz", {n: a for n, a in (arrays | {name: array}).items() if a is not None}, {})
+    with pytest.raises(InputError, match="trajectories_raw.npz (is damaged|holds no)"):
+        read_tracks(tmp_path)
+
+
 def test_contours_by_frame(tmp_path: Path) -> None:
     path = tmp_path / "C.csv"
     assert read_contours(path) == {}
     path.write_text("frame,vertex,x,y,normal_x,normal_y,sigma,on_edge\n3,0,1.5,2,0,1,0.2,1\n3,1,2.5,2,0,1,3,0\n5,0,9,9,0,1,0.2,1\n")
     found = read_contours(path)
     assert list(found) == [3, 5] and found[3][0].tolist() == [[1.5, 2], [2.5, 2]] and found[3][1].tolist() == [True, False]
-    path.write_text("frame,x\n1,2\n")
-    with pytest.raises(InputError, match="damaged"):
-        read_contours(path)
+    head = "frame,vertex,x,y,on_edge\n"
+    for row in (f"1{'0' * 400},0,1,2,1", "1,0,nan,2,1", "1,0,1e300,2,1", "1,0,\0,2,1", "1,2"):
+        path.write_text(f"{head}{row}\n")
+        with pytest.raises(InputError, match="damaged"):
+            read_contours(path)
 
 

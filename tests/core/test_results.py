@@ -75,6 +75,19 @@ def test_run_json(tmp_path: Path) -> None:
         results.read_run()
 
 
+@pytest.mark.parametrize(("name", "value", "said"), [
+    ("stages", [], "stages"), ("stages", {"measure": 1}, "measure"), ("stages", {"track": {"key": 3}}, "track"), ("frames", [0], "frames"),
+    ("stages", {"track": {"trajectories": "many", "mean_length_frames": 2.0}}, "track"), ("frames", [3, 1], "frames"),
+    ("stages", {"fit": {"joint_sigma_mm": None}}, "fit"), ("stages", {"fit": {"joint_sigma_mm": 1.0, "frames": [3]}}, "fit"),
+    ("stages", {"fit": {"joint_sigma_mm": 10**400}}, "fit"), ("settings", [], "settings"), ("settings", {"skin": 3}, "settings"),
+    ("warnings", [1], "warnings"), ("inputs", {"rig.toml": 5}, "inputs"), ("views", "LCR", "views"), ("take", None, "take"),
+])  # fmt: skip
+def test_a_run_json_that_no_run_wrote(tmp_path: Path, name: str, value: object, said: str) -> None:
+    store.write_json(tmp_path / "run.json", {"format": "tricap-run", "version": 1, name: value})
+    with pytest.raises(InputError, match=f"run.json is damaged: “{said}” cannot be what it says; remove the file and run again"):
+        Results(tmp_path).read_run()
+
+
 def test_clouds_and_trajectories(tmp_path: Path) -> None:
     random, results = np.random.default_rng(0), Results(tmp_path)
     K = np.tile(np.diag([1e-6, 4e-6, 4e-6]), (5, 1, 1))

@@ -1,5 +1,6 @@
 """What a change concerns: the right stages become stale, and only those."""
 
+import os
 import shutil
 from dataclasses import fields
 from pathlib import Path
@@ -87,6 +88,13 @@ def test_other_cameras_and_other_footage_concern_everything(take: Path, tmp_path
     with open(moved / "L" / "0002.png", "ab") as file:
         file.write(b"more")
     assert all(a != b for a, b in zip(keys(take).values(), keys(moved).values()))
+
+
+def test_footage_exported_again_with_the_same_size_concerns_everything(take: Path, tmp_path: Path) -> None:
+    shutil.copytree(take, tmp_path / "take")
+    path = tmp_path / "take" / "L" / "0002.png"
+    os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns + 2_000_000_000))
+    assert all(a != b for a, b in zip(keys(take).values(), keys(tmp_path / "take").values()))
 
 
 def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:

@@ -128,3 +128,15 @@ def test_digests_tell_parts_apart(tmp_path: Path) -> None:
     (tmp_path / "f").write_bytes(b"ab")
     assert store.digest("ab", "c") != store.digest("a", "bc") != store.digest("abc")
     assert store.digest(tmp_path / "f") == store.digest(b"ab") == store.digest("ab")
+
+
+def test_the_layout_of_what_is_read(tmp_path: Path) -> None:
+    layout = {"frames": ("iu", "T"), "xyz_m": ("f", "TN3")}
+    sound = {"frames": np.arange(4), "xyz_m": np.zeros((4, 5, 3), np.float32)}
+    store.check_layout(tmp_path / "a.npz", sound, **layout)
+    wrong_ones = (np.zeros((4, 5, 2)), np.zeros((3, 5, 3)), np.zeros(4), np.zeros((4, 1), int))
+    for name, wrong in zip(("xyz_m", "xyz_m", "frames", "frames"), wrong_ones):
+        with pytest.raises(InputError, match="a.npz is damaged: .* has the shape"):
+            store.check_layout(tmp_path / "a.npz", sound | {name: wrong}, **layout)
+    with pytest.raises(InputError, match="a.npz holds no frames"):
+        store.check_layout(tmp_path / "a.npz", {"xyz_m": sound["xyz_m"]}, **layout)
