@@ -112,7 +112,7 @@ def test_with_their_diameter_known_small_reflections_are_left_out() -> None:
     for t in range(30):
         leap = 150 * (t % 2)
         bar, small = [(100.0 + leap, 200.0), (400.0 - leap, 420.0 - leap)], [(500.0 + 4 * t, 60.0), (500.0 + 4 * t, 360.0)]
-        area = np.array([80.0, 80.0, 30.0, 30.0])
+        area = np.array([300.0, 300.0, 30.0, 30.0])
         frames.append(replace(spots(*bar, *small), area_px=area))
     alone, known = track_bar(frames, 768.0), track_bar(frames, 768.0, diameter=0.05)
     assert np.nanmin(alone.xy_px[..., 0]) > 450 > np.nanmax(known.xy_px[..., 0])
