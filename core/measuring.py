@@ -28,7 +28,7 @@ from .results import Results
 from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 from .take import Footage, footage_frames
 
-ALGORITHM = "surface 8"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 9"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
@@ -187,10 +187,11 @@ def _measure(
             spacing_px=growing.seed_spacing_px,
             depth_range_m=where.depth_range_m,
             monitor=monitor,
+            pairs=growing.pairs,
         )
     cover = scan if growing.method == "published" else grow
     field = cover(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
-    field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor)
+    field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor, pairs=growing.pairs)
     field = clean_field(_single(field), cameras[ref], ref, surface)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):
@@ -223,9 +224,21 @@ def _first_foreground(
 ) -> tuple[fg.Foreground, Approximations]:
     """Where the person is in the first frame, and the seeds there."""
     cameras, ref, take = footage.rig.cameras, footage.take.reference, footage.take
-    swept = sweep_seeds(
-        images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=None, monitor=monitor
-    )
+
+    def sweep(depth_range_m: tuple[float, float] | None) -> Approximations:
+        return sweep_seeds(
+            images.spline,
+            cameras,
+            ref,
+            grid,
+            matching,
+            spacing_px=growing.seed_spacing_px,
+            depth_range_m=depth_range_m,
+            monitor=monitor,
+            pairs=growing.pairs,
+        )
+
+    swept = sweep(None)
     room, person = _room_and_person(footage, images, swept, frame)
     clicks = [*take.seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface))]
     depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
@@ -238,10 +251,7 @@ def _first_foreground(
     else:
         where = fg.Foreground(depth_range_m=(0.05, 1e3), method="everything")
     where = replace(where, planes=room)
-    near, far = where.depth_range_m
-    seeds = sweep_seeds(
-        images.spline, cameras, ref, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=(near, far), monitor=monitor
-    )
+    seeds = sweep(where.depth_range_m)
     if take.seeds.surface and frame == take.seeds.frame:
         seeds = with_clicked(footage, images.spline, seeds, matching)
     return where, seeds

@@ -112,7 +112,12 @@ class Results:
     def write_cloud(self, cloud: PointCloud) -> None:
         """clouds/NNNN.ply"""
         write_cloud(
-            self.cloud_path(cloud.frame), xyz_m=cloud.xyz_m, sigma_m=cloud.sigma_m, normals=cloud.normals, intensity=cloud.intensity
+            self.cloud_path(cloud.frame),
+            xyz_m=cloud.xyz_m,
+            sigma_m=cloud.sigma_m,
+            normals=cloud.normals,
+            intensity=cloud.intensity,
+            rays=cloud.rays,
         )
 
     def write_trajectories(self, filtered: Filtered, fps: float) -> None:

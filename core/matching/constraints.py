@@ -6,6 +6,9 @@ the cells around, gives the starts, and its slopes and curvatures are pseudo-obs
 that an affine patch averages away (SCIENCE §4), so that a round body is measured where it is, with a patch large enough to be precise. The
 patch is wider than the unconstrained one and fades out (Gaussian window): its precision is that of the middle, not that of its rim.
 
+Every point is measured in the views that found it; one of more than are needed in which the patch then looks unlike (an occlusion, a
+reflection) is left out.
+
 What the rig does not know is estimated from the points themselves: σ_c² = median of the squared shifts across the epipolar lines − their
 own variance (of a first adjustment in which these shifts are free). Where σ_c is large, the calibration contradicts the images, and the
 field is kept as it was matched.
@@ -13,6 +16,7 @@ field is kept as it was matched.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +29,7 @@ from .least_squares import MatchingSettings, MatchStatus, patch_offsets
 from .multi_image import MultiImageMatches, match_multi_image
 from .neighbourhood import RADIUS_CELLS, NeighbourFit, fit_neighbours, neighbours_of
 from .object_space import Epipolar, SurfacePatch, SurfacePrior, match_surface, normal_to
+from .seeds import fewest_views
 from .template_patches import monomials
 
 WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
@@ -45,6 +50,8 @@ LOOSER = 2.0
 MAX_STEEPNESS = 5.0  # change of depth per distance across
 OUTLINE_SIGMA_PX = 1.3  # across the ray where no neighbour supports a point: at an outline the patch hangs over the edge
 
+Found = TypeVar("Found", SurfacePatch, MultiImageMatches)
+
 
 def constrain(
     field: TripletField,
@@ -55,16 +62,16 @@ def constrain(
     *,
     foreground: Foreground,
     monitor: Monitor,
-    neighbours: bool = True,
+    pairs: bool = False,
 ) -> TripletField:
     """The field measured again under `settings.constraint`; points that fail are left out. "none" returns the field as it is.
 
-    Without `neighbours` what the cells around say is used for the starts only.
+    A point needs three rays, or both of two views; with `pairs` two.
     """
     if settings.constraint == "none" or not len(field.cell):
         return field
     measure = _object_space if settings.constraint == "object" else _epipolar
-    return measure(field, images, cameras, reference, settings, foreground, monitor, neighbours)
+    return measure(field, images, cameras, reference, settings, foreground, monitor, fewest_views(len(cameras), pairs))
 
 
 def _surface_of(field: TripletField, camera: Camera, reference: int, speed: float) -> NeighbourFit:
@@ -95,11 +102,12 @@ def _object_space(
     settings: MatchingSettings,
     foreground: Foreground,
     monitor: Monitor,
-    neighbours: bool,
+    fewest: int,
 ) -> TripletField:
     rows, speed = field.grid.rows, _px_per_inverse_metre(cameras, reference)
     around = _surface_of(field, cameras[reference], reference, speed)
-    xy, start = field.grid.xy(field.cell), around.coefficients[:, : 6 if neighbours else 3]
+    xy, start = field.grid.xy(field.cell), around.coefficients[:, : 6 if settings.neighbours else 3]
+    seen = _seen(field, reference)
     prior = _prior(start, speed)
     wide = replace(loosened(settings), patch_px=settings.patch_px + WINDOW_EXTRA_PX, max_sigma0=LOOSER * settings.max_sigma0)
 
@@ -118,17 +126,22 @@ def _object_space(
             sigma_across_px=sigma_c,
             prior=SurfacePrior(value=prior.value[which], sigma=prior.sigma[which]),
             weight=np.broadcast_to(weight, (len(which), len(weight))),
+            seen=seen[which],
             monitor=monitor,
         )
 
     every = np.arange(len(xy))
     sample = match(every[:: max(1, len(xy) // SAMPLE)], prior, FREE_SIGMA_PX)
-    rig_sigma_px = _rig_sigma(sample.across_px[sample.ok], sample.across_sigma_px[sample.ok])
+    known = sample.ok[:, None] & sample.seen
+    rig_sigma_px = _rig_sigma(sample.across_px[known], sample.across_sigma_px[known])
     if rig_sigma_px > MAX_RIG_SIGMA_PX:
         return field
     sigma_c = max(MIN_SIGMA_C_PX, rig_sigma_px)
     found = match(every, prior, sigma_c)
-    if neighbours:
+    again = _without_unlike(seen, found.ok, found.correlation, settings.min_correlation, fewest)
+    if len(again):
+        _replace(found, again, match(again, prior, sigma_c))
+    if settings.neighbours:
         stiff = SurfacePrior(value=prior.value, sigma=prior.sigma * np.array([1, STIFF, STIFF, STIFF, STIFF, STIFF]))
         again = np.flatnonzero(~found.ok)
         _replace(found, again, match(again, stiff, sigma_c))
@@ -155,6 +168,19 @@ def _agrees(field: TripletField, found: SurfacePatch, base: Camera, reference: i
     return np.abs(1 / np.maximum(w, 1e-6) - depth) < np.maximum(allowed, SAME_PLACE_M)
 
 
+def _seen(field: TripletField, reference: int) -> np.ndarray:
+    """(N, S) which search views found the points."""
+    return np.delete(np.isfinite(field.xy).all(axis=2), reference, axis=1)
+
+
+def _without_unlike(seen: np.ndarray, ok: np.ndarray, correlation: np.ndarray, smallest: float, fewest: int) -> np.ndarray:
+    """Rows (m,) of points that failed though enough of their views look alike; the others are taken out of `seen` (N, S), in place."""
+    alike = seen & (correlation >= smallest)
+    rows = np.flatnonzero(~ok & (alike.sum(axis=1) >= fewest) & (alike.sum(axis=1) < seen.sum(axis=1)))
+    seen[rows] = alike[rows]
+    return rows
+
+
 def _prior(start: np.ndarray, speed: float) -> SurfacePrior:
     """What the neighbours say of slopes and curvatures, the less surely the rounder it is there; of planes (N, 3) they say nothing."""
     sigma = np.full(start.shape, np.inf)
@@ -177,9 +203,9 @@ def _rig_sigma(across_px: np.ndarray, sigma_px: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, float(np.median(across_px**2)) / MEDIAN_OF_CHI2 - float(np.median(sigma_px**2)))))
 
 
-def _replace(found: SurfacePatch, rows: np.ndarray, other: SurfacePatch) -> None:
+def _replace(found: Found, rows: np.ndarray, other: Found) -> None:
     """Put the good ones of `other` in the rows of `found`."""
-    for name in SurfacePatch.__dataclass_fields__:
+    for name in type(found).__dataclass_fields__:
         if name != "status":
             getattr(found, name)[rows[other.ok]] = getattr(other, name)[other.ok]
     found.status[rows[other.ok]] = other.status[other.ok]
@@ -205,13 +231,14 @@ def _from_surface(
     for i, k in enumerate(views):
         c, e, A, _ = Epipolar(base, cameras[k], rows, at).centre(np.column_stack([w, slope]))
         n = normal_to(e)
-        xy[:, k], shape[:, k] = c + found.across_px[:, i, None] * n, A
+        seen = found.seen[:, i]
+        xy[:, k], shape[:, k] = np.where(seen[:, None], c + found.across_px[:, i, None] * n, np.nan), A
         K[:, k] = (
             variance[:, None, None] * e[:, :, None] * e[:, None]
             + (found.across_sigma_px[:, i] ** 2)[:, None, None] * n[:, :, None] * n[:, None]
         )
-        square += np.sum((found.across_px[:, i, None] * n * (1.0, rows.step)) ** 2, axis=1)
-        speed = np.maximum(speed, np.linalg.norm(e, axis=1))
+        square += np.where(seen, np.sum((found.across_px[:, i, None] * n * (1.0, rows.step)) ** 2, axis=1), 0.0)
+        speed = np.where(seen, np.maximum(speed, np.linalg.norm(e, axis=1)), speed)
     found.status[(found.status == MatchStatus.OK) & (steepness > MAX_STEEPNESS)] = MatchStatus.SHAPE_TOO_LARGE
     ray = base.rays(rows.to_frame(at))
     excess = found.across_px / np.sqrt(found.across_sigma_px**2 + max(rig_sigma_px, MIN_SIGMA_C_PX) ** 2)
@@ -224,8 +251,8 @@ def _from_surface(
         xyz_m=base.centre_m + ray / w[:, None],
         covariance_m2=ray[:, :, None] * ray[:, None] * (variance / w**4)[:, None, None]
         + _model_covariance(ray, w, speed, around, rig_sigma_px, base),
-        residual_px=np.sqrt(square / len(cameras)),
-        sigma0=np.sqrt(np.sum(excess**2, axis=1) / len(views)),
+        residual_px=np.sqrt(square / (1 + found.seen.sum(axis=1))),
+        sigma0=np.sqrt(np.sum(excess**2, axis=1) / found.seen.sum(axis=1)),
         spread=np.zeros_like(field.spread) if curved else found.spread,  # with curvatures adjusted nothing is left to correct
     )
 
@@ -247,7 +274,7 @@ def _epipolar(
     settings: MatchingSettings,
     foreground: Foreground,
     monitor: Monitor,
-    neighbours: bool,
+    fewest: int,
 ) -> TripletField:
     rows, base, xy = field.grid.rows, cameras[reference], field.grid.xy(field.cell)
     views = [k for k in range(len(cameras)) if k != reference]
@@ -256,23 +283,26 @@ def _epipolar(
     theta, ray = around.coefficients[:, :3], base.rays(rows.to_frame(xy))
     lines = [Epipolar(base, cameras[k], rows, xy).centre(theta) for k in views]
     middle, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
-    X = base.points_at_depth(rows.to_frame(xy), 1 / theta[:, 0])
+    X, seen = base.points_at_depth(rows.to_frame(xy), 1 / theta[:, 0]), _seen(field, reference)
 
     def match(which: np.ndarray, sigma_c: float) -> MultiImageMatches:
         a, b, c, d = xy[which], middle[which], shape[which], X[which]
+        part, near = seen[which], settings.neighbours
         return match_multi_image(
-            images, cameras, reference, rows, a, b, c, d, settings, sigma_c_px=sigma_c, neighbours=neighbours, monitor=monitor
+            images, cameras, reference, rows, a, b, c, d, settings, sigma_c_px=sigma_c, neighbours=near, seen=part, monitor=monitor
         )
 
     sample = match(np.arange(len(xy))[:: max(1, len(xy) // SAMPLE)], FREE_SIGMA_PX)
-    known = sample.ok
-    residual = sample.residual_px[known][:, 1:, 1]
-    rig_sigma_px = _rig_sigma(residual, np.sqrt(sample.covariance[known][:, :, 1, 1]) * rows.step)
+    known = sample.ok[:, None] & sample.seen
+    rig_sigma_px = _rig_sigma(sample.residual_px[:, 1:, 1][known], np.sqrt(sample.covariance[:, :, 1, 1][known]) * rows.step)
     found = match(np.arange(len(xy)), max(MIN_SIGMA_C_PX, rig_sigma_px))
-    order = [reference, *views]
+    again = _without_unlike(seen, found.ok, found.correlation, settings.min_correlation, fewest)
+    if len(again):
+        _replace(found, again, match(again, max(MIN_SIGMA_C_PX, rig_sigma_px)))
+    rays = 1 + found.seen.sum(axis=1)
     at, A, K = field.xy.copy(), field.shape.copy(), field.covariance.copy()
     at[:, reference] = xy + found.offset
-    at[:, views], A[:, views], K[:, views] = found.xy, found.shape, found.covariance
+    at[:, views], A[:, views], K[:, views] = np.where(found.seen[..., None], found.xy, np.nan), found.shape, found.covariance
     square = np.sum(found.residual_px**2, axis=(1, 2))
     result = replace(
         field,
@@ -282,8 +312,8 @@ def _epipolar(
         correlation=found.correlation.min(axis=1),
         xyz_m=found.xyz_m,
         covariance_m2=found.covariance_m2 + _model_covariance(ray, theta[:, 0], speed, around, rig_sigma_px, base),
-        residual_px=np.sqrt(square / len(order)),
-        sigma0=np.sqrt(square / (2 * len(order) - 3)) / max(MIN_SIGMA_C_PX, rig_sigma_px),
+        residual_px=np.sqrt(square / rays),
+        sigma0=np.sqrt(square / (2 * rays - 3)) / max(MIN_SIGMA_C_PX, rig_sigma_px),
         spread=found.spread,
     )
     return _kept(result, found.ok, foreground, base)

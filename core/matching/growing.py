@@ -2,13 +2,14 @@
 
 As published (D'Apuzzo et al. 2000, §2.2) the centre image is the template, a point's start is its matched neighbour shifted with the
 neighbour's shape, and what fails is tried again from other neighbours. Here the neighbours of all points that were just accepted form one
-array, and a point is accepted only when it is found in every view, its rays meet, and its depth continues that of its neighbour:
+array, and a point is accepted only when enough views find it, its rays meet, and its depth continues that of its neighbour:
 
     start_k(p + δ) = x_k(p) + A_k(p) δ                                                    (1)
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -19,8 +20,8 @@ from ..progress import Monitor
 from ..settings import knob
 from .foreground import Foreground
 from .grid import TemplateGrid
-from .least_squares import Matches, MatchingSettings, MatchStatus, match_patches
-from .seeds import Approximations
+from .least_squares import Matches, MatchingSettings, match_patches
+from .seeds import Approximations, fewest_views
 
 NEIGHBOURS = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
 TEMPLATE_SIGMA_PX = 0.02  # of the template point itself, so that it may move along with the adjustment
@@ -68,7 +69,7 @@ class GrowingSettings:
         high=10.0,
     )
     max_ray_sigma0: float = knob(3.0, "Largest distance by which rays may miss, in units of its own sigma.", low=1.0, high=100.0)
-    pairs: bool = knob(False, "Keep points that only two views can see, because they lie outside the images of the others.")
+    pairs: bool = knob(False, "Keep points that only two views see; the cloud says how many rays each point has.")
     max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across.", low=0.5, high=20.0)
 
 
@@ -132,21 +133,23 @@ def grow(
 ) -> TripletField:
     """Grow the field from the seeds until no neighbour can be matched any more; again with larger patches, and at last with a smaller one.
 
-    A point needs three rays, or all of them where there are two views; with `pairs`, two rays will do where the other views cannot see it.
-    Only points that the foreground allows are accepted.
+    A point needs three rays, of the views that see it, or both where there are two views; with `pairs`, two rays will do for what is then
+    left. Only points that the foreground allows are accepted.
     """
     n_cells = grid.shape[0] * grid.shape[1]
     state = _State(n_cells, len(cameras))
     camera = cameras[reference]
-    cells, start, shape, parent_depth = _seed_front(grid, seeds, reference)
+    seed_front = cells, start, shape, parent_depth = _seed_front(grid, seeds, reference)
     matched, point, _ = _measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching, EQUAL_SIGMA_PX, pairs=False)
     limit_px, rig_sigma_px = _rig_quality(matched, point, growing)
     depths = camera.to_camera(point.xyz_m)[:, 2]
-    for level in (*range(rounds_of_larger_patches(matching, growing, depths, camera) + 1), NARROW):
+    levels = (*range(rounds_of_larger_patches(matching, growing, depths, camera) + 1), NARROW)
+    for pairs, level in product((False, True) if growing.pairs and len(cameras) > 2 else (False,), levels):
         views, settings = images, replace(matching, patch_px=max(SMALLEST_PX, matching.patch_px + PATCH_STEP_PX * level))
-        if level:
+        if level or pairs:
             state.attempts[:] = 0
-            cells, start, shape, parent_depth = _front_from(state, np.flatnonzero(state.accepted), grid, growing.attempts, camera)
+            front = _front_from(state, np.flatnonzero(state.accepted), grid, growing.attempts, camera)
+            cells, start, shape, parent_depth = _with_seeds(state, seed_front, front) if pairs and not level else front
         if level == NARROW:
             settings = replace(settings, max_sigma_px=NARROW_SURE * settings.max_sigma_px)
         if level >= SMOOTH_FROM:
@@ -157,9 +160,9 @@ def grow(
             state.attempts[cells] += 1
             state.tried[cells] = True
             xy = grid.xy(cells)
-            matched, point, depth = _measure(views, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px, growing.pairs)
-            good = _acceptable(matched, point, depth, parent_depth, grid, camera, growing, limit_px, foreground)
-            _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], grid, cameras, reference)
+            matched, point, depth = _measure(views, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px, pairs)
+            good = _acceptable(matched, point, depth, parent_depth, grid, camera, replace(growing, pairs=pairs), limit_px, foreground)
+            _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], shape[good], grid, cameras, reference)
             state.smoothed[cells[good]] = level >= SMOOTH_FROM
             cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
     return _field(state, grid, limit_px)
@@ -192,15 +195,26 @@ def _rig_quality(matched: Sequence[Matches], seeds: Intersection, growing: Growi
     if not known.any():
         return growing.max_residual_px, 0.0
     typical = float(np.median(seeds.rms_residual_px[known]))
-    rays = len(matched) + 1
-    explained = float(np.median([np.trace(m.transfer_covariance[known], axis1=1, axis2=2) / 2 for m in matched]))
+    rays = float(np.median(seeds.rays[known]))
+    explained = float(np.median(np.concatenate([np.trace(m.transfer_covariance[known & m.ok], axis1=1, axis2=2) / 2 for m in matched])))
     unexplained = typical**2 * rays / (2 * rays - 3) - explained
     return max(growing.max_residual_px, min(SEED_MEDIANS * typical, MAX_LIMIT_PX)), float(np.sqrt(max(0.0, unexplained)))
 
 
+Front = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _with_seeds(state: "_State", seeds: Front, front: Front) -> Front:
+    """The seeds that are not yet taken, and the rest of a front."""
+    fresh = ~state.accepted[seeds[0]]
+    rest = ~np.isin(front[0], seeds[0][fresh])
+    cells, start, shape, depth = (np.concatenate([a[fresh], b[rest]]) for a, b in zip(seeds, front))
+    return cells, start, shape, depth
+
+
 def _front_from(
     state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts: int, camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> Front:
     """The next cells to try, their starts and shapes in every view, and the depth that they should continue."""
     cells, parents = _next_front(state, fresh, grid, attempts)
     step = grid.xy(cells) - grid.xy(parents)
@@ -208,7 +222,7 @@ def _front_from(
     return cells, start, state.shape[parents], camera.to_camera(state.xyz[parents])[:, 2]
 
 
-def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> Front:
     """The seeds moved to their nearest cells, one per cell; their depth is not yet bound to anything (NaN)."""
     cells = grid.nearest(seeds.xy[:, reference])
     cells, first = np.unique(cells, return_index=True)
@@ -253,10 +267,8 @@ def _measure(
 
 
 def _enough_rays(matched: Sequence[Matches], pairs: bool) -> np.ndarray:
-    """(N,) whether three rays were found (or all there are), or with `pairs` two, where the point lies outside all other views."""
-    rays = 1 + np.sum([m.ok for m in matched], axis=0)
-    found_or_outside = np.all([m.ok | (m.status == MatchStatus.OUT_OF_IMAGE) for m in matched], axis=0)
-    return (rays >= min(3, 1 + len(matched))) | (pairs & (rays == 2) & found_or_outside)
+    """(N,) whether as many views as are needed find the point."""
+    return np.asarray(np.sum([m.ok for m in matched], axis=0) >= fewest_views(1 + len(matched), pairs))
 
 
 def _acceptable(
@@ -297,6 +309,7 @@ def _store(
     point: Intersection,
     good: np.ndarray,
     xy: np.ndarray,
+    shape: np.ndarray,
     grid: TemplateGrid,
     cameras: Sequence[Camera],
     reference: int,
@@ -307,11 +320,12 @@ def _store(
     state.shape[cells, reference], state.spread[cells] = np.eye(2), matched[0].spread
     state.covariance[cells, reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
     for k, m in zip(views, matched):
-        # a view that does not see the point goes on from where the point would be
+        # a view that does not see the point goes on from where the point would be, with the shape that was expected there
         unseen = grid.rows.from_frame(cameras[k].project(point.xyz_m[good]))
         state.middle[cells, k] = np.where(m.ok[:, None], m.xy, unseen)
         state.xy[cells, k] = np.where(m.ok[:, None], m.transfer_xy, np.nan)
-        state.shape[cells, k], state.covariance[cells, k] = m.shape, m.transfer_covariance
+        state.shape[cells, k] = np.where(m.ok[:, None, None], m.shape, shape[:, k])
+        state.covariance[cells, k] = m.transfer_covariance
     state.correlation[cells] = np.min([np.where(m.ok, m.correlation, 1.0) for m in matched], axis=0)
     state.xyz[cells], state.covariance_m2[cells] = point.xyz_m[good], point.covariance_m2[good]
     state.residual[cells], state.sigma0[cells] = point.rms_residual_px[good], point.sigma0[good]

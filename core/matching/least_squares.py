@@ -60,6 +60,9 @@ class MatchingSettings:
         "Geometry in the matching: none, collinearity observations (epipolar), or one piece of surface seen by all views (object).",
         choices=("none", "epipolar", "object"),
     )
+    neighbours: bool = knob(
+        True, "What neighbouring points say of the surface enters constrained matching as observations, not as its start alone."
+    )
     max_shear: float = knob(0.75, "Largest change of the patch's shape from its start.", low=0.1, high=3.0)
 
 

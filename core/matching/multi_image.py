@@ -42,8 +42,9 @@ class MultiImageMatches:
     covariance: np.ndarray  # (N, S, 2, 2) of xy
     xyz_m: np.ndarray  # (N, 3)
     covariance_m2: np.ndarray  # (N, 3, 3)
-    residual_px: np.ndarray  # (N, S + 1, 2) image point − projection, the template first, full-frame pixels
-    correlation: np.ndarray  # (N, S)
+    residual_px: np.ndarray  # (N, S + 1, 2) image point − projection, the template first, full-frame pixels; 0 in views without part
+    seen: np.ndarray  # (N, S) which views took part
+    correlation: np.ndarray  # (N, S), 1 in views that did not
     offset: np.ndarray  # (N, 2) o
     spread: np.ndarray  # (N, 2) variance of the texture's energy about o
     iterations: np.ndarray  # (N,)
@@ -68,23 +69,27 @@ def match_multi_image(
     *,
     sigma_c_px: float,
     neighbours: bool = False,
+    seen: np.ndarray | None = None,
     monitor: Monitor | None = None,
 ) -> MultiImageMatches:
     """Match the reference view's points `xy` (N, 2) (rows' pixels) in all other views, under collinearity.
 
     Starts: `middle` (N, S, 2) and `shape` (N, S, 2, 2) in the search views, in the order of the cameras, and `xyz_m` (N, 3). With
-    `neighbours` these starts are what the neighbours predict and enter as pseudo-observations (4). `sigma_c_px` is in full-frame
-    pixels: 0.001 makes (2) a condition.
+    `neighbours` these starts are what the neighbours predict and enter as pseudo-observations (4). `sigma_c_px` is in
+    full-frame pixels: 0.001 makes (2) a condition. `seen` (N, S) says which search views take part in each point, by default all; one
+    that does but does not hold the point makes it OUT_OF_IMAGE.
     Cost: about 40 µs per point of 13×13 and search image.
     """
     n = len(xy)
     order = [reference, *(k for k in range(len(cameras)) if k != reference)]
+    taking_part = np.ones((n, len(cameras) - 1), dtype=bool) if seen is None else seen
 
     def work(span: slice) -> MultiImageMatches:
         if monitor is not None and monitor.cancelled:
             monitor.step("surface", span.start, n)
         patches = TemplatePatches(images[reference], xy[span], settings.patch_px, rows.step)
-        adjustment = _Adjustment(patches, [images[k] for k in order], [cameras[k] for k in order], rows, settings, sigma_c_px, neighbours)
+        views, rig = [images[k] for k in order], [cameras[k] for k in order]
+        adjustment = _Adjustment(patches, views, rig, rows, settings, sigma_c_px, neighbours, taking_part[span])
         return adjustment.solve(xy[span], middle[span], shape[span], xyz_m[span])
 
     spans = [slice(i, min(i + CHUNK, n)) for i in range(0, max(n, 1), CHUNK)]
@@ -108,9 +113,10 @@ class _Adjustment:
         settings: MatchingSettings,
         sigma_c_px: float,
         neighbours: bool,
+        seen: np.ndarray,
     ) -> None:
         self._patches, self._images, self._cameras, self._rows = patches, images, cameras, rows
-        self._settings, self._neighbours = settings, neighbours
+        self._settings, self._neighbours, self._seen = settings, neighbours, seen
         self._weight = np.array([1.0, rows.step**2]) / sigma_c_px**2  # of (2), (3) in rows' pixels
         self._S = len(images) - 1
         n = len(patches.offset)
@@ -128,6 +134,8 @@ class _Adjustment:
 
     def solve(self, xy: np.ndarray, middle: np.ndarray, shape: np.ndarray, xyz_m: np.ndarray) -> MultiImageMatches:
         s, n, S = self._settings, len(xy), self._S
+        middle = np.where(self._seen[..., None], middle, 0.0)
+        shape = np.where(self._seen[..., None, None], shape, np.eye(2))
         c, A, X = (np.array(a, dtype=np.float64) for a in (middle, shape, xyz_m))
         status = np.full(n, MatchStatus.NOT_CONVERGED, dtype=np.int8)
         status[~self._patches.textured] = MatchStatus.NO_TEXTURE
@@ -138,8 +146,9 @@ class _Adjustment:
         for iteration in range(1, s.max_iterations + 1):
             if not len(active):
                 break
-            grey, rho[active], seen = self._grey_values(c[active], A[active], active)
+            grey, rho[active], held = self._grey_values(c[active], A[active], active)
             P[active] = 1 / np.maximum([self._patches.residual_variance(r, 8, active) for r in rho[active].T], MIN_NOISE**2).T
+            P[active] *= self._seen[active]
             N, rhs = self._normal(P[active], grey, xy[active], c[active], A[active], X[active], (middle[active], shape[active]), active)
             step = solve_normals(N, rhs)
             d, moved = step[:, : 6 * S].reshape(-1, S, 2, 3), np.full(len(active), np.nan)
@@ -151,22 +160,22 @@ class _Adjustment:
             done = moved < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * sigma)
             status[active[done]] = MatchStatus.OK
             status[active[away]] = MatchStatus.SHIFT_TOO_LARGE
-            status[active[~seen]] = MatchStatus.OUT_OF_IMAGE
-            active = active[~(done | away | ~seen)]
+            status[active[~held]] = MatchStatus.OUT_OF_IMAGE
+            active = active[~(done | away | ~held)]
         return self._judge(xy, middle, shape, c, A, X, P, rho, iterations, status)
 
     def _grey_values(self, c: np.ndarray, A: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Right sides of (1) (m, S, 6), correlations (m, S), and whether all search images hold the patches."""
-        p = self._patches
-        rhs, rho, seen = np.zeros((len(rows), self._S, 6)), np.zeros((len(rows), self._S)), np.ones(len(rows), dtype=bool)
+        """Right sides of (1) (m, S, 6), correlations (m, S), and whether all search images that take part hold the patches."""
+        p, taking_part = self._patches, self._seen[rows]
+        rhs, rho, held = np.zeros((len(rows), self._S, 6)), np.zeros((len(rows), self._S)), np.ones(len(rows), dtype=bool)
         for k, image in enumerate(self._images[1:]):
             visible = image.inside(c[:, k], np.array(p.half) * 0.5)
             c32, A32 = np.where(visible[:, None], c[:, k], 0.0).astype(np.float32), A[:, k].astype(np.float32)
             x, y = (c32[:, i, None] + A32[:, i, :1] * p.u + A32[:, i, 1:] * p.v for i in range(2))
             rho[:, k], (gx, gy) = p.compare(image.sample(x, y), rows)
             rhs[:, k] = -np.concatenate([gx, gy], axis=1)
-            seen &= visible
-        return rhs, rho, seen
+            held &= visible | ~taking_part[:, k]
+        return rhs, np.where(taking_part, rho, 1.0), held
 
     def _normal(
         self,
@@ -186,7 +195,7 @@ class _Adjustment:
         rhs[:, 6 * S :] = np.einsum("nkiv,i,nki->nv", F, W, v)
         for k in range(S):
             at = slice(6 * k, 6 * k + 6)
-            AE = A[:, k] @ self._E[rows]
+            AE = A[:, k] @ self._E[rows] * self._seen[rows, k, None, None]
             N[:, at, at] += P[:, k, None, None] * self._H[rows]
             rhs[:, at] = P[:, k, None] * grey[:, k] - np.einsum("nia,i,ni->na", AE, W, v[:, k + 1])
             if self._neighbours:
@@ -201,7 +210,9 @@ class _Adjustment:
         at = np.concatenate([(xy + o)[:, None], c + np.einsum("nkij,nj->nki", A, o)], axis=1)
         projected = [camera.project_with_jacobian(X) for camera in self._cameras]
         v = at - self._rows.from_frame(np.stack([x for x, _ in projected], axis=1))
-        return v, np.stack([J for _, J in projected], axis=1) / np.array([1.0, self._rows.step])[:, None]
+        F = np.stack([J for _, J in projected], axis=1) / np.array([1.0, self._rows.step])[:, None]
+        there = np.insert(self._seen[rows], 0, True, axis=1)[..., None]  # the template always is
+        return np.where(there, v, 0.0), np.where(there[..., None], F, 0.0)
 
     def _geometry(self, c: np.ndarray, A: np.ndarray, X: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
         """What (2) and (3) give to the normal matrix; and an empty right side."""
@@ -210,8 +221,9 @@ class _Adjustment:
         _, F = self._collinearity(np.zeros((len(c), 2)), c, A, X, rows)
         N[:, at_x, at_x] = np.einsum("nkia,i,nkib->nab", F, W, F)
         for k in range(S):
-            at, AE = slice(6 * k, 6 * k + 6), A[:, k] @ self._E[rows]
-            N[:, at, at] = np.einsum("nia,i,nib->nab", AE, W, AE)
+            seen = self._seen[rows, k, None, None]
+            at, AE = slice(6 * k, 6 * k + 6), A[:, k] @ self._E[rows] * seen
+            N[:, at, at] = np.einsum("nia,i,nib->nab", AE, W, AE) + ~seen * np.eye(6)
             N[:, at, at_x] = -np.einsum("nia,i,nib->nab", AE, W, F[:, k + 1])
             N[:, at_x, at] = N[:, at, at_x].transpose(0, 2, 1)
         return N, np.zeros((len(c), 6 * S + 3))
@@ -226,7 +238,7 @@ class _Adjustment:
             if self._neighbours:
                 for N in (texture, middle):
                     _add_neighbours(N[:, at, at], np.zeros((len(c), 6)), c[:, k], A[:, k], c[:, k], A[:, k])
-            noise = 0.5 * (self._patches.gradient_noise / P[:, k])[:, None, None] * self._noise
+            noise = 0.5 * (self._patches.gradient_noise / np.maximum(P[:, k], 1e-12))[:, None, None] * self._noise
             texture[:, at, at] += P[:, k, None, None] * without_noise(self._H, noise)
             for j in range(S):
                 share = (1.0 if j == k else 0.5) * np.sqrt(P[:, k] * P[:, j])
@@ -254,7 +266,8 @@ class _Adjustment:
         AE = A @ self._E[:, None]
         at = [slice(6 * k, 6 * k + 6) for k in range(S)]
         Kx = np.stack([AE[:, k] @ K[:, at[k], at[k]] @ AE[:, k].transpose(0, 2, 1) for k in range(S)], axis=1)
-        sigma = np.sqrt(np.maximum(np.nan_to_num(Kx[:, :, [0, 1], [0, 1]], nan=1e6), 0)).max(axis=(1, 2))
+        variance = np.nan_to_num(Kx[:, :, [0, 1], [0, 1]], nan=1e6) * self._seen[..., None]
+        sigma = np.sqrt(np.maximum(variance, 0)).max(axis=(1, 2))
         pixels = np.maximum(patches.pixels, 9.0)
         sigma0 = 50 * np.sqrt(np.clip(1 - rho.min(axis=1) ** 2, 0, 1) * pixels / (pixels - 8))
         for bad, why in (
@@ -274,6 +287,7 @@ class _Adjustment:
             xyz_m=Xs,
             covariance_m2=K[:, 6 * S :, 6 * S :],
             residual_px=v * (1.0, self._rows.step),
+            seen=self._seen,
             correlation=rho,
             offset=patches.offset,
             spread=patches.spread,

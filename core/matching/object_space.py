@@ -14,6 +14,8 @@ With the direction s_k = A_k⁻¹ ∂x_k/∂w in the template (A_k = ∂x_k/∂(
 
     N = Σ_k P_k J_kᵀ M J_k + P_prior ,   N dθ = Σ_k P_k J_kᵀ M (f − r0 − r1 g_k) + P_prior (θ_prior − θ)    (4)
 
+A view that does not see a point has P_k = 0 there.
+
 Covariance: the template's noise is common to all search images (σ_f² = σ²/2), and the noise of the gradients makes N too large
 (SCIENCE §4), so with N' free of the gradients' noise
 
@@ -56,7 +58,8 @@ class SurfacePatch:
     covariance: np.ndarray  # (N, P, P)
     across_px: np.ndarray  # (N, S) δ of the S search views, rows' pixels
     across_sigma_px: np.ndarray  # (N, S)
-    correlation: np.ndarray  # (N, S)
+    seen: np.ndarray  # (N, S) which views took part
+    correlation: np.ndarray  # (N, S), 1 in views that did not
     sigma_px: np.ndarray  # (N,) of the inverse depth at the texture's centre, as the largest shift in a search view
     offset: np.ndarray  # (N, 2) the texture's centre of gravity, from the patch's middle
     spread: np.ndarray  # (N, 2) variance of the texture's energy about it
@@ -118,16 +121,18 @@ def match_surface(
     sigma_across_px: float,
     prior: SurfacePrior | None = None,
     weight: np.ndarray | None = None,
+    seen: np.ndarray | None = None,
     monitor: Monitor | None = None,
 ) -> SurfacePatch:
     """Fit the surface (1) at the reference view's points `xy` (N, 2) (rows' pixels) to all images at once.
 
     `start` (N, 3) or (N, 6) holds approximate θ; its width chooses planes or quadrics. `sigma_across_px` is σ_c, in rows' pixels: 0.001
-    holds the patches on their epipolar lines. `weight` (N, n) is that of the patch's pixels. A search image that does not hold a point
-    makes it OUT_OF_IMAGE.
+    holds the patches on their epipolar lines. `weight` (N, n) is that of the patch's pixels. `seen` (N, S) says which search views take
+    part in each point, by default all; one that does but does not hold the point makes it OUT_OF_IMAGE.
     Cost: about 30 µs per point of 13×13 and search image.
     """
     n = len(xy)
+    taking_part = np.ones((n, len(cameras) - 1), dtype=bool) if seen is None else seen
 
     def work(span: slice) -> SurfacePatch:
         if monitor is not None and monitor.cancelled:
@@ -143,7 +148,7 @@ def match_surface(
         )
         lines = [Epipolar(cameras[reference], c, rows, xy[span]) for k, c in enumerate(cameras) if k != reference]
         views = [image for k, image in enumerate(images) if k != reference]
-        return _Adjustment(patches, views, lines, part, settings, sigma_across_px).solve(start[span])
+        return _Adjustment(patches, views, lines, part, settings, sigma_across_px, taking_part[span]).solve(start[span])
 
     spans = [slice(i, min(i + CHUNK, n)) for i in range(0, max(n, 1), CHUNK)]
     if len(spans) == 1:
@@ -162,12 +167,12 @@ class _Linear:
     weight: np.ndarray  # (m, S) P_k
     correlation: np.ndarray  # (m, S)
     speed: np.ndarray  # (m,) largest |∂x_k/∂w|
-    seen: np.ndarray  # (m,) by all search views
+    held: np.ndarray  # (m,) by all search views that take part
 
     @classmethod
     def empty(cls, m: int, S: int) -> "_Linear":
         z = np.zeros
-        return cls(along=z((m, S, 2)), side=z((m, S, 2)), weight=z((m, S)), correlation=z((m, S)), speed=z(m), seen=np.ones(m, dtype=bool))
+        return cls(along=z((m, S, 2)), side=z((m, S, 2)), weight=z((m, S)), correlation=z((m, S)), speed=z(m), held=np.ones(m, dtype=bool))
 
     def put(self, rows: np.ndarray, other: "_Linear") -> None:
         for name in self.__slots__:
@@ -185,8 +190,9 @@ class _Adjustment:
         prior: SurfacePrior | None,
         settings: MatchingSettings,
         sigma_across_px: float,
+        seen: np.ndarray,
     ) -> None:
-        self._patches, self._images, self._lines, self._prior = patches, images, lines, prior
+        self._patches, self._images, self._lines, self._prior, self._seen = patches, images, lines, prior, seen
         self._settings, self._across_weight = settings, 1 / sigma_across_px**2
         self._S, self._P = len(images), patches.monomials.shape[1]
 
@@ -215,8 +221,8 @@ class _Adjustment:
             done = length < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * linear.speed / np.sqrt(np.maximum(N[:, 0, 0], 1e-30)))
             status[active[done]] = MatchStatus.OK
             status[active[away]] = MatchStatus.SHIFT_TOO_LARGE
-            status[active[~linear.seen]] = MatchStatus.OUT_OF_IMAGE
-            active = active[~(done | away | ~linear.seen)]
+            status[active[~linear.held]] = MatchStatus.OUT_OF_IMAGE
+            active = active[~(done | away | ~linear.held)]
         return self._judge(start, theta, across, state, iterations, status)
 
     def _linearise(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray) -> tuple["_Linear", np.ndarray]:
@@ -224,19 +230,23 @@ class _Adjustment:
         P, patches = self._P, self._patches
         state, rhs = _Linear.empty(len(rows), self._S), np.zeros((len(rows), P + self._S))
         for k, (image, line) in enumerate(zip(self._images, self._lines)):
+            seen = self._seen[rows, k]
             c, e, A, L = line.centre(theta, rows)
+            if not seen.all():  # a point may lie behind a camera that does not see it
+                c, e, A, L = (np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 1.0) for a in (c, e, A, L))
             normal = normal_to(e)
             c = c + across[:, k, None] * normal
             visible = image.inside(c, np.array(patches.half) * 0.5)
             x, y = line.warp(theta, patches.monomials, rows, np.where(visible[:, None], c, 0.0), L)
+            x, y = np.where(seen[:, None], x, np.float32(0)), np.where(seen[:, None], y, np.float32(0))
             rho, (gx, gy) = patches.compare(image.sample(x, y), rows)
             s, t = _apply_inverse(A, e), _apply_inverse(A, normal)
-            weight = 1 / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
+            weight = seen / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
             rhs[:, :P] -= weight[:, None] * (s[:, :1] * gx + s[:, 1:] * gy)
             rhs[:, P + k] -= weight * (t[:, 0] * gx[:, 0] + t[:, 1] * gy[:, 0])
-            state.along[:, k], state.side[:, k], state.weight[:, k], state.correlation[:, k] = s, t, weight, rho
-            np.maximum(state.speed, np.linalg.norm(e, axis=1), out=state.speed)
-            state.seen &= visible
+            state.along[:, k], state.side[:, k], state.weight[:, k], state.correlation[:, k] = s, t, weight, np.where(seen, rho, 1.0)
+            np.maximum(state.speed, seen * np.linalg.norm(e, axis=1), out=state.speed)
+            state.held &= visible | ~seen
         return state, rhs
 
     def _normal(self, a: "_Linear", rows: np.ndarray | slice) -> np.ndarray:
@@ -263,7 +273,7 @@ class _Adjustment:
         total = np.einsum("nk,nki->ni", a.weight, a.along)
         common[:, :P, :P] = patches.normal(total, total)
         for k in range(self._S):
-            s, t = a.along[:, k], a.side[:, k]
+            s, t = a.along[:, k] * self._seen[:, [k]], a.side[:, k] * self._seen[:, [k]]
             noise[:, :P, :P] += np.einsum("ni,ni->n", s, s)[:, None, None] * patches.noise_moment
             self._cross(noise, k, np.einsum("ni,ni->n", s, t)[:, None] * patches.noise_moment[:, 0])
             noise[:, P + k, P + k] = np.einsum("ni,ni->n", t, t) * patches.noise_moment[:, 0, 0]
@@ -317,6 +327,7 @@ class _Adjustment:
             covariance=K[:, :P, :P],
             across_px=across,
             across_sigma_px=side,
+            seen=self._seen,
             correlation=correlation,
             sigma_px=sigma,
             offset=patches.offset,

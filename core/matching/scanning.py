@@ -28,7 +28,7 @@ from .grid import TemplateGrid
 from .growing import MAX_LIMIT_PX, SEED_MEDIANS, TEMPLATE_SIGMA_PX, GrowingSettings, TripletField
 from .least_squares import Matches, MatchingSettings, match_patches
 from .neighbourhood import neighbours_of, unlike_neighbours
-from .seeds import Approximations
+from .seeds import Approximations, fewest_views
 
 HORIZONTAL, VERTICAL = np.array([(-1, 0), (1, 0)]), np.array([(0, -1), (0, 1)])
 AROUND = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
@@ -248,15 +248,18 @@ class _Scan:
 def _merged(
     scans: Sequence[_Scan], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, growing: GrowingSettings, foreground: Foreground
 ) -> TripletField:
-    """Triplets: the cells found in every search image, intersected."""
-    cell = np.flatnonzero(np.all([s.found for s in scans], axis=0))
+    """Triplets: the cells found in as many search images as are needed, intersected."""
+    count = np.sum([s.found for s in scans], axis=0)
+    cell = np.flatnonzero(count >= fewest_views(len(cameras), growing.pairs))
     n, views = len(cell), [k for k in range(len(cameras)) if k != reference]
     xy, shape, K = np.zeros((n, len(cameras), 2)), np.zeros((n, len(cameras), 2, 2)), np.zeros((n, len(cameras), 2, 2))
-    offset = np.mean([s.offset[cell] for s in scans], axis=0)
+    seen = np.stack([s.found[cell] for s in scans])
+    offset = np.sum([s.offset[cell] * f[:, None] for s, f in zip(scans, seen)], axis=0) / count[cell, None]
     xy[:, reference], shape[:, reference], K[:, reference] = grid.xy(cell) + offset, np.eye(2), np.eye(2) * TEMPLATE_SIGMA_PX**2
-    for k, s in zip(views, scans):
+    for k, s, found in zip(views, scans, seen):
         # a bigger patch has another centre of gravity: the images of the same template point are intersected
         xy[:, k] = s.xy[cell] + np.einsum("nij,nj->ni", s.shape[cell], offset - s.offset[cell])
+        xy[~found, k] = np.nan
         shape[:, k], K[:, k] = s.shape[cell], s.covariance[cell]
     point = forward_intersection(cameras, grid.rows.to_frame(xy), grid.rows.covariance_to_frame(K))
     typical = float(np.nanmedian(point.rms_residual_px)) if n else 0.0
@@ -267,12 +270,12 @@ def _merged(
         xy=xy,
         shape=shape,
         covariance=K,
-        correlation=np.min([s.correlation[cell] for s in scans], axis=0),
+        correlation=np.min([np.where(f, s.correlation[cell], 1.0) for s, f in zip(scans, seen)], axis=0),
         xyz_m=point.xyz_m,
         covariance_m2=point.covariance_m2,
         residual_px=point.rms_residual_px,
         sigma0=point.sigma0,
-        spread=scans[0].spread[cell],
+        spread=np.stack([s.spread[cell] for s in scans])[seen.argmax(axis=0), np.arange(n)],
         smoothed=np.zeros(n, dtype=bool),
         tried=int(np.any([s.tried for s in scans], axis=0).sum()),
         limit_px=limit_px,

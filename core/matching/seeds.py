@@ -3,7 +3,10 @@
 On a coarse grid of textured points of the reference image, each ray is sampled in inverse depth, so finely that the search images move by
 about a pixel; the patch, warped as a plane facing the reference camera would be, is compared in all other views:
 
-    score(w) = Σ_k ρ_k(w) / K ,   w = 1 / depth ,   best w taken if it is high, alone, and found in every view          (1)
+    score(w) = Σ_k ρ_k(w) / K ,   w = 1 / depth ,   best w taken if it is high, alone, and found in all K views         (1)
+
+With more views than two beside the reference, a point that not all of them see is scored over one view less, the best ones at every depth,
+and so on down to two (with `pairs`, to one).
 
 Least squares matching then refines the winners. Of a clicked surface seed only the depths near the click are swept.
 """
@@ -73,10 +76,12 @@ def sweep_seeds(
     spacing_px: int,
     depth_range_m: tuple[float, float] | None,
     monitor: Monitor,
+    pairs: bool = False,
 ) -> Approximations:
     """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
 
-    `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig.
+    `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig. With
+    `pairs`, one view beside the reference is enough.
     """
     rows = grid.rows
     xy = _textured(images[reference], settings, rows, grid.every(max(1, round(spacing_px / grid.spacing_px))))
@@ -88,8 +93,8 @@ def sweep_seeds(
     for i in range(0, len(xy), block):
         monitor.step("seeds", i, len(xy))
         part = slice(i, i + block)
-        score = _sweep_scores(smooth, cameras, reference, rows, settings, xy[part], inverse)
-        depth[part], good[part] = _peaks(score, inverse)
+        rho = _sweep_correlations(smooth, cameras, reference, rows, settings, xy[part], inverse)
+        depth[part], good[part] = _best_depths(rho, inverse, fewest_views(len(cameras), pairs))
     return approximations_at_depth(cameras, reference, rows, xy[good], depth[good])
 
 
@@ -106,7 +111,7 @@ def sweep_ray(
     if not len(at):
         return None
     inverse = _inverse_depths(cameras, 0, *(depth_range_m or _default_range(cameras)))
-    depth, good = _peaks(_sweep_scores(images, cameras, 0, rows, settings, at, inverse), inverse)
+    depth, good = _best_depths(_sweep_correlations(images, cameras, 0, rows, settings, at, inverse), inverse, len(cameras) - 1)
     return float(depth[0]) if good[0] else None
 
 
@@ -121,7 +126,7 @@ def settled_depths(
     settings: MatchingSettings,
 ) -> np.ndarray:
     """Depths (M,) near `depth_m` ± `sigma_m` at which the patches about `xy` (M, 2) (rows' pixels of the reference) look most alike in
-    all views; the given depth where that is not clear."""
+    as many views as see them; the given depth where that is not clear."""
     smooth = [image.smoothed(SWEEP_SMOOTHING_PX, rows.step) for image in images]
     settled = np.array(depth_m, dtype=np.float64)
     for i, (depth, sigma) in enumerate(zip(depth_m, sigma_m)):
@@ -129,7 +134,8 @@ def settled_depths(
         if len(at):
             reach = min(CLICK_SIGMAS * sigma, CLICK_SHARE * depth)
             inverse = _inverse_depths(cameras, reference, depth - reach, depth + reach)
-            best, clear = _peaks(_sweep_scores(smooth, cameras, reference, rows, settings, at, inverse), inverse)
+            rho = _sweep_correlations(smooth, cameras, reference, rows, settings, at, inverse)
+            best, clear = _best_depths(rho, inverse, 1)
             settled[i] = best[0] if clear[0] else depth
     return settled
 
@@ -155,7 +161,12 @@ def _inverse_depths(cameras: Sequence[Camera], reference: int, near: float, far:
     return np.linspace(1 / far, 1 / near, count)
 
 
-def _sweep_scores(
+def fewest_views(cameras: int, pairs: bool) -> int:
+    """How many views beside the reference must see a point: two, or all there are; with `pairs` one."""
+    return 1 if pairs else min(2, cameras - 1)
+
+
+def _sweep_correlations(
     images: Sequence[SplineImage],
     cameras: Sequence[Camera],
     reference: int,
@@ -164,26 +175,34 @@ def _sweep_scores(
     xy: np.ndarray,
     inverse: np.ndarray,
 ) -> np.ndarray:
-    """Smallest correlation over the search views (m, D), −1 where a view does not see the point.  (1)"""
+    """Correlations (S, m, D) of the patches in the S search views, NaN where a view does not hold them."""
     m, D = len(xy), len(inverse)
     u, v, half = patch_offsets(settings.patch_px, rows.step)
     keep = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > 9 else np.ones(len(u), dtype=bool)
     u, v = u[keep], v[keep]
     f = _normalised(images[reference].sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
     corners = _corners(cameras[reference], rows, xy, 1 / inverse[None])
-    total, views = np.zeros((m, D)), 0
-    seen_by_all = np.ones((m, D), dtype=bool)
+    found = []
     for k in range(len(cameras)):
         if k == reference:
             continue
         c, A = (a.reshape(m * D, *a.shape[2:]) for a in _image_of(cameras[k], rows, corners))
         inside = images[k].inside(c, np.array(half))
-        rho = np.full(m * D, -1.0)
+        rho = np.full(m * D, np.nan)
         rho[inside] = _correlations(images[k], c[inside], A[inside], f, np.repeat(np.arange(m), D)[inside], u, v)
-        total += rho.reshape(m, D)
-        seen_by_all &= inside.reshape(m, D)
-        views += 1
-    return np.where(seen_by_all, total / views, -1.0)
+        found.append(rho.reshape(m, D))
+    return np.stack(found)
+
+
+def _best_depths(rho: np.ndarray, inverse: np.ndarray, fewest: int) -> tuple[np.ndarray, np.ndarray]:
+    """The depths (m,) at which most of the views (S, m, D) agree, but not fewer than `fewest`, and whether they are clear."""
+    ordered = -np.sort(-np.where(np.isnan(rho), -np.inf, rho), axis=0)  # the best view first
+    depth, good = np.zeros(rho.shape[1]), np.zeros(rho.shape[1], dtype=bool)
+    for views in range(len(rho), min(fewest, len(rho)) - 1, -1):
+        score = np.where(np.isfinite(ordered[views - 1]), ordered[:views].sum(axis=0) / views, -1.0)  # (1)
+        found, clear = _peaks(score, inverse)
+        depth, good = np.where(good, depth, found), good | clear
+    return depth, good
 
 
 def _correlations(

@@ -1,7 +1,8 @@
 """PLY files, binary little-endian: clouds and meshes, written whole or not at all, and read with distrust.
 
-A cloud has the vertex properties x y z [m], sigma [m], nx ny nz and intensity, all float32; a mesh has x y z and faces, each a
-list (uchar count, int indices). World coordinates. Format: G. Turk, The PLY Polygon File Format, 1994.
+A cloud has the vertex properties x y z [m], sigma [m], nx ny nz and intensity, all float32, and rays, a uchar, where it is known in how
+many views each point was measured; a mesh has x y z and faces, each a list (uchar count, int indices). World coordinates.
+Format: G. Turk, The PLY Polygon File Format, 1994.
 """
 
 from collections.abc import Mapping
@@ -42,15 +43,23 @@ class Ply:
         return every[every.min(axis=1) >= 0]
 
 
-def write_cloud(path: Path, *, xyz_m: np.ndarray, sigma_m: np.ndarray, normals: np.ndarray, intensity: np.ndarray) -> None:
-    """Write a cloud of N points: positions (N, 3), their mean sigma (N,), unit normals (N, 3), grey values (N,).
+def write_cloud(
+    path: Path, *, xyz_m: np.ndarray, sigma_m: np.ndarray, normals: np.ndarray, intensity: np.ndarray, rays: np.ndarray | None = None
+) -> None:
+    """Write a cloud of N points: positions (N, 3), their mean sigma (N,), unit normals (N, 3), grey values (N,), numbers of rays (N,).
 
     Raises:
         InputError: the file cannot be written.
     """
-    columns = np.column_stack([xyz_m, sigma_m, normals, intensity]).astype("<f4")
     names = ("x", "y", "z", "sigma", "nx", "ny", "nz", "intensity")
-    store.write_bytes(Path(path), _header(len(columns), names) + columns.tobytes())
+    columns = dict(zip(names, np.column_stack([xyz_m, sigma_m, normals, intensity]).astype("<f4").T))
+    if rays is not None:
+        columns["rays"] = np.asarray(rays, dtype=np.uint8)
+    rows = np.zeros(len(columns["x"]), dtype=[(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    kinds = {name: "uchar" if name == "rays" else "float" for name in columns}
+    store.write_bytes(Path(path), _header(len(rows), kinds) + rows.tobytes())
 
 
 def write_mesh(path: Path, vertices_m: np.ndarray, faces: np.ndarray) -> None:
@@ -62,12 +71,12 @@ def write_mesh(path: Path, vertices_m: np.ndarray, faces: np.ndarray) -> None:
     vertices, faces = np.asarray(vertices_m).astype("<f4").reshape(-1, 3), np.asarray(faces)
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("index", "<i4", (faces.shape[1],))])
     rows["count"], rows["index"] = faces.shape[1], faces
-    store.write_bytes(Path(path), _header(len(vertices), ("x", "y", "z"), len(faces)) + vertices.tobytes() + rows.tobytes())
+    store.write_bytes(Path(path), _header(len(vertices), dict.fromkeys("xyz", "float"), len(faces)) + vertices.tobytes() + rows.tobytes())
 
 
-def _header(vertices: int, names: tuple[str, ...], faces: int | None = None) -> bytes:
+def _header(vertices: int, kinds: Mapping[str, str], faces: int | None = None) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", "comment Tricap, metres", f"element vertex {vertices}"]
-    lines += [f"property float {name}" for name in names]
+    lines += [f"property {kind} {name}" for name, kind in kinds.items()]
     if faces is not None:
         lines += [f"element face {faces}", "property list uchar int vertex_indices"]
     return ("\n".join(lines) + "\n").encode() + END

@@ -52,6 +52,11 @@ class PointCloud:
         """(N,) root of the trace of the covariance: the mean error of position."""
         return np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
 
+    @property
+    def rays(self) -> np.ndarray:
+        """(N,) uint8, how many views each point was measured in."""
+        return np.isfinite(self.xy_px).all(axis=2).sum(axis=1).astype(np.uint8)
+
     def select(self, rows: np.ndarray) -> "PointCloud":
         """The cloud with only these rows (a mask or indices)."""
         return PointCloud(frame=self.frame, **{f.name: getattr(self, f.name)[rows] for f in fields(PointCloud) if f.name != "frame"})

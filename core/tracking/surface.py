@@ -76,7 +76,8 @@ def _well_inside(field: TripletField, cloud: PointCloud, rows: np.ndarray, view:
     back = camera.centre_m - xyz
     facing = np.einsum("ni,ni->n", cloud.normals[rows], back) / np.linalg.norm(back, axis=1)
     coverage = _coverage(field, field.xy[rows, view.reference], camera.to_camera(xyz)[:, 2], view)
-    return (coverage >= view.tracking.min_coverage) & (facing >= STEEPEST_COSINE)
+    rays = np.isfinite(field.xy[rows]).all(axis=2).sum(axis=1)
+    return (coverage >= view.tracking.min_coverage) & (facing >= STEEPEST_COSINE) & (rays >= min(3, len(view.cameras)))
 
 
 def _coverage(field: TripletField, xy: np.ndarray, depth: np.ndarray, view: TrackingView) -> np.ndarray:

@@ -70,8 +70,8 @@ def measure(scene: str, texture: str, seed: int) -> list[dict]:
     field, grow_s = grown(rig, images, matching)
     for constraint, neighbours in VARIANTS:
         began = time.process_time()
-        settings = replace(matching, constraint=constraint)
-        found = constrain(field, images, rig, 1, settings, foreground=EVERYWHERE, monitor=Monitor(), neighbours=neighbours)
+        settings = replace(matching, constraint=constraint, neighbours=neighbours)
+        found = constrain(field, images, rig, 1, settings, foreground=EVERYWHERE, monitor=Monitor())
         spent = time.process_time() - began
         if neighbours:
             found = clean_field(found, rig[1], 1, SurfaceSettings())
