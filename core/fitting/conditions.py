@@ -20,6 +20,7 @@ from .robust import robust_weights
 from .segmentation import HeldSegments, segment
 from .settings import FitSettings
 from .silhouettes import Silhouettes
+from .soft_segmentation import soft_segment
 from .state import BodyState, ShapeParameters
 
 SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
@@ -60,12 +61,12 @@ class Conditions:
         Points within one patch share the model's error: the weight of their common part is divided among them (`crowding`).
         """
         s = self.settings
-        find = partial(segment, points, state, self.model.surface, s.gate_m * wide)
-        rows, bone = find() if held is None else held.get(points.frame, state, find)
+        find = partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * wide)
+        rows, bone, part = find() if held is None else held.get(points.frame, state, find)
         own, model = points.sigma_m[rows] ** 2 + 1e-12, s.model_sigma_m**2
         share = max(1.0, (s.model_patch_m / s.voxel_m) ** 2)
         found = SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=np.sqrt(own + model),
-                              crowding=(own + share * model) / (own + model), form=s.residual)
+                              crowding=(own + share * model) / (own + model) / part, form=s.residual)
         return found.scaled(state)
 
     def seen_surface(self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0,
@@ -107,3 +108,10 @@ class Conditions:
         state = self.parameters.state(motion, vector)
         found: list[SurfacePoints | SilhouetteRays] = [self.surface(points, state), *self.silhouettes.observe(t, state)]
         return sum(float(robust_weights(o.residual(state) * o.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", 3.0).sum()) for o in found)
+
+
+def _hard(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float,
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `soft_segment`: every point is wholly one limb's."""
+    rows, bone = segment(points, state, surface, gate_m)
+    return rows, bone, np.ones(len(rows))

@@ -27,7 +27,7 @@ def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: 
     n, gate = len(points.xyz_m), np.broadcast_to(gate_m, (len(state.lengths_m),))
     nearest, owner = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
     own = np.zeros(n, dtype=bool)
-    for b, rows in _candidates(points.xyz_m, state, gate):
+    for b, rows in candidates(points.xyz_m, state, gate):
         gap, along, facing = from_bone(points.xyz_m[rows], points.normals[rows], state, b)
         closer = gap < nearest[rows]
         rows = rows[closer]
@@ -55,12 +55,12 @@ class HeldSegments:
 def crop(points: CloudPoints, state: BodyState, reach_m: float) -> CloudPoints:
     """The points within `reach_m` of the bones: what a fit near this posture can ever need."""
     near = np.zeros(len(points.xyz_m), dtype=bool)
-    for b, rows in _candidates(points.xyz_m, state, np.full(len(state.lengths_m), reach_m)):
+    for b, rows in candidates(points.xyz_m, state, np.full(len(state.lengths_m), reach_m)):
         near[rows] |= from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] < reach_m
     return points.take(np.flatnonzero(near))
 
 
-def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> list[tuple[int, np.ndarray]]:
+def candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> list[tuple[int, np.ndarray]]:
     """For each bone with balls the points (K,) in a sphere that holds all within its `reach_m` (B,) of its surface."""
     bones = np.unique(state.balls.bone_index)
     widest = np.array([state.profiles[b].radii_m.max() for b in bones.tolist()])
@@ -75,6 +75,12 @@ def _candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> lis
 
 def from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance from the limb's surface (N,) [m], fraction along the bone (N,), and whether the normal points outwards (N,)."""
+    gap, along, cosine = beside_bone(xyz_m, normals, state, bone)
+    return gap, along, cosine >= FACING
+
+
+def beside_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `from_bone`, with the cosine (N,) between the normal and the limb's; 1 where the normal is unknown."""
     local = (xyz_m - state.head_m[bone]) @ state.R[bone]
     length = state.lengths_m[bone]
     along, across = local[:, 1] / length, local[:, CROSS]
@@ -87,4 +93,5 @@ def from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: in
     outward /= axes
     normal = (normals @ state.R[bone])[:, CROSS]
     size = np.linalg.norm(normal, axis=1) * np.linalg.norm(outward, axis=1)
-    return distance - radius, along, np.einsum("ni,ni->n", normal, outward) >= FACING * size
+    cosine = np.where(size > 0, np.einsum("ni,ni->n", normal, outward) / np.maximum(size, 1e-300), 1.0)
+    return distance - radius, along, cosine

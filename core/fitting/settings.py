@@ -14,6 +14,7 @@ class FitSettings:
                          choices=("metric", "paper"))
     balls: str = knob("three", "Metaballs of a bone: three; one, to compare; complete: three, then refined in an anatomical arrangement.",
                       choices=("three", "one", "complete"))
+    segmentation: str = knob("hard", "A point belongs to its nearest limb, or in parts to several.", choices=("hard", "soft"))
     weights: bool = knob(False, "The balls' weights are parameters of the fit too: edges can be sharper or rounder.")
     robust: str = knob("geman-mcclure", "How gross points lose their weight.", choices=("geman-mcclure", "huber"))
     robust_width: float = knob(3.0, "Residual, in robust standard deviations, at which a point loses half its pull.", low=1.0, high=20.0)
