@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .camera import Camera
+from .small_matrices import invert_spd
 
 STEPS = 4
 CONVERGED_M = 1e-7
@@ -42,7 +43,7 @@ def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covarianc
     seen = np.isfinite(xy_px).all(axis=2)
     rays = seen.sum(axis=1)
     P = np.zeros((n, len(cameras), 2, 2))
-    P[seen] = np.linalg.inv(covariance_px2[seen])
+    P[seen] = invert_spd(covariance_px2[seen])
     X = np.full((n, 3), np.nan)
     good = rays >= 2
     X[good] = _meeting_points(cameras, xy_px[good], seen[good])
@@ -55,7 +56,7 @@ def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covarianc
     N, _, v = _normal_equations(cameras, X, xy_px, P, seen)
     K = np.full((n, 3, 3), np.nan)
     usable = np.isfinite(N).all(axis=(1, 2)) & good
-    K[usable] = np.linalg.inv(N[usable] + np.eye(3) * 1e-9)
+    K[usable] = invert_spd(N[usable] + np.eye(3) * 1e-9)
     X[~usable] = np.nan
     vPv = np.einsum("nki,nkij,nkj->n", np.nan_to_num(v), P, np.nan_to_num(v))
     return Intersection(
@@ -93,8 +94,8 @@ def _normal_equations(
 
 
 def _solve(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """x of N x = rhs for many 3×3 systems; NaN where it cannot be solved."""
-    x = np.full(rhs.shape, np.nan)
-    fine = np.isfinite(N).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.where(np.isfinite(N), N, 0.0))) > 0)
-    x[fine] = np.linalg.solve(N[fine], rhs[fine][..., None])[..., 0]
+    """x of N x = rhs for many positive definite 3×3 systems; NaN where it cannot be solved."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        x = np.einsum("nij,nj->ni", invert_spd(N), rhs)
+    x[~np.isfinite(x).all(axis=1)] = np.nan
     return x

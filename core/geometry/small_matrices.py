@@ -1,4 +1,4 @@
-"""Inverses of many small symmetric positive definite matrices at once, as arrays over the matrices.
+"""Inverses and products of many small matrices at once, as arrays over the matrices.
 
 LAPACK called matrix by matrix costs several microseconds each, most of it for the call; here the loop runs over the pivots.
 """
@@ -20,3 +20,18 @@ def invert_spd(matrices: np.ndarray) -> np.ndarray:
             M[pivot], M[:, pivot] = row, -column * inverse
             M[pivot, pivot] = inverse
     return np.moveaxis(M, -1, 0)
+
+
+def sandwich(A: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """A K Aᵀ (N, 2, 2) of symmetric K (N, 2, 2); numpy's product takes longer for matrices so small."""
+    left = [[A[:, i, 0] * K[:, 0, j] + A[:, i, 1] * K[:, 1, j] for j in range(2)] for i in range(2)]
+    out = np.empty_like(A)
+    out[:, 0, 0], out[:, 1, 1] = (left[i][0] * A[:, i, 0] + left[i][1] * A[:, i, 1] for i in range(2))
+    out[:, 0, 1] = out[:, 1, 0] = left[0][0] * A[:, 1, 0] + left[0][1] * A[:, 1, 1]
+    return out
+
+
+def largest(v: np.ndarray) -> np.ndarray:
+    """Largest absolute value (N,) in the few columns of v (N, k)."""
+    columns = np.abs(np.ascontiguousarray(v.T))
+    return np.asarray(columns.max(axis=0))

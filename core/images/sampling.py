@@ -48,8 +48,10 @@ class SplineImage:
 
         `centre` (N, 2) and `shape` (N, 2, 2) in pixels; N and n stay below 32,767.
         """
-        warp = (FINENESS * np.concatenate([centre[:, :, None], shape], axis=2)).astype(np.float32)
-        return cv2.remap(self._fine, warp[:, 0] @ basis, warp[:, 1] @ basis, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        warp = np.empty((2, len(centre), 3), np.float32)
+        warp[:, :, 0], warp[:, :, 1:] = FINENESS * centre.T, FINENESS * shape.transpose(1, 0, 2)
+        x, y = (warp.reshape(-1, 3) @ basis).reshape(2, len(centre), -1)
+        return cv2.remap(self._fine, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
 
     def smoothed(self, sigma_px: float, row_step: int) -> "SplineImage":
         """The image after a Gaussian of `sigma_px` full-frame pixels (a field's rows are `row_step` of them); kept for the next call."""
@@ -63,9 +65,10 @@ class SplineImage:
     def inside(self, xy: np.ndarray, margin: np.ndarray | float) -> np.ndarray:
         """Whether points (…, 2) lie inside the image by at least `margin` pixels; NaN does not."""
         h, w = self.shape
-        m = np.broadcast_to(np.asarray(margin, dtype=np.float64), (2,))
+        mx, my = margin if isinstance(margin, np.ndarray) else (margin, margin)
+        x, y = xy[..., 0], xy[..., 1]
         with np.errstate(invalid="ignore"):
-            return (xy[..., 0] >= m[0]) & (xy[..., 1] >= m[1]) & (xy[..., 0] <= w - 1 - m[0]) & (xy[..., 1] <= h - 1 - m[1])
+            return np.asarray((x >= mx) & (y >= my) & (x <= w - 1 - mx) & (y <= h - 1 - my))
 
 
 def correlated_noise(fx: np.ndarray, fy: np.ndarray, smoothing: tuple[float, float]) -> np.ndarray:

@@ -24,21 +24,23 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 
-from ..geometry.small_matrices import invert_spd
+from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from ..progress import Monitor
 from ..settings import knob
 
-CHUNK = 512
+CHUNK, LARGEST = 512, 1024  # patches that threads do not share; the most that a piece has when they do
 THREADS = 2
 MAX_STEP_PX = 2.0
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
 MIN_CONDITION = 1e-6
 PARAMETERS = 8
 PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "offset", "spread", "textured")  # arrays of a template side
+UPPER, SYMMETRIC = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a 3×3 matrix: its upper part, and back
 NOISE_ENERGY = 4.0  # of a gradient [grey values² / px²]: less is noise, not texture
 
 
@@ -107,11 +109,12 @@ class Matches:
         return self.status == MatchStatus.OK
 
 
+@lru_cache(maxsize=64)
 def patch_offsets(patch_px: int, row_step: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Patch coordinates u, v (n,) float32 about the centre, and the half size; `row_step` 2 halves the rows (a field)."""
     half_w, half_h = patch_px // 2, max(2, round((patch_px / row_step - 1) / 2))
-    v, u = np.mgrid[-half_h : half_h + 1, -half_w : half_w + 1].astype(np.float32)
-    return u.ravel(), v.ravel(), (half_w, half_h)
+    _, u, v = _basis(half_w, half_h)
+    return u, v, (half_w, half_h)
 
 
 def match_patches(
@@ -124,21 +127,23 @@ def match_patches(
     *,
     row_step: int = 1,
     template_shape: np.ndarray | None = None,
+    of_texture: bool = True,
     monitor: Monitor | None = None,
 ) -> list[Matches]:
     """Find the patches about `xy` (N, 2) of the template image in each search image.
 
     `starts` are the approximate positions (N, 2) and `shapes` the approximate affine shapes (N, 2, 2), one of each per search image.
     `template_shape` (N, 2, 2) warps the patch in the template itself (a patch that was itself matched). NaN starts are OUT_OF_IMAGE.
-    Cost: about 10 µs per patch of 13×13 and search image.
+    Without `of_texture` the patch's middle stands for the texture's centre of gravity (5). Cost: 8 µs per patch of 13×13 and image.
     """
     n = len(xy)
-    spans = [slice(i, min(i + CHUNK, n)) for i in range(0, n, CHUNK)]
+    spans = _spans(n)
 
     def work(span: slice) -> list[Matches]:
         if monitor is not None and monitor.cancelled:
             monitor.step("matching", span.start, n)
-        patches = PatchTemplates(template, xy[span], settings, row_step, None if template_shape is None else template_shape[span])
+        drawn = None if template_shape is None else template_shape[span]
+        patches = PatchTemplates(template, xy[span], settings, row_step, drawn, of_texture=of_texture)
         return [patches.find(g, s[span], A[span]) for g, s, A in zip(searches, starts, shapes)]
 
     if len(spans) > 1:
@@ -150,22 +155,30 @@ def match_patches(
 
 
 def prepare_templates(image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int) -> "PatchTemplates":
-    """The template side of the patches about `xy` (N, 2), to be matched many times."""
-    spans = [slice(i, min(i + CHUNK, len(xy))) for i in range(0, max(1, len(xy)), CHUNK)]
-    return PatchTemplates.joined([PatchTemplates(image, xy[span], settings, row_step, None) for span in spans])
+    """The template side of the patches about `xy` (N, 2), to be matched many times by their middles."""
+    spans = _spans(len(xy)) or [slice(0, 0)]
+    return PatchTemplates.joined([PatchTemplates(image, xy[span], settings, row_step, None, of_texture=False) for span in spans])
 
 
 def match_prepared(templates: "PatchTemplates", rows: np.ndarray, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
     """Find the prepared templates `rows` (N,) in an image, from positions `start` (N, 2) and shapes (N, 2, 2)."""
-    spans = [slice(i, min(i + CHUNK, len(rows))) for i in range(0, max(1, len(rows)), CHUNK)]
+    spans = _spans(len(rows)) or [slice(0, 0)]
+    all_in_order = np.array_equal(rows, np.arange(len(templates.inside)))  # most often: slices then, no copies
 
     def work(span: slice) -> Matches:
-        return templates.select(rows[span]).find(image, start[span], shape[span])
+        return templates.select(span if all_in_order else rows[span]).find(image, start[span], shape[span])
 
     if len(spans) == 1:
         return work(spans[0])
     with ThreadPoolExecutor(THREADS) as pool:
         return join_matches(list(pool.map(work, spans)))
+
+
+def _spans(n: int) -> list[slice]:
+    """Equal pieces of n patches: small enough for the cache, large enough for arrays to pay, and two where two threads can share them."""
+    count = max(-(-n // LARGEST), THREADS if n > CHUNK else 1)
+    cuts = [n * i // count for i in range(count + 1)]
+    return [slice(a, b) for a, b in zip(cuts, cuts[1:])] if n else []
 
 
 def join_matches(parts: Sequence[Matches]) -> Matches:
@@ -177,30 +190,37 @@ def join_matches(parts: Sequence[Matches]) -> Matches:
 class PatchTemplates:
     """The template side of a chunk: patches, gradients, and the inverse of the reduced normal matrix."""
 
-    def __init__(self, image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int, shape: np.ndarray | None) -> None:
-        self._settings = settings
+    def __init__(
+        self, image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int, shape: np.ndarray | None, *, of_texture: bool
+    ) -> None:
+        self._settings, self._of_texture = settings, of_texture
         self._u, self._v, self._half = patch_offsets(settings.patch_px, row_step)
         self.n_pixels = len(self._u)
         self._pixels = _basis(*self._half)  # (3, n)
         self._monomials = np.ascontiguousarray(self._pixels.T)  # (n, 3)
+        self._mean = np.full(self.n_pixels, 1 / self.n_pixels, dtype=np.float32)
         self.inside = image.inside(xy, np.array(self._half) + 1.0)
         f, fx, fy = self._sample(image, np.where(self.inside[:, None], xy, 0.0), shape)
-        f = f - f.mean(axis=1, keepdims=True)
+        f -= (f @ self._mean)[:, None]
         self.contrast = np.sqrt(np.einsum("ij,ij->i", f, f))
-        self.f = f / np.maximum(self.contrast, 1e-6)[:, None]
+        f *= (1 / np.maximum(self.contrast, np.float32(1e-6)))[:, None]
+        self.f = f
         self.fx, self.fy = fx, fy
         self.q = self._project(self.f)  # Jᵀ f̂
         H = self._normal_matrix()
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
         eye = np.eye(6) * MIN_CONDITION
         self.inverse = invert_spd(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
-        self.offset, self.spread = self._centre_of_gravity()
+        self.offset: np.ndarray = np.zeros((len(xy), 2))
+        self.spread = self.offset
+        if of_texture:
+            self.offset, self.spread = self._centre_of_gravity()
         patch = (-1, 2 * self._half[1] + 1, 2 * self._half[0] + 1)
         self.noise_factor = correlated_noise(fx.reshape(patch), fy.reshape(patch), image.smoothing)
         self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
 
-    def select(self, rows: np.ndarray) -> "PatchTemplates":
-        """Only these rows (a mask or indices)."""
+    def select(self, rows: np.ndarray | slice) -> "PatchTemplates":
+        """Only these rows (a mask, indices or a slice)."""
         chosen = copy(self)
         for name in PER_PATCH:
             setattr(chosen, name, getattr(self, name)[rows])
@@ -219,10 +239,9 @@ class PatchTemplates:
         w, h = self._half
         A = np.broadcast_to(np.eye(2), (len(xy), 2, 2)) if shape is None else shape
         P = image.sample_patches(xy, A, _basis(w + 2, h + 2)).reshape(len(xy), 2 * h + 5, 2 * w + 5)
-        fx = _difference(P[:, 2:-2, 3:-1], P[:, 2:-2, 1:-3], P[:, 2:-2, 4:], P[:, 2:-2, :-4])
-        fy = _difference(P[:, 3:-1, 2:-2], P[:, 1:-3, 2:-2], P[:, 4:, 2:-2], P[:, :-4, 2:-2])
         flat = (len(xy), self.n_pixels)
-        return P[:, 2:-2, 2:-2].reshape(flat), fx.reshape(flat), fy.reshape(flat)
+        f, fx, fy = (a.reshape(P.shape)[:, 2:-2, 2:-2].reshape(flat) for a in (P, _difference(P, 1), _difference(P, 2 * w + 5)))
+        return f, fx, fy
 
     def _centre_of_gravity(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance (m, 2) of the patch coordinates, weighted by the energy of the gradients above their noise.  (5)"""
@@ -233,17 +252,17 @@ class PatchTemplates:
         moment = (energy @ uv / total).astype(np.float64)
         return moment[:, :2], moment[:, 2:] - moment[:, :2] ** 2
 
-    def _project(self, g: np.ndarray | np.float32, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+    def _project(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Jᵀ g (m, 6)."""
         return np.concatenate([(self.fx[rows] * g) @ self._monomials, (self.fy[rows] * g) @ self._monomials], axis=1)
 
     def _normal_matrix(self) -> np.ndarray:
         """H = Jᵀ M J (m, 6, 6), from products of the gradients with the monomials up to second order.  (2)"""
         m = self._monomials
-        second = (m[:, :, None] * m[:, None, :]).reshape(self.n_pixels, 9)
-        xx, xy, yy = ((a * b @ second).reshape(-1, 3, 3) for a, b in ((self.fx, self.fx), (self.fx, self.fy), (self.fy, self.fy)))
+        second = np.ascontiguousarray(m[:, UPPER[0]] * m[:, UPPER[1]])  # (n, 6)
+        xx, xy, yy = ((a * b @ second)[:, SYMMETRIC] for a, b in ((self.fx, self.fx), (self.fx, self.fy), (self.fy, self.fy)))
         H = np.concatenate([np.concatenate([xx, xy], 2), np.concatenate([xy, yy], 2)], 1).astype(np.float64)
-        mean, q = self._project(np.float32(1.0)).astype(np.float64), self.q.astype(np.float64)
+        mean, q = np.concatenate([self.fx @ m, self.fy @ m], axis=1).astype(np.float64), self.q.astype(np.float64)
         return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
     def find(self, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
@@ -261,7 +280,7 @@ class PatchTemplates:
             step, rho = self._step(image, c[active], A[active], slice(None) if len(active) == n else active)  # all: no copies
             correlation[active], iterations[active] = rho, iteration
             c[active], A[active], moved = _compose(c[active], A[active], step)
-            gone = (np.abs(c[active] - start[active]).max(axis=1) > 2 * s.max_shift_px) | ~np.isfinite(moved)
+            gone = (largest(c[active] - start[active]) > 2 * s.max_shift_px) | ~np.isfinite(moved)
             done = moved < np.maximum(s.converged_px, CONVERGED_SIGMAS * self._sigma(rho, active))
             status[active[done]] = MatchStatus.OK
             status[active[gone]] = MatchStatus.SHIFT_TOO_LARGE
@@ -270,7 +289,7 @@ class PatchTemplates:
 
     def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
         g = image.sample_patches(c, A, self._pixels)
-        g -= g.mean(axis=1, keepdims=True)
+        g -= (g @ self._mean)[:, None]
         power = np.maximum(np.einsum("ij,ij->i", g, g), 1e-6)
         along = np.einsum("ij,ij->i", g, self.f[rows])
         gain = self.contrast[rows] * along / power  # r1
@@ -297,16 +316,17 @@ class PatchTemplates:
         dof = max(1, self.n_pixels - PARAMETERS)
         lost = np.clip(1 - correlation**2, 0, 1)
         variance = self.noise_factor * self.contrast.astype(np.float64) ** 2 * lost / dof  # (4)
-        K = variance[:, None, None] * (A @ self.inverse[:, ::3, ::3] @ A.transpose(0, 2, 1))
-        E = np.concatenate([np.ones((len(c), 1)), self.offset], axis=1)
-        transferred = np.einsum("ni,naibj,nj->nab", E, self.inverse.reshape(-1, 2, 3, 2, 3), E)  # (5)
-        K_o = variance[:, None, None] * (A @ transferred @ A.transpose(0, 2, 1))
+        K = K_o = variance[:, None, None] * sandwich(A, self.inverse[:, ::3, ::3])
+        if self._of_texture:
+            E = np.concatenate([np.ones((len(c), 1)), self.offset], axis=1)
+            transferred = np.einsum("nabj,nj->nab", np.einsum("naibj,ni->nabj", self.inverse.reshape(-1, 2, 3, 2, 3), E), E)  # (5)
+            K_o = variance[:, None, None] * sandwich(A, transferred)
         sigma0 = 50 * np.sqrt(lost * self.n_pixels / dof)
-        sigma = np.sqrt(np.maximum(K[:, [0, 1], [0, 1]], 0)).max(axis=1)
+        sigma = np.sqrt(np.maximum(np.maximum(K[:, 0, 0], K[:, 1, 1]), 0))
         for bad, why in (
-            (np.abs(c - start).max(axis=1) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
+            (largest(c - start) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
             (~image.inside(c, np.array(self._half) * 0.5), MatchStatus.OUT_OF_IMAGE),
-            (np.abs(A - start_shape).max(axis=(1, 2)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
+            (largest((A - start_shape).reshape(-1, 4)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
             (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
             (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE),
             (sigma0 > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE),
@@ -326,48 +346,47 @@ class PatchTemplates:
         )
 
 
+@lru_cache(maxsize=64)
 def _basis(half_w: int, half_h: int) -> np.ndarray:
     """Rows 1, u, v (3, n) float32 of a patch's pixels."""
     v, u = np.mgrid[-half_h : half_h + 1, -half_w : half_w + 1].astype(np.float32)
-    return np.stack([np.ones(u.size, np.float32), u.ravel(), v.ravel()])
+    basis = np.stack([np.ones(u.size, np.float32), u.ravel(), v.ravel()])
+    basis.setflags(write=False)
+    return basis
 
 
-def _difference(after: np.ndarray, before: np.ndarray, after2: np.ndarray, before2: np.ndarray) -> np.ndarray:
-    """Central difference of fourth order from the values one and two pixels away."""
-    near, far = after - before, after2 - before2
-    near *= np.float32(2 / 3)
-    far *= np.float32(1 / 12)
-    near -= far
-    return near
+def _difference(values: np.ndarray, step: int) -> np.ndarray:
+    """Central differences of fourth order from the values `step` and 2 `step` away in the flattened array; zero at its ends."""
+    p = values.reshape(-1)
+    out = np.zeros(p.size, np.float32)
+    if p.size > 4 * step:
+        near, far = out[2 * step : -2 * step], p[4 * step :] - p[: -4 * step]
+        np.subtract(p[3 * step : -step], p[step : -3 * step], out=near)
+        near *= np.float32(2 / 3)
+        far *= np.float32(1 / 12)
+        near -= far
+    return out
 
 
 def _compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The warp after the inverse of a step, and how far the centre moved [px].  (3)"""
-    d = step[:, [0, 3]]
-    length = np.linalg.norm(d, axis=1)
-    shrink = np.minimum(1.0, MAX_STEP_PX / np.maximum(length, 1e-9))
-    d = d * shrink[:, None]
-    B = np.eye(2) + step[:, [1, 2, 4, 5]].reshape(-1, 2, 2) * shrink[:, None, None]
-    det = B[:, 0, 0] * B[:, 1, 1] - B[:, 0, 1] * B[:, 1, 0]
-    adjugate = np.stack([B[:, 1, 1], -B[:, 0, 1], -B[:, 1, 0], B[:, 0, 0]], axis=1).reshape(-1, 2, 2)
-    A_new = A @ (adjugate / np.where(np.abs(det) < 0.1, np.nan, det)[:, None, None])
-    move = np.einsum("nij,nj->ni", A_new, d)
-    bad = ~np.isfinite(move).all(axis=1)
-    A_new[bad], moved = A[bad], np.linalg.norm(move, axis=1)
-    return c - np.where(bad[:, None], 0.0, move), A_new, moved
+    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
+    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
+    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
+    det = a * e - b * d
+    inverse = 1 / np.where(np.abs(det) < 0.1, np.nan, det)
+    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
+    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
+    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
+    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
+    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
+    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
+    if bad.any():
+        A_new[bad], move[bad] = A[bad], 0.0
+    return c - move, A_new, moved
 
 
 def _empty() -> Matches:
-    z = np.zeros
-    return Matches(
-        xy=z((0, 2)),
-        shape=z((0, 2, 2)),
-        covariance=z((0, 2, 2)),
-        offset=z((0, 2)),
-        spread=z((0, 2)),
-        transfer_covariance=z((0, 2, 2)),
-        sigma0=z(0),
-        correlation=z(0),
-        iterations=z(0, np.int16),
-        status=z(0, np.int8),
-    )
+    pairs, matrices, z = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
+    return Matches(xy=pairs, shape=matrices, covariance=matrices, offset=pairs, spread=pairs, transfer_covariance=matrices, sigma0=z,
+                   correlation=z, iterations=np.zeros(0, np.int16), status=np.zeros(0, np.int8))  # fmt: skip

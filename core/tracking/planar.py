@@ -131,7 +131,7 @@ def _step(
             start, best = search_box(now[0], after[0], points.xy[rest], centre[rest], box, matching.patch_px, 1)
             eye = np.tile(np.eye(2), (len(rest), 1, 1))
             start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)
-            there = match_patches(now[1], points.xy[rest], [after[1]], [start], [eye], matching)[0]
+            there = match_patches(now[1], points.xy[rest], [after[1]], [start], [eye], matching, of_texture=False)[0]
             good = there.ok & _returns(now[1], after[1], points.xy[rest], there.xy, there.shape, there.covariance, matching)
             held = hold(there, good, points.key_shape[rest], points.drift[rest], templates, rest, after[1],
                         tracking.drift_correlation)  # fmt: skip
@@ -169,7 +169,7 @@ def _returns(
     """Which points come back to where they were.  (1)"""
     inverse = np.linalg.inv(np.where(np.abs(np.linalg.det(shape)) > 0.05, 1.0, np.nan)[:, None, None] * shape)
     inverse = np.where(np.isfinite(inverse), inverse, np.eye(2))
-    back = match_patches(after, found, [now], [xy], [inverse], matching)[0]
+    back = match_patches(after, found, [now], [xy], [inverse], matching, of_texture=False)[0]
     sigma = np.sqrt(np.maximum(np.trace(covariance + back.covariance, axis1=1, axis2=2), 0.0))
     return back.ok & (np.linalg.norm(back.xy - xy, axis=1) <= np.maximum(RETURN_PX, RETURN_SIGMAS * sigma))
 

@@ -194,7 +194,8 @@ def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray
     for k in range(len(view.cameras)):
         begin = np.where((status[:, k] == TrackStatus.MEASURED)[:, None], start[:, k], np.nan)
         m = match_patches(
-            images.spline[k], points.xy[:, k], [images.next_spline[k]], [begin], [eye], view.matching, row_step=view.rows.step
+            images.spline[k], points.xy[:, k], [images.next_spline[k]], [begin], [eye], view.matching, row_step=view.rows.step,
+            of_texture=False
         )[0]
         mark(status[:, k], ~m.ok, TrackStatus.NOT_MATCHED)
         matches.append(m)
@@ -247,6 +248,7 @@ def match_spatially(
         [points.shape[:, k] for k in view.others],
         view.matching,
         row_step=view.rows.step,
+        of_texture=False,
     )
     for k, s in zip(view.others, spatial):
         mark(status[:, k], ~s.ok, TrackStatus.NOT_VERIFIED)

@@ -12,7 +12,7 @@ import pytest
 from scipy.fft import fft2, fftfreq, ifft2
 
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.least_squares import Matches, MatchingSettings, MatchStatus, join_matches, match_patches, patch_offsets
+from tricap.core.matching.least_squares import Matches, MatchingSettings, MatchStatus, _spans, join_matches, match_patches, patch_offsets
 from tricap.core.progress import Cancelled, Monitor
 
 SIZE, CONTRAST = 300, 20.0
@@ -275,3 +275,21 @@ def test_smoothing_helps_weak_texture_and_its_sigma_allows_for_it() -> None:
                 z.extend((e / np.sqrt(m.transfer_covariance[m.ok][:, [0, 1], [0, 1]])).ravel())
     assert np.median(errors[1.0]) < 0.8 * np.median(errors[0.0])
     assert 0.6 < np.median(np.abs(z)) / 0.6745 < 1.25
+
+
+def test_without_its_texture_a_patch_is_its_middle() -> None:
+    xy = points()
+    a, b = noisy_pair(1.5, 2.0, (0.4, -0.3), 0)
+    eye = np.tile(np.eye(2), (len(xy), 1, 1))
+    whole, middle = (match_patches(SplineImage(a), xy, [SplineImage(b)], [xy], [eye], OPEN, of_texture=t)[0] for t in (True, False))
+    assert np.array_equal(whole.xy, middle.xy) and np.array_equal(whole.covariance, middle.covariance)
+    assert np.abs(whole.offset).max() > 0.1 and not middle.offset.any() and not middle.spread.any()
+    assert np.array_equal(middle.transfer_covariance, middle.covariance) and np.array_equal(middle.transfer_xy, middle.xy)
+
+
+@pytest.mark.parametrize("n", [0, 1, 511, 512, 513, 1650, 5000])
+def test_pieces_for_the_threads_are_equal_and_cover_all(n: int) -> None:
+    spans = _spans(n)
+    assert [i for span in spans for i in range(n)[span]] == list(range(n))
+    sizes = [span.stop - span.start for span in spans]
+    assert not n or max(sizes) - min(sizes) <= 1 and max(sizes) <= 1024 and (len(spans) > 1) == (n > 512)
