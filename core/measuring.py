@@ -116,7 +116,7 @@ def measure_frames(
     order = [*range(first, footage.frames.stop), *range(first - 1, footage.frames.start - 1, -1)]
     base = store.digest(
         ALGORITHM,
-        repr((matching, growing, surface, enhance)),
+        repr((matching, growing, surface.of_measuring, enhance)),
         take.rig_path,
         repr((take.interlaced, take.first_field, take.reference_view, _seed_table(footage))),
         repr([(v.name, v.offset_frames) for v in take.views]),

@@ -43,6 +43,7 @@ from .results import Results
 from .settings import from_table, nearest_name, to_table
 from .stages import CONCERNS, DERIVED, STAGES, command_of, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
+from .surface.voxels import as_written
 from .take import Footage, open_take, read_take
 from .tracking.contour import ContourSettings
 from .tracking.settings import TrackingSettings, TrackStatus
@@ -206,7 +207,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         run.footage, run.account["offsets"] = in_step(run.footage, monitor)
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
-            run.results.write_cloud(run.corrected(m.cloud))
+            run.results.write_cloud(as_written(run.corrected(m.cloud), s["surface"]))
             done.append(note_of(m))
             room = room or m.foreground
     except Cancelled as stop:

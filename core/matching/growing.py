@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from ..geometry.camera import Camera
 from ..geometry.intersection import Intersection, forward_intersection
@@ -29,6 +30,7 @@ NOISE_SIGMAS = 4.0
 EQUAL_SIGMA_PX = 1.0  # far above matching's own: all rays weigh alike
 PATCH_STEP_PX = 4
 SMOOTH_FROM = 2
+RAY_TEST = 0.999
 NARROW = -1  # the last round: fingers, and what shows beside an outline, are narrower than the patch
 SMALLEST_PX, NARROW_SURE = 5, 0.5  # px; of the largest sigma: few pixels must have much texture
 RETRY_SMOOTHING_PX = 1.0  # what fails is weak texture: noise that is finer than its details is kept out
@@ -68,7 +70,12 @@ class GrowingSettings:
         low=0.05,
         high=10.0,
     )
-    max_ray_sigma0: float = knob(3.0, "Largest distance by which rays may miss, in units of its own sigma.", low=1.0, high=100.0)
+    max_ray_sigma0: float = knob(  # χ² removes 2 % more points, hardly any of them wrong
+        3.0,
+        "Largest distance by which rays may miss, in units of its own sigma; 0: the χ² test at 99.9 % for their number.",
+        low=0.0,
+        high=100.0,
+    )
     pairs: bool = knob(False, "Keep points that only two views see; the cloud says how many rays each point has.")
     max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across.", low=0.5, high=20.0)
 
@@ -290,12 +297,18 @@ def _acceptable(
         return (
             _enough_rays(matched, growing.pairs)
             & (point.rms_residual_px <= limit_px)
-            & (point.sigma0 <= growing.max_ray_sigma0)
+            & (point.sigma0 <= (growing.max_ray_sigma0 or chi2_limit(point.rays)))
             & (depth >= near)
             & (depth <= far)
             & continues
             & ~foreground.excludes(point.xyz_m, point.covariance_m2)
         )
+
+
+def chi2_limit(rays: np.ndarray) -> np.ndarray:
+    """Largest sigma0 (N,) of intersections of so many rays that 999 in 1000 good points have: 2 K − 3 are redundant."""
+    redundant = np.maximum(2 * rays - 3, 1)
+    return np.asarray(np.sqrt(2 * gammaincinv(redundant / 2, RAY_TEST) / redundant))
 
 
 def _rows(m: Matches, rows: np.ndarray) -> Matches:

@@ -4,7 +4,7 @@ Filters (D'Apuzzo et al. 2000, §2.3): a point must agree with its neighbours an
 intersection's covariance and half of the curvature correction, for what remains of it.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.ndimage import label
@@ -26,6 +26,15 @@ class SurfaceSettings:
     min_island: int = knob(20, "Groups of fewer connected points than this are removed.", low=1, high=10_000)
     max_deviation: float = knob(4.0, "Largest distance from the neighbours' surface, in units of their scatter.", low=1.0, high=20.0)
     correct_curvature: bool = knob(True, "Correct round surfaces' flattening by the patch; matching in object space needs no correction.")
+    voxel_mm: float = knob(
+        0.0, "Side of the cubes in which the points of the written clouds are averaged; 0 writes all.", unit="mm", low=0.0, high=1000.0
+    )
+    voxel_points: int = knob(2, "Cubes with fewer points than this are left out.", low=1, high=1000)
+
+    @property
+    def of_measuring(self) -> "SurfaceSettings":
+        """These settings as far as they concern what is measured, and not how it is written."""
+        return replace(self, voxel_mm=0.0, voxel_points=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -12,6 +12,7 @@ from tricap.core import pipeline
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.matching.growing import chi2_limit
 from tricap.core.motion.ply import read_ply
 from tricap.core.progress import Monitor
 
@@ -100,3 +101,13 @@ def test_with_pairs_two_of_three_views_are_enough(plane_take: Path, tmp_path: Pa
     (take / "take.toml").write_text(text.replace("[[views]]", "frames = [0, 1]\n[[views]]", 1))
     m = scenes.measure(take, tmp_path / "out", {"growing": COARSE["growing"] | {"pairs": True}})[0]
     assert len(m.cloud.xyz_m) > 350 and (m.cloud.rays == 2).all() and np.median(np.abs(plane.distance_m(m.cloud.xyz_m))) < 1e-3
+
+
+def test_the_test_of_rays_knows_their_number(four_views: Path, tmp_path: Path, scenes: Any) -> None:
+    """χ² of 99.9 % over 2 K − 3: 3.29 for two rays, 2.33 for three (tables of the distribution). As a setting it is stricter."""
+    assert np.allclose(chi2_limit(np.array([2, 3, 4])) ** 2 * (1, 3, 5), (10.828, 16.266, 20.515), atol=1e-3)
+    sizes = [
+        len(scenes.measure(four_views, tmp_path / str(limit), {"growing": COARSE["growing"] | {"max_ray_sigma0": limit}})[0].cloud.xyz_m)
+        for limit in (0.0, 3.0)
+    ]
+    assert 0.85 * sizes[1] < sizes[0] < sizes[1]
