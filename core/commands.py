@@ -57,7 +57,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     _stage_command(commands, "seeds", "show the depth and number of the surface seeds that are found", _seeds, out=False)
     _stage_command(commands, "measure", "the surface of each frame", _stages("measure"))
     points_command.add_arguments(_stage_command(commands, "track", "trajectories of the surface's points, or of chosen ones", _track))
-    _stage_command(commands, "fit", "the body's shape and motion", _stages("measure", "track", "fit"))
+    _stage_command(commands, "fit", "the body's shape and motion", _stages("fit"))
     everything = _stage_command(commands, "run", "all of it, from the images to the Blender file; a stopped run goes on", _run)
     everything.add_argument("--restart", action="store_true", help="begin anew instead of going on")
     demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")

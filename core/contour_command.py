@@ -15,12 +15,23 @@ from .arguments import frame_range, overrides
 from .errors import InputError
 from .images.sequence import read_image
 from .inspection import body_outline
+from .measuring import NothingMeasured
 from .progress import Monitor
 from .settings import nearest_name
-from .tracking.contour import Contour, ContourSettings, contour_of_mask, mask_of_points, predict_contour, relax_contour, resampled
+from .tracking.contour import (
+    Contour,
+    ContourSettings,
+    carried_points,
+    contour_of_mask,
+    mask_of_points,
+    predict_contour,
+    relax_contour,
+    resampled,
+)
 from .tracking.point_tables import read_polygon
 
-BACKGROUND_SIGMAS, CLOSING_PX = 4.0, 3
+BACKGROUND_SIGMAS, OPENING_PX, CLOSING_PX = 4.0, 1, 3
+SHADOW_PX, SHADOW_SCATTER, DARKEST_SHADOW = 7, 0.06, 0.6  # window, and what a shadow leaves of the light
 CLOSING_CELLS, ONE_PIECE = (2, 3, 4, 6), 0.9
 APART_PX, AGREEING = 8.0, 0.95  # a contour of which more than a twentieth is further from the measured outline begins anew
 
@@ -69,7 +80,10 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
-    """Track the contour in the views of these names (measures and tracks first where that is needed): contours/NAME.csv of each.
+    """Track the contour in the views of these names: contours/NAME.csv of each.
+
+    Measures and tracks first where that is needed: a background shows the outline in every frame, and what cannot be measured, or is not
+    to be (fitting.use_surface), is followed in the images from a polygon.
 
     Says what was found. A body that the contours begin with is that of the same frames and settings; with the contours it is stale.
 
@@ -85,9 +99,20 @@ def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start:
     if start.body and not job.results.path("skin").is_dir():
         folder = job.results.folder
         raise InputError(f"{folder} holds no body with a skin that was fitted to these frames with these settings; run `tricap fit` first.")
-    if job.trajectories is None:
-        pipeline.track(job, monitor)
+    own_start = start.polygon is not None or start.background is not None or start.body
+    if job.trajectories is None and start.background is None and (job.settings["fitting"].use_surface or not own_start):
+        _track_if_possible(job, monitor, own_start)
     return [_write_contour(job, name, names.index(name), monitor, start) for name in views]
+
+
+def _track_if_possible(job: pipeline.Run, monitor: Monitor, own_start: bool) -> None:
+    """Measure and track; that there is nothing to measure is no fault where the contour has another start."""
+    try:
+        pipeline.track(job, monitor)
+    except NothingMeasured as error:
+        if not own_start:
+            raise
+        job.warn(f"{error} The outline was followed in the images.")
 
 
 def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
@@ -101,52 +126,66 @@ def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, st
 
 
 def track_contour(job: pipeline.Run, view: int, monitor: Monitor, start: Start) -> Iterator[tuple[int, Contour]]:
-    """(frame, contour) of one view; each predicted by the projected trajectories inside the last one that had any.
+    """(frame, contour) of one view; each predicted by the projected trajectories inside the last one that had any, or else by points that
+    are followed in the images.
 
-    A predicted contour that differs too much from the frame's own outline, of the measured surface or of the fitted body, gives way to it,
-    unless it began with a polygon.
+    A predicted contour that differs too much from the frame's own outline, of the measured surface, of the fitted body or before the
+    background, gives way to it, unless it began with a polygon.
 
     Raises:
         InputError: there is nothing to start from.
     """
     camera, tracks, settings = job.footage.rig.cameras[view], job.trajectories, job.settings["contour"]
-    assert tracks is not None
-    base: Contour | None = None  # in frame number `last`
-    last = 0
-    for i, m in enumerate(job.measured):
-        monitor.step("contours", i, len(job.measured))
-        grey = job.footage.take.rows_at(m.frame).whole(job.footage.read(m.frame)[view])
+    base: Contour | None = None  # in frame number `last`, of the image `before`
+    last, before = 0, np.zeros((0, 0))
+    for i, cloud in enumerate(job.clouds):
+        monitor.step("contours", i, len(job.clouds))
+        grey = job.footage.take.rows_at(cloud.frame).whole(job.footage.read(cloud.frame)[view])
         own = np.zeros((0, 2))
         if start.body:
-            own = _of_body(body_outline(job.results.folder, m.frame, camera), settings)
-        elif start.polygon is None and (base is not None or start.background is None):
-            own = _outline(grey, camera.project(m.cloud.xyz_m), settings)
+            own = _of_body(body_outline(job.results.folder, cloud.frame, camera), settings)
+        elif start.background is not None:
+            own = _before_background(grey, start.background, settings)
+        elif start.polygon is None:
+            own = _outline(grey, camera.project(cloud.xyz_m), settings)
         if base is None:
-            predicted = _first(grey, own, start, settings)
+            predicted = own if start.polygon is None else resampled(start.polygon, settings.spacing_px)
             if len(predicted) < 8:
-                raise InputError(f"There is no outline to start from in frame {m.frame}; give one with --polygon.")
+                raise InputError(f"There is no outline to start from in frame {cloud.frame}; give one with --polygon.")
         else:
-            carried = predict_contour(base.xy_px, camera.project(tracks.xyz_m[last]), camera.project(tracks.xyz_m[i]))
+            places = carried_points(base.xy_px, before, grey) if tracks is None else (
+                camera.project(tracks.xyz_m[last]), camera.project(tracks.xyz_m[i]))
+            carried = predict_contour(base.xy_px, *places)
             predicted = _renewed(carried, own)
         contour = relax_contour(predicted, grey, settings)
-        if base is None or tracks.seen[i].any():
-            base, last = contour, i
-        yield m.frame, contour
+        if base is None or (contour.seen.any() if tracks is None else tracks.seen[i].any()):
+            base, last, before = contour, i, grey
+        yield cloud.frame, contour
 
 
-def _first(grey: np.ndarray, own: np.ndarray, start: Start, settings: ContourSettings) -> np.ndarray:
-    """The first contour: the polygon, or what differs from the background, or the frame's own outline."""
-    if start.polygon is not None:
-        return resampled(start.polygon, settings.spacing_px)
-    if start.background is None:
-        return own
-    if start.background.shape != grey.shape:
+def _before_background(grey: np.ndarray, background: np.ndarray, settings: ContourSettings) -> np.ndarray:
+    """The outline of what differs from the background, shadows aside: they darken a place by little, and evenly.
+
+    Raises:
+        InputError: the background is of another size.
+    """
+    if background.shape != grey.shape:
         raise InputError("The background image has another size than the view; take it with the same camera.")
-    difference = cv2.GaussianBlur(np.abs(grey - start.background).astype(np.float32), (0, 0), 1.5)
+    difference = cv2.GaussianBlur(np.abs(grey - background).astype(np.float32), (0, 0), 1.5)
     limit = max(float(np.median(difference)) * BACKGROUND_SIGMAS, 4.0)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * CLOSING_PX + 1,) * 2)
-    mask = cv2.morphologyEx((difference > limit).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    mask = ((difference > limit) & ~_shadow(grey, background)).astype(np.uint8)
+    for operation, radius in ((cv2.MORPH_OPEN, OPENING_PX), (cv2.MORPH_CLOSE, CLOSING_PX)):
+        mask = cv2.morphologyEx(mask, operation, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2))
     return contour_of_mask(mask, settings.spacing_px)
+
+
+def _shadow(grey: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Where (h, w) an image is the background, darker by a factor that is nearly the same all around (Horprasert et al. 1999)."""
+    ratio = ((grey + 1) / (background + 1)).astype(np.float32)
+    mean, square = (cv2.blur(r, (SHADOW_PX, SHADOW_PX)) for r in (ratio, ratio**2))
+    even = np.sqrt(np.maximum(square - mean**2, 0.0)) < SHADOW_SCATTER
+    smooth = cv2.GaussianBlur(ratio, (0, 0), 1.5)
+    return np.asarray(even & (smooth > DARKEST_SHADOW) & (smooth < 1.0))
 
 
 def _of_body(outlines: list[np.ndarray], settings: ContourSettings) -> np.ndarray:

@@ -56,12 +56,11 @@ class FrameTable:
 
 
 def frame_table(notes: Sequence[FrameNote], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
-    """The table of a run, as far as it is; points count as measured, before corrections."""
-    frames = np.array([n.frame for n in notes], dtype=np.int64)
+    """The table of a run, as far as it is; points count as measured, before corrections. Without measured frames, those of the body."""
+    frames = np.array([n.frame for n in notes] if notes or body is None else body.motion.frames, dtype=np.int64)
     values = {name: np.full(len(frames), np.nan) for name in COLUMNS}
-    values["points"] = np.array([float(n.points) for n in notes])
-    values["sigma_mm"] = 1e3 * np.array([n.sigma_m for n in notes])
-    values["residual_px"] = np.array([n.residual_px for n in notes])
+    for i, note in enumerate(notes):
+        values["points"][i], values["sigma_mm"][i], values["residual_px"][i] = note.points, 1e3 * note.sigma_m, note.residual_px
     if trajectories is not None:
         for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
             at = np.searchsorted(frames, trajectories.frames[t])

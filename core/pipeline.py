@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from . import store
+from .account import new_account
 from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
@@ -21,7 +21,6 @@ from .checking.take_check import causes_of_failure, doubts, with_cause
 from .checking.timing import in_step
 from .clicked_points import clicked_depth
 from .correcting import corrected_cloud, corrected_tracks
-from .empty_sources import find_empty
 from .errors import InputError
 from .fit_sources import clicks_left_out, fit_input, missing_for_fit
 from .fitting.body_motion import BodyFit
@@ -40,14 +39,15 @@ from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
 from .report.pages import write_report
 from .results import Results
-from .settings import from_table, nearest_name, to_table
-from .stages import CONCERNS, DERIVED, STAGES, command_of, stage_keys, still_good
+from .settings import from_table, nearest_name
+from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
 from .surface.voxels import as_written
 from .take import Footage, open_take, read_take
 from .tracking.contour import ContourSettings
 from .tracking.settings import TrackingSettings, TrackStatus
 from .tracking.trajectories import Trajectories, assemble
+from .without_surface import can_do_without, empty_clouds, empty_views
 
 SETTINGS: dict[str, type] = {
     "timing": TimingSettings,
@@ -75,14 +75,15 @@ class Run:
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
+    surfaceless: bool = False  # nothing could be measured, or nothing is to be
 
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)
 
     @property
-    def clouds(self) -> Clouds:
-        """The clouds in the order of time, as the user corrected them."""
-        return Clouds(measured=self.measured, corrected=self.corrected)
+    def clouds(self) -> Sequence[PointCloud]:
+        """The clouds in the order of time, as the user corrected them; without points where nothing was measured."""
+        return Clouds(measured=self.measured, corrected=self.corrected) if self.measured else empty_clouds(self.footage)
 
     def corrected(self, cloud: PointCloud) -> PointCloud:
         """A cloud without what the user took out."""
@@ -100,13 +101,20 @@ class Run:
         write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.notes, self.trajectories, self.body))
         self.results.write_run(self.account)
 
+    def do_without_surface(self, why: str) -> None:
+        """Note that there are no clouds and no trajectories."""
+        self.surfaceless = True
+        self.results.remove("clouds", "trajectories.npz", "trajectories_raw.npz")
+        for stage in ("measure", "track"):
+            self.finish_stage(stage, time.perf_counter(), not_done=why)
+
     def __str__(self) -> str:
         """One line for a panel."""
         stages = self.account["stages"]
-        parts = [f"{stages.get('measure', {}).get('frames', 0)} frames"]
-        if "measure" in stages:
+        parts = [f"{len(self.footage.frames)} frames"]
+        if "points_per_frame" in stages.get("measure", {}):
             parts.append(f"{stages['measure']['points_per_frame']:.0f} points a frame (sigma {stages['measure']['sigma_mm']:.2f} mm)")
-        if "track" in stages:
+        if "trajectories" in stages.get("track", {}):
             parts.append(f"{stages['track']['trajectories']} trajectories")
         if "fit" in stages and "not_done" not in stages["fit"]:
             parts.append("body fitted")
@@ -153,7 +161,7 @@ def open_run(
         if restart:
             results.remove("clouds", *DERIVED, "cache")  # the cache last: it marks the folder as ours
         before = {} if restart else results.read_run()
-        account = _account(footage, settings)
+        account = new_account(footage, settings)
         account["stages"] = kept = still_good(before, keys)
         if before:  # what was made otherwise must not stand beside the new
             results.remove(*(name for stage, c in CONCERNS.items() if stage not in kept for name in c.files))
@@ -173,28 +181,8 @@ def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:
     return replace(footage, frames=range(*frames))
 
 
-def _account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What run.json says before anything was computed."""
-    take = footage.take
-    return {
-        "take": str(take.folder),
-        "frames": [footage.frames.start, footage.frames.stop],
-        "fps": take.fps,
-        "interlaced": take.interlaced,
-        "views": [v.name for v in take.views],
-        "reference_view": take.reference_view,
-        "model": take.body_model,
-        "settings": {name: to_table(value) for name, value in settings.items()},
-        "inputs": {"take.toml": store.digest(take.folder / "take.toml"), take.rig_path.name: store.digest(take.rig_path)},
-        "rig": {k: v for k, v in footage.rig.metadata.items() if isinstance(v, (str, int, float))},
-        "repeat": command_of(footage, settings),
-        "stages": {},
-        "warnings": [],
-    }
-
-
 def measure(run: Run, monitor: Monitor) -> None:
-    """The surface of every frame: clouds/NNNN.ply.
+    """The surface of every frame: clouds/NNNN.ply. That nothing can be measured is a warning where outlines or keypoints can stand for it.
 
     Raises:
         InputError: the footage cannot be read, or nothing can be measured.
@@ -215,6 +203,9 @@ def measure(run: Run, monitor: Monitor) -> None:
             f"Stopped: the surface of {len(done)} of {len(run.footage.frames)} frames is kept; the same command goes on from there."
         ) from stop
     except NothingMeasured as error:
+        if can_do_without(run.footage, run.results):
+            run.warn(f"{error} The body rests on outlines and keypoints.")
+            return run.do_without_surface("nothing could be measured")
         cause = next(iter(causes_of_failure(run.footage, monitor)), None)
         if cause is None:
             raise
@@ -243,8 +234,10 @@ def track(run: Run, monitor: Monitor) -> None:
         InputError: see `measure`.
         Cancelled: what is done is kept.
     """
-    if not run.measured:
+    if not run.measured and not run.surfaceless:
         measure(run, monitor)
+    if run.surfaceless:
+        return
     began, s = time.perf_counter(), run.settings
     try:
         limit_px = run.measured.limit_px
@@ -288,6 +281,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         InputError: the clicks contradict each other, or the limb has no points.
         Cancelled: surface and tracks are kept.
     """
+    if not run.settings["fitting"].use_surface and not run.surfaceless:
+        run.do_without_surface("fitting.use_surface is false")
     if run.trajectories is None:
         track(run, monitor)
     began = time.perf_counter()
@@ -300,7 +295,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         run.finish_stage("fit", began, not_done=missing)
         return
     try:
-        empty = find_empty(run.footage, run.clouds, monitor) if run.settings["fitting"].use_background else []
+        empty = empty_views(run.footage, run.results, run.clouds, run.settings["fitting"], monitor)
         given = fit_input(run.footage, run.clouds, run.trajectories, run.results, empty)
         run.body = body = fit_sequence(given, run.settings["fitting"], monitor)
         _write_body(run, body, monitor)
@@ -308,7 +303,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
         raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop
     except InputError as error:
-        raise with_cause(error, run.footage, run.measured[0].frame) from error
+        raise with_cause(error, run.footage, run.measured.notes[0].frame) if run.measured else error from error
     states = {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
     if set(states) - {"fitted"}:
         run.warn(
@@ -363,7 +358,7 @@ def run(
 
 def all_stages(run: Run, monitor: Monitor) -> None:
     """Measure, track, fit and report, as `run` does, of an opened take."""
-    for stage in (measure, track, fit, report):
+    for stage in (measure, track, fit, report) if run.settings["fitting"].use_surface else (fit, report):
         stage(run, monitor)
 
 
@@ -371,7 +366,8 @@ def is_complete(run: Run) -> bool:
     """Whether everything was done with the same input before, and still lies in the folder."""
     done = run.account["stages"]
     body = () if "not_done" in done.get("fit", {}) else ("body.toml", "joints.csv", "motion.csv")
-    files = ("clouds", "trajectories.npz", "report", *body)
+    surface = () if "not_done" in done.get("measure", {}) else ("clouds", "trajectories.npz")
+    files = ("report", *surface, *body)
     return {*STAGES, "report"} <= set(done) and all(run.results.path(name).exists() for name in files)
 
 

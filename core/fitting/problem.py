@@ -19,6 +19,8 @@ from .observations import Block, FromBlocks, MaterialSteps, Observation
 from .robust import robust_scale, robust_weights, variance_factor
 from .state import BodyState, ShapeParameters
 
+LARGEST_SCALE = {"contours": 1.0}  # a body too thin all around would take that for the outlines' noise, and stay so: outlines are few
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
@@ -61,9 +63,9 @@ class Problem:
         place[self.free_shape] = np.arange(len(self.free_shape))
         return place
 
-    def weights(self, residuals: np.ndarray, scale: float, crowding: np.ndarray | float) -> np.ndarray:
-        """Weights of robust observations in (1)."""
-        return robust_weights(residuals / scale, self.robust, self.robust_width) / (scale**2 * crowding)
+    def weights(self, residuals: np.ndarray, scale: float, crowding: np.ndarray | float, largest: float = np.inf) -> np.ndarray:
+        """Weights of robust observations in (1); against other kinds they do not count for less than with the `largest` scale."""
+        return robust_weights(residuals / scale, self.robust, self.robust_width) / (min(scale, largest) ** 2 * crowding)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -119,7 +121,7 @@ def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarr
 def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scales:
     """By how much the weights understate variances (`robust.variance_factor`)."""
     return Scales(**{kind: variance_factor(np.concatenate(r) / scales.of(kind), problem.robust, problem.robust_width)
-                     for kind, r in lin.residuals.items() if r})
+                     * max(1.0, scales.of(kind) / LARGEST_SCALE.get(kind, np.inf)) ** 2 for kind, r in lin.residuals.items() if r})
 
 
 def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, before: Scales) -> Scales:
@@ -151,7 +153,7 @@ def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scal
         w: np.ndarray | float = 1.0
         if o.kind:
             lin.residuals.setdefault(o.kind, []).append(r)
-            w = problem.weights(r, scales.of(o.kind), o.crowding) / factor.of(o.kind)
+            w = problem.weights(r, scales.of(o.kind), o.crowding, LARGEST_SCALE.get(o.kind, np.inf)) / factor.of(o.kind)
         frame.append((o, w))
         lin.cost += float(np.sum(w * r * r))
         for rows, columns, J in blocks_of(o, state, len(free) > 0):

@@ -21,6 +21,8 @@ class FitSettings:
     voxel_m: float = knob(0.008, "Points are averaged in voxels of this size.", unit="m", low=0.001, high=0.1)
     model_sigma_m: float = knob(0.004, "What a real body differs from its metaballs.", unit="m", low=0.0, high=0.05)
     model_patch_m: float = knob(0.06, "Points within a patch of this size share the model's error.", unit="m", low=0.0, high=0.5)
+    use_surface: bool = knob(True, "Let measured points attract the body; without them the fit rests on outlines and keypoints alone, and "
+                                   "nothing is measured for it.")
     use_trajectories: bool = knob(True, "Let tracked points hold their places in the limbs: twist, sliding, centres of the joints.")
     track_sigma_m: float = knob(0.001, "How far a tracked point moves on its limb from frame to frame.", unit="m", low=0.0, high=0.05)
     shared_frames: float = knob(40.0, "Over how many frames the model's error stays the same; beliefs of the shape weigh as much more.",
@@ -29,6 +31,7 @@ class FitSettings:
     use_background: bool = knob(True, "Keep limbs out of pixels that show the still background (cameras and background must stand still).")
     empty_sigma_px: float = knob(4.0, "How exactly the person's outline is known from the background.", unit="px", low=0.5, high=50.0)
     gate_m: float = knob(0.035, "A point further than this from a limb's surface is not the limb's.", unit="m", low=0.005, high=0.3)
+    outline_gate_m: float = knob(0.10, "A ray of an outline further than this from every limb touches none.", unit="m", low=0.005, high=1.0)
     click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)
     length_sigma: float = knob(0.15, "Relative sigma of the model's bone lengths.", low=0.001, high=1.0)
     radius_sigma: float = knob(0.2, "Relative sigma of the model's radii.", low=0.001, high=1.0)

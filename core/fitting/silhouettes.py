@@ -1,7 +1,7 @@
 """Contours of the views as rays that touch the body, frame by frame, and the limb that each touches.
 
 A ray of the outline touches the limb that it enters deepest, or passes nearest: a ray inside any limb would be inside the outline. It is
-nobody's when it is further from every limb than the gate, when it meets the limb where the surface is another part's, or when the outline
+nobody's when it is further from every limb than the gate, when it meets the limb far beyond its ends, or when the outline
 faces the other way than the limb.
 """
 
@@ -18,6 +18,7 @@ from .settings import FitSettings
 from .state import BodyState
 
 SPACING_M = 0.012  # of the rays, at the body
+BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders, the crown and the tips of the feet, where the parts' fields meet
 OUTLINE_PATCHES = 3  # an outline that follows a wrong edge does so for about this many patches of the model's error, in all views
 
 
@@ -51,7 +52,7 @@ class Silhouettes:
             return []
 
         def find() -> tuple[np.ndarray, np.ndarray]:
-            return touched(rays, state, self._surface, self._settings.gate_m * wide)
+            return touched(rays, state, self._surface, self._settings.outline_gate_m * wide)
 
         rows, bone = find() if held is None else held.get(("rays", t), state, find)
         if not len(rows):
@@ -94,7 +95,7 @@ def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarra
         gap, along, facing = from_bone(X, rays.outward, state, b)
         closer = gap < nearest
         nearest[closer], owner[closer] = gap[closer], b
-        own[closer] = ((along >= surface[b, 0]) & (along <= surface[b, 1]) & facing)[closer]
+        own[closer] = ((along >= surface[b, 0] - BEYOND) & (along <= surface[b, 1] + BEYOND) & facing)[closer]
     rows = np.flatnonzero(own & (np.abs(nearest) < gate[owner]))
     return rows, owner[rows]
 

@@ -37,6 +37,7 @@ LARGEST_FORCE_PX = 1.0
 NEIGHBOURS = 8  # vertices either way over which scatter is taken
 LAST_PX = 2  # how far the largest gradient may lie from (3)
 LEAST_SIGMA_PX, UNSEEN_SIGMA_PX = 0.025, 3.0  # the least: of interpolating the parabola
+GRID_PX, FLOW_PX, HOME_PX = 6.0, 15, 1.0  # of points followed in the images: their distance, window, and how near they come back
 IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6
 PROFILE_PX, LEAST_VARIANCE = 6, 4.0  # of (3): length of a profile beyond the search, and what noise has
 SIGNIFICANT = 20.0  # of (3), twice a difference of log likelihoods: by noise alone one vertex in a thousand has as much
@@ -120,6 +121,22 @@ def predict_contour(xy_px: np.ndarray, before_px: np.ndarray, after_px: np.ndarr
     places, n = np.flatnonzero(near), len(xy_px)
     wrapped = np.concatenate([places - n, places, places + n])
     return xy_px + np.stack([np.interp(np.arange(n), wrapped, np.tile(u[:, i], 3)) for i in range(2)], axis=1)
+
+
+def carried_points(xy_px: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 2), (N, 2) of a grid inside a contour (V, 2) in one image, and where the next image shows them (Lucas & Kanade 1981, with
+    pyramids: Bouguet 2000); those that the way back does not bring home are left out."""
+    low, high = np.floor(xy_px.min(axis=0)), np.ceil(xy_px.max(axis=0))
+    grid = np.stack(np.meshgrid(*(np.arange(a, b + 1, GRID_PX) for a, b in zip(low, high))), axis=-1).reshape(-1, 2).astype(np.float32)
+    polygon = xy_px.astype(np.float32).reshape(-1, 1, 2)
+    start = grid[[cv2.pointPolygonTest(polygon, (float(x), float(y)), False) >= 0 for x, y in grid]]
+    if not len(start):
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    images = [np.clip(image, 0, 255).astype(np.uint8) for image in (before, after)]
+    there, found, _ = cv2.calcOpticalFlowPyrLK(*images, start, np.zeros_like(start), winSize=(FLOW_PX, FLOW_PX))
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(*images[::-1], there, np.zeros_like(start), winSize=(FLOW_PX, FLOW_PX))
+    good = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm(back - start, axis=1) < HOME_PX)
+    return start[good].astype(np.float64), there[good].astype(np.float64)
 
 
 def relax_contour(predicted_px: np.ndarray, grey: np.ndarray, settings: ContourSettings) -> Contour:

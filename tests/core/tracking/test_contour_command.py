@@ -5,11 +5,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from tricap.core.commands import main
-from tricap.core.contour_command import Start, track_contour
+from tricap.core.contour_command import Start, _before_background, track_contour
 from tricap.core.errors import InputError
 from tricap.core.images.fields import RowGrid
 from tricap.core.motion.ply import write_mesh
@@ -50,7 +51,7 @@ class Recorded:
         self.job: Any = SimpleNamespace(
             footage=SimpleNamespace(rig=rig, take=take, read=lambda i: [None, images[i], None]),
             trajectories=SimpleNamespace(xyz_m=xyz, seen=np.isfinite(xyz[..., 0])),
-            measured=[SimpleNamespace(frame=i, cloud=SimpleNamespace(xyz_m=x)) for i, x in enumerate(xyz)],
+            clouds=[SimpleNamespace(frame=i, xyz_m=x) for i, x in enumerate(xyz)],
             results=SimpleNamespace(folder=folder),
             settings={"contour": ContourSettings()},
         )
@@ -80,13 +81,40 @@ def test_a_black_frame_carries_the_contour_through(tmp_path: Path, scenes: Any, 
 def test_from_the_fitted_body(tmp_path: Path, scenes: Any) -> None:
     """The skin's outline is there where nothing was measured and no point tracked; without a skin it is said so."""
     recorded = Recorded(scenes, tmp_path)
-    for m in recorded.job.measured:
-        m.cloud.xyz_m = np.zeros((0, 3))
+    for cloud in recorded.job.clouds:
+        cloud.xyz_m = np.zeros((0, 3))
     recorded.job.trajectories.xyz_m[:] = np.nan
     found = recorded.contours(Start(body=True))
     assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 for c, b in zip(found, recorded.bodies))
     with pytest.raises(InputError, match="no outline"):
         recorded.contours(Start())
+
+
+@pytest.mark.parametrize("with_background", [False, True])
+def test_an_outline_is_followed_where_nothing_is_measured(tmp_path: Path, scenes: Any, with_background: bool) -> None:
+    """From a polygon by points followed in the images, or before the background in every frame."""
+    recorded = Recorded(scenes, tmp_path, black=(3,) if not with_background else ())
+    recorded.job.trajectories = None
+    for cloud in recorded.job.clouds:
+        cloud.xyz_m = np.zeros((0, 3))
+    background = scenes.render(scenes.three_cameras().cameras[1], [], noise=1.0, seed=99)
+    start = Start(background=background) if with_background else Start(polygon=outline_of(scenes, recorded.bodies[0])[::400])
+    found = recorded.contours(start)
+    assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 and c.seen.mean() > 0.6 for i, (c, b) in enumerate(zip(found, recorded.bodies))
+               if with_background or i != 3)  # fmt: skip
+    with pytest.raises(InputError, match="another size"):
+        recorded.contours(Start(background=background[1:]))
+
+
+def test_a_shadow_is_no_part_of_the_person(scenes: Any) -> None:
+    camera, body = scenes.three_cameras().cameras[1], scenes.Body(half_m=HALF_M)
+    background = scenes.render(camera, [], noise=1.0, seed=1)
+    light = np.ones(background.shape, np.float32)
+    light[90:140, 60:180] = 0.75
+    shaded = scenes.render(camera, [], noise=1.0, seed=2) * cv2.GaussianBlur(light, (0, 0), 4.0)
+    person = scenes.render(camera, [body], noise=0.0, background=-1.0) >= 0
+    contour = _before_background(np.where(person, scenes.render(camera, [body], noise=1.0, seed=3), shaded), background, ContourSettings())
+    assert np.median(apart(scenes, contour, body)) < 2.5 and np.quantile(apart(scenes, contour, body), 0.95) < 5.0  # blurred by 1.5 px
 
 
 @pytest.mark.slow

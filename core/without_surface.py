@@ -1,0 +1,83 @@
+"""Recordings whose surface cannot be measured (views far apart, a person without texture) or need not be: what a body can rest on then."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from .empty_sources import STEP_PX, UNIT_PX, find_empty
+from .fitting.fit_input import EmptyView
+from .fitting.settings import FitSettings
+from .inspection import read_contours
+from .progress import Monitor
+from .results import Results
+from .surface.cloud import PointCloud
+from .take import Footage
+
+LEAST_CORNERS = 3
+
+
+def can_do_without(footage: Footage, results: Results) -> bool:
+    """Whether outlines (`tricap contour`) or keypoints can stand for measured points."""
+    return bool(footage.take.keypoints) or any(results.path("contours", f"{v.name}.csv").is_file() for v in footage.take.views)
+
+
+def empty_clouds(footage: Footage) -> list[PointCloud]:
+    """A cloud without points for every frame."""
+    none, views = np.zeros((0, 3)), len(footage.take.views)
+    return [PointCloud(frame=frame, xyz_m=none, covariance_m2=np.zeros((0, 3, 3)), normals=none, intensity=np.zeros(0),
+                       xy_px=np.zeros((0, views, 2)), residual_px=np.zeros(0)) for frame in footage.frames]
+
+
+def outline_polygons(footage: Footage, results: Results) -> dict[str, dict[int, np.ndarray]]:
+    """The polygon (V, 2) px that `tricap contour` found about the person, by view and frame; views without one are left out.
+
+    Raises:
+        InputError: a table of contours is damaged.
+    """
+    found: dict[str, dict[int, np.ndarray]] = {}
+    for view in footage.take.views:
+        polygons = {frame: xy for frame, (xy, _) in read_contours(results.path("contours", f"{view.name}.csv")).items()
+                    if frame in footage.frames and len(xy) >= LEAST_CORNERS and np.isfinite(xy).all()}
+        if polygons:
+            found[view.name] = polygons
+    return found
+
+
+def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """The mask (h, w) of a polygon (V, 2)."""
+    mask = np.zeros(size_px[::-1], np.uint8)
+    cv2.fillPoly(mask, [np.rint(polygon_px * 16).astype(np.int32)], 1, shift=4)
+    return mask.astype(bool)
+
+
+def empty_views(footage: Footage, results: Results, clouds: Sequence[PointCloud], settings: FitSettings,
+                monitor: Monitor) -> list[EmptyView]:
+    """Where the views show no part of the person: outside the outline, and in views without one where the still background is seen.
+
+    Raises:
+        InputError: an image or a table of contours cannot be read.
+        Cancelled: the user asked to stop.
+    """
+    if not settings.use_background:
+        return []
+    outlines = outline_polygons(footage, results) if settings.use_contours else {}
+    others = find_empty(footage, clouds, monitor) if len(outlines) < len(footage.take.views) else []
+    return outside_outlines(footage, outlines) + [empty for empty in others if empty.view not in outlines]
+
+
+def outside_outlines(footage: Footage, outlines: dict[str, dict[int, np.ndarray]]) -> list[EmptyView]:
+    """Where the views show no part of the person: outside of the outline."""
+    found = []
+    for name, polygons in outlines.items():
+        tables = [_distances(filled(xy, footage.rig[name].size_px)) for xy in polygons.values()]
+        found.append(EmptyView(view=name, frame=np.array(list(polygons)), distance=np.stack(tables), step_px=STEP_PX, unit_px=UNIT_PX))
+    return found
+
+
+def _distances(inside: np.ndarray) -> np.ndarray:
+    """Distance (h', w') of the middles of squares from the mask, in steps of `UNIT_PX`."""
+    far = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    h, w = (n // STEP_PX for n in inside.shape)
+    middles = far[: h * STEP_PX, : w * STEP_PX].reshape(h, STEP_PX, w, STEP_PX).mean(axis=(1, 3))
+    return np.asarray(np.minimum(middles / UNIT_PX, 255)).astype(np.uint8)
