@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import numpy as np
 
@@ -62,12 +63,19 @@ class Conditions:
         """
         s = self.settings
         find = partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * wide)
-        rows, bone, part = find() if held is None else held.get(points.frame, state, find)
+        if held is None:
+            return self._observed(points, *find()).scaled(state)
+        owners = held.get(points.frame, state, find)
+        made = (held.made(points.frame, owners) or self._observed(points, *owners)).scaled(state)
+        held.keep(points.frame, owners, made)
+        return cast(SurfacePoints, made)
+
+    def _observed(self, points: CloudPoints, rows: np.ndarray, bone: np.ndarray, part: np.ndarray) -> SurfacePoints:
+        s = self.settings
         own, model = points.sigma_m[rows] ** 2 + 1e-12, s.model_sigma_m**2
         share = max(1.0, (s.model_patch_m / s.voxel_m) ** 2)
-        found = SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=np.sqrt(own + model),
-                              crowding=(own + share * model) / (own + model) / part, form=s.residual)
-        return found.scaled(state)
+        return SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=np.sqrt(own + model),
+                             crowding=(own + share * model) / (own + model) / part, form=s.residual)
 
     def seen_surface(self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0,
                      held: HeldSegments | None = None) -> list[Observation]:
@@ -77,7 +85,7 @@ class Conditions:
     def evidence(self, t: int, points: CloudPoints, state: BodyState) -> np.ndarray:
         """How many points each bone (B,) has, and what stands for points: rays of outlines, and a keypoint at its end, which is enough."""
         b, ends = len(state.lengths_m), [self.model.skeleton.joint_names.index(bone.tail_joint) for bone in self.model.skeleton.bones]
-        counts = np.bincount(self.surface(points, state).bone, minlength=b)
+        counts = np.bincount(segment(points, state, self.model.surface, self.settings.gate_m)[1], minlength=b)
         for rays in self.silhouettes.observe(t, state):
             counts += POINTS_OF_RAY * np.bincount(rays.bone, minlength=b)
         return np.asarray(counts + np.where(np.isin(ends, self.tracks.joints(t)), self.settings.min_points, 0))

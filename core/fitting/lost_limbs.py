@@ -12,7 +12,7 @@ from scipy.stats import qmc
 
 from .cloud_points import CloudPoints
 from .conditions import Conditions
-from .segmentation import from_bone
+from .segmentation import from_bone, segment
 from .state import BodyState, free_bones
 
 ROUNDS = ((400, 150.0, 0.03, 4), (60, 25.0, 0.02, 2), (60, 10.0, 0.015, 1))  # postures, spread [°], width [m] of weights, best kept
@@ -34,8 +34,8 @@ def found_again(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector
     At most one for each lost limb; each includes those before it.
     """
     state = fit.parameters.state(motion, vector)
-    surface = fit.surface(points, state)
-    counts = np.bincount(surface.bone, minlength=len(state.lengths_m))
+    _, owners = segment(points, state, fit.model.surface, fit.settings.gate_m)
+    counts = np.bincount(owners, minlength=len(state.lengths_m))
     found, now = [], motion
     for limb in lost_limbs(fit, counts):
         rows = _unexplained(fit, points, state, limb)

@@ -15,12 +15,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..body.metaballs import VISIBLE
 from ..body.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from .state import BodyState
 
 CROSS = [0, 2]  # the two axes across a bone
+SMALLEST, LINEAR = 1e-250, 0.03
+
+
+def distance(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """D = √(−½ ln F) − √(½ ln 2) and dD/dF of values (N,) of a field; inside, where −½ ln F falls below `LINEAR`, along its tangent."""
+    F = np.maximum(F, SMALLEST)
+    u = -0.5 * np.log(F)
+    root = np.sqrt(np.maximum(u, LINEAR))
+    return root + np.minimum(u - LINEAR, 0.0) / (2 * np.sqrt(LINEAR)) - VISIBLE, -0.25 / (F * root)
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -117,6 +127,11 @@ class PartField:
     def F(self) -> np.ndarray:
         """(N,)"""
         return self.terms.sum(axis=1)
+
+    @cached_property
+    def distance(self) -> tuple[np.ndarray, np.ndarray]:
+        """D (N,) and dD/dF (N,) of the values."""
+        return distance(self.F)
 
     @cached_property
     def gradient(self) -> np.ndarray:

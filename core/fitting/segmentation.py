@@ -42,6 +42,7 @@ class HeldSegments:
 
     def __init__(self) -> None:
         self._held: dict[Hashable, tuple[np.ndarray, Any]] = {}
+        self._made: dict[Hashable, tuple[Any, Any]] = {}
 
     def get(self, key: Hashable, state: BodyState, find: Callable[[], Any]) -> Any:
         """What was found for `key` when the body was where it is now, within `HARDLY_M`; else what `find` finds now."""
@@ -52,11 +53,21 @@ class HeldSegments:
         return self._held[key][1]
 
 
+    def made(self, key: Hashable, found: Any) -> Any:
+        """What was kept for `key` as made of just this `found`; None if that has changed."""
+        known = self._made.get(key)
+        return known[1] if known is not None and known[0] is found else None
+
+    def keep(self, key: Hashable, found: Any, made: Any) -> None:
+        """Keep what was made of what was found."""
+        self._made[key] = found, made
+
+
 def crop(points: CloudPoints, state: BodyState, reach_m: float) -> CloudPoints:
     """The points within `reach_m` of the bones: what a fit near this posture can ever need."""
     near = np.zeros(len(points.xyz_m), dtype=bool)
     for b, rows in candidates(points.xyz_m, state, np.full(len(state.lengths_m), reach_m)):
-        near[rows] |= from_bone(points.xyz_m[rows], points.normals[rows], state, b)[0] < reach_m
+        near[rows] |= _gap(points.xyz_m[rows], state, b)[0] < reach_m
     return points.take(np.flatnonzero(near))
 
 
@@ -81,17 +92,21 @@ def from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: in
 
 def beside_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `from_bone`, with the cosine (N,) between the normal and the limb's; 1 where the normal is unknown."""
+    gap, along, outward = _gap(xyz_m, state, bone)
+    normal = (normals @ state.R[bone])[:, CROSS]
+    size = np.sqrt(np.einsum("ni,ni->n", normal, normal) * np.einsum("ni,ni->n", outward, outward))
+    cosine = np.where(size > 0, np.einsum("ni,ni->n", normal, outward) / np.maximum(size, 1e-300), 1.0)
+    return gap, along, cosine
+
+
+def _gap(xyz_m: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance from the limb's surface (N,) [m], fraction along the bone (N,), and the direction of its normal across the bone (N, 2)."""
     local = (xyz_m - state.head_m[bone]) @ state.R[bone]
     length = state.lengths_m[bone]
     along, across = local[:, 1] / length, local[:, CROSS]
     beyond = local[:, 1] - np.clip(local[:, 1], 0.0, length)
-    distance = np.hypot(np.hypot(across[:, 0], across[:, 1]), beyond)
     axes = state.profiles[bone].across(along, across)
     outward = across / axes
-    stretch = np.linalg.norm(outward, axis=1)
-    radius = np.linalg.norm(across, axis=1) / np.maximum(stretch, 1e-9)  # of the ellipse in the point's direction
-    outward /= axes
-    normal = (normals @ state.R[bone])[:, CROSS]
-    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(outward, axis=1)
-    cosine = np.where(size > 0, np.einsum("ni,ni->n", normal, outward) / np.maximum(size, 1e-300), 1.0)
-    return distance - radius, along, cosine
+    aside = np.einsum("ni,ni->n", across, across)
+    radius = np.sqrt(aside / np.maximum(np.einsum("ni,ni->n", outward, outward), 1e-18))  # of the ellipse in the point's direction
+    return np.sqrt(aside + beyond**2) - radius, along, outward / axes

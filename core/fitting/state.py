@@ -54,6 +54,11 @@ class BodyState:
         return len(self.lengths_m) + (3 if self.weights else 2) * len(self.balls.weight)
 
     @cached_property
+    def log_radii(self) -> np.ndarray:
+        """(M,) mean of ln of the balls' cross radii."""
+        return np.asarray(np.log(self.balls.radii_m[:, CROSS]).mean(axis=1))
+
+    @cached_property
     def joints_m(self) -> np.ndarray:
         """Joint positions (J, 3)."""
         bones, at_tail = (np.array(column) for column in zip(*self.skeleton.joint_bones))
@@ -104,7 +109,8 @@ class ShapeParameters:
         self.n_lengths = len(template.lengths_m)
         self.parts = tuple(Part(self.skeleton, b, template.metaballs.bone_index, weights) for b in range(self.n_lengths))
         self.counted = chain_neighbours(template)
-        self._profiles: tuple[bytes, dict[int, BoneProfile]] = (b"", {})
+        self._last_body: tuple[bytes, tuple[np.ndarray, Metaballs], dict[int, BoneProfile]] | None = None
+        self._last_states: tuple[bytes, list[BodyState]] = (b"", [])
         self.layout = Layout(_names(template, weights), _sets(self.n_lengths, len(template.metaballs.weight), weights))
 
     def vector(self, shape: BodyShape | None = None) -> np.ndarray:
@@ -113,7 +119,13 @@ class ShapeParameters:
         return _vector(shape.lengths_m, shape.metaballs, self.weights)
 
     def body(self, vector: np.ndarray) -> tuple[np.ndarray, Metaballs]:
-        """Lengths (B,) [m] and balls of a shape vector; what is not estimated comes from the template."""
+        """Lengths (B,) [m] and balls of a shape vector; what is not estimated comes from the template. The last one is kept."""
+        key = vector.tobytes()
+        if self._last_body is None or self._last_body[0] != key:
+            self._last_body = key, self._body(vector), {}
+        return self._last_body[1]
+
+    def _body(self, vector: np.ndarray) -> tuple[np.ndarray, Metaballs]:
         balls, old = self.template.metaballs, self.template.lengths_m
         lengths, radii = np.exp(vector[: self.n_lengths]), balls.radii_m.copy()
         radii[:, 1] *= (lengths / old)[balls.bone_index]
@@ -134,16 +146,23 @@ class ShapeParameters:
 
     def profiles(self, vector: np.ndarray) -> dict[int, BoneProfile]:
         """The profiles of the bones of a shape vector (S,); the last ones are kept."""
-        key = vector.tobytes()
-        if self._profiles[0] != key:
-            lengths, balls = self.body(vector)
-            self._profiles = key, bone_profiles(self.skeleton, lengths, balls, self.counted)
-        return self._profiles[1]
+        lengths, balls = self.body(vector)
+        assert self._last_body is not None
+        found = self._last_body[2]
+        if not found:
+            found.update(bone_profiles(self.skeleton, lengths, balls, self.counted))
+        return found
 
     def states(self, motion: np.ndarray, vector: np.ndarray) -> list[BodyState]:
-        """The body of a shape vector (S,) in T postures (T, D)."""
+        """The body of a shape vector (S,) in T postures (T, D). The last are kept: derivatives follow a cost at the same place."""
+        key = b"".join((vector.tobytes(), np.asarray(motion, dtype=np.float64).tobytes()))
+        if self._last_states[0] != key:
+            self._last_states = key, self._states(np.asarray(motion, dtype=np.float64), np.array(vector))
+        return self._last_states[1]
+
+    def _states(self, motion: np.ndarray, vector: np.ndarray) -> list[BodyState]:
         lengths, balls = self.body(vector)
-        forward, vector = frames_and_axes(self.skeleton, lengths, motion), np.array(vector)
+        forward = frames_and_axes(self.skeleton, lengths, motion)
         return [BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=m, parts=self.parts, R=R, head_m=head, axes=axes,
                           weights=self.weights, find_profiles=partial(self.profiles, vector))
                 for m, R, head, axes in zip(motion, *forward)]

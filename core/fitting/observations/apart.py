@@ -14,7 +14,6 @@ import numpy as np
 from ..part_field import PartField
 from ..state import BodyState
 from .blocks import Block, FromBlocks
-from .surface_point import distance
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -36,7 +35,7 @@ class Apart(FromBlocks):
         for c in np.unique(self.other).tolist():
             rows = np.flatnonzero(self.other == c)
             field = PartField(state.parts[c], state, X[rows])
-            steep = np.linalg.norm(field.gradient, axis=1) * np.abs(distance(field.F)[1])
+            steep = np.linalg.norm(field.gradient, axis=1) * np.abs(field.distance[1])
             slope[rows] = np.maximum(steep, 0.3 / state.balls.radii_m[field.part.balls].mean())
         return replace(self, slope=slope)
 
@@ -50,7 +49,7 @@ class Apart(FromBlocks):
         X, missing = self._places(state), np.empty(len(self.bone))
         for c in np.unique(self.other).tolist():
             rows = np.flatnonzero(self.other == c)
-            missing[rows] = self.radius_m[rows] - distance(PartField(state.parts[c], state, X[rows]).F)[0] / self._slope[rows]
+            missing[rows] = self.radius_m[rows] - PartField(state.parts[c], state, X[rows]).distance[0] / self._slope[rows]
         return np.maximum(missing, 0.0) / self.sigma_m
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
@@ -70,7 +69,7 @@ class Apart(FromBlocks):
                 full[state.n_motion + lengths] += field.gradient[0] @ stretched
                 full[state.n_motion + self.bone[row]] += field.gradient[0] @ self._along(state, row)
             columns = np.flatnonzero(full)
-            yield np.array([row]), columns, (-distance(field.F)[1][0] / self._slope[row] / self.sigma_m * full[columns])[None]
+            yield np.array([row]), columns, (-field.distance[1][0] / self._slope[row] / self.sigma_m * full[columns])[None]
 
     @property
     def _slope(self) -> np.ndarray:

@@ -11,17 +11,15 @@ radii run away). Inside, where −½ ln F falls below `LINEAR`, the root is cont
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...body.metaballs import THRESHOLD, VISIBLE
+from ...body.metaballs import THRESHOLD, VISIBLE, Metaballs
 from ..part_field import PartField
 from ..state import CROSS, BodyState
 from .blocks import Block, FromBlocks
 
-SMALLEST = 1e-250
-LINEAR = 0.03
 SCALE_RANGE = (0.4, 2.5)  # bounds of |∇D| in units of 1 / (mean l of the part)
 
 
@@ -31,7 +29,8 @@ class _Scaled:
 
     rows: np.ndarray  # (n,) of the points
     bone: int
-    field: PartField  # at the state of `scaled`
+    balls: Metaballs  # of the state of `scaled`
+    shares: np.ndarray  # (n, m) which part of F came from which of the part's balls
     scale: np.ndarray  # (n,) |∇D| or |∇F|, 1/m
     log_radius: np.ndarray  # (n,) ln l₀
 
@@ -46,47 +45,52 @@ class SurfacePoints(FromBlocks):
     crowding: np.ndarray | float = 1.0  # (N,) how many times less a point tells than if its error were its own
     form: str = "metric"  # or "paper"
     parts: tuple[_Scaled, ...] | None = None
-    moved: bool = False  # since `scaled`
     kind: str = "points"
+    _last: dict[int, PartField] = field(default_factory=dict, init=False, repr=False)  # by bone, at the last state that was asked for
 
     def scaled(self, state: BodyState) -> "SurfacePoints":
         """The same points with weights for this state.  (12)"""
-        parts = []
-        for b in np.unique(self.bone):
-            rows = np.flatnonzero(self.bone == b)
-            field = PartField(state.parts[b], state, self.xyz_m[rows])
-            typical = 1 / state.balls.radii_m[field.part.balls][:, CROSS].mean()
-            if self.form == "paper":
-                scale = np.full(len(rows), 4 * THRESHOLD * VISIBLE * typical)
-            else:
-                slope = np.linalg.norm(field.gradient, axis=1) * np.abs(distance(field.F)[1])
-                scale = np.clip(slope, SCALE_RANGE[0] * typical, SCALE_RANGE[1] * typical)
-            parts.append(_Scaled(rows=rows, bone=int(b), field=field, scale=scale, log_radius=field.shares @ _log_radii(field)))
-        return replace(self, parts=tuple(parts))
+        groups = [(held.bone, held.rows) for held in self.parts] if self.parts is not None else _by_bone(self.bone)
+        parts = tuple(self._weighed(b, rows, state) for b, rows in groups)
+        again = replace(self, parts=parts)
+        again._last.update(self._last)
+        return again
+
+    def _weighed(self, bone: int, rows: np.ndarray, state: BodyState) -> _Scaled:
+        there = self._field(bone, rows, state)
+        typical = 1 / state.balls.radii_m[there.part.balls][:, CROSS].mean()
+        if self.form == "paper":
+            scale = np.full(len(rows), 4 * THRESHOLD * VISIBLE * typical)
+        else:
+            gradient = there.gradient
+            slope = np.sqrt(np.einsum("ni,ni->n", gradient, gradient)) * np.abs(there.distance[1])
+            scale = np.clip(slope, SCALE_RANGE[0] * typical, SCALE_RANGE[1] * typical)
+        return _Scaled(rows=rows, bone=bone, balls=state.balls, shares=there.shares, scale=scale,
+                       log_radius=there.shares @ state.log_radii[there.part.balls])
 
     def at(self, xyz_m: np.ndarray) -> "SurfacePoints":
         """The same weights at other places (N, 3)."""
-        return replace(self, xyz_m=xyz_m, moved=True)
+        return replace(self, xyz_m=xyz_m)
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(N,)"""
         value = np.empty(len(self.bone))
         for held in self._held():
-            field = self._field(held, state)
-            value[held.rows] = self._value(field.F)[0] / self._unit(held, field)
+            there = self._field(held.bone, held.rows, state)
+            value[held.rows] = self._value(there)[0] / self._unit(held, there)
         return value
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
         """Derivatives, part by part."""
         for held in self._held():
-            field = self._field(held, state)
-            value, slope = self._value(field.F)
-            J = field.jacobian(shape)
-            J *= slope[:, None]
+            there = self._field(held.bone, held.rows, state)
+            value, slope = self._value(there)
+            unit = self._unit(held, there)
+            J = there.jacobian(shape)
+            J *= (slope / unit)[:, None]
             if shape:
-                J[:, field.part.of_radii] += value[:, None] * np.repeat(held.field.shares / 2, 2, axis=1)
-            J /= self._unit(held, field)[:, None]
-            yield held.rows, field.part.columns(shape), J
+                J[:, there.part.of_radii] += (value / unit)[:, None] * np.repeat(held.shares / 2, 2, axis=1)
+            yield held.rows, there.part.columns(shape), J
 
     @property
     def size(self) -> int:
@@ -98,26 +102,21 @@ class SurfacePoints(FromBlocks):
             raise ValueError("surface points need `scaled(state)` first")
         return self.parts
 
-    def _field(self, held: _Scaled, state: BodyState) -> PartField:
-        if state is held.field.state and not self.moved:
-            return held.field
-        return PartField(state.parts[held.bone], state, self.xyz_m[held.rows])
+    def _field(self, bone: int, rows: np.ndarray, state: BodyState) -> PartField:
+        known = self._last.get(bone)
+        if known is None or known.state is not state:
+            known = self._last[bone] = PartField(state.parts[bone], state, self.xyz_m[rows])
+        return known
 
-    def _unit(self, held: _Scaled, field: PartField) -> np.ndarray:
-        return self.sigma_m[held.rows] * held.scale * np.exp(held.log_radius - held.field.shares @ _log_radii(field))
+    def _unit(self, held: _Scaled, there: PartField) -> np.ndarray:
+        unit = self.sigma_m[held.rows] * held.scale
+        if there.state.balls is held.balls:
+            return np.asarray(unit)
+        return np.asarray(unit * np.exp(held.log_radius - held.shares @ there.state.log_radii[there.part.balls]))
 
-    def _value(self, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (THRESHOLD - F, np.full_like(F, -1.0)) if self.form == "paper" else distance(F)
-
-
-def _log_radii(field: PartField) -> np.ndarray:
-    """ln of the mean cross radius (m,) of a part's balls."""
-    return np.log(field.state.balls.radii_m[field.part.balls][:, CROSS]).mean(axis=1)
+    def _value(self, there: PartField) -> tuple[np.ndarray, np.ndarray]:
+        return (THRESHOLD - there.F, np.full_like(there.F, -1.0)) if self.form == "paper" else there.distance
 
 
-def distance(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """D and dD/dF of values (N,) of a field.  (1)"""
-    F = np.maximum(F, SMALLEST)
-    u = -0.5 * np.log(F)
-    root = np.sqrt(np.maximum(u, LINEAR))
-    return root + np.minimum(u - LINEAR, 0.0) / (2 * np.sqrt(LINEAR)) - VISIBLE, -0.25 / (F * root)
+def _by_bone(bone: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    return [(b, np.flatnonzero(bone == b)) for b in np.unique(bone).tolist()]
