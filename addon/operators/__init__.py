@@ -3,20 +3,23 @@
 import bpy
 
 from .. import jobs
-from . import build_scene, cancel, load_sample, run, stages
+from . import build_scene, cancel, import_tracks, load_sample, run, stages
 
-CLASSES = (load_sample.LoadSample, stages.Measure, stages.Track, stages.Fit, run.Run, build_scene.BuildScene, cancel.Cancel)
+CLASSES = (load_sample.LoadSample, stages.Measure, stages.Track, stages.Fit, run.Run, build_scene.BuildScene, import_tracks.ImportTracks2d,
+           cancel.Cancel)
 
 
 def register() -> None:
     """Register the operators."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
+    bpy.types.TOPBAR_MT_file_import.append(import_tracks.menu)
 
 
 def unregister() -> None:
     """Stop a running job and unregister the operators."""
     jobs.stop_current()
     jobs.stop_watching()
+    bpy.types.TOPBAR_MT_file_import.remove(import_tracks.menu)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

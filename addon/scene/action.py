@@ -31,9 +31,9 @@ def add_action(armature_object: bpy.types.Object, shape: BodyShape, frames: np.n
         bone_name, channel, index = channels[name]
         pose_bone = armature_object.pose.bones[bone_name]
         path = pose_bone.path_from_id()
-        _key(action, armature_object, f"{path}.{channel}", index, frames, values[:, column])
+        key(action, armature_object, f"{path}.{channel}", index, frames, values[:, column])
         pose_bone[f"sigma {name}"] = 0.0
-        _key(action, armature_object, f'{path}["sigma {name}"]', 0, frames, sigma[:, column])
+        key(action, armature_object, f'{path}["sigma {name}"]', 0, frames, sigma[:, column])
     motion = {name: values[:, column] for column, name in enumerate(dof_names)}
     for bone in shape.skeleton.bones:
         _mute_limits_that_bind(armature_object.pose.bones[bone.name], bone, motion)
@@ -56,18 +56,20 @@ def add_simplified(armature_object: bpy.types.Object, shape: BodyShape, frames: 
         tolerance = np.radians(tolerance_deg) * (1.0 if channel == "rotation_euler" else METRES_PER_RADIAN)
         kept = known[kept_keys(frames[known], values[known, column], tolerance)]
         path = f"{armature_object.pose.bones[bone_name].path_from_id()}.{channel}"
-        _key(action, armature_object, path, index, frames[kept], values[kept, column])
+        key(action, armature_object, path, index, frames[kept], values[kept, column])
     return action
 
 
-def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, index: int, frames: np.ndarray, values: np.ndarray) -> None:
+def key(action: bpy.types.Action, owner: bpy.types.Object, path: str, index: int, frames: np.ndarray, values: np.ndarray,
+        interpolation: str = "LINEAR") -> None:
+    """Key one channel of an object in these frames; NaN gives no key."""
     known = np.isfinite(values)
     curve = action.fcurve_ensure_for_datablock(owner, path, index=index)
     points = curve.keyframe_points
     points.add(int(known.sum()))
     points.foreach_set("co", np.stack([frames[known], values[known]], axis=-1).astype(np.float32).ravel())
-    linear = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
-    points.foreach_set("interpolation", np.full(len(points), linear, dtype=np.int32))
+    kind = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items[interpolation].value
+    points.foreach_set("interpolation", np.full(len(points), kind, dtype=np.int32))
     curve.update()
 
 

@@ -81,6 +81,35 @@ def write_planar(path: Path, names: tuple[str, ...], tracks: PlanarTracks) -> No
     store.write_text(Path(path), "\n".join(lines) + "\n")
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PlanarTable:
+    """What `write_planar` wrote: N points over T frames; NaN where a point is not seen."""
+
+    frames: np.ndarray  # (T,) ascending
+    names: tuple[str, ...]  # (N,)
+    xy_px: np.ndarray  # (T, N, 2)
+
+
+def read_planar(path: Path) -> PlanarTable:
+    """The table that `write_planar` wrote.
+
+    Raises:
+        InputError: it cannot be read, or is no such table.
+    """
+    try:
+        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
+        places = {(int(r["frame"]), r["point"]): (float(r["x"] or "nan"), float(r["y"] or "nan")) for r in rows}
+    except OSError as error:
+        raise InputError(f"Cannot read the tracks {path}: {error.strerror or error}.") from error
+    except (UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is no table of 2-D tracks ({error}); choose what `tricap track2d` wrote.") from error
+    if not places:
+        raise InputError(f"{path} holds no tracks; choose what `tricap track2d` wrote.")
+    frames, names = sorted({frame for frame, _ in places}), tuple(dict.fromkeys(name for _, name in places))
+    xy = np.array([[places.get((frame, name), (np.nan, np.nan)) for name in names] for frame in frames])
+    return PlanarTable(frames=np.array(frames), names=names, xy_px=np.where(np.isfinite(xy).all(axis=2, keepdims=True), xy, np.nan))
+
+
 def write_key_points(
     space: Path, images: Path, names: tuple[str, ...], views: tuple[str, ...], fps: float, points: KeyPoints
 ) -> None:

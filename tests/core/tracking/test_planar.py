@@ -12,7 +12,7 @@ from tricap.core.errors import InputError
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
 from tricap.core.tracking.planar import PlanarTracks, track_planar
-from tricap.core.tracking.point_tables import read_points, read_polygon
+from tricap.core.tracking.point_tables import read_planar, read_points, read_polygon
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus
 
 SIZE = (200, 160)
@@ -105,6 +105,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     last = np.array(lines[-1].split(",")[2:4], dtype=float)
     assert np.allclose(last, place(3)[0] @ (82, 100) + place(3)[1], atol=0.3)
     assert len(list((tmp_path / "p").glob("*.png"))) == 4
+    table_read = read_planar(out)
+    assert table_read.names == ("nose", "chin") and table_read.frames.tolist() == [0, 1, 2, 3] and np.allclose(table_read.xy_px[3, 1], last)
     for text, said in (("point,x,y\na,1,nan\n", "line 2"), ("point,x\na,1\n", "“y”"), ("point,x,y\na,500,5\n", "outside"),
                        ("", "no points"), ("point,x,y,joined_to\na,5,5,b\n", "joins"), ("point,x,y\na,5,5\na,6,6\n", "twice")):  # fmt: skip
         table.write_text(text, encoding="utf-8")

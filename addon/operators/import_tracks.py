@@ -1,0 +1,65 @@
+"""bpy.ops.tricap.import_tracks2d(filepath="tracks.csv", points="points.csv", footage="face.mp4")"""
+
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.settings import nearest_name
+from ...core.track2d_command import open_footage
+from ...core.tracking.point_tables import PlanarTable, read_planar, read_points
+from .. import folders
+from ..scene.planar import add_planar
+
+RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+
+class ImportTracks2d(bpy.types.Operator):
+    """Points that `tricap track2d` followed in one camera: an empty for each over the footage, and curves between those that are joined"""
+
+    bl_idname = "tricap.import_tracks2d"
+    bl_label = "Tricap 2-D Tracks (.csv)"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: bpy.props.StringProperty(subtype="FILE_PATH", options=RELATIVE)  # type: ignore[valid-type]
+    filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})  # type: ignore[valid-type]
+    points: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Points", options=RELATIVE, description="The table of the chosen points, whose joined_to says what is joined; empty: nothing")
+    footage: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Footage", options=RELATIVE, description="The movie or the folder of images that they were followed in; empty: none is shown")
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the file."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Read the files, then build."""
+        try:
+            table = read_planar(folders.absolute(self.filepath))
+            joined = read_joints(folders.absolute(self.points), table) if self.points else ()
+            footage = open_footage(folders.absolute(self.footage)) if self.footage else None
+            made = add_planar(context.scene, table, joined, footage)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{made.name}: {len(table.names)} points over {len(table.frames)} frames, {len(joined)} curves")
+        return {"FINISHED"}
+
+
+def read_joints(path: Path, table: PlanarTable) -> tuple[tuple[str, str], ...]:
+    """The pairs of points to join.
+
+    Raises:
+        InputError: the file is no table of points, or joins one that was not followed.
+    """
+    joined = read_points(path).joined
+    for name in (name for pair in joined for name in pair):
+        if name not in table.names:
+            raise InputError(f"{path} joins “{name}”, which is not among the tracks.{nearest_name(name, table.names)}")
+    return joined
+
+
+def menu(self: bpy.types.Menu, _: bpy.types.Context) -> None:
+    """The entry in File > Import."""
+    self.layout.operator(ImportTracks2d.bl_idname)
