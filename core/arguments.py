@@ -38,3 +38,15 @@ def frame_range(text: str | None) -> tuple[int, int] | None:
     if not colon or not first.isdecimal() or not last.isdecimal():
         raise InputError(f"--frames {text} cannot be read; write the first frame and one after the last, such as 0:40.")
     return int(first), int(last)
+
+
+def pictured(frames: range, wanted: list[int]) -> list[int]:
+    """--pictures FRAME …: frames that are there.
+
+    Raises:
+        InputError: a frame is not.
+    """
+    for frame in wanted:
+        if frame not in frames:
+            raise InputError(f"--pictures {frame} is not among the frames {frames.start} to {frames.stop - 1}; choose others.")
+    return wanted

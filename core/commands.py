@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 
 from . import batch_command, calibrate_command, check_command, contour_command, fields_command, pipeline, points_command, track2d_command
-from .arguments import frame_range, overrides
+from .arguments import frame_range, overrides, pictured
 from .errors import InputError
 from .geometry.rig import read_rig
 from .images.fields import BOTH, INTERLACE
@@ -60,6 +60,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     _stage_command(commands, "fit", "the body's shape and motion", _stages("fit"))
     everything = _stage_command(commands, "run", "all of it, from the images to the Blender file; a stopped run goes on", _run)
     everything.add_argument("--restart", action="store_true", help="begin anew instead of going on")
+    everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="the frames of the report's pictures")
     demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
     demo.set_defaults(run=_demo, json=False)
@@ -110,6 +111,7 @@ def _track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), restart=args.restart) as job:
+        job.pictured = pictured(job.footage.frames, args.pictures)
         pipeline.all_stages(job, monitor)
         scene = _build_scene(job, args.parser, monitor)
         return _summary(job, args.json) + ([] if args.json else scene)

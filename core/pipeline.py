@@ -38,6 +38,7 @@ from .motion.ply import write_mesh
 from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
 from .report.pages import write_report
+from .report.silhouettes import Silhouettes, by_view, silhouettes_of
 from .results import Results
 from .settings import from_table, nearest_name
 from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
@@ -47,7 +48,7 @@ from .take import Footage, open_take, read_take
 from .tracking.contour import ContourSettings
 from .tracking.settings import TrackingSettings, TrackStatus
 from .tracking.trajectories import Trajectories, assemble
-from .without_surface import can_do_without, empty_clouds, empty_views
+from .without_surface import can_do_without, empty_clouds, empty_views, outline_polygons
 
 SETTINGS: dict[str, type] = {
     "timing": TimingSettings,
@@ -76,6 +77,8 @@ class Run:
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
     surfaceless: bool = False  # nothing could be measured, or nothing is to be
+    silhouettes: Silhouettes = field(default_factory=Silhouettes)
+    pictured: Sequence[int] = ()  # the frames of the report's pictures; none: the first, a middle and the last
 
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)
@@ -299,6 +302,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         given = fit_input(run.footage, run.clouds, run.trajectories, run.results, empty)
         run.body = body = fit_sequence(given, run.settings["fitting"], monitor)
         _write_body(run, body, monitor)
+        outlines = outline_polygons(run.footage, run.results)
+        run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, empty, monitor)
     except Cancelled as stop:
         run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
         raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop
@@ -325,6 +330,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         sigma0=_median(body.motion.sigma0),
         joint_sigma_mm=1e3 * _median(body.motion.joint_sigma_m),
         **({"outline_mm": 1e3 * _median(body.outline_m)} if len(body.outline_m) else {}),
+        **({"silhouettes": by_view(run.silhouettes.fits)} if run.silhouettes.fits else {}),
     )
 
 
@@ -332,7 +338,8 @@ def report(run: Run, monitor: Monitor) -> None:
     """report/report.html with its pictures."""
     began = time.perf_counter()
     run.account["stages"].pop("report", None)  # a page does not tell of the page before it
-    write_report(run.results, run.footage, run.account, run.clouds, run.trajectories, run.body, monitor)
+    given = (run.clouds, run.trajectories, run.body, run.silhouettes)
+    write_report(run.results, run.footage, run.account, *given, monitor, run.pictured)
     run.finish_stage("report", began)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from ..fitting.body_motion import BodyFit
 from ..surface.cloud import PointCloud
 from ..tracking.trajectories import Trajectories
+from .silhouettes import SilhouetteFit
 
 FRAME_TO_FRAME = "scatter from frame to frame"
 ESTIMATED = "from the adjustment"
@@ -15,7 +16,11 @@ Row = dict[str, Any]
 
 
 def figure_rows(
-    account: Mapping[str, Any], clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None
+    account: Mapping[str, Any],
+    clouds: Sequence[PointCloud],
+    trajectories: Trajectories | None,
+    body: BodyFit | None,
+    silhouettes: Sequence[SilhouetteFit] = (),
 ) -> list[Row]:
     """The rows; `sigma_of` says what each sigma is made of. NaN, where there is nothing to make it of, becomes null in the file."""
     per_frame = {
@@ -29,7 +34,24 @@ def figure_rows(
     for view, offset in account.get("offsets", {}).items():
         if offset["late_frames"] is not None and offset["sigma_frames"] is not None:
             rows.append(_row(f"view {view} is late by", offset["late_frames"], offset["sigma_frames"], "frames", ESTIMATED))
-    return rows + (_of_body(body) if body is not None else [])
+    return rows + _of_silhouettes(silhouettes) + (_of_body(body) if body is not None else [])
+
+
+def _of_silhouettes(fits: Sequence[SilhouetteFit]) -> list[Row]:
+    """The IoU of each view, and how far the person's outline is from the body's."""
+    rows = []
+    for view, person in dict.fromkeys((f.view, f.person) for f in fits):
+        mine = [f for f in fits if (f.view, f.person) == (view, person)]
+        for name, unit, values in ((f"silhouette of view {view}, IoU with the person's {person}", "", [f.iou for f in mine]),
+                                   (f"outline of view {view} from the body's", "px", [f.distance_px for f in mine])):
+            known = [v for v in values if np.isfinite(v)]
+            rows += [_row(name, float(np.median(known)), float(np.std(known)), unit, FRAME_TO_FRAME)] if known else []
+    return rows
+
+
+def number(value: float) -> float | None:
+    """A number for JSON: null where there is none."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _of_body(body: BodyFit) -> list[Row]:

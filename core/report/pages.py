@@ -3,6 +3,7 @@
 import base64
 import html
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,9 @@ from ..surface.cloud import PointCloud
 from ..take import Footage
 from ..tracking.trajectories import Trajectories
 from . import pictures
-from .figures import Row, figure_rows, quoted
+from .figures import Row, figure_rows, number, quoted
 from .graphs import curve_graph
+from .silhouettes import OUTLINE, SilhouetteFit, Silhouettes
 
 STYLE = (
     "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}img,svg{max-width:100%}"
@@ -41,22 +43,29 @@ def write_report(
     clouds: Sequence[PointCloud],
     trajectories: Trajectories | None,
     body: BodyFit | None,
+    silhouettes: Silhouettes,
     monitor: Monitor,
+    pictured: Sequence[int] = (),
 ) -> None:
-    """Write the page and its pictures. Cancelling leaves the report of the run before."""
-    shown = _pictures(footage, account, clouds, trajectories, body, monitor)
+    """Write the page and its pictures, of the frames `pictured` (none: the first, a middle and the last).
+
+    Cancelling leaves the report of the run before.
+    """
+    shown = _pictures(footage, account, clouds, trajectories, body, silhouettes, monitor, pictured)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
         monitor.step("report", len(shown) + done, 2 * len(shown))
         files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
-    rows = figure_rows(account, clouds, trajectories, body)
+    rows = figure_rows(account, clouds, trajectories, body, silhouettes.fits)
     small = {name: (caption, picture) for name, (caption, _, picture) in files.items()}
-    page = _page(account, rows, small, _graphs(clouds, trajectories, body))
+    page = _page(account, rows, small, _graphs(clouds, trajectories, body) + _silhouette_graphs(silhouettes.fits))
     monitor.step("report", 1, 1)
     results.remove("report")
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
-    store.write_json(results.path("report", "report.json"), {"format": "tricap-report", "version": 1, **account, "figures": rows})
+    per_frame = [asdict(f) | {"iou": number(f.iou), "distance_px": number(f.distance_px)} for f in silhouettes.fits]
+    said = {"format": "tricap-report", "version": 1, **account, "figures": rows, "silhouettes": per_frame}
+    store.write_json(results.path("report", "report.json"), said)
     store.write_text(results.path("report", "report.html"), page)
 
 
@@ -66,14 +75,16 @@ def _pictures(
     clouds: Sequence[PointCloud],
     trajectories: Trajectories | None,
     body: BodyFit | None,
+    silhouettes: Silhouettes,
     monitor: Monitor,
+    pictured: Sequence[int],
 ) -> dict[str, tuple[str, np.ndarray]]:
-    """File name → (caption, picture), for the first, a middle and the last frame."""
+    """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
     skin = SkinSettings(**account["settings"]["skin"])
     found: dict[str, tuple[str, np.ndarray]] = {}
-    chosen = sorted({0, len(clouds) // 2, len(clouds) - 1})
+    chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or sorted({0, len(clouds) // 2, len(clouds) - 1})
     total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
 
     def add(name: str, caption: str, picture: np.ndarray) -> None:
@@ -94,9 +105,27 @@ def _pictures(
             add(f"tracks_{frame:04d}.png", caption, pictures.tracks_over_footage(images[ref], camera, trajectories, i))
         for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
             if body is not None:
-                picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin)
-                add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body", picture)
+                person = silhouettes.outlines.get(name, {}).get(frame)
+                picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
+                said = _said_of(silhouettes, name, frame)
+                add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body{said}", picture)
     return found
+
+
+def _said_of(silhouettes: Silhouettes, view: str, frame: int) -> str:
+    """What a caption says of the silhouette."""
+    found = [f for f in silhouettes.fits if (f.view, f.frame) == (view, frame)]
+    if not found:
+        return ""
+    drawn = " (red)" if found[0].person == OUTLINE else ""
+    return f" and its outline (green); IoU {found[0].iou:.3f} with the person's {found[0].person}{drawn}"
+
+
+def _silhouette_graphs(fits: Sequence[SilhouetteFit]) -> list[str]:
+    """IoU over the frames, view by view."""
+    views = list(dict.fromkeys(f.view for f in fits))
+    tables = {view: np.array([(f.frame, f.iou) for f in fits if f.view == view]) for view in views}
+    return [curve_graph(f"IoU of the silhouette, view {view}", "", t[:, 0].astype(int), {view: t[:, 1]}) for view, t in tables.items()]
 
 
 def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None) -> list[str]:
@@ -157,6 +186,8 @@ def _quotable(rows: Sequence[Row]) -> str:
 def _figures(figures: Mapping[str, Any]) -> str:
     said = []
     for name, value in figures.items():
+        if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
+            continue  # a table of its own among the figures
         text = (
             f"{value:.3g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:.0f}" if isinstance(value, float) else str(value)
         )

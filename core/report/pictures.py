@@ -12,22 +12,32 @@ from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..surface.cloud import PointCloud
 from ..tracking.trajectories import Trajectories
+from .silhouettes import outlines_of
 
 SKIN_COLOUR = np.array([120.0, 190.0, 255.0])  # BGR
 BONE_COLOUR, JOINT_COLOUR = (60, 60, 230), (40, 220, 255)
+BODY_OUTLINE, PERSON_OUTLINE = (60, 220, 60), (40, 40, 240)
 OPACITY = 0.55
 PANEL_PX = 480
 TAIL_FRAMES = 10
 
 
-def body_over_footage(grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> np.ndarray:
-    """The skin of one posture, shaded, with its bones, over one view (h, w, 3) uint8. `values` (D,) are the posture's DOFs."""
+def body_over_footage(grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings,
+                      person_px: np.ndarray | None = None) -> np.ndarray:
+    """The skin of one posture, shaded, with its bones and outline, over one view (h, w, 3) uint8. `values` (D,) are the posture's DOFs.
+
+    `person_px` (V, 2): the outline of the person in the footage, drawn as well.
+    """
     skin = body_skin(shape, values, settings)
     picture = colour(grey).astype(np.float32)
     light, covered = shade(camera, skin.vertices_m, skin.triangles)
     alpha = (OPACITY * covered)[..., None]
     picture = (1 - alpha) * picture + alpha * light[..., None] * SKIN_COLOUR
-    return _draw_bones(picture.clip(0, 255).astype(np.uint8), camera, shape, values)
+    drawn = _draw_bones(picture.clip(0, 255).astype(np.uint8), camera, shape, values)
+    cv2.polylines(drawn, outlines_of(covered > 0.5), True, BODY_OUTLINE, 1, cv2.LINE_AA)
+    if person_px is not None:
+        cv2.polylines(drawn, [np.rint(person_px * 8).astype(np.int32)], True, PERSON_OUTLINE, 1, cv2.LINE_AA, 3)
+    return drawn
 
 
 def _draw_bones(picture: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray) -> np.ndarray:

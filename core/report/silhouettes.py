@@ -1,0 +1,134 @@
+"""How well the fitted body's silhouette agrees with the person's, view by view and frame by frame.
+
+    IoU = |body ∩ person| / |body ∪ person|                                                                (1)
+
+The person is what lies within the outline that `tricap contour` found, or else what hides the still background, in squares of some pixels.
+An outline has no holes, so those of the body (between an arm and the trunk) are filled too. The distance is that of the person's outline
+from the nearest point of the body's, the median over the outline.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from ..body.shape import BodyShape
+from ..body.skin import SkinSettings, body_skin
+from ..errors import InputError
+from ..fitting.body_motion import BodyFit
+from ..fitting.fit_input import EmptyView
+from ..geometry.camera import Camera
+from ..geometry.raster import rasterize
+from ..progress import Monitor
+from ..take import Footage
+from ..without_surface import filled
+
+MOST_FRAMES = 60  # evenly over the take: a frame of four views takes a third of a second
+OUTLINE, BACKGROUND = "outline", "background"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SilhouetteFit:
+    """The agreement in one view and frame."""
+
+    view: str
+    frame: int
+    iou: float
+    distance_px: float
+    person: str  # what tells where the person is: "outline" or "background"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Silhouettes:
+    """The agreement wherever the person's silhouette is known, and the outlines (V, 2) px of `tricap contour` by view and frame."""
+
+    fits: tuple[SilhouetteFit, ...] = ()
+    outlines: Mapping[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
+
+
+def silhouettes_of(footage: Footage, body: BodyFit, settings: SkinSettings, outlines: Mapping[str, Mapping[int, np.ndarray]],
+                   empty: Sequence[EmptyView], monitor: Monitor) -> Silhouettes:
+    """The agreement of the body with the outlines, and in views without one with what hides the still background (`empty`).
+
+    Raises:
+        Cancelled: the user asked to stop.
+    """
+    hidden = {e.view: e for e in empty}
+    frames = body.motion.frames
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round().astype(int))
+    if not outlines and not hidden:
+        return Silhouettes()
+    found = []
+    for n, i in enumerate(chosen.tolist()):
+        monitor.step("silhouettes", n, len(chosen))
+        frame = int(frames[i])
+        for camera, mask in zip(footage.rig.cameras, body_masks(footage.rig.cameras, body.shape, body.motion.values[i], settings)):
+            polygon = outlines.get(camera.name, {}).get(frame)
+            if polygon is not None:
+                found.append(_agreement(camera.name, frame, mask, filled(polygon, camera.size_px), OUTLINE))
+            elif camera.name in hidden and (far := hidden[camera.name].of_frame(frame)) is not None:
+                found.append(_before_background(camera.name, frame, mask, far == 0, hidden[camera.name].step_px))
+    return Silhouettes(fits=tuple(found), outlines=outlines)
+
+
+def by_view(fits: Sequence[SilhouetteFit]) -> dict[str, dict[str, float]]:
+    """The median and least IoU and the median distance of each view, for run.json; frames without a silhouette are passed over."""
+    table: dict[str, dict[str, float]] = {}
+    known = [f for f in fits if np.isfinite(f.iou) and np.isfinite(f.distance_px)]
+    for view in dict.fromkeys(f.view for f in known):
+        mine = [f for f in known if f.view == view]
+        iou, distance = [f.iou for f in mine], [f.distance_px for f in mine]
+        table[view] = {"iou": round(float(np.median(iou)), 4), "least_iou": round(min(iou), 4),
+                       "distance_px": round(float(np.median(distance)), 3), "frames": len(mine)}
+    return table
+
+
+def body_masks(cameras: Sequence[Camera], shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> list[np.ndarray]:
+    """What each camera shows of a body (h, w), holes filled; nothing of a body without a skin."""
+    try:
+        skin = body_skin(shape, values, settings)
+    except InputError:
+        return [np.zeros(camera.size_px[::-1], bool) for camera in cameras]
+    masks = []
+    for camera in cameras:
+        raster = rasterize(camera, skin.vertices_m, skin.triangles, back_faces=True)
+        masks.append(_filled_holes(raster.image(np.ones(len(raster.sample)), 0.0) > 0))
+    return masks
+
+
+def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
+    """The closed outlines (M, 2) px about a mask (h, w)."""
+    return [c[:, 0] for c in cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]
+
+
+def _before_background(view: str, frame: int, body: np.ndarray, person: np.ndarray, step_px: int) -> SilhouetteFit:
+    """In squares of `step_px`, with the largest region that hides the background."""
+    h, w = person.shape
+    squares = body[: h * step_px, : w * step_px].reshape(h, step_px, w, step_px).mean(axis=(1, 3)) > 0.5
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(person.astype(np.uint8))
+    largest = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])) if len(stats) > 1 else person
+    fit = _agreement(view, frame, squares, _filled_holes(largest), BACKGROUND)
+    return SilhouetteFit(view=view, frame=frame, iou=fit.iou, distance_px=step_px * fit.distance_px, person=BACKGROUND)
+
+
+def _agreement(view: str, frame: int, body: np.ndarray, person: np.ndarray, source: str) -> SilhouetteFit:
+    union = int((body | person).sum())
+    distance = np.nan
+    edge = np.ones(body.shape, np.uint8)
+    for outline in outlines_of(body):
+        edge[outline[:, 1], outline[:, 0]] = 0
+    seen = outlines_of(person)
+    if seen and not edge.all():
+        far = cv2.distanceTransform(edge, cv2.DIST_L2, cv2.DIST_MASK_5)
+        largest = max(seen, key=len)
+        distance = float(np.median(far[largest[:, 1], largest[:, 0]]))
+    return SilhouetteFit(view=view, frame=frame, iou=float((body & person).sum() / union) if union else np.nan, distance_px=distance,
+                         person=source)
+
+
+def _filled_holes(mask: np.ndarray) -> np.ndarray:
+    whole = np.zeros(mask.shape, np.uint8)
+    for outline in cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
+        cv2.drawContours(whole, [outline], -1, 1, cv2.FILLED)
+    return whole > 0
