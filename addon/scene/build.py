@@ -23,7 +23,8 @@ from . import action, armature, cameras, clips, implicit, metaballs, skin, surro
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import at_rest
-from .trajectories import add_arrows, add_trajectories
+from .segments import Segments
+from .trajectories import add_arrows, add_trajectories, sparser
 
 COLLECTION = "Tricap"
 NEAR_M = 0.03  # a cloud's point has the speed of a tracked point within this distance
@@ -43,6 +44,8 @@ class SceneOptions:
     simplify_deg: float = 0.0  # above 0: the armature plays a second action with few keys, within this tolerance
     colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
     arrows: bool = False  # velocities as arrows
+    frame: int | None = None  # of the implicit surface; None: the middle one
+    most_points: int = 300_000  # of the cloud, and of all trajectories' places, in all frames: more are thinned evenly
 
 
 DEFAULTS = SceneOptions()
@@ -74,12 +77,14 @@ def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = 
 
 def write_scene(contents: Contents, blend: Path | None = None, options: SceneOptions = DEFAULTS,
                 monitor: Monitor | None = None) -> SceneReport:
-    """The second half of `build_scene`: main thread only."""
+    """The second half of `build_scene`: main thread only. What can fail is done before anything of an earlier build is removed."""
     if options.exact_skin and blend is None:
         raise InputError("The exact skin is kept in a file beside the Blender file; give the Blender file a name.")
     scene = bpy.context.scene
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
+    surface = _implicit_surface(contents, options, monitor) if options.implicit else None
+    opened = _opened_clips(scene, contents)
     remove_earlier()
     collection = bpy.data.collections.new(COLLECTION)
     collection[OUT_KEY] = str(contents.out)
@@ -87,14 +92,14 @@ def write_scene(contents: Contents, blend: Path | None = None, options: SceneOpt
     scene.collection.children.link(collection)
     set_time(scene, contents)
     warnings, counts = list(contents.warnings), {}
-    counts["cameras"] = _add_cameras(scene, collection, contents, warnings)
-    counts["cloud points"] = _add_cloud(collection, contents, options.colour)
+    counts["cameras"] = _add_cameras(scene, collection, contents, opened, warnings)
+    segments = Segments(contents)
+    counts["cloud points"] = _add_cloud(collection, contents, segments, options, warnings)
     if contents.trajectories is not None:
-        add_trajectories(collection, contents.trajectories)
-        if options.arrows:
-            add_arrows(collection, contents.trajectories)
-        counts["trajectories"] = contents.trajectories["xyz_m"].shape[1]
-    counts |= _add_body(collection, contents, warnings, options, blend, monitor)
+        counts["trajectories"] = _add_trajectories(collection, contents.trajectories, segments, options, warnings)
+    counts |= _add_body(collection, contents, warnings, options, blend)
+    if surface is not None:
+        implicit.add_implicit(collection, *surface, potential_named(options.field))
     surroundings.add_lights(collection)
     if contents.footage is not None and contents.footage.rig.metadata.get("floor") is True:
         surroundings.add_floor(collection)
@@ -167,7 +172,25 @@ def _caches_beside(path: Path) -> Iterator[None]:
             modifier.filepath = file
 
 
-def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, contents: Contents, warnings: list[str]) -> int:
+Opened = list[tuple[bpy.types.MovieClip, list[Path]]]
+
+
+def _opened_clips(scene: bpy.types.Scene, contents: Contents) -> Opened:
+    """The clip of every view and the files that it shows."""
+    opened: Opened = []
+    footage = contents.footage
+    try:
+        for view, camera, sequence in zip(footage.take.views, footage.rig.cameras, footage.sequences) if footage else ():
+            made = [folder / clips.FIELDS / view.name for folder in (footage.take.folder, contents.out)]
+            files = clips.shown_files(sequence, footage.take.instants, made[0] if made[0].is_dir() else made[1])
+            opened.append((clips.clip_of_view(scene, view.name, files[0], camera), files))
+    except InputError:
+        bpy.data.batch_remove([clip for clip, _ in opened if clip.users == 0])
+        raise
+    return opened
+
+
+def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, contents: Contents, opened: Opened, warnings: list[str]) -> int:
     footage = contents.footage
     if footage is None:
         return 0
@@ -175,12 +198,11 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
     reference = footage.rig.cameras[take.reference]
     cameras.frame_render(scene, reference)
     warnings += cameras.frame_faults(footage.rig, reference)
-    for view, camera, sequence in zip(take.views, footage.rig.cameras, footage.sequences):
+    for view, camera, (clip, files) in zip(take.views, footage.rig.cameras, opened):
         camera_object = cameras.add_camera(collection, camera)
         camera_object["tricap_interlaced"] = take.interlaced
-        made = [folder / clips.FIELDS / view.name for folder in (take.folder, contents.out)]
-        files = clips.shown_files(sequence, take.instants, made[0] if made[0].is_dir() else made[1])
-        clip = clips.clip_of_view(scene, view.name, files[0], camera)
+        if clip.name.startswith(name := f"Footage {view.name}"):
+            clip.name = name  # which an earlier build's clip had until now
         clip.frame_start = -take.instants.per_image * view.offset_frames
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
@@ -189,37 +211,71 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
     return len(take.views)
 
 
-def _add_cloud(collection: bpy.types.Collection, contents: Contents, colour: str) -> int:
-    clouds = [_cloud_points(frame, ply, contents.trajectories) for frame, ply in contents.clouds.items()]
-    if clouds:
-        add_cloud(collection, clouds, colour)
-    return sum(len(cloud.xyz_m) for cloud in clouds)
+def _add_cloud(collection: bpy.types.Collection, contents: Contents, segments: Segments, options: SceneOptions, warnings: list[str]
+               ) -> int:
+    whole = sum(len(ply.xyz_m) for ply in contents.clouds.values())
+    every = -(-whole // options.most_points) or 1
+    if every > 1:
+        where = contents.out / "clouds"
+        warnings.append(f"The scene's cloud is one in {every} of {whole} points, so that it stays quick; all are in {where}.")
+    shown = [_cloud_points(frame, ply, every, contents.trajectories, segments) for frame, ply in contents.clouds.items()]
+    if shown:
+        segments.name(add_cloud(collection, shown, options.colour))
+    return sum(len(cloud.xyz_m) for cloud in shown)
 
 
-def _cloud_points(frame: int, ply: Ply, trajectories: Mapping[str, np.ndarray] | None) -> CloudPoints:
-    xyz = ply.xyz_m
-    column = {name: ply.vertex.get(name, np.zeros(len(xyz))) for name in ("sigma", "nx", "ny", "nz", "intensity")}
+def _cloud_points(frame: int, ply: Ply, every: int, trajectories: Mapping[str, np.ndarray] | None, segments: Segments) -> CloudPoints:
+    xyz = ply.xyz_m[::every]
+    names = ("sigma", "nx", "ny", "nz", "intensity")
+    column = {name: ply.vertex[name][::every] if name in ply.vertex else np.zeros(len(xyz)) for name in names}
     normals = np.stack([column[name] for name in ("nx", "ny", "nz")], axis=-1)
     return CloudPoints(frame=frame, xyz_m=xyz, sigma_m=column["sigma"], normals=normals, intensity=column["intensity"],
-                       speed_m_s=_speed_nearby(frame, xyz, trajectories))
+                       velocity_m_s=_velocity_nearby(frame, xyz, trajectories), segment=segments.of(frame, xyz))
 
 
-def _speed_nearby(frame: int, xyz: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
-    """Speed (N,) of the nearest tracked point of the frame; 0 where none is near."""
+def _add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], segments: Segments, options: SceneOptions,
+                      warnings: list[str]) -> int:
+    shown, every = sparser(arrays, options.most_points)
+    if every > 1:
+        warnings.append(f"The scene shows one in {every} of {arrays['xyz_m'].shape[1]} trajectories, so that it stays quick.")
+    add_trajectories(collection, shown, segments)
+    if options.arrows:
+        add_arrows(collection, shown)
+    return int(shown["xyz_m"].shape[1])
+
+
+def _velocity_nearby(frame: int, xyz: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
+    """Velocity (N, 3) of the nearest tracked point of the frame; 0 where none is near."""
     at = np.flatnonzero(trajectories["frames"] == frame) if trajectories is not None else np.zeros(0, dtype=int)
     if trajectories is None or not len(at) or not len(xyz):
-        return np.zeros(len(xyz))
+        return np.zeros((len(xyz), 3))
     place, velocity = trajectories["xyz_m"][at[0]], trajectories["velocity_m_s"][at[0]]
     known = np.isfinite(place).all(axis=1) & np.isfinite(velocity).all(axis=1)
     if not known.any():
-        return np.zeros(len(xyz))
+        return np.zeros((len(xyz), 3))
     distance, nearest = cKDTree(place[known]).query(xyz, distance_upper_bound=NEAR_M)
-    speed = np.linalg.norm(velocity[known], axis=1)
-    return np.where(np.isfinite(distance), speed[np.minimum(nearest, len(speed) - 1)], 0.0)
+    return np.where(np.isfinite(distance)[:, None], velocity[known][np.minimum(nearest, known.sum() - 1)], 0.0)
 
 
-def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: list[str], options: SceneOptions, blend: Path | None,
-              monitor: Monitor | None) -> dict[str, int]:
+def _implicit_surface(contents: Contents, options: SceneOptions, monitor: Monitor | None
+                      ) -> tuple[tuple[np.ndarray, np.ndarray], int] | None:
+    """The implicit surface in the chosen or the middle frame, and which that is; None without a posture there.
+
+    Raises:
+        InputError: the field is unknown, or this Blender was built without OpenVDB.
+    """
+    shape, motion, potential = contents.shape, contents.motion, potential_named(options.field)
+    if shape is None:
+        return None
+    posture, frame = np.zeros(len(shape.skeleton.dof_names)), contents.frames[0]
+    if motion is not None:
+        row = len(motion.frames) // 2 if options.frame is None else int(np.argmin(np.abs(motion.frames - options.frame)))
+        posture, frame = motion.values[row], int(motion.frames[row])
+    return (implicit.implicit_surface(shape, posture, monitor, potential), frame) if np.isfinite(posture).all() else None
+
+
+def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: list[str], options: SceneOptions, blend: Path | None
+              ) -> dict[str, int]:
     shape, motion = contents.shape, contents.motion
     if shape is None:
         return {}
@@ -231,7 +287,7 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
     flesh = metaballs.add_metaballs(collection, armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
-        skin_object = skin.add_skin(collection, armature_object, shape, options.detail)
+        skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings)
         if contents.skins is not None and blend is not None:
             other = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
             for part in flesh:
@@ -244,11 +300,6 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
         skin_object.hide_set(True)  # it lies in the metaballs' or the exact skin's surface
         skin_object.hide_render = True
         counts["skin faces"] = len(skin_object.data.polygons)
-    if options.implicit:
-        row = len(values) // 2
-        posture, frame = (values[row], int(motion.frames[row])) if motion is not None else (np.zeros(n), contents.frames[0])
-        if np.isfinite(posture).all():
-            implicit.add_implicit(collection, shape, posture, frame, monitor, potential_named(options.field))
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
         counts["frames of motion"] = len(motion.frames)

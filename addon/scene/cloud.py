@@ -1,6 +1,7 @@
 """The point clouds of all frames as ONE mesh object of points; geometry nodes show the current frame's.
 
-Named attributes on the points: frame (int), sigma [m], intensity and speed [m/s] (float), normal (vector).
+Named attributes on the points: frame and segment (int, see `segments`), sigma [m], intensity and speed [m/s] (float), normal and velocity
+[m/s] (vector).
 """
 
 from collections.abc import Sequence
@@ -19,14 +20,20 @@ REDDEST_PERCENTILE = 98.0
 
 @dataclass(frozen=True, kw_only=True)
 class CloudPoints:
-    """The points of one frame: xyz_m (N, 3), sigma_m (N,), normals (N, 3), intensity (N,), speed_m_s (N,) 0 = unknown."""
+    """The points of one frame: xyz_m and normals (N, 3), sigma_m, intensity and segment (N,), velocity_m_s (N, 3) 0 = unknown."""
 
     frame: int
     xyz_m: np.ndarray
     sigma_m: np.ndarray
     normals: np.ndarray
     intensity: np.ndarray
-    speed_m_s: np.ndarray
+    velocity_m_s: np.ndarray
+    segment: np.ndarray
+
+    @property
+    def speed_m_s(self) -> np.ndarray:
+        """(N,)"""
+        return np.asarray(np.linalg.norm(self.velocity_m_s, axis=1))
 
 
 def add_cloud(collection: bpy.types.Collection, clouds: Sequence[CloudPoints], colour: str = "intensity") -> bpy.types.Object:
@@ -38,6 +45,8 @@ def add_cloud(collection: bpy.types.Collection, clouds: Sequence[CloudPoints], c
     write(mesh, "sigma", "FLOAT", np.concatenate([cloud.sigma_m for cloud in clouds]))
     write(mesh, "intensity", "FLOAT", np.concatenate([cloud.intensity for cloud in clouds]))
     write(mesh, "speed", "FLOAT", np.concatenate([cloud.speed_m_s for cloud in clouds]))
+    write(mesh, "velocity", "FLOAT_VECTOR", np.concatenate([cloud.velocity_m_s for cloud in clouds]))
+    write(mesh, "segment", "INT", np.concatenate([cloud.segment for cloud in clouds]))
     write(mesh, "frame", "INT", np.concatenate([np.full(len(cloud.xyz_m), cloud.frame) for cloud in clouds]))
     material = _material(clouds, colour)
     mesh.materials.append(material)
@@ -76,7 +85,8 @@ def _material(clouds: Sequence[CloudPoints], colour: str) -> bpy.types.Material:
     if colour == "intensity":
         return paint.attribute_material(NAME, colour, 1.0 / _white(clouds))
     values = np.concatenate([cloud.sigma_m if colour == "sigma" else cloud.speed_m_s for cloud in clouds])
-    return paint.heat_material(NAME, colour, float(np.percentile(values, REDDEST_PERCENTILE)) or 1.0)
+    values = values[np.isfinite(values)]
+    return paint.heat_material(NAME, colour, (float(np.percentile(values, REDDEST_PERCENTILE)) if len(values) else 0.0) or 1.0)
 
 
 def _white(clouds: Sequence[CloudPoints]) -> float:

@@ -45,6 +45,7 @@ class Contents:
     trajectories: Mapping[str, np.ndarray] | None = None
     shape: BodyShape | None = None
     motion: MotionTable | None = None
+    skin_settings: SkinSettings = field(default_factory=SkinSettings)
     skins: FrameSkins | None = None  # only where they were asked for
     warnings: tuple[str, ...] = ()
 
@@ -82,8 +83,10 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     shape = _optional(out / "body.toml", "armature and metaballs", read_body, warnings)
     motion = _motion(out / "motion.csv", shape, warnings)
     monitor.step("reading results", 3, 3)
+    settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
-                   skins=_skins(run, out / "skin", monitor, warnings) if skins else None, warnings=tuple(warnings))
+                   skin_settings=settings, skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
+                   warnings=tuple(warnings))
 
 
 def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage | None:
@@ -107,7 +110,7 @@ def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Pl
     return clouds
 
 
-def _skins(run: Mapping[str, Any], folder: Path, monitor: Monitor, warnings: list[str]) -> FrameSkins | None:
+def _skins(settings: SkinSettings, folder: Path, monitor: Monitor, warnings: list[str]) -> FrameSkins | None:
     files = {int(path.stem): path for path in folder.glob("*.ply") if path.stem.isdigit()}
     if not files:
         warnings.append(f"No exact skin in the scene: {folder} holds no skins; run the fit again.")
@@ -118,7 +121,6 @@ def _skins(run: Mapping[str, Any], folder: Path, monitor: Monitor, warnings: lis
         vertices.append(read_ply(files[frame]).xyz_m.astype("<f4"))
         if len(vertices[-1]) != len(vertices[0]):
             raise InputError(f"{files[frame]} has {len(vertices[-1])} points, the skins before {len(vertices[0])}; run the fit again.")
-    settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     return FrameSkins(frames=np.array(sorted(files)), vertices_m=np.stack(vertices), settings=settings)
 
 

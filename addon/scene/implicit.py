@@ -13,10 +13,11 @@ from ...core.progress import Monitor
 SPACING_M = 0.005
 
 
-def add_implicit(collection: bpy.types.Collection, shape: BodyShape, motion: np.ndarray, frame: int,
-                 monitor: Monitor | None = None, potential: Potential = EXPONENTIAL) -> bpy.types.Object:
-    """The surface F = ½ of the body in one posture, `motion` (D,) rad and metres, to 0.4 mm (a grid of 5 mm). Its name tells the frame,
-    and the field where it is not the fitted one.
+def implicit_surface(shape: BodyShape, motion: np.ndarray, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) and quads (K, 4) of the surface F = ½ of the body in one posture, `motion` (D,) rad and metres.
+
+    To 0.4 mm, from a grid of 5 mm.
 
     Raises:
         InputError: this Blender was built without OpenVDB.
@@ -27,8 +28,15 @@ def add_implicit(collection: bpy.types.Collection, shape: BodyShape, motion: np.
     grid = openvdb.FloatGrid()
     grid.copyFromArray(THRESHOLD - sampled.values)  # a level set: negative inside
     points, quads = grid.convertToQuads(0.0)
+    return sampled.origin_m + SPACING_M * points, quads
+
+
+def add_implicit(collection: bpy.types.Collection, surface: tuple[np.ndarray, np.ndarray], frame: int, potential: Potential = EXPONENTIAL
+                 ) -> bpy.types.Object:
+    """The surface as an object whose name tells the frame, and the field where it is not the fitted one."""
+    points, quads = surface
     mesh = bpy.data.meshes.new(f"Implicit surface {frame:04d}" + (f" {potential.name}" if potential.name != EXPONENTIAL.name else ""))
-    mesh.from_pydata((sampled.origin_m + SPACING_M * points).tolist(), [], quads.tolist())
+    mesh.from_pydata(points.tolist(), [], quads.tolist())
     mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
     mesh.update()
     checked = bpy.data.objects.new(mesh.name, mesh)

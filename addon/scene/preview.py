@@ -17,6 +17,7 @@ from mathutils import Matrix, Vector
 from ...core import store
 from ...core.errors import InputError
 from ...core.geometry.camera import Camera
+from ...core.geometry.camera_derivatives import image_of, interior_of
 from ...core.progress import Monitor
 from .contents import Contents
 
@@ -70,8 +71,13 @@ def turntable(path: Path, frame: int | None = None, monitor: Monitor | None = No
 
 
 def undistorted(grey: np.ndarray, camera: Camera) -> np.ndarray:
-    """The picture as the camera would see it with an ideal lens of the same matrix."""
-    return np.asarray(cv2.undistort(grey.astype(np.float32), camera.matrix, np.asarray(camera.distortions)))
+    """The picture as Blender's camera sees it: an ideal lens of the same principal point and focal lengths, affinity included."""
+    interior = interior_of(camera)
+    f, cx, cy, b1 = interior[0], *interior[1:3], interior[8]
+    y, x = np.indices(grey.shape, dtype=np.float64)
+    rays = np.stack([(x - cx) / (f * (1 + b1)), (y - cy) / f, np.ones(grey.shape)], axis=-1)
+    places = image_of(interior, rays.reshape(-1, 3)).reshape(*grey.shape, 2).astype(np.float32)
+    return np.asarray(cv2.remap(grey.astype(np.float32), places, None, cv2.INTER_LINEAR))
 
 
 @contextmanager
@@ -101,9 +107,11 @@ def _turning_camera(scene: bpy.types.Scene) -> Iterator:
     data.lens, data.sensor_fit = TURN_LENS_MM, "VERTICAL"
     data.sensor_height = 36.0
     distance = 1.15 * radius / math.sin(math.atan(0.5 * data.sensor_height / data.lens))
-    kept = scene.camera, scene.render.resolution_x, scene.render.resolution_y
+    render = scene.render
+    kept = scene.camera, render.resolution_x, render.resolution_y, render.pixel_aspect_x, render.pixel_aspect_y
     scene.camera = camera
-    scene.render.resolution_x, scene.render.resolution_y = TURN_SIZE_PX
+    render.resolution_x, render.resolution_y = TURN_SIZE_PX
+    render.pixel_aspect_x = render.pixel_aspect_y = 1.0
 
     def turn(angle: float) -> None:
         place = centre + distance * Vector((math.sin(angle), -math.cos(angle), 0.15))
@@ -112,7 +120,7 @@ def _turning_camera(scene: bpy.types.Scene) -> Iterator:
     try:
         yield turn
     finally:
-        scene.camera, scene.render.resolution_x, scene.render.resolution_y = kept
+        scene.camera, render.resolution_x, render.resolution_y, render.pixel_aspect_x, render.pixel_aspect_y = kept
         bpy.data.cameras.remove(data)
 
 

@@ -25,13 +25,15 @@ SKIN_COLOUR = (0.80, 0.52, 0.41)
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
 
-def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape, detail: int = 1) -> bpy.types.Object:
-    """The skin of the rest pose, bound to the armature; `detail` cuts its B-spline patches finer.
+def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape, detail: int = 1,
+             settings: SkinSettings = SkinSettings()) -> bpy.types.Object:  # noqa: B008  frozen
+    """The skin of the rest pose, bound to the armature, sampled as the run's settings say; `detail` cuts its B-spline patches finer.
 
     Raises:
         InputError: the body has no metaballs.
     """
-    skin = _skin(shape, np.zeros(len(shape.skeleton.dof_names)), detail)
+    skin = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
+    skin = refined(skin, detail) if detail > 1 else skin
     skin_object = _mesh_object(collection, NAME, skin)
     skin_object.parent = armature_object
     _bind(skin_object, skin)
@@ -58,11 +60,6 @@ def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: Fr
     modifier.cache_format, modifier.filepath = "PC2", str(cache)
     modifier.frame_start = float(first)
     return skin_object
-
-
-def _skin(shape: BodyShape, motion: np.ndarray, detail: int) -> Skin:
-    skin = body_skin(shape, motion, SkinSettings())
-    return refined(skin, detail) if detail > 1 else skin
 
 
 def _mesh_object(collection: bpy.types.Collection, name: str, skin: Skin) -> bpy.types.Object:
