@@ -19,6 +19,7 @@ from ..core import store
 from ..core.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
 from ..core.images.fields import BOTH, Instants, instants
+from ..core.person_sources import PERSON_SOURCES
 from ..core.take import Take
 from ..core.take_file import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import folders, properties, seeds
@@ -208,7 +209,8 @@ def table(scene: bpy.types.Scene) -> Table:
     """
     props, old = scene.tricap, read_table(folder_of(scene))
     made = dict(old) or new_table([])
-    made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": [view_entry(view) for view in props.views]}
+    views = [view_entry(view) | _told(old, view.name) for view in props.views]
+    made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": views}
     said = props.first_field != "odd" or "first_field" in old  # odd need not be said
     _put(made, "first_field", _first_field(scene) if said else "")
     _put(made, "reference_view", props.reference_view if props.reference_view in [view.name for view in props.views] else "")
@@ -287,6 +289,12 @@ def _show_model(scene: bpy.types.Scene, name: str) -> None:
     known = {item.identifier for item in props.bl_rna.properties["model"].enum_items}
     props.model = name if name in known else "own" if name else "none"
     props.model_file = name if props.model == "own" else ""
+
+
+def _told(old: Table, name: str) -> Table:
+    """What the file says of a view and the scene does not keep: its masks or its background."""
+    entry = next((e for e in old.get("views", []) if e["name"] == name), {})
+    return {key: entry[key] for key in PERSON_SOURCES if key in entry}
 
 
 def view_entry(view: Any) -> Table:

@@ -25,6 +25,7 @@ from .matching.scanning import scan
 from .matching.seeds import Approximations, sweep_seeds
 from .progress import Monitor
 from .results import Results
+from .silhouettes import silhouette_file, silhouettes, told_by
 from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 from .take import Footage, footage_frames
 
@@ -129,7 +130,7 @@ def measure_frames(
         if frame == first - 1:
             before = start
         known = [before.key] if before else _image_digests(footage, _furthest_frame(footage, frame))  # the room is found with that frame
-        key = store.digest(base, *known, str(frame), *_image_digests(footage, frame))
+        key = store.digest(base, *known, str(frame), *_image_digests(footage, frame), *_silhouette_digests(footage, frame))
         measured = read_checkpoint(footage, results, frame, key)
         if measured is None:
             measured = _measure(footage, matching, growing, surface, frame, before, key, part, enhance)
@@ -154,6 +155,12 @@ def _image_digests(footage: Footage, frame: int) -> list[str]:
     return parts
 
 
+def _silhouette_digests(footage: Footage, frame: int) -> list[str]:
+    """The content of the masks and backgrounds of a frame."""
+    told = (silhouette_file(footage, k, frame) for k in range(len(footage.take.views)))
+    return [store.digest(path) for path in told if path is not None and path.is_file()]
+
+
 def _seed_table(footage: Footage) -> list[tuple[str, list[tuple[str, list[float]]]]]:
     seeds = footage.take.seeds
     clicks = [*seeds.joints.items(), *((f"surface {i}", at) for i, at in enumerate(seeds.surface))]
@@ -174,8 +181,9 @@ def _measure(
     take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
     images = load_images(footage, frame, enhance)
     grid = template_grid(images.spline[ref].shape, take.rows_at(frame), growing.spacing_px)
+    person = silhouettes(footage, images.grey, frame, first=before is None)
     if before is None:
-        where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, monitor)
+        where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, person, monitor)
     else:
         where = fg.after(cameras[ref].to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
         seeds = sweep_seeds(
@@ -189,6 +197,8 @@ def _measure(
             monitor=monitor,
             pairs=growing.pairs,
         )
+    told = told_by(footage)
+    where = replace(where, silhouettes=person, method=f"{where.method}, {told}" if told else where.method)
     cover = scan if growing.method == "published" else grow
     field = cover(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
     field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor, pairs=growing.pairs)
@@ -196,7 +206,7 @@ def _measure(
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):
         raise NothingMeasured(frame)
-    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key)
+    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=replace(where, silhouettes=()), key=key)
 
 
 def first_seeds(
@@ -210,7 +220,8 @@ def first_seeds(
     """Where the person is in one frame, and the surface seeds there."""
     images = load_images(footage, frame, enhance)
     grid = template_grid(images.spline[footage.take.reference].shape, footage.take.rows_at(frame), growing.spacing_px)
-    return _first_foreground(footage, images, grid, matching, growing, frame, monitor)
+    person = silhouettes(footage, images.grey, frame, first=True)
+    return _first_foreground(footage, images, grid, matching, growing, frame, person, monitor)
 
 
 def _first_foreground(
@@ -220,13 +231,14 @@ def _first_foreground(
     matching: MatchingSettings,
     growing: GrowingSettings,
     frame: int,
+    person: tuple[fg.Silhouette, ...],
     monitor: Monitor,
 ) -> tuple[fg.Foreground, Approximations]:
-    """Where the person is in the first frame, and the seeds there."""
+    """Where the person is in the first frame, inside silhouettes if there are any, and the seeds there."""
     cameras, ref, take = footage.rig.cameras, footage.take.reference, footage.take
 
     def sweep(depth_range_m: tuple[float, float] | None) -> Approximations:
-        return sweep_seeds(
+        found = sweep_seeds(
             images.spline,
             cameras,
             ref,
@@ -237,17 +249,20 @@ def _first_foreground(
             monitor=monitor,
             pairs=growing.pairs,
         )
+        xyz = cameras[ref].points_at_depth(take.rows_at(frame).to_frame(found.xy[:, ref]), found.depth_m)
+        beside = fg.Foreground(depth_range_m=(0.0, np.inf), method="", silhouettes=person).excludes(xyz, np.zeros((len(xyz), 3, 3)))
+        return Approximations(**{f.name: getattr(found, f.name)[~beside] for f in fields(Approximations)})
 
     swept = sweep(None)
-    room, person = _room_and_person(footage, images, swept, frame)
+    room, moving = _room_and_person(footage, images, swept, frame)
     clicks = [*take.seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface))]
     depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
     if clicks and frame == take.seeds.frame:
         where = fg.around_clicks(depth)
     elif clicks:
-        where = fg.since_clicks(depth, abs(frame - take.seeds.frame) / take.fps, person)
-    elif len(person):
-        where = fg.nearest_surface(person)
+        where = fg.since_clicks(depth, abs(frame - take.seeds.frame) / take.fps, moving)
+    elif len(moving):
+        where = fg.nearest_surface(moving)
     else:
         where = fg.Foreground(depth_range_m=(0.05, 1e3), method="everything")
     where = replace(where, planes=room)

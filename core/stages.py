@@ -16,7 +16,7 @@ from . import following, measuring, store
 from .body.model_file import model_files
 from .errors import InputError
 from .settings import to_table
-from .take import Footage, Seeds, Take
+from .take import Footage, Seeds, Take, View
 
 STAGES = ("measure", "track", "fit")
 
@@ -38,7 +38,13 @@ def _seen(footage: Footage) -> Any:
     files = [[_stamp(path) for path in s.files()] for s in footage.sequences]
     rig = store.digest(take.rig_path)
     rows = take.interlaced, take.first_field
-    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.seeds), regions, measuring.ALGORITHM
+    person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v)) for v in take.views]
+    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.seeds), regions, person, measuring.ALGORITHM
+
+
+def _person_files(take: Take, view: View) -> Any:
+    pattern = view.mask or view.masks or view.background
+    return [_stamp(path) for path in sorted(take.folder.glob(pattern))] if pattern else []
 
 
 def _followed(footage: Footage) -> Any:

@@ -17,6 +17,7 @@ from .geometry.rig import Rig, read_rig
 from .images.fields import BOTH, INTERLACE, Instants, RowGrid, instants
 from .images.sequence import Sequence, open_sequence
 from .keypoint_sources import KeypointSource, keypoint_sources
+from .person_sources import PERSON_SOURCES, person_source
 from .settings import nearest_name
 from .toml_values import check_keys, frame_pair, inside, is_number, is_pixel, table_of, tables_of
 from .values import frozen
@@ -34,12 +35,18 @@ Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class View:
-    """One camera's footage: image files (a pattern) or a movie. Image 0 of the take is its number `offset_frames`."""
+    """One camera's footage: image files (a pattern) or a movie. Image 0 of the take is its number `offset_frames`.
+
+    One of `mask`, `masks` (a pattern, an image for every image) and `background` may say where the person is.
+    """
 
     name: str
     images: str | None = None
     movie: str | None = None
     offset_frames: int = 0
+    mask: str | None = None
+    masks: str | None = None
+    background: str | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -293,7 +300,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
     views = []
     for entry in entries:
         label = f"view {entry.get('name')!r} of {where}"
-        check_keys(entry, ("name", "images", "movie", "offset_frames"), label)
+        check_keys(entry, ("name", "images", "movie", "offset_frames", *PERSON_SOURCES), label)
         offset = entry.get("offset_frames", 0)
         if not isinstance(entry.get("name"), str) or not entry["name"] or not isinstance(offset, int):
             raise InputError(f"A {label} needs a name (text); `offset_frames` is a whole number.")
@@ -301,7 +308,8 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
             raise InputError(f"The {label} has a character in its name that file names cannot have; choose a plain name such as \"L\".")
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
-        views.append(View(name=entry["name"], images=entry.get("images"), movie=entry.get("movie"), offset_frames=offset))
+        files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
+        views.append(View(name=entry["name"], offset_frames=offset, **files))
     if len({v.name for v in views}) < len(views):
         raise InputError(f"Two views of {where} have the same name; give each its own.")
     return tuple(views)

@@ -18,6 +18,7 @@ ROWS = 64
 WINDOW_PX = 7  # side of the window in which two images are compared
 LOOSE = 1.6  # times the noise: a window of 7×7 has a root mean square of 1.0 ± 0.1 times it
 QUANTISED = 0.5  # grey values: what rounding adds
+EMPTY_SHARE = 0.25  # of a picture shows the background, whoever stands before it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -34,6 +35,13 @@ class Background:
         """Where (h, w) an image shows the background."""
         square = cv2.blur((image.astype(np.float32) - self.grey) ** 2, (WINDOW_PX, WINDOW_PX), borderType=cv2.BORDER_REFLECT_101)
         return np.asarray(square < (LOOSE * self.noise + QUANTISED) ** 2)
+
+
+def empty_view(grey: np.ndarray, image: np.ndarray) -> Background:
+    """The background of which an image (h, w) was taken, with its noise from another `image`, a quarter of which shows it at least."""
+    difference = image.astype(np.float32) - grey.astype(np.float32)
+    square = cv2.blur(difference**2, (WINDOW_PX, WINDOW_PX), borderType=cv2.BORDER_REFLECT_101)
+    return Background(grey=grey, noise=float(np.sqrt(np.quantile(square, EMPTY_SHARE))))
 
 
 def still_background(images: Sequence[np.ndarray]) -> Background | None:

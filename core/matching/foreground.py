@@ -1,7 +1,8 @@
 """The person, not the wall: in which depths to measure, and which planes of the room to leave out.
 
 The depth range comes from what the user clicked in that frame; without clicks, or where they are of another frame, from the nearest
-surface that carries many seeds, of those that moved if these are enough; later from the frame before. Floor and walls are planes of seeds
+surface that carries many seeds, of those that moved if these are enough; later from the frame before. Where the user gave masks or images
+of the empty background, only what lies inside these silhouettes is measured. Floor and walls are planes of seeds
 that do not change over time and have nothing behind them; they are found once per take, and points on them are not measured. Which of
 these was used is said in `method`.
 """
@@ -11,6 +12,9 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+
+from ..geometry.camera import Camera
+from ..images.fields import RowGrid
 
 REACH_M = 0.55  # a body's extent in depth beyond clicked joints
 SPEED_M_S = 2.0  # of someone who walks, in depth
@@ -24,22 +28,45 @@ PLANE_EXTENT_M = 1.2  # longer than the flat front of a person who stands still
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Silhouette:
+    """Where one view shows the person: a mask (h', w) over the rows of its image."""
+
+    camera: Camera
+    rows: RowGrid
+    mask: np.ndarray
+
+    def misses(self, xyz_m: np.ndarray) -> np.ndarray:
+        """(N,) points (N, 3) that this view would show beside the person; those out of its sight may be there."""
+        xy = self.rows.from_frame(self.camera.project(xyz_m))
+        h, w = self.mask.shape
+        with np.errstate(invalid="ignore"):
+            inside = (xy > -0.5).all(axis=1) & (xy < (w - 0.5, h - 0.5)).all(axis=1)
+        at = np.rint(np.where(inside[:, None], xy, 0.0)).astype(int)
+        return np.asarray(inside & ~self.mask[at[:, 1], at[:, 0]])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Foreground:
-    """Where the person may be: depths in the reference camera, and planes n·X = d to leave out, n towards the cameras."""
+    """Where the person may be: depths in the reference camera, planes n·X = d to leave out, n towards the cameras, and silhouettes."""
 
     depth_range_m: tuple[float, float]
     method: str
     planes: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))  # (P, 4) nx ny nz d
+    silhouettes: tuple[Silhouette, ...] = ()  # of this frame
 
     def excludes(self, xyz_m: np.ndarray, covariance_m2: np.ndarray) -> np.ndarray:
-        """(N,) points (N, 3) that lie on one of the planes as far as their covariances (N, 3, 3) can tell, or behind it."""
+        """(N,) points (N, 3) that lie on one of the planes as far as their covariances (N, 3, 3) can tell, or behind it, or beside a
+        silhouette."""
+        beside = np.zeros(len(xyz_m), dtype=bool)
+        for silhouette in self.silhouettes:
+            beside |= silhouette.misses(xyz_m)
         if not len(self.planes):
-            return np.zeros(len(xyz_m), dtype=bool)
+            return beside
         n = self.planes[:, :3]
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(np.einsum("pi,nij,pj->np", n, covariance_m2, n))
             tolerance = PLANE_TOLERANCE_M + np.minimum(PLANE_SIGMAS * sigma, PLANE_TOLERANCE_M)
-            return (xyz_m @ n.T - self.planes[:, 3] < tolerance).any(axis=1)
+            return np.asarray(beside | (xyz_m @ n.T - self.planes[:, 3] < tolerance).any(axis=1))
 
 
 def around_clicks(depth_m: np.ndarray) -> Foreground:

@@ -80,12 +80,13 @@ def test_what_the_panel_does_not_edit_stays(project: ModuleType, blender: Module
     scene = blender.context.scene
     extra = {"corrections": [{"kind": "trajectory", "view": "C", "frame": 4, "xy": [1.5, 2.5]}],
              "body": {"model": "arm.R", "locked": ["elbow.R twist"], "limits": {"elbow.R flexion": [0.0, 120.0]}}}  # fmt: skip
-    write_table(take, read_table(take) | extra)
+    views = [view | ({"mask": "mask.png"} if view["name"] == "C" else {}) for view in read_table(take)["views"]]
+    write_table(take, read_table(take) | extra | {"views": views})
     project.open_take(scene, take)
     scene.tricap.fps = 50.0
     project.write(scene)
     said = read_table(take)
-    assert said["fps"] == 50.0 and {k: said[k] for k in extra} == extra
+    assert said["fps"] == 50.0 and {k: said[k] for k in extra} == extra and said["views"] == views
     project.edit(scene, lambda table: table["body"].update(locked=[]))
     assert read_table(take)["body"]["locked"] == []
     with pytest.raises(project.InputError, match="must be a table"):
