@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
-TOOLS = ["pytest>=9", "ruff", "mypy", "setuptools>=77", "dask[distributed]>=2024.8"]
+TOOLS = ["pytest>=9", "ruff", "mypy", "setuptools>=77", "c3d>=0.6", "dask[distributed]>=2024.8"]
 REQUIREMENTS = {
     (3, 11): ["bpy==4.5.15", "numpy>=1.26,<2", "opencv-python-headless<5", "scipy==1.17.1", *TOOLS],
     (3, 13): ["bpy==5.2.3", "numpy>=2.2,<3", "opencv-python-headless==5.0.0.93", "scipy==1.18.1", *TOOLS],

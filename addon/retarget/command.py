@@ -7,6 +7,7 @@ from typing import Any
 
 from ...core import store
 from ...core.errors import InputError
+from ...core.motion.markers import UNITS_M
 from ...core.progress import Monitor
 from ...core.settings import from_table
 from .programs import PROGRAMS
@@ -27,6 +28,10 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--feet", choices=("off", "auto", "always"), default="auto", help="when feet are held on the floor")
     parser.add_argument("--hands", choices=("free", "keep"), default="free",
                         help="keep: hands keep their distance from each other, head, hips and thighs where they are near")
+    parser.add_argument("--twist", choices=("off", "bones", "forearms"), default="bones",
+                        help="spread twist over twist bones, or half of a hand's also over a forearm that has none")
+    parser.add_argument("--scale", metavar="F", type=float, default=0.0, help="size of the steps against the source's; default: the legs'")
+    _add_axes(parser)
     parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0, help="leave out keys within this tolerance")
     parser.add_argument("--report", action="store_true", help="also write figures (JSON) and a picture beside FILE.blend")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
@@ -38,7 +43,13 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--out", dest="file", metavar="FILE", type=Path, required=True, help="the file to write (for ply: a folder)")
     parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain",
                         help="names, units and axes for a program")
+    _add_axes(parser)
     parser.set_defaults(run=export)
+
+
+def _add_axes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--up", choices=("Y", "Z"), default="", help="the axis that is up in a BVH, TRC, C3D or CSV file")
+    parser.add_argument("--unit", choices=tuple(UNITS_M), default="", help="the unit of such a file, if not the one that it says")
 
 
 def _need_blender(what: str) -> None:
@@ -63,9 +74,10 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
     if args.blend.suffix != ".blend":
         raise InputError(f"{args.blend.name} is no name of a Blender file; let it end in .blend.")
-    settings = from_table(RetargetSettings, {"root": args.root, "hands": args.hands}, "--root, --hands")
+    table = {"root": args.root, "hands": args.hands, "twist": args.twist, "scale": args.scale}
+    settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
-    motion = source.open_source(args.out, monitor)
+    motion = source.open_source(args.out, monitor, up=args.up, unit=args.unit)
     motion_map = apply.map_of(motion.rig)
     files.open_rig(args.rig)
     armature_object = files.the_armature(args.armature, str(args.rig))
@@ -97,4 +109,4 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
     if args.format in BY_BLENDER or args.out.suffix.lower() in IN_BLENDER and not args.out.is_dir():
         _need_blender("export")
-    return [f"{args.file}: {export_file(args.out, args.format, args.file, args.preset, monitor)}"]
+    return [f"{args.file}: {export_file(args.out, args.format, args.file, args.preset, monitor, up=args.up, unit=args.unit)}"]

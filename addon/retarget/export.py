@@ -24,8 +24,10 @@ POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")} 
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
 
 
-def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor) -> str:
+def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor, *, up: str = "", unit: str = "") -> str:
     """Write the motion or the points in OUT to `file`; a sentence about what was written. For BY_BLENDER on the main thread only.
+
+    `up`, `unit`: of OUT, for `read_motion_source`.
 
     Raises:
         InputError: OUT lacks what the format needs, or the file cannot be written.
@@ -37,8 +39,8 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor)
         return _copy_skins(out, file)
     in_blender = out.suffix.lower() in IN_BLENDER and not out.is_dir()
     if kind in POINTS and not in_blender:
-        return _write_points(kind, file, points_of(out), program)
-    motion = _opened(out, monitor) if in_blender else read_motion_source(out)
+        return _write_points(kind, file, points_of(out, up=up, unit=unit), program)
+    motion = _opened(out, monitor) if in_blender else read_motion_source(out, up=up, unit=unit)
     if kind in POINTS:
         return _write_points(kind, file, heads_of(motion), program)
     if kind == "bvh":
@@ -56,14 +58,14 @@ def _opened(path: Path, monitor: Monitor) -> Motion:
     return open_source(path, monitor)
 
 
-def points_of(out: Path) -> Markers:
+def points_of(out: Path, *, up: str = "", unit: str = "") -> Markers:
     """The joints of a run with their sigmas, or the heads of a motion's bones."""
     if out.is_dir() and (out / "joints.csv").is_file():
         table = read_joints(out / "joints.csv")
         names = tuple(table.joints_m)
         xyz, sigma = (np.stack([column[name] for name in names], axis=1) for column in (table.joints_m, table.sigma_m))
         return Markers(names=names, fps=rate(table.frames, table.time_s), frames=table.frames, xyz_m=xyz, sigma_m=sigma)
-    return heads_of(read_motion_source(out))
+    return heads_of(read_motion_source(out, up=up, unit=unit))
 
 
 def heads_of(motion: Motion) -> Markers:

@@ -11,6 +11,7 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.rig import Motion, Rig
+from ...core.motion.retarget.vrm import role_of
 from ...core.progress import Monitor
 from ..scene.armature import ROLES_KEY
 
@@ -87,14 +88,23 @@ def humanoid_roles(armature_object: bpy.types.Object) -> dict[str, str]:
     if known is not None:
         return {str(role): str(name) for role, name in known.items() if name in armature_object.data.bones}
     extension = getattr(armature_object.data, "vrm_addon_extension", None)
-    bones = getattr(getattr(getattr(extension, "vrm1", None), "humanoid", None), "human_bones", None)
-    found = {}
-    for role, attribute in VRM.items():
-        bone = getattr(bones, attribute, None)
-        name = getattr(getattr(bone, "node", None), "bone_name", "")
-        if name in armature_object.data.bones:
-            found[role] = name
+    found: dict[str, str] = {}
+    for table in (_vrm1(extension), _vrm0(extension)):  # the one that is not the file's is empty
+        found |= {role: name for role, name in table.items() if name in armature_object.data.bones and role not in found}
     return found
+
+
+def _vrm1(extension: object) -> dict[str, str]:
+    """Bones by role from the VRM add-on's table of VRM 1: one attribute for each human bone."""
+    bones = getattr(getattr(getattr(extension, "vrm1", None), "humanoid", None), "human_bones", None)
+    return {role: getattr(getattr(getattr(bones, attribute, None), "node", None), "bone_name", "") for role, attribute in VRM.items()}
+
+
+def _vrm0(extension: object) -> dict[str, str]:
+    """Bones by role from the VRM add-on's table of VRM 0: a list of human bones by their names in the file."""
+    rows = getattr(getattr(getattr(extension, "vrm0", None), "humanoid", None), "human_bones", None) or ()
+    named = {role_of(row.bone): row.node.bone_name for row in rows}
+    return {role: name for role, name in named.items() if role}
 
 
 VRM = {"hips": "hips", "head": "head"} | {

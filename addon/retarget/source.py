@@ -15,14 +15,14 @@ from .export import IN_BLENDER
 from .read import action_frames, read_motion, read_rig
 
 
-def open_source(path: Path, monitor: Monitor) -> Motion:
-    """The motion in a run's folder or a file; a file for Blender takes the place of the open one.
+def open_source(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -> Motion:
+    """The motion in a run's folder or a file; a file for Blender takes the place of the open one. `up`, `unit`: of `read_motion_source`.
 
     Raises:
         InputError: it cannot be read, or holds no motion, or two.
     """
     if path.suffix.lower() not in IN_BLENDER or path.is_dir():
-        return read_motion_source(path)
+        return read_motion_source(path, up=up, unit=unit)
     files.open_rig(path)
     moving = [o for o in bpy.data.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action]
     if len(moving) != 1:

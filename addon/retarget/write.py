@@ -1,6 +1,6 @@
 """A retargeted motion as an action of the target: all keys of a curve at once, in the bones' own rotation modes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import bpy
@@ -15,12 +15,16 @@ CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_ax
 REST = {"rotation_quaternion": (1, 0, 0, 0), "rotation_axis_angle": (0, 0, 1, 0), "rotation_euler": (0, 0, 0), "location": (0, 0, 0),
         "scale": (1, 1, 1)}
 
+Resting = tuple[str, str, np.ndarray]  # bone, path and values of a channel at rest
+
 
 @dataclass(frozen=True, kw_only=True)
 class Written:
-    """The new action, its number of keys, and the constraints that had to be muted because they would overrule it."""
+    """The new action, the one with a key in every frame if that is another, the number of keys, and the constraints that had to be muted
+    because they would overrule it."""
 
     action: bpy.types.Action
+    raw: bpy.types.Action | None
     keys: int
     muted: tuple[str, ...]
 
@@ -29,14 +33,26 @@ def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tol
                  properties: Mapping[str, Mapping[str, float]] | None = None) -> Written:
     """Give the target a new action with the motion; its former one is kept in the file. Main thread only.
 
-    `tolerance_deg`: leave out keys as long as no rotation is off by more; 0 keys every frame. `properties`: by bone, custom properties
-    that the action sets once, such as FK instead of IK.
+    `tolerance_deg`: leave out keys as long as no rotation is off by more, and keep an action with all of them, too; 0 keys every frame.
+    `properties`: by bone, custom properties that the action sets once, such as FK instead of IK.
     """
-    former = target.animation_data.action if target.animation_data else None
+    former = target.animation_data_create().action
     if former is not None:
         former.use_fake_user = True
+    resting, properties = _put_to_rest(target, result), properties or {}
+    raw = None
+    if tolerance_deg > 0:
+        raw, _ = _filled(target, result, f"{name} (every frame)", 0.0, resting, properties)
+        raw.use_fake_user = True
+    action, keys = _filled(target, result, name, tolerance_deg, resting, properties)
+    return Written(action=action, raw=raw, keys=keys, muted=_mute(target, result))
+
+
+def _filled(target: bpy.types.Object, result: Retargeted, name: str, tolerance_deg: float, resting: Sequence[Resting],
+            properties: Mapping[str, Mapping[str, float]]) -> tuple[bpy.types.Action, int]:
+    """A new action of the target with the motion, and its number of keys."""
     action = bpy.data.actions.new(name)
-    target.animation_data_create().action = action
+    target.animation_data.action = action
     frames, rig = result.motion.frames, result.motion.rig
     keys = 0
     for b in np.flatnonzero(result.driven):
@@ -50,8 +66,8 @@ def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tol
         values = location_values(target, bone, result, b, shift_m)
         keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2 * float(np.ptp(rig.head_m, axis=0).max()) / scale_of(target))
         keys += _key(action, target, f"{bone.path_from_id()}.location", frames[keep], values[keep], bone.name)
-    keys += _rest_of_the_rest(action, target, result) + _set_properties(action, target, properties or {}, frames[:1])
-    return Written(action=action, keys=keys, muted=_mute(target, result))
+    keys += sum(_key(action, target, path, frames[:1], rest[None], bone) for bone, path, rest in resting)
+    return action, keys + _set_properties(action, target, properties, frames[:1])
 
 
 def rotation_values(bone: bpy.types.PoseBone, basis: np.ndarray) -> tuple[str, np.ndarray]:
@@ -88,9 +104,9 @@ def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, frames: n
     return len(frames) * values.shape[1]
 
 
-def _rest_of_the_rest(action: bpy.types.Action, target: bpy.types.Object, result: Retargeted) -> int:
-    """One key that puts to rest what the motion does not drive but an earlier pose has left turned or shifted."""
-    rig, keys = result.motion.rig, 0
+def _put_to_rest(target: bpy.types.Object, result: Retargeted) -> list[Resting]:
+    """Put to rest what the motion does not drive but an earlier pose has left turned or shifted; what an action must say of it, once."""
+    rig, resting = result.motion.rig, list[Resting]()
     steered = {driver.data_path for driver in target.animation_data.drivers}
     for bone in target.pose.bones:
         b = rig.index.get(bone.name, -1)  # of a control rig, the controls alone
@@ -103,8 +119,8 @@ def _rest_of_the_rest(action: bpy.types.Action, target: bpy.types.Object, result
             moved = abs(now[0]) > 1e-6 if channel == "rotation_axis_angle" else np.abs(now - rest).max() > 1e-6
             if moved:
                 setattr(bone, channel, rest)
-                keys += _key(action, target, f"{bone.path_from_id()}.{channel}", result.motion.frames[:1], rest[None], bone.name)
-    return keys
+                resting.append((bone.name, f"{bone.path_from_id()}.{channel}", rest))
+    return resting
 
 
 def _set_properties(action: bpy.types.Action, target: bpy.types.Object, properties: Mapping[str, Mapping[str, float]],

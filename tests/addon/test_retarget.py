@@ -1,6 +1,7 @@
 """Retargeting in a real Blender: stick people as armatures, real rigs and motions where they are at hand, bad rigs, the command."""
 
 import json
+import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,6 +15,7 @@ from tricap.addon.retarget import apply, files
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.preview import add_preview, remove_preview
 from tricap.addon.retarget.read import action_frames, read_motion, read_rig
+from tricap.addon.retarget.write import push_to_strip
 from tricap.addon.scene.armature import add_armature
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
@@ -23,6 +25,7 @@ from tricap.core.motion.retarget.contacts import FeetSettings
 from tricap.core.motion.retarget.mapping import find_map
 from tricap.core.motion.retarget.measure import measure
 from tricap.core.motion.retarget.retarget import RetargetSettings
+from tricap.core.motion.retarget.rig import channels
 from tricap.core.motion.retarget.turns import angle_of, transposed
 from tricap.core.motion.sources import read_motion_source
 from tricap.core.progress import Monitor
@@ -47,10 +50,10 @@ def played(target: Any, frames: Any) -> Any:
     return read_motion(target, read_rig(target), [int(f) for f in frames])
 
 
-def onto(target: Any, source: Any, **feet: Any) -> apply.Outcome:
+def onto(target: Any, source: Any, tolerance_deg: float = 0.0, **feet: Any) -> apply.Outcome:
     goal, source_map = apply.read_target(target), find_map(source.rig)
     result = apply.transfer(source, source_map, goal, RetargetSettings(), FeetSettings(**feet), Monitor())
-    return apply.apply(target, source, source_map, goal, result, "Test")
+    return apply.apply(target, source, source_map, goal, result, "Test", tolerance_deg)
 
 
 @pytest.mark.parametrize("mode", ["QUATERNION", "XYZ", "ZYX", "AXIS_ANGLE"])
@@ -76,6 +79,73 @@ def test_a_new_action_and_the_old_one_kept(empty: ModuleType) -> None:
     outcome = onto(target, squat(person(), frames=10))
     assert target.animation_data.action == outcome.written.action != former and former.use_fake_user
     assert [tuple(point.co) for curve in curves(former) for point in curve.keyframe_points] == before
+
+
+def test_few_keys_and_all_of_them(empty: ModuleType) -> None:
+    target = armature(person(roll_seed=2), "Target")
+    target.pose.bones["head"].scale = (1.0, 2.0, 1.0)  # left from an earlier pose: both actions put it to rest
+    source = squat(person(), frames=30)
+    written = onto(target, source, tolerance_deg=1.0).written
+    assert written.raw is not None and written.raw.use_fake_user and written.raw.name == "Test (every frame)"
+    assert target.animation_data.action == written.action and target.pose.bones["head"].scale[1] == 1.0
+    few, every = ({c.data_path + str(c.array_index): len(c.keyframe_points) for c in curves(a)} for a in (written.action, written.raw))
+    assert set(few) == set(every) and sum(few.values()) < 0.7 * sum(every.values())
+    assert every['pose.bones["shin.L"].rotation_quaternion1'] == 30
+    assert every['pose.bones["head"].scale1'] == few['pose.bones["head"].scale1'] == 1
+    wanted = played(target, source.frames)
+    target.animation_data.action = written.raw
+    found = played(target, source.frames)
+    off = transposed(channels(wanted.rig, wanted.R)) @ channels(found.rig, found.R)
+    assert 0.2 < np.degrees(angle_of(off)).max() < 1.0, "each bone against its parent"
+
+
+def test_an_action_in_a_strip_plays_the_same(empty: ModuleType) -> None:
+    target, source = armature(person(roll_seed=2), "Target"), squat(person(), frames=12)
+    outcome = onto(target, source)
+    strip = push_to_strip(target, outcome.written.action)
+    assert target.animation_data.action is None and strip.action == outcome.written.action
+    assert (strip.frame_start, strip.frame_end) == (0.0, 11.0)
+    found, wanted = played(target, source.frames), outcome.result.motion
+    assert np.degrees(angle_of(transposed(found.R) @ wanted.R)).max() < PLAYED_DEG
+    np.testing.assert_allclose(found.head_m, wanted.head_m, atol=1e-5)
+
+
+def test_a_thousand_frames_are_written_in_seconds(empty: ModuleType) -> None:
+    target, source = armature(person(thigh_part=0.55), "Target"), squat(person(), frames=1000)
+    began = time.perf_counter()
+    outcome = onto(target, source, tolerance_deg=0.5)
+    assert time.perf_counter() - began < 15.0 and len(outcome.result.motion.frames) == 1000  # measured 2 s on one slow core
+
+
+def test_what_the_vrm_addon_says_is_taken(empty: ModuleType) -> None:
+    """Its tables of VRM 0 and 1, as properties of the same shape."""
+    bpy = empty
+    text, classes = bpy.props.StringProperty, []
+
+    def group(name: str, **properties: Any) -> Any:
+        cls = type(name, (bpy.types.PropertyGroup,), {"__annotations__": properties})
+        bpy.utils.register_class(cls)
+        classes.append(cls)
+        return bpy.props.PointerProperty(type=cls)
+
+    node = group("Node", bone_name=text())
+    group("Row0", bone=text(), node=node)
+    humanoid0 = group("Humanoid0", human_bones=bpy.props.CollectionProperty(type=classes[-1]))
+    humanoid1 = group("Humanoid1", human_bones=group("Bones1", left_upper_arm=group("Row1", node=node)))
+    bpy.types.Armature.vrm_addon_extension = group("Said", vrm0=group("Vrm0", humanoid=humanoid0), vrm1=group("Vrm1", humanoid=humanoid1))
+    try:
+        for version in ("vrm0", "vrm1"):
+            target = armature(person(), version)
+            bones = getattr(target.data.vrm_addon_extension, version).humanoid.human_bones
+            row = bones.add() if version == "vrm0" else bones.left_upper_arm
+            if version == "vrm0":
+                row.bone = "leftUpperArm"
+            row.node.bone_name = "forearm.L"
+            assert read_rig(target).roles == {"upper_arm.L": "forearm.L"}
+    finally:
+        del bpy.types.Armature.vrm_addon_extension
+        for cls in reversed(classes):
+            bpy.utils.unregister_class(cls)
 
 
 def curves(action: Any) -> list[Any]:
@@ -108,12 +178,29 @@ def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleTy
     assert bpy.ops.tricap.retarget() == {"FINISHED"}
     assert target.animation_data.action.name != former and "limb directions" in props.last
     assert [tuple(p.co) for curve in curves(source.animation_data.action) for p in curve.keyframe_points] == kept
-    assert "UNDO" in bpy.types.TRICAP_OT_retarget.bl_options
+    the_step_is_undone(bpy, former)
+    props = bpy.context.scene.tricap_retarget
     props.rows[0].bones = "nowhere"
     with pytest.raises(RuntimeError, match="no bone “nowhere”"):
         bpy.ops.tricap.retarget()
     with pytest.raises(RuntimeError, match="source and target at once"):
         bpy.ops.tricap.retarget(source="Target")
+
+
+def the_step_is_undone(bpy: ModuleType, former: str) -> None:
+    """One undo takes the new action, its keys and what the panel says of them back."""
+    def state() -> Any:
+        target = bpy.data.objects["Target"]
+        return target.animation_data.action.name, sorted(bpy.data.actions.keys()), bpy.context.scene.tricap_retarget.last
+
+    bpy.data.objects["Target"].animation_data.action = bpy.data.actions[former]
+    before = state()
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.tricap.retarget() == {"FINISHED"} and state() != before
+    bpy.ops.ed.undo_push(message="after")
+    bpy.ops.ed.undo()
+    assert state() == before
+    assert "UNDO" in bpy.types.TRICAP_OT_retarget.bl_options
 
 
 def test_the_preview_points_alike_and_goes_away(empty: ModuleType) -> None:
@@ -176,9 +263,10 @@ def test_the_command_with_a_run_a_map_and_a_report(empty: ModuleType, small_run:
     (tmp_path / "map.json").write_text(json.dumps({"name": "mine", "bones": {"upper_arm.R": "upper_arm.R", "forearm.R": ["forearm.R"]}}))
     out = tmp_path / "out.blend"
     assert main(["retarget", str(small_run.out), "--rig", str(tmp_path / "rig.blend"), "--out", str(out),
-                 "--map", str(tmp_path / "map.json"), "--report", "--quiet"]) == 0
+                 "--map", str(tmp_path / "map.json"), "--report", "--quiet", "--twist", "off", "--scale", "2"]) == 0
     table = json.loads((tmp_path / "out.json").read_text())
-    assert table["direction_worst_deg"] < 0.01 and table["mapped_by"] == "mapping “mine”" and (tmp_path / "out.png").stat().st_size > 1000
+    assert table["scale"] == 2.0 and table["direction_worst_deg"] < 0.01
+    assert table["mapped_by"] == "mapping “mine”" and (tmp_path / "out.png").stat().st_size > 1000
     empty.ops.wm.open_mainfile(filepath=str(out))
     scene = empty.context.scene
     assert (scene.frame_start, scene.frame_end) == (2, 7)

@@ -19,9 +19,10 @@ from .rest import with_person_like_rest
 from .rig import Motion, Rig, channels, head_of
 from .roles import SEGMENTS, SIDES, parent_role, sided
 from .transfer import alignments, body_axes, follow, share_twist, turn
-from .turns import matrix_from_vector
+from .turns import matrix_from_vector, unit
 
 SHORTEST_LIMB_M = 1e-4
+LYING = 0.3  # height of the head over the hips, per distance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,8 @@ class RetargetSettings:
     scale: float = knob(0.0, "size of the target's steps against the source's; 0: by the length of the legs", low=0.0, high=1000.0)
     hands: str = knob("free", "hands follow their arms, or keep their distance from each other, head, hips and thighs where they are near",
                       choices=("free", "keep"))
-    twist: bool = knob(True, "spread the twist of the limbs over twist bones and forearms")
+    twist: str = knob("bones", "spread the twist of the limbs over twist bones, or half of a hand's also over a forearm that has none",
+                      choices=("off", "bones", "forearms"))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,8 +77,8 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
         aligned = aligned | _level(source, source_map, aligned, contacts)
     turned = turn(source, source_map, target, target_map, aligned)
     monitor.step("retargeting", 1, 4)
-    if settings.twist:
-        turned = share_twist(target, target_map, turned)
+    if settings.twist != "off":
+        turned = share_twist(target, target_map, turned, lone_forearms=settings.twist == "forearms")
     R, driven = turned.R, turned.driven
     carrier = _carrier(target, target_map) if "hips" in aligned and settings.root != "still" else -1
     monitor.step("retargeting", 2, 4)
@@ -90,7 +92,7 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
         R = follow(target, hold_hands(source, source_map, held, target_map, scale), driven)
         head = _heads(target, R, carrier, shift, target_map)
     moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
-    notes = (*filter(None, [rest_note]), *_notes(source_map, target_map, aligned))
+    notes = (*filter(None, [rest_note, lies(source, source_map)]), *_notes(source_map, target_map, aligned))
     monitor.step("retargeting", 4, 4)
     loose = {b: head[:, b] - head_of(target, R, head, b) for b in loose_parts(target, target_map) if driven[b] and b != carrier}
     return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, loose_m=loose, driven=driven, scale=scale,
@@ -101,6 +103,15 @@ def _notes(source_map: RigMap, target_map: RigMap, common: Container[str]) -> tu
     lost = [role for role in source_map.bones if role not in target_map.bones and "." not in role[:-2]]
     notes = [f"the target has no {', '.join(lost)}: their parents take it up"] if lost else []
     return (*notes, *([] if "hips" in common else ["the body does not travel: no hips in common"]))
+
+
+def lies(motion: Motion, rig_map: RigMap) -> str:
+    """A sentence if the trunk lies in most frames: a file with another axis up than was taken does so."""
+    low, high = (rig_map.first(role) for role in ("hips", "head"))
+    if low is None or high is None:
+        return ""
+    up = unit(motion.head_m[:, motion.rig.index[high]] - motion.head_m[:, motion.rig.index[low]])[:, 2]
+    return "" if np.median(up) > LYING else "the source lies, or stands on its head; if it should not, say which axis is up (--up)"
 
 
 def _place(rig: Rig, rig_map: RigMap, part: str, side: str) -> np.ndarray | None:

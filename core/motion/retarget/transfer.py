@@ -10,8 +10,9 @@ directions of limbs agree exactly; feet get A by their heading only, since what 
 parts keep their rest posture: A = A_body. Chains of another number of bones get D interpolated along their length.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -124,12 +125,19 @@ def turn(motion: Motion, source_map: RigMap, target: Rig, target_map: RigMap, al
     return Turned(R=follow(target, R, driven), driven=driven)
 
 
+def kept(chain: Sequence[Any], role: str) -> Any:
+    """Which of a part's bones, from the body outwards, has the part's own rotation, without what `share_twist` has spread."""
+    return chain[0] if part_of(role) in ("forearm", "shin") else chain[-1]
+
+
 def _nodes(rig: Rig, rig_map: RigMap, role: str, since_rest: np.ndarray) -> Nodes:
     """The source's rotations along a chain: at 0 that of what the chain hangs on, then after each of its bones."""
     chain = [rig.index[name] for name in rig_map.bones[role]]
     above = parent_role(role)
     while above and above not in rig_map.bones:
         above = parent_role(above)
+    if part_of(role) not in SPREAD:
+        return np.array([0.0, 1.0]), np.stack([since_rest[:, kept(chain, role)]] * 2)
     start = since_rest[:, rig.index[rig_map.bones[above][-1]]] if above else since_rest[:, chain[0]]
     return np.concatenate([[0.0], _fractions(rig, chain)]), np.stack([start, *(since_rest[:, b] for b in chain)])
 
@@ -176,11 +184,14 @@ def _point(motion: Motion, source_map: RigMap, target: Rig, target_map: RigMap, 
             wanted[bone] = shortest(now, along) @ wanted[bone]
 
 
-def share_twist(target: Rig, target_map: RigMap, turned: Turned) -> Turned:
-    """Spread the twist of hands, feet and upper limbs over the bones that are there for it.
+def share_twist(target: Rig, target_map: RigMap, turned: Turned, *, lone_forearms: bool = False) -> Turned:
+    """Spread the twist of hands, feet and upper limbs over the bones that are there for it: turning a bone about its own axis moves no
+    joint.
 
-    The hand's twist runs down the forearm, half of it in the forearm itself where it has no twist bones: turning a bone about its own
-    axis moves no joint. An upper arm's or thigh's twist bones turn back towards the shoulder or hip.
+    The hand's twist runs down the forearm, the foot's down the shin, from the first of their bones, which keeps the part's own rotation;
+    the twist bones of an upper arm or thigh turn back towards the shoulder or hip, from the last, which keeps it. So what was spread can
+    be read back (`kept`). With `lone_forearms` a forearm of one bone without twist bones takes half of the hand's twist; that cannot be
+    read back.
     """
     R, driven = turned.R.copy(), turned.driven.copy()
     for side in SIDES:
@@ -193,7 +204,7 @@ def share_twist(target: Rig, target_map: RigMap, turned: Turned) -> Turned:
                 continue
             twist = _twist(target, turned.R, chain[0], d, target.index[end] if end else None)
             if twist is not None:
-                _spread(target, R, chain, beside, d, twist, outwards=bool(after), alone=part == "forearm" and not beside)
+                _spread(target, R, chain, beside, d, twist, outwards=bool(after), alone=lone_forearms and part == "forearm" and not beside)
                 driven[beside] = True
     return Turned(R=follow(target, R, driven), driven=driven)
 
@@ -212,7 +223,7 @@ def _spread(target: Rig, R: np.ndarray, chain: list[int], beside: list[int], d: 
     """Write into R; `alone`: a lone bone takes half of the twist that comes from its end."""
     before, n, m = R.copy(), len(chain), len(beside)
     if outwards:
-        parts = [(k + 0.5) / n if n > 1 or alone else 0.0 for k in range(n)]
+        parts = [0.5] if alone and n == 1 else [k / n for k in range(n)]
     else:
         parts = [(k + 1) / n - 1.0 for k in range(n)]
     for b, part in zip(chain, parts):

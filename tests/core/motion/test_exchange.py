@@ -14,12 +14,13 @@ from tricap.core.motion.markers import Markers
 from tricap.core.motion.points_csv import read_points_csv, write_points_csv
 from tricap.core.motion.retarget.mapping import find_map
 from tricap.core.motion.retarget.points import joint_of, joint_of_bone, motion_from_points
+from tricap.core.motion.retarget.retarget import lies, retarget
 from tricap.core.motion.retarget.transfer import directions
 from tricap.core.motion.retarget.turns import angle_of, transposed
 from tricap.core.motion.sources import read_motion_source
 from tricap.core.motion.trc import read_trc, write_trc
 
-from .persons import flail, person
+from .persons import flail, person, squat
 
 PLACE_M = 2e-6  # text has 1e-6 of the unit, C3D float32 of millimetres
 MOCAP = Path(__file__).resolve().parents[4] / "shared" / "mocap"
@@ -93,10 +94,31 @@ def test_wide_tables_are_read(tmp_path: Path) -> None:
     assert found.names == ("elbow.R",) and abs(found.fps - 10.0) < 1e-9 and np.isnan(found.xyz_m[1]).all()
 
 
+@pytest.mark.parametrize(("kind", "axes"), [("trc", "Z up"), ("c3d", "Y up"), ("csv", "Y up")])
+def test_up_and_unit_are_said(tmp_path: Path, kind: str, axes: str) -> None:
+    """A file with another axis up lies down unless it is said; and one in another unit than it says is as large as it is."""
+    standing = squat(person(), frames=4)
+    joint = {"thigh": "hip", "shin": "knee", "foot": "ankle", "upper_arm": "shoulder"}
+    names = tuple(".".join([joint.get(part, part), *side]) for part, *side in (name.split(".") for name in standing.rig.names))
+    markers = Markers(names=names, fps=30.0, frames=standing.frames, xyz_m=standing.head_m,
+                      sigma_m=np.full(standing.head_m.shape[:2], np.nan))
+    file, write = tmp_path / f"a.{kind}", {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}[kind]
+    write(file, markers, axes=axes, unit="m")  # type: ignore[operator]
+    flat, up = read_motion_source(file), read_motion_source(file, up=axes[0], unit="dm")
+    target = person()
+    maps = find_map(flat.rig), find_map(up.rig), find_map(target)
+    assert "--up" in lies(flat, maps[0]) and not lies(up, maps[1])
+    assert abs(np.ptp(up.head_m[0, :, 2]) - 0.1 * np.ptp(standing.head_m[0, :, 2])) < 0.02
+    assert any("--up" in note for note in retarget(flat, maps[0], target, maps[2]).notes)
+    write_bvh(tmp_path / "a.bvh", standing)
+    with pytest.raises(InputError, match="fathom"):
+        read_motion_source(tmp_path / "a.bvh", unit="fathom")
+    assert np.ptp(read_motion_source(tmp_path / "a.bvh", up="Z", unit="cm").head_m[0, :, 1]) < 0.02
+
+
 def test_another_reader_of_c3d_agrees(tmp_path: Path) -> None:
-    c3d = pytest.importorskip("c3d")
-    if not hasattr(c3d, "Reader"):
-        pytest.skip("the library c3d is not installed")
+    import c3d
+
     points = cloud()
     write_c3d(tmp_path / "points.c3d", points)
     with (tmp_path / "points.c3d").open("rb") as file:

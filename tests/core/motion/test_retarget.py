@@ -31,6 +31,7 @@ from tricap.core.motion.sources import body_motion, read_motion_source
 from .persons import flail, person, squat
 
 OFF = FeetSettings(mode="off")
+MOCAP = Path(__file__).resolve().parents[4] / "shared" / "mocap" / "cmu"
 EXACT_DEG = 1e-5  # rounding of arccos-free angles; measured 2e-6
 BACK_DEG = 1e-4  # promised: 1°; the transfer is exact but for what the chains' spreading rounds, measured 3e-6
 
@@ -47,15 +48,62 @@ def test_limbs_point_where_the_sources_do(change: dict[str, object]) -> None:
     assert len(figures.by_part_deg) == 8 and figures.direction_worst_deg < EXACT_DEG, figures
 
 
-def test_there_and_back_again() -> None:
-    source, other = flail(person(roll_seed=1)), person(arms_down_deg=45.0, heading_deg=180.0, roll_seed=2, size=0.6, thigh_part=0.55)
-    maps = find_map(source.rig), find_map(other)
-    there = retarget(source, maps[0], other, maps[1], RetargetSettings(twist=False), OFF)
-    back = retarget(there.motion, maps[1], source.rig, maps[0], RetargetSettings(twist=False), OFF)
+@pytest.mark.parametrize("other", ["plain", "twist bones beside", "limbs of two bones"])
+def test_there_and_back_again(other: str) -> None:
+    """Every bone returns, whatever the other rig has for twist."""
+    source, rig = flail(person(roll_seed=1)), person(arms_down_deg=45.0, heading_deg=180.0, roll_seed=2, size=0.6, thigh_part=0.55)
+    maps = find_map(source.rig), find_map(rig)
+    if other != "plain":
+        rig, maps = split_limbs(rig, beside="beside" in other), (maps[0], find_map(split_limbs(rig, beside="beside" in other)))
+        assert (maps[1].twist if "beside" in other else len(maps[1].bones["shin.R"]) == 2), maps[1]
+    there = retarget(source, maps[0], rig, maps[1], feet_settings=OFF)
+    back = retarget(there.motion, maps[1], source.rig, maps[0], feet_settings=OFF)
     turned = np.degrees(angle_of(transposed(source.R) @ back.motion.R))
     assert turned.max() < BACK_DEG
     rise = back.motion.head_m - source.head_m  # the floor is found anew: all one height
     np.testing.assert_allclose(rise, np.broadcast_to((0.0, 0.0, rise[0, 0, 2]), rise.shape), atol=1e-6)
+
+
+def split_limbs(rig: Rig, *, beside: bool) -> Rig:
+    """Forearms, shins, upper arms and thighs with a twist bone on their outer half; or cut in two, what follows hanging on the second."""
+    names, parents = list(rig.names), list(rig.parents)
+    R, head, tail = list(rig.R_rest), list(rig.head_m), list(rig.tail_m)
+    for b, name in [(b, name) for b, name in enumerate(rig.names) if name.startswith(("forearm", "shin", "upper_arm", "thigh"))]:
+        middle = (head[b] + tail[b]) / 2
+        if not beside:
+            parents = [len(names) if p == b else p for p in parents]
+            tail[b] = middle
+        names.append(f"{name[:-2]}_twist{name[-2:]}" if beside else f"{name[:-2]}_b{name[-2:]}")
+        parents.append(b)
+        R, head, tail = [*R, R[b]], [*head, middle], [*tail, rig.tail_m[b]]
+    order = sorted(range(len(names)), key=lambda b: depth(parents, b))
+    place = {b: i for i, b in enumerate(order)}
+    n = len(names)
+    return Rig(names=tuple(names[b] for b in order), parents=np.array([place.get(parents[b], -1) for b in order]),
+               R_rest=np.array(R)[order], head_m=np.array(head)[order], tail_m=np.array(tail)[order], connected=np.zeros(n, dtype=bool),
+               inherits_rotation=np.ones(n, dtype=bool))
+
+
+def depth(parents: list[int], b: int) -> int:
+    return 0 if parents[b] < 0 else 1 + depth(parents, parents[b])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["squat", "02_01_walk", "02_04_jump_balance"])
+def test_limbs_return_from_a_rig_on_which_feet_were_held(name: str) -> None:
+    """Promised: 1°. Feet are held on both ways, on legs of other proportions. Measured 0.35° (walk) and 0.25° (jump); feet themselves are
+    levelled anew wherever they stand, by up to 36° while they roll."""
+    own, other = person(roll_seed=1), person(arms_down_deg=45.0, heading_deg=180.0, roll_seed=2, size=0.6, thigh_part=0.55)
+    if name == "squat":
+        recorded = squat(person())
+    elif (MOCAP / f"{name}.bvh").is_file():
+        recorded = read_motion_source(MOCAP / f"{name}.bvh")
+    else:
+        pytest.skip("the motions are not on this machine (no folder shared/mocap beside the repository)")
+    source = retarget(recorded, find_map(recorded.rig), own, find_map(own)).motion
+    there = retarget(source, find_map(own), other, find_map(other))
+    back = retarget(there.motion, find_map(other), own, find_map(own))
+    assert measure(source, find_map(own), back.motion, find_map(own), None).direction_rms_deg < 1.0
 
 
 def test_the_channels_give_the_motion_again() -> None:
@@ -69,7 +117,7 @@ def test_the_channels_give_the_motion_again() -> None:
 def test_twist_is_shared_and_moves_no_joint() -> None:
     source, target = flail(person()), person(roll_seed=3)
     maps = find_map(source.rig), find_map(target)
-    plain, shared = (retarget(source, maps[0], target, maps[1], RetargetSettings(twist=twist), OFF).motion for twist in (False, True))
+    plain, shared = (retarget(source, maps[0], target, maps[1], RetargetSettings(twist=twist), OFF).motion for twist in ("off", "forearms"))
     np.testing.assert_allclose(shared.head_m, plain.head_m, atol=1e-9)
     b, hand = target.index["forearm.L"], target.index["hand.L"]
     np.testing.assert_allclose(shared.R[:, hand], plain.R[:, hand], atol=1e-12)
