@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..images.retime import Recent
 from ..images.sequence import Movie
 from ..progress import Monitor
 from ..take import Footage
@@ -13,6 +14,7 @@ from .findings import Finding, doubtful, wrong
 LONGEST = 240  # frames; a longer take is looked at from its middle
 WIDTH_PX = 96
 BLANK_SPREAD, DARK, WHITE, WHITE_SHARE = 1.0, 24.0, 253.0, 0.03  # grey values; share of the pixels
+BEGINNING = 50  # frames of a movie
 UNEVEN = 0.6  # frames; time stamps are rounded
 REPEATED = 0.2  # of a view's usual motion energy, noise included
 
@@ -87,10 +89,16 @@ def picture_findings(seen: Survey, names: tuple[str, ...]) -> list[Finding]:
 
 
 def rate_findings(footage: Footage) -> list[Finding]:
-    """Movies whose frames, as far as they were looked at, do not follow each other evenly."""
+    """Movies whose frames, as far as they were looked at (or in the first second or two), do not follow each other evenly."""
     found = []
-    for view, sequence in zip(footage.take.views, footage.sequences):
-        uneven = sequence.unevenness if isinstance(sequence, Movie) else 0.0
+    for k, (view, sequence) in enumerate(zip(footage.take.views, footage.sequences)):
+        movie = sequence.behind if isinstance(sequence, Recent) else sequence
+        if not isinstance(movie, Movie):
+            continue
+        beginning = min(BEGINNING, footage.number(k, footage.frames.stop - 1) + 1)
+        if movie.shown < beginning:
+            movie.read(beginning - 1)
+        uneven = movie.unevenness
         if uneven > UNEVEN:
             said = f"View {view.name} has a variable frame rate: its frames are up to {uneven:.1f} frames off an even rate."
             advice = "Convert the movie to a constant frame rate, each frame at its own moment."

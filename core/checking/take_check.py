@@ -63,6 +63,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         lonely = [n for k, n in enumerate(names) if max(len(p.xi_px) for p in pairs if k in (p.i, p.j)) < ENOUGH]
         found += [_lonely(name) for name in lonely]
         found += [timing_finding(o) for o in offsets if o.significant or (o.method == "energy" and o.late_frames)]
+        found += [rolling_finding(o) for o in offsets if o.rolls]
         found += stale_finding({o.view: o.miss_px for o in offsets if math.isfinite(o.miss_px)})
         figures["offsets"] = {o.view: o.to_table() for o in offsets}
     return found, figures
@@ -88,7 +89,7 @@ def doubts(footage: Footage, first: int, empty: list[int], residual_px: float, m
             f"The rays of matched points miss each other by {residual_px:.1f} px: "
             "does rig.toml belong to this recording, and were the views in step?"
         )
-    causes = causes_of_failure(footage, monitor) if said else first_look(footage, first)
+    causes = causes_of_failure(footage, monitor) if said else [*first_look(footage, first), *rate_findings(footage)]
     return said + [f"{cause.sentence} {cause.advice}".strip() for cause in causes]
 
 
@@ -124,6 +125,19 @@ def timing_finding(offset: Offset) -> Finding:
         f"View {offset.view} is {abs(late):.2f} ± {sigma:.2g} frames {word} than the reference view{costs}.",
         advice,
         **offset.to_table(),
+    )
+
+
+def rolling_finding(offset: Offset) -> Finding:
+    """What to do about a view whose rows are exposed one after the other, otherwise than the reference view's."""
+    r, word = offset.readout_frames, "longer" if offset.readout_frames > 0 else "shorter"
+    return doubtful(
+        "rolling shutter",
+        f"View {offset.view} takes {abs(r):.2f} ± {offset.readout_sigma:.2g} frames {word} from its first row to its last than the "
+        f"reference view (rolling shutter); the rays of moving points there miss by up to {offset.rolling_px:.1f} px.",
+        "Use a mode that reads the sensor faster, or cameras of one kind, held level; what moves fast is best kept at middle height.",
+        readout_frames=r,
+        readout_sigma_frames=offset.readout_sigma,
     )
 
 

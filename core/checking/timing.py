@@ -3,10 +3,14 @@
     c(L) = corr(E_r(t), E_k(t + L))                                                      (1)   E: motion energy; candidates of L
     e(s) = e_0 + s (e_+ − e_−) / 2 + s² (e_+ − 2 e_0 + e_−) / 2                          (2)   miss of a point followed in view k
     Σ ρ(e_i(s) − b) → min over s, b ,   late = −(L + s)                                  (3)   ρ: Cauchy's; b: the rig's own miss
+    Σ ρ(e_i(s − r (y_i/h − ½)) − b) → min over r, s, b                                   (4)   y: the point's row of h in view k
 
 A point seen in the reference at t and in view k at t + L is followed in view k to the frames before and after; (2) is its signed distance
 from the epipolar line as if view k had been exposed s frames later. Points that rest, or move along the line, say nothing of s and much
 of b. The sigma of `late` comes from the adjustment (3).
+
+A rolling shutter exposes one row after the other: r in (4) is by how many frames view k takes longer for it, from the first row to the
+last, than the view it is compared with. Between alike cameras that see a point in the same row it shows nothing, and harms no rays.
 """
 
 from dataclasses import dataclass, replace
@@ -46,11 +50,24 @@ class Offset:
     moving: int = 0  # matches that move across the epipolar lines and fit
     speed_px: float = 0.0  # the speed across them that a tenth exceeds, per frame
     miss_px: float = np.nan  # median miss once the offset is allowed for
+    readout_frames: float = np.nan  # what its rows take longer than the reference view's, from the first to the last
+    readout_sigma: float = np.inf
 
     @property
     def significant(self) -> bool:
         """Larger than its noise, and than what matters to a measurement."""
         return self.method == "rays" and abs(self.late_frames) > max(0.05, 4 * self.sigma_frames) and self.effect_px > 0.1
+
+    @property
+    def rolls(self) -> bool:
+        """Whether its rows are read out otherwise than the reference view's, by more than noise and than what matters."""
+        readout = abs(self.readout_frames)
+        return self.method == "rays" and readout > max(0.1, 5 * self.readout_sigma) and self.rolling_px > 0.1
+
+    @property
+    def rolling_px(self) -> float:
+        """By how much that makes the rays of moving points at the first and last rows miss each other."""
+        return abs(self.readout_frames) / 2 * self.speed_px
 
     def to_table(self) -> dict[str, object]:
         """The figures, for JSON; what is not known is None."""
@@ -64,6 +81,8 @@ class Offset:
             "from": self.method,
             "moving_matches": self.moving,
             "miss_px": rounded(self.miss_px, 3),
+            "readout_frames": rounded(self.readout_frames, 4),
+            "readout_sigma_frames": rounded(self.readout_sigma, 4),
         }
 
     @property
@@ -83,7 +102,9 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
     """
     film = film or Film(footage, survey(footage, monitor))
     names = [v.name for v in footage.take.views]
-    found = {footage.take.reference: Offset(view=names[footage.take.reference], late_frames=0.0, sigma_frames=0.0, method="reference")}
+    reference = footage.take.reference
+    none = Offset(view=names[reference], late_frames=0.0, sigma_frames=0.0, method="reference", readout_frames=0.0, readout_sigma=0.0)
+    found = {reference: none}
     while len(found) < len(names):
         base, k = film.best_link(set(found))
         monitor.step("synchronization", len(found) - 1, len(names) - 1)
@@ -97,6 +118,8 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
             moving=link.moving,
             speed_px=link.speed_px,
             miss_px=link.miss_px,
+            readout_frames=link.readout_frames + found[base].readout_frames,
+            readout_sigma=float(np.hypot(link.readout_sigma, found[base].readout_sigma)),
         )
     return tuple(found[k] for k in range(len(names)))
 
@@ -202,7 +225,7 @@ def energy_lags(a: np.ndarray, b: np.ndarray) -> tuple[list[int], float]:
 
 
 def _misses(film: Film, base: int, k: int, frame: int, lag: int) -> np.ndarray | None:
-    """e_−, e_0, e_+ (m, 3) of the matches of one frame, in full-frame pixels."""
+    """e_−, e_0, e_+ in full-frame pixels, and y/h − ½, of the matches of one frame (m, 4)."""
     if not film.holds(base, frame) or not all(film.holds(k, frame + lag + step) for step in (-1, 0, 1)):
         return None
     a, b = film.features(base, frame), film.features(k, frame + lag)
@@ -214,7 +237,8 @@ def _misses(film: Film, base: int, k: int, frame: int, lag: int) -> np.ndarray |
     good = np.isfinite(np.stack(places)).all(axis=(0, 2))
     xa = film.rows.to_frame(a.xy[i[good]])
     ca, cb = film.cameras[base], film.cameras[k]
-    return np.stack([epipolar_miss_px(ca, cb, xa, film.rows.to_frame(place[good])) for place in places], axis=1)
+    y = film.rows.to_frame(places[1][good])[:, 1] / cb.size_px[1] - 0.5
+    return np.stack([*(epipolar_miss_px(ca, cb, xa, film.rows.to_frame(place[good])) for place in places), y], axis=1)
 
 
 def _followed(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -228,7 +252,7 @@ def _followed(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray
 
 
 def _fit(misses: list[np.ndarray], lag: int, name: str) -> Offset | None:
-    """The offset from the misses (m, 3) of some frames at one whole-frame lag, or None where too few moving matches fit.  (3)"""
+    """The offset from the misses (m, 4) of some frames at one whole-frame lag, or None where too few moving matches fit.  (3)"""
     e = np.concatenate(misses)
     rate, bend = (e[:, 2] - e[:, 0]) / 2, (e[:, 2] - 2 * e[:, 1] + e[:, 0]) / 2
 
@@ -253,6 +277,7 @@ def _fit(misses: list[np.ndarray], lag: int, name: str) -> Offset | None:
     if abs(s) > FARTHEST or good.sum() < max(FEWEST, LEAST * moving.sum()):
         return None
     frame = np.repeat(np.arange(len(misses)), [len(m) for m in misses])
+    readout, readout_sigma = _readout(e, s, b, frame)
     return Offset(
         view=name,
         late_frames=-(lag + s),
@@ -261,7 +286,27 @@ def _fit(misses: list[np.ndarray], lag: int, name: str) -> Offset | None:
         moving=int(good.sum()),
         speed_px=float(np.percentile(np.abs(rate[good]), 90)),
         miss_px=float(np.median(np.abs(miss(s)))),
+        readout_frames=readout,
+        readout_sigma=readout_sigma,
     )
+
+
+def _readout(e: np.ndarray, s: float, b: float, frame: np.ndarray) -> tuple[float, float]:
+    """r in frames, and its sigma, from the misses (m, 4) and the solution of (3); not known where all moves in the same row.  (4)"""
+    rate, bend, y = (e[:, 2] - e[:, 0]) / 2, (e[:, 2] - 2 * e[:, 1] + e[:, 0]) / 2, e[:, 3]
+    unknowns = np.array([0.0, s, b])
+    for _ in range(STEPS):
+        at = unknowns[1] - unknowns[0] * y
+        v = e[:, 1] + at * rate + at**2 * bend - unknowns[2]
+        w = 1 / (1 + (v / SCALE_PX) ** 2)
+        slope = rate + 2 * at * bend
+        A = np.stack([-y * slope, slope, -np.ones_like(rate)], axis=1)
+        normal = (A * w[:, None]).T @ A
+        if np.linalg.cond(normal) > 1e9:
+            return np.nan, np.inf
+        unknowns += np.linalg.solve(normal, -(A * w[:, None]).T @ v)
+        unknowns[:2] = np.clip(unknowns[:2], -1, 1)
+    return float(unknowns[0]), _sigma(A, w, v, frame)
 
 
 def _sigma(A: np.ndarray, w: np.ndarray, v: np.ndarray, frame: np.ndarray) -> float:

@@ -66,6 +66,11 @@ class Recent:
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
 
     @property
+    def behind(self) -> Sequence:
+        """The sequence that is read."""
+        return self._sequence
+
+    @property
     def count(self) -> int:
         """Number of frames."""
         return self._sequence.count

@@ -154,6 +154,11 @@ class Movie:
         return grey(image)
 
     @property
+    def shown(self) -> int:
+        """Of how many frames the moment is known: those that were decoded so far."""
+        return len(self._shown_ms)
+
+    @property
     def unevenness(self) -> float:
         """By how many frames the moments of the frames decoded so far differ from an even rate, at most; 0 where that is not known."""
         frames = np.array(sorted(self._shown_ms), dtype=np.float64)

@@ -12,13 +12,15 @@ import pytest
 
 from tricap.core import commands, pipeline
 from tricap.core.checking.findings import Checked
-from tricap.core.checking.take_check import check_take
+from tricap.core.checking.take_check import check_take, doubts
 from tricap.core.checking.timing import energy_lags, estimate_offsets
 from tricap.core.errors import InputError
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.progress import Monitor
 from tricap.core.take import open_take, read_take
+
+from ..images.test_sequence import with_a_pause
 
 SHARED = Path(__file__).parents[4] / "shared" / "takes"
 Record = Callable[..., Path]
@@ -226,3 +228,18 @@ def test_measuring_it_all_the_same_names_the_cause(make: Callable[[Path], None],
             assert any(MEASURED[make] in sentence for sentence in run.account["warnings"]), run.account["warnings"]
     except InputError as error:
         assert MEASURED[make] in str(error)
+
+
+def test_every_run_tells_a_variable_frame_rate(arm_recording: Record, tmp_path: Path) -> None:
+    """Though its own frames were all found in the checkpoints, and none was decoded."""
+    take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
+    shots = [cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR) for path in pictures(take, "R")]
+    writer = cv2.VideoWriter(str(take / "r.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, shots[0].shape[1::-1])
+    for shot in shots:
+        writer.write(shot)
+    writer.release()
+    said = take / "take.toml"
+    said.write_text(said.read_text(encoding="utf-8").replace('images = "R/*.png"', 'movie = "r.mp4"'), encoding="utf-8")
+    assert not [s for s in doubts(open_take(read_take(take)), 0, [], 0.1, Monitor()) if "frame rate" in s]
+    (take / "r.mp4").write_bytes(with_a_pause((take / "r.mp4").read_bytes()))
+    assert [s for s in doubts(open_take(read_take(take)), 0, [], 0.1, Monitor()) if "View R has a variable frame rate" in s]
