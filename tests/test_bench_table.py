@@ -37,6 +37,25 @@ def test_rows_are_ratios_to_peers_bounds_and_sizes(table: ModuleType) -> None:
     assert rows["matching: two threads, one thread"] == 1.8 and rows["matching: cost of a point, 10,000, 1,000 points"] == 0.5
 
 
+def test_drift_and_false_points_of_tracking_stand_beside_their_peers(table: ModuleType) -> None:
+    def tool(speed: float, drift: float, false: float = 0.0) -> dict[str, float]:
+        return {"points_frames_per_cpu_s": speed, "drift_px": drift, "false": false, "kept": 1.0}
+
+    results = {
+        "ours, 2-D mode": tool(10_000, 0.03, 0.002), "PyrLK": tool(200_000, 0.3), "ECC loop": tool(8000, 0.08),
+        "a step in three views": {"of PyrLK's speed per view": 0.3, "times an ECC loop over the same five matches a point": 15},
+        "CPU s of a step in three views": {"345": 0.02, "1350": 0.06}, "CPU s of 2-D mode by frames": {"6": 0.5, "24": 2.3},
+        "ours, the same points as Blender's": tool(1500, 0.03), "Blender's tracker": tool(3000, 0.06),
+    }  # fmt: skip
+    rows = {row.name.removeprefix("tracking: "): row.value for row in table.rows_of({"tracking": results})}
+    assert round(rows["2-D mode, drift, PyrLK"], 9) == 0.1 and rows["2-D mode, 1 + false points per thousand"] == 3.0
+    assert rows["2-D mode, drift, Blender's tracker"] == rows["2-D mode, points a second, Blender's tracker"] == 0.5
+    assert round(rows["cost of a frame, 24, 6 frames"], 9) == 1.0
+    results["Blender's tracker"] = "not compared"  # type: ignore[assignment]
+    missing = [row for row in table.rows_of({"tracking": results}) if row.value is None]
+    assert len(missing) == 2 and all(row.beside == "Blender's tracker" for row in missing)
+
+
 def test_what_is_worse_is_told(table: ModuleType) -> None:
     def said(value: float | None, kind: str) -> str:
         return str(table.verdict(table.Row("fit", "solver", value, kind, "scipy"), {"fit: solver, scipy": 10.0})).split(" (")[0]

@@ -55,16 +55,24 @@ def matching(rows: list[dict[str, Any]]) -> Iterator[Row]:
 
 
 def tracking(table: dict[str, Any]) -> Iterator[Row]:
-    """Against OpenCV's pyramid and a loop over ECC."""
+    """Against OpenCV's pyramid, a loop over ECC, and Blender's own tracker where there is one."""
     own, step = table["ours, 2-D mode"], table["a step in three views"]
     for peer in ("PyrLK", "ECC loop"):
         speed = own["points_frames_per_cpu_s"] / table[peer]["points_frames_per_cpu_s"]
         yield Row("tracking", "2-D mode, points a second", speed, "speed", peer)
+    yield Row("tracking", "2-D mode, drift", own["drift_px"] / table["PyrLK"]["drift_px"], "error", "PyrLK")
+    yield Row("tracking", "2-D mode, 1 + false points per thousand", 1 + 1e3 * own["false"], "error", "")
+    same, blender = table["ours, the same points as Blender's"], table["Blender's tracker"]
+    for what, name, kind in (("points a second", "points_frames_per_cpu_s", "speed"), ("drift", "drift_px", "error")):
+        value = None if isinstance(blender, str) else same[name] / blender[name]
+        yield Row("tracking", f"2-D mode, {what}", value, kind, "Blender's tracker")
     yield Row("tracking", "three views, per view", step["of PyrLK's speed per view"], "speed", "PyrLK")
     yield Row("tracking", "three views", step["times an ECC loop over the same five matches a point"], "speed", "ECC loop")
     costs = [(int(n), float(s)) for n, s in table["CPU s of a step in three views"].items()]
     (few, first), (many, last) = min(costs), max(costs)
     yield Row("tracking", f"cost of a point, {many}", last / many / (first / few), "cost", f"{few} points")
+    (short, first), *_, (long, last) = sorted((int(n), float(s)) for n, s in table["CPU s of 2-D mode by frames"].items())
+    yield Row("tracking", f"cost of a frame, {long}", last / (long - 1) / (first / (short - 1)), "cost", f"{short} frames")
 
 
 def fit(table: dict[str, Any]) -> Iterator[Row]:

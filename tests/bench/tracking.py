@@ -1,5 +1,6 @@
 """Tracking beside its peers: the same points of a turning, shifting film by our 2-D mode (there and back, and with key templates),
-cv2.calcOpticalFlowPyrLK and a loop over cv2.findTransformECC; then the whole step in three views against the number of points.
+cv2.calcOpticalFlowPyrLK, a loop over cv2.findTransformECC and Blender's own tracker; then the whole step in three views against the number
+of points, and the 2-D mode against the number of frames.
 
     python tests/bench/tracking.py [--json FILE]
 
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from _blender_tracker import blender_tracks
 
 from tricap.core.images.fields import Instants
 from tricap.core.images.sampling import SplineImage
@@ -139,8 +141,11 @@ def three_views(frames: list[np.ndarray], start: np.ndarray) -> float:
 def timed(method: object, frames: list[np.ndarray], start: np.ndarray) -> dict[str, float]:
     begin = time.process_time()
     path = method(frames, start)  # type: ignore[operator]
-    seconds = time.process_time() - begin
-    return {"points_frames_per_cpu_s": len(start) * (len(frames) - 1) / seconds, **score(path, start)}
+    return judged(path, start, time.process_time() - begin)
+
+
+def judged(path: np.ndarray, start: np.ndarray, seconds: float) -> dict[str, float]:
+    return {"points_frames_per_cpu_s": len(start) * (len(path) - 1) / seconds, **score(path, start)}
 
 
 def main() -> None:
@@ -162,10 +167,16 @@ def main() -> None:
         "of PyrLK's speed per view": 3 * step / lk,
         "times an ECC loop over the same five matches a point": 5 * step / ecc,
     }
-    memory = []
+    blender = blender_tracks(frames, few)
+    results["Blender's tracker"] = "not compared: this Python has no bpy module" if blender is None else judged(blender[0], few, blender[1])
+    results["ours, the same points as Blender's"] = timed(ours, frames, few)
+    memory, seconds = [], {}
     for count in (6, 12, 24):
+        begin = time.process_time()
         ours(frames[:count], few)
+        seconds[str(count)] = time.process_time() - begin
         memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    results["CPU s of 2-D mode by frames"] = seconds
     results["largest memory after 6, 12, 24 frames, MB"] = memory
     for name, value in results.items():
         print(f"{name}: {value}")
