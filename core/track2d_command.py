@@ -10,6 +10,7 @@ import numpy as np
 from . import store
 from .arguments import frame_range, overrides
 from .errors import InputError
+from .images.fields import INTERLACE, row_grid
 from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence
 from .matching.least_squares import MatchingSettings
 from .progress import Monitor
@@ -30,6 +31,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--points", type=Path, required=True, metavar="FILE", help="CSV with point,x,y in the first frame (and joined_to)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="CSV to write: frame,point,x,y,sigma,correlation,status")
     parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1; the points are those of frame A")
+    parser.add_argument("--interlaced", choices=INTERLACE, default="none", help="which lines of interlaced video to look at")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw the points, joined with lines, over the images")
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
     parser.set_defaults(run=run, json=False)
@@ -52,7 +54,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if not frames or frames[0] < 0 or frames[-1] >= sequence.count:
         raise InputError(f"--frames {args.frames} are not among the frames 0 to {sequence.count - 1} of {args.sequence}.")
     _check_inside(points, sequence.read(frames[0]), args.points)
-    tracks = track_planar(sequence.read, frames, points.xy_px, matching, tracking, monitor)
+    tracks = track_planar(sequence.read, frames, points.xy_px, matching, tracking, monitor, row_grid(args.interlaced))
     write_planar(args.out, points.names, tracks)
     if args.pictures is not None:
         _draw(args.pictures, sequence, points, tracks, monitor)

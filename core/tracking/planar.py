@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import MatchingSettings, match_patches
 from ..progress import Monitor
@@ -22,6 +23,7 @@ from .search import search_box
 from .settings import TrackingSettings, TrackStatus
 from .templates import Templates, atlas, cut_tiles, no_templates
 
+FRAME = RowGrid()  # all rows
 RETURN_PX, RETURN_SIGMAS = 0.5, 3.0
 KNOWN_BOX, UNKNOWN_BOX = (0.0, 0.4, 2.0), (0.0, 1.0, 2.0)  # of the box in each attempt, for points whose motion is known or not
 RETAKEN_CORRELATION = 0.9  # of a lost point with its template: more than in tracking, for nothing else speaks for it
@@ -53,6 +55,15 @@ class _Points:
     reason: np.ndarray
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _How:
+    """By which rules points are followed."""
+
+    matching: MatchingSettings
+    tracking: TrackingSettings
+    row_step: int  # 2 for a field
+
+
 def track_planar(
     read: Callable[[int], np.ndarray],
     frames: range,
@@ -60,17 +71,20 @@ def track_planar(
     matching: MatchingSettings,
     tracking: TrackingSettings,
     monitor: Monitor,
+    grid: RowGrid = FRAME,
 ) -> PlanarTracks:
-    """Follow points (N, 2) of the first of `frames` through the others. `read(i)` gives the grey image (h, w) of a frame.
+    """Follow points (N, 2) of the first of `frames` through the others. `read(i)` gives the grey image (h, w) of a frame, of which the rows
+    of `grid` are looked at: of interlaced video one field.
 
     The frames may run backwards. Memory does not grow with their number.
     """
-    steps = list(_follow(read, frames, np.asarray(xy_px, dtype=np.float64), matching, tracking, monitor))
+    how = _How(matching=matching, tracking=tracking, row_step=grid.step)
+    steps = list(_follow(lambda i: grid.rows(read(i)), frames, grid.from_frame(xy_px), how, monitor))
     seen = np.array([s.seen for s in steps])
-    spread = np.array([np.trace(s.drift + s.key_drift, axis1=1, axis2=2) for s in steps])
+    spread = np.array([np.trace(grid.covariance_to_frame(s.drift + s.key_drift), axis1=1, axis2=2) for s in steps])
     return PlanarTracks(
         frames=np.array(frames),
-        xy_px=np.where(seen[..., None], [s.xy for s in steps], np.nan),
+        xy_px=np.where(seen[..., None], [grid.to_frame(s.xy) for s in steps], np.nan),
         sigma_px=np.where(seen, np.sqrt(spread), np.nan),
         correlation=np.where(seen, [s.correlation for s in steps], np.nan),
         status=np.where(seen, TrackStatus.MEASURED, [s.reason for s in steps]).astype(np.int8),
@@ -81,13 +95,13 @@ def _follow(
     read: Callable[[int], np.ndarray],
     frames: range,
     xy: np.ndarray,
-    matching: MatchingSettings,
-    tracking: TrackingSettings,
+    how: _How,
     monitor: Monitor,
 ) -> Iterator[_Points]:
+    matching, step = how.matching, how.row_step
     grey = read(frames[0])
     image, n = SplineImage(grey), len(xy)
-    templates = no_templates(matching, 1).with_tiles(cut_tiles(image, np.arange(n), xy, matching, 1), matching, 1)
+    templates = no_templates(matching, step).with_tiles(cut_tiles(image, np.arange(n), xy, matching, step), matching, step)
     none = np.zeros((n, 2, 2))
     points = _Points(
         xy=xy,
@@ -105,8 +119,8 @@ def _follow(
         monitor.step("tracks", i, len(frames) - 1)
         next_grey = read(frame)
         following = SplineImage(next_grey)
-        points, fresh = _step(points, templates, (grey, image), (next_grey, following), matching, tracking)
-        templates = templates.with_tiles(cut_tiles(following, fresh, points.xy[fresh], matching, 1), matching, 1)
+        points, fresh = _step(points, templates, (grey, image), (next_grey, following), how)
+        templates = templates.with_tiles(cut_tiles(following, fresh, points.xy[fresh], matching, step), matching, step)
         grey, image = next_grey, following
         yield points
 
@@ -116,10 +130,10 @@ def _step(
     templates: Templates,
     now: tuple[np.ndarray, SplineImage],
     after: tuple[np.ndarray, SplineImage],
-    matching: MatchingSettings,
-    tracking: TrackingSettings,
+    how: _How,
 ) -> tuple[_Points, np.ndarray]:
     """One frame on; and which points need their present patch as a new template."""
+    matching, tracking = how.matching, how.tracking
     rows = np.arange(len(points.xy))
     known = np.isfinite(points.speed).all(axis=1)
     result, fresh = replace(points, seen=np.zeros(len(rows), dtype=bool), speed=np.full((len(rows), 2), np.nan)), []
@@ -128,11 +142,12 @@ def _step(
         rest = np.flatnonzero(points.seen & ~result.seen & (known | (attempt > 0)))
         if len(rest):
             box = tracking.box_px * np.where(known[rest], KNOWN_BOX[attempt], UNKNOWN_BOX[attempt])
-            start, best = search_box(now[0], after[0], points.xy[rest], centre[rest], box, matching.patch_px, 1)
+            start, best = search_box(now[0], after[0], points.xy[rest], centre[rest], box, matching.patch_px, how.row_step)
             eye = np.tile(np.eye(2), (len(rest), 1, 1))
             start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)
-            there = match_patches(now[1], points.xy[rest], [after[1]], [start], [eye], matching, of_texture=False)[0]
-            good = there.ok & _returns(now[1], after[1], points.xy[rest], there.xy, there.shape, there.covariance, matching)
+            there = match_patches(now[1], points.xy[rest], [after[1]], [start], [eye], matching, row_step=how.row_step,
+                                  of_texture=False)[0]  # fmt: skip
+            good = there.ok & _returns(now[1], after[1], points.xy[rest], there.xy, there.shape, there.covariance, how)
             held = hold(there, good, points.key_shape[rest], points.drift[rest], templates, rest, after[1],
                         tracking.drift_correlation)  # fmt: skip
             if attempt == 2:  # far from where it was expected: the template must agree
@@ -148,7 +163,7 @@ def _step(
     if len(waiting):
         box = np.full(len(waiting), float(tracking.box_px))
         grey, tiles = atlas(templates.tiles.select(waiting))
-        start, best = search_box(grey, after[0], tiles, points.xy[waiting], box, matching.patch_px, 1)
+        start, best = search_box(grey, after[0], tiles, points.xy[waiting], box, matching.patch_px, how.row_step)
         start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)
         key = templates.match(waiting, after[1], start, points.key_shape[waiting])
         good = key.ok & (key.correlation >= max(RETAKEN_CORRELATION, tracking.drift_correlation))
@@ -164,12 +179,12 @@ def _returns(
     found: np.ndarray,
     shape: np.ndarray,
     covariance: np.ndarray,
-    matching: MatchingSettings,
+    how: _How,
 ) -> np.ndarray:
     """Which points come back to where they were.  (1)"""
     inverse = np.linalg.inv(np.where(np.abs(np.linalg.det(shape)) > 0.05, 1.0, np.nan)[:, None, None] * shape)
     inverse = np.where(np.isfinite(inverse), inverse, np.eye(2))
-    back = match_patches(after, found, [now], [xy], [inverse], matching, of_texture=False)[0]
+    back = match_patches(after, found, [now], [xy], [inverse], how.matching, row_step=how.row_step, of_texture=False)[0]
     sigma = np.sqrt(np.maximum(np.trace(covariance + back.covariance, axis1=1, axis2=2), 0.0))
     return back.ok & (np.linalg.norm(back.xy - xy, axis=1) <= np.maximum(RETURN_PX, RETURN_SIGMAS * sigma))
 

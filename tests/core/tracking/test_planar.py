@@ -9,6 +9,7 @@ import pytest
 
 from tricap.core.commands import main
 from tricap.core.errors import InputError
+from tricap.core.images.fields import row_grid
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
 from tricap.core.tracking.planar import PlanarTracks, track_planar
@@ -86,6 +87,20 @@ def test_black_frames_are_no_crash() -> None:
     frames[2][:] = 0
     tracks = follow(frames)
     assert (tracks.status[2] != TrackStatus.MEASURED).all() and (tracks.status[4] == TrackStatus.MEASURED).all()
+
+
+def test_a_field_of_interlaced_video() -> None:
+    """The other lines show other moments, now earlier, now later: one field alone gives its own places, and both together do not."""
+    others, shown = film(30), film(6)
+    for i in range(6):
+        shown[i][1::2] = others[5 * i][1::2]
+    truth = np.stack([POINTS @ place(i)[0].T + place(i)[1] for i in range(6)])
+    how = (range(6), POINTS, MatchingSettings(), TrackingSettings(), Monitor())
+    field, both = (track_planar(lambda i: shown[i], *how, grid=row_grid(lines)) for lines in ("odd", "none"))
+    assert (field.status == TrackStatus.MEASURED).all()
+    off = np.linalg.norm(field.xy_px - truth, axis=2)
+    assert off.max() < 0.5 and 0.4 < np.sqrt(np.mean((off[1:] / field.sigma_px[1:]) ** 2)) < 1.6
+    assert (both.status[3] == TrackStatus.MEASURED).mean() < 0.5
 
 
 def write(folder: Path, frames: list[np.ndarray]) -> Path:
