@@ -20,12 +20,16 @@ BEYOND_M = 0.05  # points so far beyond a limb's reach, or so near to another pa
 
 
 def lost_limbs(fit: Conditions, counts: np.ndarray) -> list[np.ndarray]:
-    """The limbs (bones of each, from the body outwards) whose bones all have too few points; `counts` (B,) of a posture."""
+    """The limbs, or the lower parts of limbs, (bones of each, from the body outwards) whose bones all have too few points.
+
+    `counts` (B,) of a posture. A part that belongs to a larger one is not named for itself.
+    """
     skeleton, free = fit.model.skeleton, free_bones(fit.parameters)
     few = counts < fit.settings.min_points / 2
-    roots = [b for b in np.flatnonzero(free) if skeleton.parents[b] >= 0 and not free[skeleton.parents[b]] and _limb(fit, int(b))]
-    limbs = [np.array([c for c in np.flatnonzero(free) if root in _line(skeleton.parents, int(c))]) for root in roots]
-    return [limb for limb in limbs if few[limb].all()]
+    of_limbs = [int(b) for b in np.flatnonzero(free) if skeleton.parents[b] >= 0 and _limb(fit, int(b))]
+    outer = {b: np.array([c for c in np.flatnonzero(free) if b in _line(skeleton.parents, int(c))]) for b in of_limbs}
+    lost = [b for b, bones in outer.items() if few[bones].all()]
+    return [outer[b] for b in lost if int(skeleton.parents[b]) not in lost]
 
 
 def found_again(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> list[np.ndarray]:
@@ -81,9 +85,14 @@ def _unexplained(fit: Conditions, points: CloudPoints, state: BodyState, limb: n
 
 
 def _postures(fit: Conditions, motion: np.ndarray, limb: np.ndarray, count: int, spread: float) -> np.ndarray:
-    """Postures (count, D) of one limb, evenly within `spread` [rad] of a posture and the joints' limits; the rest of the body as it is."""
-    skeleton = fit.model.skeleton
-    columns = np.flatnonzero(np.isin(skeleton.dof_bone, limb) & ~np.isin(np.arange(len(motion)), skeleton.held))
+    """Postures (count, D) of one limb, evenly within `spread` [rad] of a posture and the joints' limits; the rest of the body as it is.
+
+    A free bone that is not lost turns about itself too: its points hardly tell by how much, and it carries the limb around.
+    """
+    skeleton, free = fit.model.skeleton, free_bones(fit.parameters)
+    above = int(skeleton.parents[limb[0]])
+    twist = (skeleton.dof_bone == above) & free[above] & np.array([dof.axis == "y" for dof in skeleton.dofs])
+    columns = np.flatnonzero((np.isin(skeleton.dof_bone, limb) | twist) & ~np.isin(np.arange(len(motion)), skeleton.held))
     low, high = (np.array([skeleton.dofs[c].limits[i] for c in columns]) for i in (0, 1))
     low, high = np.maximum(low, motion[columns] - spread), np.minimum(high, motion[columns] + spread)
     tried = np.tile(motion, (count, 1))

@@ -52,3 +52,19 @@ def test_a_raised_arm_is_found(standing) -> None:
     moved = np.flatnonzero(np.abs(found - before) > 1e-9)
     assert {shape.skeleton.dof_names[i].partition(" ")[0] for i in moved} <= {"shoulder.R", "elbow.R"}
     assert not found_again(fit, points_of(shape, raised, others), before, vector)  # hidden: nothing is invented
+
+
+def test_a_forearm_is_found_whose_upper_arm_was_never_lost(standing) -> None:
+    fit, shape, before = standing
+    layout, bent = shape.skeleton.layout, before.copy()
+    for name, degrees in (("shoulder.R twist", 40.0), ("elbow.R flexion", 95.0)):
+        bent[layout[name]] = np.radians(degrees)
+    seen = {"chest": 200, "spine": 100, "upper_arm.R": 80, "upper_arm.L": 60, "forearm.L": 60, "thigh.L": 60, "shin.L": 60,
+            "thigh.R": 60, "shin.R": 60}
+    vector = fit.parameters.vector(shape)
+    (found,) = found_again(fit, points_of(shape, bent, seen | {"forearm.R": 80}), before, vector)
+    true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)[WRIST] for m in (bent, before, found))
+    assert np.linalg.norm(was - true) > 0.3 and np.linalg.norm(now - true) < 0.08
+    moved = np.flatnonzero(np.abs(found - before) > 1e-9)
+    assert {shape.skeleton.dof_names[i] for i in moved} <= {"shoulder.R twist", "elbow.R flexion", "elbow.R twist"}
+    assert not found_again(fit, points_of(shape, bent, seen), before, vector)
