@@ -54,6 +54,12 @@ def test_packages_of_the_project_are_all_listed() -> None:
     assert packages == set(PROJECT["tool"]["setuptools"]["packages"]), "pyproject.toml, [tool.setuptools] packages"
 
 
+def test_type_checkers_find_the_types_of_core() -> None:
+    """The marker of PEP 561 lies beside the modules and is part of the Python package."""
+    assert (ROOT / "core" / "py.typed").is_file()
+    assert "py.typed" in PROJECT["tool"]["setuptools"]["package-data"]["tricap.core"]
+
+
 def test_only_what_belongs_in_it_is_shipped(dev: ModuleType, junk_tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dev, "ROOT", junk_tree)
     assert dev.shipped_files() == [

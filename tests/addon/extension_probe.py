@@ -6,7 +6,7 @@ With FOLDER it also makes a short sample recording there and runs the whole path
 """
 
 import gc
-import importlib
+import importlib.util
 import json
 import os
 import sys
@@ -83,6 +83,32 @@ def run_the_path(folder: Path) -> dict[str, object]:
     }
 
 
+def counts(added: dict[str, list[str]]) -> dict[str, list[str]]:
+    """What was added, without the addresses of functions, which are others after each import."""
+    return {kind: [name.split(" at 0x")[0] for name in names] for kind, names in added.items()}
+
+
+def reloaded(before: dict[str, list[str]], package: str) -> list[dict[str, object]]:
+    """What is there after each way to load the code anew: every module reloaded in place, all imported again, installed over itself."""
+    found = []
+    for way in ("reload", "import", "install"):
+        bpy.ops.preferences.addon_disable(module=EXTENSION)
+        if way == "reload":
+            for module in own_modules().values():
+                importlib.reload(module)
+        elif way == "import":
+            for name in own_modules():
+                del sys.modules[name]
+        bpy.ops.preferences.addon_enable(module=EXTENSION)
+        if way == "install":
+            bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True, overwrite=True)
+        jobs, watch = (importlib.import_module(f"{EXTENSION}.addon.{name}") for name in ("jobs", "steps.watch"))
+        states = watch.refresh(bpy.context.scene).states
+        found.append({"way": way, "added": counts(difference(traces(), before)), "classes": registered_classes(),
+                      "listeners": len(jobs.ENDED), "footage": states["footage"].word})
+    return found
+
+
 def main(package: str, report: str, folder: str | None = None) -> None:
     before = traces()
     found: dict[str, object] = {}
@@ -103,6 +129,7 @@ def main(package: str, report: str, folder: str | None = None) -> None:
     repositories = [repository.module for repository in bpy.context.preferences.extensions.repos]
     bpy.ops.preferences.addon_enable(module=EXTENSION)
     found["enabled again"] = EXTENSION in bpy.context.preferences.addons
+    found["reloaded"] = reloaded(before, package) if importlib.util.find_spec(f"{EXTENSION}.addon") else []
     bpy.ops.extensions.package_uninstall(repo_index=repositories.index("user_default"), pkg_id="tricap")
     found["left after uninstalling"] = difference(traces(), before)
     found["modules left"] = sorted(own_modules())

@@ -114,6 +114,14 @@ def test_it_leaves_nothing_behind(found: dict[str, Any]) -> None:
     assert_nothing_left(found)
 
 
+@pytest.mark.parametrize("way", ["reload", "import", "install"])
+def test_loaded_anew_it_is_there_once(found: dict[str, Any], way: str) -> None:
+    now = next(each for each in found["reloaded"] if each["way"] == way)
+    without_addresses = {kind: [name.split(" at 0x")[0] for name in names] for kind, names in found["added"].items()}
+    assert now["added"] == without_addresses and now["footage"] == "empty" and now["listeners"] == 1
+    assert now["classes"] == found["classes"]
+
+
 def test_an_extension_that_leaves_things_behind_is_found_out(dev: ModuleType, tmp_path: Path) -> None:
     source = tmp_path / "source"
     (source / "core").mkdir(parents=True)
