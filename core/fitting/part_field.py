@@ -63,6 +63,11 @@ class Part:
         return [(int(b), slice(int(i), int(j))) for b, i, j in zip(bones, first, ends)]
 
     @cached_property
+    def bone_of_ball(self) -> np.ndarray:
+        """(m,) which of its bones carries each of its balls."""
+        return np.repeat(np.arange(len(self.bones)), [own.stop - own.start for _, own in self.bones])
+
+    @cached_property
     def dofs(self) -> np.ndarray:
         """(d,) the DOFs that move any of its balls, base first."""
         n = len(self.skeleton.base_dofs)
@@ -115,13 +120,13 @@ class PartField:
 
     def __init__(self, part: Part, state: "BodyState", xyz_m: np.ndarray) -> None:
         self.part, self.state, self.xyz_m = part, state, xyz_m
-        self._radii = state.balls.radii_m[part.balls]
-        self._centres = state.balls.centre[part.balls] * state.lengths_m[state.balls.bone_index[part.balls], None]
-        self._q = np.empty((len(xyz_m), len(part.balls), 3))
-        for b, own in part.bones:
-            local = (xyz_m - state.head_m[b]) @ state.R[b]
-            self._q[:, own] = (local[:, None, :] - self._centres[own]) / self._radii[own]
-        self.terms = state.balls.weight[part.balls] * np.exp(-2 * np.einsum("nmi,nmi->nm", self._q, self._q))
+        frames, shifts = state.ball_frames
+        m = len(part.balls)
+        self._W = frames[part.balls].transpose(1, 2, 0).reshape(3, 3 * m)  # columns: the balls' x axes, then y, then z, in units of 1/l
+        self._q = xyz_m @ self._W - shifts[part.balls].T.ravel()  # (N, 3m)
+        squares = self._q * self._q
+        d = squares[:, :m] + squares[:, m : 2 * m] + squares[:, 2 * m :]
+        self.terms = state.balls.weight[part.balls] * np.exp(-2 * d)
 
     @cached_property
     def F(self) -> np.ndarray:
@@ -136,7 +141,7 @@ class PartField:
     @cached_property
     def gradient(self) -> np.ndarray:
         """(N, 3) in the world's axes."""
-        return np.asarray(self._bone_gradients.sum(axis=1))
+        return np.asarray(self._pulls @ (-4 * self._W.T))
 
     @cached_property
     def shares(self) -> np.ndarray:
@@ -149,30 +154,42 @@ class PartField:
         return np.concatenate([motion, self._to_shape()], axis=1) if shape else motion
 
     @cached_property
+    def _pulls(self) -> np.ndarray:
+        """(N, 3m) w exp(−2d) q."""
+        n, m = self.terms.shape
+        return np.asarray((self._q.reshape(n, 3, m) * self.terms[:, None]).reshape(n, 3 * m))
+
+    @cached_property
     def _bone_gradients(self) -> np.ndarray:
-        local = (-4 * self.terms)[..., None] * (self._q / self._radii)
-        return np.stack([local[:, own].sum(axis=1) @ self.state.R[b].T for b, own in self.part.bones], axis=1)
+        """(N, k, 3) the part of the gradient that comes from each of the part's bones."""
+        m, k = len(self.part.balls), len(self.part.bones)
+        table = np.zeros((3, m, k, 3))
+        table[:, np.arange(m), self.part.bone_of_ball] = -4 * self._W.reshape(3, 3, m).transpose(1, 2, 0)
+        return (self._pulls @ table.reshape(3 * m, 3 * k)).reshape(-1, k, 3)
 
     def _to_motion(self) -> np.ndarray:
         state, part, n = self.state, self.part, len(self.part.skeleton.base_dofs)
-        moved, _ = part.tables
-        axes = state.axes[part.dofs]
-        lever = cross(axes, state.head_m[part.skeleton.dof_bone[part.dofs]])  # a_k × o_k
-        g = self._bone_gradients
-        moments = cross(self.xyz_m[:, None], g)
-        table = np.concatenate([np.einsum("kd,di->kid", moved, lever), np.einsum("kd,di->kid", moved, -axes)], axis=1)
+        axes, g, X = state.axes[part.dofs], self._bone_gradients, self.xyz_m[:, :, None]
+        table = part.tables[0][:, None] * np.concatenate([state.levers[part.dofs], -axes], axis=1).T  # (k, 6, d)
         table[:, :3, :n] = -axes[:n].T
-        wrench = np.concatenate([g, moments], axis=2).reshape(len(g), -1)  # force and moment of each bone
-        return wrench @ table.reshape(-1, len(part.dofs))  # (1): −a·((X − o) × g) = −a·(X × g) + (a × o)·g
+        wrench = np.empty((len(g), g.shape[1], 6))  # force and moment X × g of each bone
+        wrench[..., :3] = g
+        for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)), 3):
+            wrench[..., i] = X[:, a] * g[..., b] - X[:, b] * g[..., a]
+        return wrench.reshape(len(g), -1) @ table.reshape(-1, len(part.dofs))  # (1): −a·((X − o) × g) = −a·(X × g) + (a × o)·g
 
     def _to_shape(self) -> np.ndarray:
-        state, part, q = self.state, self.part, self._q
+        state, part = self.state, self.part
+        n, m = self.terms.shape
+        q = self._q.reshape(n, 3, m)
         stretch = state.lengths_m[part.lengths, None] * state.R[part.lengths, :, 1]
         table = np.einsum("kl,li->kil", part.tables[1], stretch).reshape(-1, len(part.lengths))
-        lengths = -self._bone_gradients.reshape(len(q), -1) @ table
-        own = 4 * self.terms * (q[..., 1] ** 2 + np.einsum("nmi,mi->nm", q, self._centres / self._radii))
+        lengths = -self._bone_gradients.reshape(n, -1) @ table
+        centres = state.balls.centre[part.balls] * state.lengths_m[state.balls.bone_index[part.balls], None]
+        offset = (centres / state.balls.radii_m[part.balls]).T  # (3, m)
+        own = 4 * self.terms * (q[:, 1] ** 2 + (q * offset).sum(axis=1))
         for b, balls in part.bones:
             lengths[:, np.searchsorted(part.lengths, b)] += own[:, balls].sum(axis=1)  # (2)
-        cross = 4 * self.terms[..., None] * q[..., CROSS] ** 2  # (3)
+        cross = 4 * self.terms[..., None] * np.stack([q[:, 0] ** 2, q[:, 2] ** 2], axis=2)  # (3)
         weights = self.terms if part.weights else self.terms[:, :0]
-        return np.concatenate([lengths, cross.reshape(len(q), -1), weights], axis=1)
+        return np.concatenate([lengths, cross.reshape(n, -1), weights], axis=1)

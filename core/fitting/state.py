@@ -15,7 +15,7 @@ from ..body.bone_profile import BoneProfile, bone_profiles, chain_neighbours
 from ..body.metaballs import Metaballs
 from ..body.shape import BodyShape
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
-from .part_field import CROSS, Part
+from .part_field import CROSS, Part, cross
 
 __all__ = ["CROSS", "FIRM", "BodyState", "ShapeParameters", "free_bones", "shape_vector"]
 
@@ -52,6 +52,18 @@ class BodyState:
     def n_shape(self) -> int:
         """S."""
         return len(self.lengths_m) + (3 if self.weights else 2) * len(self.balls.weight)
+
+    @cached_property
+    def ball_frames(self) -> tuple[np.ndarray, np.ndarray]:
+        """From a world point X to q = (x/l_x, y/l_y, z/l_z) of every ball: X @ (M, 3, 3) − (M, 3)."""
+        of, radii = self.balls.bone_index, self.balls.radii_m
+        frames = self.R[of] / radii[:, None, :]
+        return frames, np.einsum("mi,mij->mj", self.head_m[of], frames) + self.balls.centres_m(self.lengths_m) / radii
+
+    @cached_property
+    def levers(self) -> np.ndarray:
+        """(D, 3) a × o of the DOFs' axes a and the places o that they pass through."""
+        return cross(self.axes, self.head_m[self.skeleton.dof_bone])
 
     @cached_property
     def log_radii(self) -> np.ndarray:
