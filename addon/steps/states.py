@@ -184,6 +184,8 @@ def _stage(step: str, states: Mapping[str, State], found: _Found) -> State:
         return State(word="ready" if before == "done" else "empty", why=_READY[step])
     if entry.get("key") != found.keys[stage]:
         return State(word="stale", why="Something that it depends on was changed since; run it again.")
+    if "not_done" in entry and step != "body":
+        return State(word="done", why=f"Left out: {entry['not_done']}.")
     if "not_done" in entry:
         return State(word="ready" if states["seeds"].word == "done" else "empty", why=f"No body was fitted: {entry['not_done']}.")
     return State(word="done", why=_figures(step, entry))

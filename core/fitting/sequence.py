@@ -43,6 +43,7 @@ from .segmentation import HeldSegments
 from .settings import FitSettings
 from .silhouettes import Silhouettes
 from .solver import Solution, solve
+from .standing_feet import StandingFeet
 from .state import BodyState, ShapeParameters, free_bones
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
@@ -74,15 +75,24 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
     motion, points, known = follow(fit, points, given.time_s, first, tracks, monitor)
     sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
     lengths = clicked_lengths(fit, points[fit.click], first)
-    problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths)
+    feet = _standing(fit, motion, first.vector, given.time_s)
+    problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths, feet)
     solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
     solution = _begun_anew(fit, points, given.time_s, solution, problem, monitor)
     if settings.balls == "complete":
         fit = _completed(fit, solution)
-        problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths)
+        problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths, feet)
         solution = solve(problem, solution.motion, fit.parameters.vector(), steps=settings.sequence_steps, scales=solution.scales,
                          monitor=monitor, stage="refine the complete model")
     return _result(fit, points, given.time_s, solution, problem)
+
+
+def _standing(fit: Conditions, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
+    """Which feet stand in a motion (T, D), if that is asked for."""
+    if not fit.settings.floor:
+        return None
+    joints = np.stack([state.joints_m for state in fit.parameters.states(motion, vector)])
+    return StandingFeet(joints, fit.model.skeleton.joint_names, time_s)
 
 
 def _completed(fit: Conditions, solution: Solution) -> Conditions:
@@ -132,7 +142,7 @@ def _loosest(fit: Conditions) -> np.ndarray:
 
 
 def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, sigma: np.ndarray, tracks: MaterialTracks | None,
-                    lengths: tuple[np.ndarray, np.ndarray]) -> Problem:
+                    lengths: tuple[np.ndarray, np.ndarray], feet: StandingFeet | None) -> Problem:
     s = fit.settings
     priors = lasting(fit.priors, time_s)
 
@@ -140,7 +150,7 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
 
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [*fit.seen_surface(t, points[t], state, held=held), *fit.joints(t), *fit.empty.observe(t), *priors,
-                *fit.limbs.observe(state)]
+                *fit.limbs.observe(state), *(feet.observe(t) if feet is not None else [])]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
     return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),

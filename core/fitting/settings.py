@@ -32,6 +32,7 @@ class FitSettings:
     empty_sigma_px: float = knob(4.0, "How exactly the person's outline is known from the background.", unit="px", low=0.5, high=50.0)
     gate_m: float = knob(0.035, "A point further than this from a limb's surface is not the limb's.", unit="m", low=0.005, high=0.3)
     outline_gate_m: float = knob(0.10, "A ray of an outline further than this from every limb touches none.", unit="m", low=0.005, high=1.0)
+    floor: bool = knob(False, "A foot that stands keeps the height that feet have when they stand (world: Z up, a level floor).")
     click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)
     length_sigma: float = knob(0.15, "Relative sigma of the model's bone lengths.", low=0.001, high=1.0)
     radius_sigma: float = knob(0.2, "Relative sigma of the model's radii.", low=0.001, high=1.0)

@@ -1,6 +1,7 @@
 """The eight steps: the state of each at every point of the way, what a change makes stale, and what each wrong move is told."""
 
 import importlib
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -162,6 +163,16 @@ def test_a_run_json_that_no_run_wrote(
     assert words() == "done done done failed empty empty empty empty" and "remove the file and run again" in why("surface")
     with pytest.raises(RuntimeError, match="run.json is damaged"):
         blender.ops.tricap.measure()
+
+
+def test_a_surface_that_was_left_out_is_no_open_step(blender: ModuleType, done: Any, words: Words, why: Any, tmp_path: Path) -> None:
+    path = tmp_path / "out" / "run.json"
+    run = json.loads(path.read_text())
+    for stage in ("measure", "track"):
+        run["stages"][stage] = {"seconds": 0.0, "key": run["stages"][stage]["key"], "not_done": "fitting.use_surface is false"}
+    path.write_text(json.dumps(run))
+    shutil.rmtree(tmp_path / "out" / "clouds")
+    assert words().split()[3:6] == ["done", "done", "done"] and "Left out" in why("surface")
 
 
 def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any, tmp_path: Path, words: Words) -> None:

@@ -18,10 +18,11 @@ from tricap.core.fitting.problem import Problem
 from tricap.core.fitting.sequence import fit_sequence
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solver import solve
+from tricap.core.fitting.standing_feet import StandingFeet
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.raster import rasterize
 
-from .limb_scene import outlines
+from .limb_scene import measured_cloud, outlines
 
 SETTINGS = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
 
@@ -181,3 +182,27 @@ def test_outlines_make_a_thick_arm_thick(make_scene) -> None:
     fit = fit_sequence(_given(scene, clouds=blind, contours=contours), FitSettings())
     grown = fit.shape.metaballs.radii_m[:, [0, 2]] / shape.metaballs.radii_m[:, [0, 2]]
     assert 1.2 < np.median(grown) < 1.6, grown  # 1.29 (the model holds back); 1.02 when the misfit is taken for noise
+
+
+def test_a_standing_foot_keeps_its_height(make_scene) -> None:
+    """A leg whose foot stands in the first half and swings in the second; a noisy start says when, and its height is held."""
+    time_s, rng = np.arange(30) / 30, np.random.default_rng(0)
+    names = ("hip.R", "knee.R", "ankle.R", "toe.R")
+    joints = np.zeros((30, 4, 3))
+    joints[:, 2, 2], joints[:, 3, 2] = 0.09, 0.02
+    joints[15:, 2:, 0] = np.linspace(0, 0.8, 15)[:, None]  # it goes forward, low over the floor
+    joints[15:, 2:, 2] += 0.1 * np.sin(np.linspace(0, np.pi, 15))[:, None]
+    feet = StandingFeet(joints + rng.normal(0, 0.002, joints.shape), names, time_s)
+    assert feet.stands[:13, 2:].all() and not feet.stands[17:28, 2:].any() and not feet.stands[:, :2].any()
+    assert feet.level_m[2:] == pytest.approx([0.09, 0.02], abs=0.004)
+    assert feet.observe(20) == [] and feet.observe(3)[0].joint.tolist() == [2, 3]
+    assert not StandingFeet(joints[:1], names, time_s[:1]).stands.any()
+
+
+def test_the_floor_steadies_a_foot_that_stands(make_scene) -> None:
+    scene, rng = make_scene(model="leg.R", seed=4), np.random.default_rng(1)
+    clouds = [measured_cloud(scene.shape, scene.motion[0], t, rng, points=60, noise=0.008, gross=0.0) for t in range(8)]
+    ankle = scene.shape.skeleton.joint_names.index("ankle.R")
+    given = _given(scene, clouds=clouds, time_s=np.arange(8) / 25)
+    free, held = (fit_sequence(given, replace(SETTINGS, floor=floor)).motion.joints_m[:, ankle, 2] for floor in (False, True))
+    assert np.ptp(held) < 0.6 * np.ptp(free), (np.ptp(held), np.ptp(free))
