@@ -98,11 +98,13 @@ def apply(armature_object: bpy.types.Object, source: Motion, source_map: RigMap,
     notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source_map.missing]
     if written.muted:
         notes.append(f"{len(written.muted)} constraints on driven bones were muted: {', '.join(written.muted[:3])} …")
-    notes += check_played(armature_object, result, max(BENT_DEG, 1.5 * tolerance_deg))
+    armature_object.animation_data.action = written.raw or written.action
+    notes += check_played(armature_object, result)
+    armature_object.animation_data.action = written.action
     return Outcome(result=result, written=written, figures=figures, notes=tuple(dict.fromkeys(notes)))
 
 
-def check_played(armature_object: bpy.types.Object, result: Retargeted, tolerance_deg: float) -> list[str]:
+def check_played(armature_object: bpy.types.Object, result: Retargeted) -> list[str]:
     """A sentence if Blender plays something else than what was keyed, because something else steers the bones."""
     wanted = result.motion
     some = np.unique(np.linspace(0, len(wanted.frames) - 1, SAMPLES).round().astype(int))
@@ -113,10 +115,10 @@ def check_played(armature_object: bpy.types.Object, result: Retargeted, toleranc
     turned = np.degrees(angle_of(transposed(played.R) @ wanted.R[whole]))[:, result.driven].max(axis=0)
     moved = np.linalg.norm(played.head_m - wanted.head_m[whole], axis=2)[:, result.driven].max(axis=0)
     names = [wanted.rig.names[b] for b in np.flatnonzero(result.driven)]
-    if turned.max() > tolerance_deg:
+    if turned.max() > BENT_DEG:
         worst = names[int(turned.argmax())]
         return [f"something else steers the rig, too: “{worst}” plays up to {turned.max():.0f}° off what was keyed"]
-    if moved.max() > np.radians(tolerance_deg) * wanted.rig.height_m:
+    if moved.max() > np.radians(BENT_DEG) * wanted.rig.height_m:
         worst = names[int(moved.argmax())]
         return [f"something else steers the rig, too: “{worst}” plays up to {1e3 * moved.max():.0f} mm off what was keyed"]
     return []

@@ -64,9 +64,9 @@ class Retarget(JobOperator, bpy.types.Operator):
             self._name = f"{moving.name} on {self._target.name}"
             motion = read_motion(moving, read_rig(moving), action_frames(moving))
             return lambda monitor: compute(lambda: motion, goal, settings, feet, monitor)
-        path = Path(bpy.path.abspath(self.file or props.file))
+        path, said = Path(bpy.path.abspath(self.file or props.file)), properties.said(props)
         self._name = path.stem
-        return lambda monitor: compute(lambda: resampled(read_motion_source(path), fps, start), goal, settings, feet, monitor)
+        return lambda monitor: compute(lambda: resampled(read_motion_source(path, **said), fps, start), goal, settings, feet, monitor)
 
     def finish(self, context: bpy.types.Context, result: Made) -> set[str]:
         """Write the action."""

@@ -1,12 +1,14 @@
 """The section “Onto a Character” of the panel. draw() only draws."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.retarget import RetargetSettings
+from ...core.motion.sources import FILES
 from . import properties
 
 
@@ -48,6 +50,10 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     column.prop(props, "source")
     if props.source is None:
         column.prop(props, "file")
+        if Path(props.file).suffix.lower() in FILES:
+            row = column.row(align=True)
+            row.prop(props, "up")
+            row.prop(props, "unit")
     column.prop(props, "target")
     header, body = layout.panel("tricap_retarget_map", default_closed=True)
     header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (found by itself)")

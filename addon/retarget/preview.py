@@ -16,7 +16,7 @@ from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.retarget import leg_ratio
 from ...core.motion.retarget.rig import Rig
 from ...core.motion.retarget.roles import part_of
-from ...core.motion.retarget.transfer import alignments
+from ...core.motion.retarget.transfer import alignments, kept
 
 NAME = "Tricap preview"
 KEPT = "tricap_before_preview"  # of the target: the properties that steer its controls, as they were
@@ -37,7 +37,7 @@ def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, t
     bpy.context.scene.collection.children.link(collection)
     count = 0
     for role, A in aligned.items():
-        follows = source_map.bones[role][-1]
+        follows = kept(source_map.bones[role], role)
         R_s = source_rig.R_rest[source_rig.index[follows]]
         chain = rig_map.bones[role]
         for bone in chain if part_of(role) not in ("hand", "neck", "spine") else chain[-1:]:

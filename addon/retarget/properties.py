@@ -1,11 +1,13 @@
 """What the panel of retargeting remembers, in the scene: `scene.tricap_retarget`."""
 
 import json
+from collections.abc import Iterable
 from typing import Any
 
 import bpy
 
 from ...core.errors import InputError
+from ...core.motion.markers import UNITS_M
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.retarget import RetargetSettings
@@ -13,11 +15,21 @@ from ...core.motion.retarget.roles import ROLES
 from ...core.motion.retarget.steering import Steering
 from ..properties import group_class
 
+USUAL = "USUAL"
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
 def _is_armature(_: bpy.types.PropertyGroup, thing: bpy.types.Object) -> bool:
     return bool(thing.type == "ARMATURE")
+
+
+def _with_usual(names: Iterable[str]) -> list[tuple[str, str, str]]:
+    return [(USUAL, "As Usual", "As the file says, or as is the custom of its kind"), *((name, name, "") for name in names)]
+
+
+def said(props: Any) -> dict[str, str]:
+    """Up axis and unit of the file, for `read_motion_source`."""
+    return {name: "" if getattr(props, name) == USUAL else getattr(props, name) for name in ("up", "unit")}
 
 
 class MapRow(bpy.types.PropertyGroup):
@@ -39,6 +51,10 @@ class Retargeting(bpy.types.PropertyGroup):
                                       description="The armature that moves")
     file: bpy.props.StringProperty(name="Motion", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
                                    description="Instead of an armature: a run's folder, BVH, TRC, C3D or CSV")
+    up: bpy.props.EnumProperty(name="Up", items=_with_usual(("Y", "Z")),  # type: ignore[valid-type]
+                               description="The axis that is up in the file, if the body lies down otherwise")
+    unit: bpy.props.EnumProperty(name="Unit", items=_with_usual(UNITS_M),  # type: ignore[valid-type]
+                                 description="The unit of the file, if it is not the one that it says")
     target: bpy.props.PointerProperty(type=bpy.types.Object, name="Target", poll=_is_armature,  # type: ignore[valid-type]
                                       description="The armature that shall move")
     tolerance_deg: bpy.props.FloatProperty(name="Simplify [°]", min=0.0, max=10.0, default=0.0,  # type: ignore[valid-type]

@@ -85,7 +85,9 @@ def test_few_keys_and_all_of_them(empty: ModuleType) -> None:
     target = armature(person(roll_seed=2), "Target")
     target.pose.bones["head"].scale = (1.0, 2.0, 1.0)  # left from an earlier pose: both actions put it to rest
     source = squat(person(), frames=30)
-    written = onto(target, source, tolerance_deg=1.0).written
+    outcome = onto(target, source, tolerance_deg=1.0)
+    written = outcome.written
+    assert not any("steers" in note for note in outcome.notes)
     assert written.raw is not None and written.raw.use_fake_user and written.raw.name == "Test (every frame)"
     assert target.animation_data.action == written.action and target.pose.bones["head"].scale[1] == 1.0
     few, every = ({c.data_path + str(c.array_index): len(c.keyframe_points) for c in curves(a)} for a in (written.action, written.raw))

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from tricap.addon.retarget.build import build_armature
+from tricap.core.motion.bvh import write_bvh
 from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.motion.retarget.rig import Rig
 
@@ -48,6 +49,15 @@ def test_a_saved_mapping_keeps_its_steering(blender: ModuleType, props: Any, tmp
     assert ops.retarget_find_map() == {"FINISHED"} and not props.steering
     with pytest.raises(RuntimeError, match="Cannot read"):
         ops.retarget_load_map(filepath=str(tmp_path / "nowhere.json"))
+
+
+def test_a_file_that_lies_down_is_put_upright(blender: ModuleType, props: Any, tmp_path: Path) -> None:
+    source = squat(person(), frames=4)
+    write_bvh(tmp_path / "a.bvh", source)
+    props.source, props.file, props.up = None, str(tmp_path / "a.bvh"), "Z"
+    assert blender.ops.tricap.retarget() == {"FINISHED"} and "which axis is up" in props.last
+    props.up = "Y"
+    assert blender.ops.tricap.retarget() == {"FINISHED"} and "which axis is up" not in props.last
 
 
 def test_lines_are_added_and_removed(blender: ModuleType, props: Any, tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def lies(motion: Motion, rig_map: RigMap) -> str:
     if low is None or high is None:
         return ""
     up = unit(motion.head_m[:, motion.rig.index[high]] - motion.head_m[:, motion.rig.index[low]])[:, 2]
-    return "" if np.median(up) > LYING else "the source lies, or stands on its head; if it should not, say which axis is up (--up)"
+    return "" if np.median(up) > LYING else "the source lies, or stands on its head; if it should not, say which axis is up"
 
 
 def _place(rig: Rig, rig_map: RigMap, part: str, side: str) -> np.ndarray | None:

@@ -107,9 +107,9 @@ def test_up_and_unit_are_said(tmp_path: Path, kind: str, axes: str) -> None:
     flat, up = read_motion_source(file), read_motion_source(file, up=axes[0], unit="dm")
     target = person()
     maps = find_map(flat.rig), find_map(up.rig), find_map(target)
-    assert "--up" in lies(flat, maps[0]) and not lies(up, maps[1])
+    assert "axis is up" in lies(flat, maps[0]) and not lies(up, maps[1])
     assert abs(np.ptp(up.head_m[0, :, 2]) - 0.1 * np.ptp(standing.head_m[0, :, 2])) < 0.02
-    assert any("--up" in note for note in retarget(flat, maps[0], target, maps[2]).notes)
+    assert any("axis is up" in note for note in retarget(flat, maps[0], target, maps[2]).notes)
     write_bvh(tmp_path / "a.bvh", standing)
     with pytest.raises(InputError, match="fathom"):
         read_motion_source(tmp_path / "a.bvh", unit="fathom")
