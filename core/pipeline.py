@@ -39,7 +39,7 @@ from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
 from .report.pages import write_report
 from .report.silhouettes import Silhouettes, by_view, silhouettes_of
-from .results import Results
+from .results import KeptFit, Results
 from .settings import from_table, nearest_name
 from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
@@ -300,8 +300,9 @@ def fit(run: Run, monitor: Monitor) -> None:
     try:
         empty = empty_views(run.footage, run.results, run.clouds, run.settings["fitting"], monitor)
         given = fit_input(run.footage, run.clouds, run.trajectories, run.results, empty)
-        run.body = body = fit_sequence(given, run.settings["fitting"], monitor)
+        run.body = body = fit_sequence(given, run.settings["fitting"], monitor, KeptFit(run.results, run.keys["fit"]))
         _write_body(run, body, monitor)
+        run.results.remove("cache/fit")
         outlines = outline_polygons(run.footage, run.results)
         run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, empty, monitor)
     except Cancelled as stop:

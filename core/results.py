@@ -140,6 +140,21 @@ class Results:
         store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})
 
 
+class KeptFit:
+    """The checkpoint of a fit under way (`fitting.way.Kept`): cache/fit/way.npz."""
+
+    def __init__(self, results: Results, key: str) -> None:
+        self._results, self._key = results, key
+
+    def load(self) -> dict[str, np.ndarray] | None:
+        """What an interrupted fit of the same input left."""
+        return self._results.load_checkpoint("fit", "way", self._key)
+
+    def save(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep this instead."""
+        self._results.save_checkpoint("fit", "way", self._key, arrays)
+
+
 def _written(folder: Path) -> list[Path]:
     """Everything that some command writes to in a folder of results, and the folders of checkpoints that are there."""
     cache = folder / "cache"

@@ -20,6 +20,7 @@ from .observations import MotionPrior, Observation, StepsFromFixed
 from .segmentation import HeldSegments, crop
 from .solver import Solution, solve
 from .state import BodyState, free_bones
+from .way import KEEP_EVERY, Kept, Way
 
 LOST_SUPPORT = 0.6  # a frame with a smaller share of its neighbour's support is tried again
 COASTING = 5  # after so many frames without points the prediction stands still
@@ -30,32 +31,45 @@ WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per fram
 
 
 def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first: Solution, tracks: MaterialTracks | None,
-           monitor: Monitor) -> tuple[np.ndarray, list[CloudPoints], np.ndarray]:
+           monitor: Monitor, kept: Kept | None = None) -> tuple[np.ndarray, list[CloudPoints], np.ndarray]:
     """Motion (T, D) of all frames, the points near the body in each, and where each DOF (T, D) was seen."""
-    fit, T, done = replace(fit, priors=lasting(fit.priors, time_s)), len(points), 1  # the frame before has said them already
-    motion = np.empty((T, first.motion.shape[1]))
+    fit, T = replace(fit, priors=lasting(fit.priors, time_s)), len(points)  # the frame before has said them already
+    motion = np.full((T, first.motion.shape[1]), np.nan)
     motion[fit.click] = first.motion[0]
-    known = np.ones(motion.shape, dtype=bool)
-    for direction in (1, -1):
-        support, seen = None, [fit.click]
-        unseen = _unseen(fit, fit.click, points[fit.click], first.motion[0], first.vector, np.zeros(len(fit.model.skeleton.bones)))
-        for t in range(fit.click + direction, T if direction > 0 else -1, direction):
-            monitor.step("fit frame after frame", done, T)
-            before = fit.parameters.state(motion[t - direction], first.vector)
-            moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else []
-            near = _some(crop(points[t], before, REACH_M))
-            predictions = _predictions(motion, time_s, seen, t, np.where(_came_out(known, seen), 0.0, _slowing(fit, unseen)))
-            wide = 1 + np.minimum(WIDENING * unseen, WIDEST - 1)
-            motion[t], found = _next_posture(fit, t, near, moved, predictions, first, support, wide)
-            known[t] = False
-            if found is not None:
-                support = found
-                seen.append(t)
-                unseen = _unseen(fit, t, near, motion[t], first.vector, unseen)
-                known[t] = _slowing(fit, unseen) == 1
-            done += 1
-    states = fit.parameters.states(motion, first.vector)
-    return motion, [crop(p, state, REACH_M / 2) for p, state in zip(points, states)], known
+    at_click = _unseen(fit, fit.click, points[fit.click], first.motion[0], first.vector, np.zeros(len(fit.model.skeleton.bones)))
+    way = Way(motion=motion, known=np.ones(motion.shape, dtype=bool), unseen=at_click, seen=[fit.click])
+    way = way.goes_on(kept.load() if kept else None)
+    ahead, back = [(t, 1) for t in range(fit.click + 1, T)], [(t, -1) for t in range(fit.click - 1, -1, -1)]
+    for t, direction in [*ahead, *back][way.done - 1 :]:
+        monitor.step("fit frame after frame", way.done, T)
+        if t == fit.click + direction:
+            way.support, way.seen, way.unseen = None, [fit.click], at_click
+        _step(fit, way, t, direction, points[t], time_s, first, tracks)
+        way.done += 1
+        if kept is not None and way.done % KEEP_EVERY == 0:
+            kept.save(way.arrays())
+    if tracks is not None:
+        tracks.forget()  # a fit that went on from a checkpoint knows less of them
+    states = fit.parameters.states(way.motion, first.vector)
+    return way.motion, [crop(p, state, REACH_M / 2) for p, state in zip(points, states)], way.known
+
+
+def _step(fit: Conditions, way: Way, t: int, direction: int, points: CloudPoints, time_s: np.ndarray, first: Solution,
+          tracks: MaterialTracks | None) -> None:
+    """The posture of frame t from that of the frame before."""
+    motion, seen = way.motion, way.seen
+    before = fit.parameters.state(motion[t - direction], first.vector)
+    moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else []
+    near = _some(crop(points, before, REACH_M))
+    predictions = _predictions(motion, time_s, seen, t, np.where(_came_out(way.known, seen), 0.0, _slowing(fit, way.unseen)))
+    wide = 1 + np.minimum(WIDENING * way.unseen, WIDEST - 1)
+    motion[t], found = _next_posture(fit, t, near, moved, predictions, first, way.support, wide)
+    way.known[t] = False
+    if found is not None:
+        way.support = found
+        seen.append(t)
+        way.unseen = _unseen(fit, t, near, motion[t], first.vector, way.unseen)
+        way.known[t] = _slowing(fit, way.unseen) == 1
 
 
 def _some(points: CloudPoints) -> CloudPoints:

@@ -56,6 +56,10 @@ class MaterialTracks:
         return MaterialSteps(from_m=self._xyz[t][rows[keep]], to_m=self._xyz[t + 1][rows[keep]], bone=found[0][keep],
                              sigma_m=np.sqrt(own + skin), crowding=np.repeat((own + share * skin) / (own + skin), 3))
 
+    def forget(self) -> None:
+        """Ask anew whose each point is: what comes next shall not depend on what was asked before."""
+        self._held = HeldSegments()
+
     def _limbs(self, t: int, rows: np.ndarray, sigma: np.ndarray, state: BodyState) -> np.ndarray:
         """The bone of each point in one frame, −1 for nobody's."""
         points = CloudPoints(frame=t, xyz_m=self._xyz[t][rows], normals=np.zeros((len(rows), 3)), sigma_m=sigma)

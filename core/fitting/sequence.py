@@ -45,6 +45,7 @@ from .silhouettes import Silhouettes
 from .solver import Solution, solve
 from .standing_feet import StandingFeet
 from .state import BodyState, ShapeParameters, free_bones
+from .way import Kept
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
 
@@ -54,8 +55,10 @@ MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that 
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
-def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None) -> BodyFit:
+def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None, kept: Kept | None = None) -> BodyFit:
     """Shape and motion of the person. Frames without points are bridged and say so in their status. Time is linear in frames.
+
+    With `kept`, the work frame after frame is kept there from time to time, and gone on with.
 
     Raises:
         InputError: the model or a degree of freedom is unknown, clicks are missing or contradict each other, or the limb has no points
@@ -72,7 +75,7 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
     tracks = None
     if given.trajectories is not None and settings.use_trajectories:
         tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
-    motion, points, known = follow(fit, points, given.time_s, first, tracks, monitor)
+    motion, points, known = follow(fit, points, given.time_s, first, tracks, monitor, kept)
     sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
     lengths = clicked_lengths(fit, points[fit.click], first)
     feet = _standing(fit, motion, first.vector, given.time_s)
