@@ -1,7 +1,7 @@
 """C3D: points over time with residuals, binary (The C3D File Format User Guide, Motion Lab Systems, 2008).
 
 Own and small: only the points are read and written, no analogue channels. The library `c3d` would be one more wheel to carry for these
-lines, trusts the counts in a file's header, and leaves sigmas to its user; it serves the tests as an independent reader where it is there.
+lines, trusts the counts in a file's header, and leaves sigmas to its user; it serves the tests as an independent reader.
 
 Blocks of 512 bytes: header, parameters (groups and entries with relative pointers), then per frame and point x, y, z and a fourth word:
 negative for an unknown point, else its low byte times the scale is the residual; here that is the point's sigma, 0 if that is unknown.

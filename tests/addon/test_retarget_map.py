@@ -1,5 +1,6 @@
 """The mapping's editor in a Blender with the extension: lines, files, steering, and whose lines they are."""
 
+import importlib
 import json
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +14,7 @@ from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.motion.retarget.rig import Rig
 
 from ..core.motion.persons import flail, person, squat
+from .layout import Layout
 
 
 @pytest.fixture
@@ -84,3 +86,21 @@ def test_lines_of_another_target_are_not_used(blender: ModuleType, props: Any) -
     assert "lines are those of “Target” and were not used" in props.last and props.target.animation_data.action.name == "Source on Other"
     ops.retarget_add_line()
     assert props.rows_of == props.target and len(props.rows) == 1
+
+
+def test_the_editor_is_drawn(blender: ModuleType, props: Any, tmp_path: Path) -> None:
+    """Every button and property of it exists; whose lines they are is said, twist is shown, and what a file may need."""
+    panel = importlib.import_module("bl_ext.user_default.tricap.addon.retarget.panel")
+
+    def drawn() -> Layout:
+        layout = Layout()
+        panel.draw_retarget(layout, blender.context)
+        return layout
+
+    empty = drawn()
+    buttons = {"find_map", "load_map", "save_map", "add_line", "remove_line"}
+    assert {f"tricap.retarget_{name}" for name in buttons} <= set(empty.operators) and "unit" not in empty.properties
+    assert blender.ops.tricap.retarget_find_map() == {"FINISHED"}
+    assert [layout.properties.count("twist") for layout in (empty, drawn())] == [1, 2], "the setting alone; and that of the selected line"
+    props.target, props.source, props.file = props.source, None, str(tmp_path / "a.trc")
+    assert any("those of “Target”" in text for text in drawn().texts) and {"up", "unit"} <= set(drawn().properties)

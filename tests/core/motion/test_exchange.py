@@ -2,6 +2,7 @@
 
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,12 @@ def test_another_reader_of_c3d_agrees(tmp_path: Path) -> None:
     known = np.isfinite(points.xyz_m[..., 0])
     np.testing.assert_allclose(data[known][:, :3] / 1000.0, points.xyz_m[known], atol=PLACE_M)
     np.testing.assert_allclose(data[known][:, 3] / 1000.0, points.sigma_m[known], atol=1e-6)
+    write_c3d(tmp_path / "gaps.c3d", replace(points, frames=[*range(20), *range(25, 45)]))
+    with (tmp_path / "gaps.c3d").open("rb") as file:
+        reader = c3d.Reader(file)
+        found = {i: rows for i, rows, _ in reader.read_frames()}
+    assert (reader.first_frame, reader.last_frame) == (1, 45) and list(found) == list(range(1, 46))
+    assert (np.array([found[i][:, 3] for i in range(21, 26)]) < 0).all() and (np.array([found[i][0, 3] for i in range(26, 46)]) >= 0).all()
     assert (data[~known][:, 3] < 0).all() and [i for i, _ in frames] == points.frames.tolist()
 
 
