@@ -19,7 +19,8 @@ from .state import BodyState
 
 SPACING_M = 0.012  # of the rays, at the body
 BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders, the crown and the tips of the feet, where the parts' fields meet
-OUTLINE_PATCHES = 3  # an outline that follows a wrong edge does so for about this many patches of the model's error, in all views
+OUTLINE_PATCHES = 3  # an outline that follows a wrong edge does so for about this many patches of the model's error, in all views alike
+ALIKE = float(np.cos(np.radians(40.0)))  # views that look in directions closer than this show the same outline
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -30,6 +31,7 @@ class Rays:
     direction: np.ndarray  # (N, 3) unit
     outward: np.ndarray  # (N, 3) unit, away from the person and across the ray
     angle: np.ndarray  # (N,) sigma across the ray, rad
+    alike: np.ndarray  # (N,) how many views show about the same outline
 
 
 class Silhouettes:
@@ -59,30 +61,33 @@ class Silhouettes:
             return []
         away = np.linalg.norm(state.head_m[bone] - rays.origin_m[rows], axis=1)
         own, model = (rays.angle[rows] * away) ** 2 + 1e-12, self._settings.model_sigma_m**2
-        share = max(1.0, len(self._tables) * OUTLINE_PATCHES * self._settings.model_patch_m / SPACING_M)
+        share = np.maximum(1.0, rays.alike[rows] * OUTLINE_PATCHES * self._settings.model_patch_m / SPACING_M)
         found = SilhouetteRays(origin_m=rays.origin_m[rows], direction=rays.direction[rows], bone=bone, sigma_m=np.sqrt(own + model),
                                crowding=(own + share * model) / (own + model))
         return [found.scaled(state)]
 
     def _of_frame(self, t: int, state: BodyState) -> Rays | None:
-        parts = [_view_rays(camera, table.xy_px[rows], table.normal[rows], table.sigma_px[rows], state.head_m.mean(axis=0))
+        ahead = np.array([camera.R_cam_world[2] for camera, _ in self._tables]).reshape(-1, 3)
+        parts = [_view_rays(camera, table.xy_px[rows], table.normal[rows], table.sigma_px[rows], state.head_m.mean(axis=0),
+                            int((ahead @ camera.R_cam_world[2] > ALIKE).sum()))
                  for camera, table in self._tables if len(rows := np.flatnonzero(table.frame == self._frames[t]))]
         if not parts:
             return None
         columns: Mapping[str, np.ndarray] = {name: np.concatenate([getattr(p, name) for p in parts])
-                                             for name in ("origin_m", "direction", "outward", "angle")}
+                                             for name in ("origin_m", "direction", "outward", "angle", "alike")}
         return Rays(**columns)
 
 
-def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: np.ndarray, about_m: np.ndarray) -> Rays:
-    """The rays of one view, thinned to `SPACING_M` at a place (3,) of the body."""
+def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: np.ndarray, about_m: np.ndarray,
+               alike: int) -> Rays:
+    """The rays of one view, thinned to `SPACING_M` at a place (3,) of the body; `alike` views show about the same."""
     pixel_m = np.linalg.norm(about_m - camera.centre_m) / camera.focal_px
     gap = np.median(np.linalg.norm(np.diff(xy_px, axis=0), axis=1)) * pixel_m if len(xy_px) > 1 else SPACING_M
     keep = np.arange(0, len(xy_px), max(1, round(SPACING_M / max(gap, 1e-9))))
     direction, beside = (_unit(camera.rays(xy)) for xy in (xy_px[keep], xy_px[keep] + normal[keep]))
     outward = _unit(beside - np.einsum("ni,ni->n", beside, direction)[:, None] * direction)
     return Rays(origin_m=np.broadcast_to(camera.centre_m, direction.shape), direction=direction, outward=outward,
-                angle=sigma_px[keep] / camera.focal_px)
+                angle=sigma_px[keep] / camera.focal_px, alike=np.full(len(keep), alike))
 
 
 def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:

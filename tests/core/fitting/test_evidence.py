@@ -17,10 +17,12 @@ from tricap.core.fitting.observations import MotionPrior
 from tricap.core.fitting.problem import Problem
 from tricap.core.fitting.sequence import fit_sequence
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.silhouettes import Silhouettes
 from tricap.core.fitting.solver import solve
 from tricap.core.fitting.standing_feet import StandingFeet
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.raster import rasterize
+from tricap.core.geometry.rig import Rig
 
 from .limb_scene import measured_cloud, outlines
 
@@ -206,3 +208,21 @@ def test_the_floor_steadies_a_foot_that_stands(make_scene) -> None:
     given = _given(scene, clouds=clouds, time_s=np.arange(8) / 25)
     free, held = (fit_sequence(given, replace(SETTINGS, floor=floor)).motion.joints_m[:, ankle, 2] for floor in (False, True))
     assert np.ptp(held) < 0.6 * np.ptp(free), (np.ptp(held), np.ptp(free))
+
+
+def test_views_from_around_are_witnesses_of_their_own(make_scene) -> None:
+    """Three views in a row follow the same wrong edge together; views at right angles do not."""
+    scene = make_scene()
+    row = scene.rig.cameras
+    around = []
+    for k, camera in enumerate(row):
+        c, s = np.cos(k * np.pi / 2), np.sin(k * np.pi / 2)
+        about_z = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        around.append(replace(camera, R_cam_world=camera.R_cam_world @ about_z))
+    parameters = ShapeParameters(scene.shape)
+    state = parameters.state(scene.motion[0], parameters.vector())
+    crowding = []
+    for cameras in (row, tuple(around)):
+        given = _given(scene, rig=Rig(cameras=cameras), contours=outlines(scene))
+        crowding.append(max(np.max(o.crowding) for o in Silhouettes(given, read_model("arm.R").surface, FitSettings()).observe(0, state)))
+    assert crowding[0] > 2 * crowding[1] > 2
