@@ -1,12 +1,15 @@
-"""What run.json says before anything was computed: what is run, with which settings and inputs, and how to repeat it."""
+"""What run.json says: what is run, with which settings and inputs, how to repeat it; and figures of what was found."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from . import store
 from .settings import to_table
 from .stages import command_of
 from .take import Footage
+from .tracking.trajectories import Trajectories
 
 
 def new_account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -27,3 +30,21 @@ def new_account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]
         "stages": {},
         "warnings": [],
     }
+
+
+def track_figures(kept: Trajectories) -> dict[str, Any]:
+    """How many trajectories were kept, and how long and sure they are."""
+    seen = kept.seen
+    return {
+        "trajectories": int(seen.shape[1]),
+        "points_per_frame": float(seen.sum(axis=1).mean()),
+        "mean_length_frames": float(seen.sum(axis=0).mean()) if seen.shape[1] else 0.0,
+        "sigma_mm": 1e3 * median(kept.sigma_m[seen]),
+    }
+
+
+def median(values: Sequence[float] | np.ndarray) -> float:
+    """The median of what is finite, 0 where nothing is."""
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    return float(np.median(finite)) if len(finite) else 0.0

@@ -22,7 +22,7 @@ from .tracking.step import FramePair, TrackingView
 from .tracking.surface import on_surface, regenerate, start_tracks
 from .tracking.templates import Templates, Tiles, cut_tiles, no_templates
 from .tracking.tracked import TrackedFrame, joined, nothing
-from .tracking.waiting import Waiting, nobody
+from .tracking.waiting import Guide, Waiting, nobody
 
 ALGORITHM = "tracking 9"  # part of every key: raise it when the same input gives other numbers
 DROPOUT = 0.1  # of the points: where fewer are found in a frame, it is the frame that is missing
@@ -38,11 +38,11 @@ class _State:
     waiting: Waiting
     born: int  # the next identity
 
-    def after(self, tracked: TrackedFrame, cut: Tiles, view: TrackingView) -> "_State":
+    def after(self, tracked: TrackedFrame, cut: Tiles, view: TrackingView, guide: Guide | None) -> "_State":
         """The state after a frame, with the templates that were cut in it; a frame that was left out changes nothing."""
         if self.current is not None and not len(tracked.identity) and not len(tracked.ended):
             return self
-        waiting = self.waiting if self.current is None else self.waiting.after(self.current, tracked, view.tracking)
+        waiting = self.waiting if self.current is None else self.waiting.after(self.current, tracked, view.tracking, guide)
         wanted = np.concatenate([tracked.identity, waiting.points.identity])
         return _State(
             before=self.current,
@@ -62,31 +62,34 @@ def track_frames(
     results: Results,
     monitor: Monitor,
     enhance: EnhanceSettings | None = None,
+    guide: Guide | None = None,
 ) -> Iterator[TrackedFrame]:
     """Follow the surface through the frames (in the order of time), in which rays were allowed to miss by `limit_px`.
 
-    Frames that were tracked before are not tracked again for other knobs of the filters.
+    Frames that were tracked before are not tracked again for other knobs of the filters. Lost points can have a `guide`; what is tracked
+    with one has checkpoints of its own.
     """
     tracking = tracking.of_the_step
     view = tracking_view(footage, matching, tracking, limit_px)
     none = no_templates(view.matching, view.rows.step)
     state = _State(before=None, current=None, templates=none, waiting=nobody(len(view.cameras)), born=0)
-    key = store.digest(ALGORITHM, repr((matching, tracking, limit_px, enhance)))
+    key = store.digest(ALGORITHM, repr((matching, tracking, limit_px, enhance)), *([guide.key] if guide else []))
+    group = "guided" if guide else "tracks"
     images: FrameImages | None = None
     for i, m in enumerate(measured):
         monitor.step("tracks", i, len(measured))
         key = store.digest(key, m.key)
-        done = _from_checkpoint(results, m.frame, key)
+        done = _from_checkpoint(results, group, m.frame, key)
         if done is None:
             if state.current is not None and images is None:
                 images = load_images(footage, state.current.frame, enhance)
             following = load_images(footage, m.frame, enhance)
-            tracked = _advance(view.at(m.frame), state, images, following, m, i, monitor)
+            tracked = _advance(view.at(m.frame), state, images, following, m, i, monitor, guide)
             done = tracked, _cut(view, tracked, following)
-            _checkpoint(results, *done, key)
+            _checkpoint(results, group, *done, key)
         else:
             following = None
-        after = state.after(*done, view)
+        after = state.after(*done, view, guide)
         images = images if after is state else following
         state = after
         yield done[0]
@@ -113,6 +116,7 @@ def _advance(
     m: MeasuredFrame,
     index: int,
     monitor: Monitor,
+    guide: Guide | None,
 ) -> TrackedFrame:
     if state.current is None or images is None:
         return start_tracks(m.field, m.cloud, view)
@@ -121,7 +125,7 @@ def _advance(
     if len(tracked.identity) < DROPOUT * len(state.current.identity) and m.frame - state.current.frame <= view.tracking.bridge_frames:
         return nothing(m.frame, len(view.cameras))
     if view.tracking.scheme == "space":
-        waiting = state.waiting.carried(state.current, tracked, view.tracking)
+        waiting = state.waiting.carried(state.current, tracked, view.tracking, guide).in_sight(guide)
         regained = on_surface(waiting.retaken(view, state.templates, following.spline), m.field, m.cloud, view)
         tracked = joined(on_surface(tracked, m.field, m.cloud, view), regained)
     every = view.tracking.regenerate_every
@@ -135,13 +139,13 @@ def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Tile
     return cut_tiles(images.spline[view.reference], tracked.identity[fresh], at, view.matching, view.rows.step)
 
 
-def _checkpoint(results: Results, tracked: TrackedFrame, cut: Tiles, key: str) -> None:
+def _checkpoint(results: Results, group: str, tracked: TrackedFrame, cut: Tiles, key: str) -> None:
     arrays = tracked.arrays() | {f"cut_{f.name}": getattr(cut, f.name) for f in fields(Tiles)}
-    results.save_checkpoint("tracks", f"{tracked.frame:04d}", key, arrays)
+    results.save_checkpoint(group, f"{tracked.frame:04d}", key, arrays)
 
 
-def _from_checkpoint(results: Results, frame: int, key: str) -> tuple[TrackedFrame, Tiles] | None:
-    arrays = results.load_checkpoint("tracks", f"{frame:04d}", key)
+def _from_checkpoint(results: Results, group: str, frame: int, key: str) -> tuple[TrackedFrame, Tiles] | None:
+    arrays = results.load_checkpoint(group, f"{frame:04d}", key)
     if arrays is None:
         return None
     cut = Tiles(**{f.name: arrays.pop(f"cut_{f.name}") for f in fields(Tiles)})

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from .account import new_account
+from .account import median, new_account, track_figures
 from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
+from .body_guide import BodyGuide
 from .checking.take_check import causes_of_failure, doubts, with_cause
 from .checking.timing import in_step
 from .clicked_points import clicked_depth
@@ -48,6 +49,7 @@ from .take import Footage, open_take, read_take
 from .tracking.contour import ContourSettings
 from .tracking.settings import TrackingSettings, TrackStatus
 from .tracking.trajectories import Trajectories, assemble
+from .tracking.waiting import Guide
 from .without_surface import can_do_without, empty_clouds, empty_views, outline_polygons
 
 SETTINGS: dict[str, type] = {
@@ -215,7 +217,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         raise NothingMeasured(error.frame, f"{cause.sentence} {cause.advice}".strip()) from error
     notes = tuple(sorted(done, key=lambda n: n.frame))
     run.measured = MeasuredFrames(footage=run.footage, results=run.results, notes=notes)
-    residual = _median([n.residual_px for n in notes])
+    residual = median([n.residual_px for n in notes])
     for sentence in doubts(run.footage, notes[0].frame, [n.frame for n in notes if not n.points], residual, monitor):
         run.warn(sentence)
     run.finish_stage(
@@ -224,7 +226,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         frames=len(notes),
         points_per_frame=float(np.mean([n.points for n in notes])),
         residual_px=residual,
-        sigma_mm=1e3 * _median([n.sigma_m for n in notes]),
+        sigma_mm=1e3 * median([n.sigma_m for n in notes]),
         foreground=room.method if room else "",
         background_planes=len(room.planes) if room else 0,
     )
@@ -241,10 +243,20 @@ def track(run: Run, monitor: Monitor) -> None:
         measure(run, monitor)
     if run.surfaceless:
         return
-    began, s = time.perf_counter(), run.settings
+    began = time.perf_counter()
+    run.finish_stage("track", began, **_follow(run, monitor))
+
+
+def _follow(run: Run, monitor: Monitor, guide: Guide | None = None) -> dict[str, Any]:
+    """Write the trajectories, of lost points with a guide or without; gives figures for run.json.
+
+    Raises:
+        Cancelled: what is done is kept.
+    """
+    s = run.settings
     try:
         limit_px = run.measured.limit_px
-        steps = track_frames(run.footage, run.measured, limit_px, s["matching"], s["tracking"], run.results, monitor, s["enhance"])
+        steps = track_frames(run.footage, run.measured, limit_px, s["matching"], s["tracking"], run.results, monitor, s["enhance"], guide)
         raw = assemble(steps, run.footage.take.fps)
     except Cancelled as stop:
         raise Cancelled(
@@ -263,16 +275,7 @@ def track(run: Run, monitor: Monitor) -> None:
         run.warn(sentence)
     if not seen.shape[1] and raw.seen.any():
         run.warn(f"No trajectory was kept of {raw.seen.shape[1]}: most were removed as “{why.most_common(1)[0][0]}”.")
-    run.finish_stage(
-        "track",
-        began,
-        started=int(raw.seen.shape[1] + raw.omitted),
-        trajectories=int(seen.shape[1]),
-        points_per_frame=float(seen.sum(axis=1).mean()),
-        mean_length_frames=float(seen.sum(axis=0).mean()) if seen.shape[1] else 0.0,
-        reasons=dict(why.most_common()),
-        sigma_mm=1e3 * _median(run.trajectories.sigma_m[seen]),
-    )
+    return {"started": int(raw.seen.shape[1] + raw.omitted), **track_figures(filtered.kept), "reasons": dict(why.most_common())}
 
 
 def fit(run: Run, monitor: Monitor) -> None:
@@ -302,6 +305,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         given = fit_input(run.footage, run.clouds, run.trajectories, run.results, empty)
         run.body = body = fit_sequence(given, run.settings["fitting"], monitor, KeptFit(run.results, run.keys["fit"]))
         _write_body(run, body, monitor)
+        guided = run.settings["fitting"].track_again and run.measured
+        again = _follow(run, monitor, BodyGuide(body, run.footage)) if guided else {}
         run.results.remove("cache/fit")
         outlines = outline_polygons(run.footage, run.results)
         run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, empty, monitor)
@@ -328,10 +333,11 @@ def fit(run: Run, monitor: Monitor) -> None:
         frames=states,
         iterations=body.iterations,
         converged=body.converged,
-        sigma0=_median(body.motion.sigma0),
-        joint_sigma_mm=1e3 * _median(body.motion.joint_sigma_m),
-        **({"outline_mm": 1e3 * _median(body.outline_m)} if len(body.outline_m) else {}),
+        sigma0=median(body.motion.sigma0),
+        joint_sigma_mm=1e3 * median(body.motion.joint_sigma_m),
+        **({"outline_mm": 1e3 * median(body.outline_m)} if len(body.outline_m) else {}),
         **({"silhouettes": by_view(run.silhouettes.fits)} if run.silhouettes.fits else {}),
+        **({"tracked_again": again} if again else {}),
     )
 
 
@@ -392,9 +398,3 @@ def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
     write_joints(run.results.path("joints.csv"), body.motion)
     write_motion(run.results.path("motion.csv"), body.motion, body.shape.skeleton)
     write_body(run.results.path("body.toml"), body.shape)
-
-
-def _median(values: Sequence[float] | np.ndarray) -> float:
-    finite = np.asarray(values, dtype=np.float64)
-    finite = finite[np.isfinite(finite)]
-    return float(np.median(finite)) if len(finite) else 0.0

@@ -106,10 +106,13 @@ def stage_of(group: str) -> str:
 
 
 def still_good(run: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any]:
-    """The stages in a run.json that were done with these keys; the report is as good as the fit."""
+    """The stages in a run.json that were done with these keys; the report is as good as the fit, and so are tracks that the body guided."""
     keys = {**keys, "report": keys["fit"]}
     stages: dict[str, Any] = run.get("stages", {})
-    return {name: entry for name, entry in stages.items() if entry.get("key") == keys.get(name, "")}
+    good = {name: entry for name, entry in stages.items() if entry.get("key") == keys.get(name, "")}
+    if "fit" not in good and "tracked_again" in stages.get("fit", {}):
+        good.pop("track", None)
+    return good
 
 
 def _stamp(path: Path) -> tuple[str, int, int]:

@@ -19,6 +19,7 @@ from tricap.core.progress import Monitor
 from tricap.core.results import Results
 from tricap.core.take import open_take, read_take
 from tricap.core.tracking.step import TrackedFrame
+from tricap.core.tracking.waiting import Guide
 
 WIDTH, HEIGHT, FOCAL_PX, DEPTH_M = 200, 150, 600.0, 2.16  # 3.6 mm a pixel
 
@@ -132,14 +133,15 @@ def measure(folder: Path, out: Path, overrides: Mapping[str, Any] | None = None,
 
 
 def track(
-    folder: Path, out: Path, measured: Sequence[MeasuredFrame], overrides: Mapping[str, Any] | None = None, monitor: Monitor | None = None
-) -> list[TrackedFrame]:
+    folder: Path, out: Path, measured: Sequence[MeasuredFrame], overrides: Mapping[str, Any] | None = None, monitor: Monitor | None = None,
+    guide: Guide | None = None,
+) -> list[TrackedFrame]:  # fmt: skip
     """The tracked points of a take that was measured."""
     footage = open_take(read_take(folder))
     s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
     limit_px = float(np.median([m.field.limit_px for m in measured]))
     results, monitor = Results(out), monitor or Monitor()
-    return list(track_frames(footage, measured, limit_px, s["matching"], s["tracking"], results, monitor, s["enhance"]))
+    return list(track_frames(footage, measured, limit_px, s["matching"], s["tracking"], results, monitor, s["enhance"], guide))
 
 
 @dataclass(frozen=True)

@@ -140,6 +140,46 @@ def test_lost_points_wait_and_go_on_under_their_identity(tmp_path: Path, scenes:
     assert regained[5].mean() > 0.8 and not regained[0].any()
 
 
+class Traveller:
+    """A guide that knows a plane's exact way: one bone, all points on it."""
+
+    longest_frames = 50
+
+    def __init__(self, bodies: list[Any], in_sight: bool) -> None:
+        self.bodies, self.in_sight, self.asked = bodies, in_sight, 0
+        self.key = f"a plane in sight: {in_sight}"
+
+    def bind(self, frame: int, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(len(xyz_m), dtype=np.int64), xyz_m - self.bodies[frame].t
+
+    def places(self, frame: int, bone: np.ndarray, own_m: np.ndarray) -> np.ndarray:
+        self.asked += len(bone)
+        return own_m + self.bodies[frame].t
+
+    def sees(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
+        return np.full(len(xyz_m), self.in_sight)
+
+
+def test_a_guide_carries_lost_points_longer_than_neighbours_may(tmp_path: Path, scenes: Any) -> None:
+    """Hidden for two frames where one may be waited: only a guide brings the points back, to their places, and not where it hides them."""
+    bodies = [scenes.Body(half_m=(0.24, 0.18)).moved(np.eye(3), [0.004 * i, 0.002 * i, 0.0]) for i in range(5)]
+    bar = scenes.Body(half_m=(0.01, 0.3), t=np.array([0.0, 0.0, 1.95]), seed=5)
+    shown = [[b, bar] if i in (2, 3) else [b] for i, b in enumerate(bodies)]
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), shown, noise=1.0)
+    measured = scenes.measure(take, tmp_path / "out", {"growing": {"spacing_px": 6}})
+    knobs, regained = {"tracking": {"regenerate_every": 0, "wait_frames": 1}}, {}
+    for guide in (None, Traveller(bodies, True), Traveller(bodies, False)):
+        steps = scenes.track(take, tmp_path / "out", measured, knobs, guide=guide)
+        hidden = np.setdiff1d(steps[1].identity, steps[2].identity)
+        regained[guide.in_sight if guide else None] = np.isin(hidden, steps[4].identity).mean()
+        back = np.isin(steps[4].identity, hidden)
+        was = steps[1].xyz_m[np.searchsorted(steps[1].identity, steps[4].identity[back])]
+        away = np.linalg.norm((steps[4].xyz_m[back] - was)[:, :2] - [0.012, 0.006], axis=1)
+        assert len(hidden) > 10 and (away < 0.3 * scenes.pixel_m).all()
+        assert guide is None or guide.asked >= len(hidden)
+    assert regained[True] > 0.8 and regained[None] == regained[False] == 0
+
+
 def step(frame: int, identity: list[int], xyz: object, ended: list[int] | None = None) -> Any:
     """What `assemble` reads of a tracked frame."""
     n, gone = len(identity), ended or []
