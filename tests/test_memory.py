@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -13,12 +14,25 @@ from tricap.core.tracking.trajectories import assemble
 KB_PER_FRAME = 60.0  # 8 were measured; a kept cloud of this size has 150, a kept set of pictures 330
 
 
-@pytest.mark.slow
-def test_measuring_and_tracking_keep_no_frames(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def memory() -> ModuleType:
+    """The benchmark of memory."""
     spec = importlib.util.spec_from_file_location("bench_memory", Path(__file__).parent / "bench" / "memory.py")
     assert spec and spec.loader
-    memory = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(memory)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_a_fit_of_a_thousand_frames_needs_less_than_2_gb(memory: ModuleType) -> None:
+    """A whole body with 4,000 points a frame: 234 MB for 10 frames and 0.2 MB for each more, 424 MB in all, were measured."""
+    row = memory.fit_growth((5, 20))
+    assert row["mb_1000_frames"] < memory.FIT_LIMIT_MB, row
+
+
+@pytest.mark.slow
+def test_measuring_and_tracking_keep_no_frames(memory: ModuleType) -> None:
     (row,) = memory.growth(("track",), [15, 45], pictures=4)  # which measures first
     assert row["kb_per_frame"] < KB_PER_FRAME, row
 

@@ -3,7 +3,8 @@
     python tests/bench/memory.py [--frames 40 160] [--json FILE]
 
 The clip is 40 pictures a camera shown to and fro, each a hard link, so that a long one takes no more room than a short one. Each length is
-run in a process of its own; what grows is told per frame and for 30,000 frames.
+run in a process of its own; what grows is told per frame and for 30,000 frames. The fit of a whole body, which looks at all frames at once,
+is told for 1,000 frames, and may need 2 GB for them.
 """
 
 import argparse
@@ -21,16 +22,26 @@ from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E4
 CLIP_FRAMES = 30_000
 COARSE = ("growing.spacing_px=6", "tracking.spacing_px=12")
 STAGES = ("measure", "track", "run")
-CHILD = """
-import pathlib, resource, sys
-from tricap.core import commands
-code = commands.main(sys.argv[1:])
+FIT_FRAMES, FIT_LIMIT_MB = 1000, 2048
+PEAK = """
 status = pathlib.Path("/proc/self/status")
 if status.exists():  # what getrusage says on Linux contains the process that started this one
     print(next(int(line.split()[1]) / 1024 for line in status.read_text().splitlines() if line.startswith("VmHWM")))
 else:
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20))
+"""
+CHILD = f"""
+import pathlib, resource, sys
+from tricap.core import commands
+code = commands.main(sys.argv[1:])
+{PEAK}
 sys.exit(code)
+"""
+FIT_CHILD = f"""
+import pathlib, resource, sys
+import fit
+fit.fit_times(int(sys.argv[1]), fit.FitSettings(sequence_steps=3))
+{PEAK}
 """
 
 
@@ -54,6 +65,21 @@ def peak_mb(stage: str, take: Path, out: Path) -> float:
     if done.returncode:
         raise SystemExit(f"tricap {stage} ended with {done.returncode}: {done.stderr}")
     return float(done.stdout.split()[-1])
+
+
+def fit_growth(lengths: tuple[int, int] = (10, 30)) -> dict[str, object]:
+    """The row of the fit: a whole body's frames, with 4,000 points each, held in memory all at once."""
+    peaks = {}
+    for n in lengths:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])}
+        done = subprocess.run([sys.executable, "-c", FIT_CHILD, str(n)], capture_output=True, text=True, check=False, env=environment)
+        if done.returncode:
+            raise SystemExit(f"The fit of {n} frames ended with {done.returncode}: {done.stderr}")
+        peaks[n] = float(done.stdout.split()[-1])
+    (few, least), (many, most) = peaks.items()
+    added = (most - least) / (many - few)
+    return {"stage": "fit", "peak_mb": {str(n): round(p, 1) for n, p in peaks.items()}, "kb_per_frame": round(1024 * added, 1),
+            "mb_1000_frames": round(most + added * (FIT_FRAMES - many))}
 
 
 def growth(stages: tuple[str, ...], lengths: list[int], width_px: int = 192, pictures: int = 40) -> list[dict[str, object]]:
@@ -82,8 +108,13 @@ def main() -> None:
     rows = growth(tuple(args.stages), sorted(args.frames))
     for row in rows:
         print(f"{row['stage']:<8} peak {row['peak_mb']} MB, {row['kb_per_frame']} KB a frame, 20 minutes: {row['mb_20_minutes']} MB")
+    fit = fit_growth()
+    print(f"fit      peak {fit['peak_mb']} MB, {fit['kb_per_frame']} KB a frame, {FIT_FRAMES} frames: {fit['mb_1000_frames']} MB")
+    rows.append(fit)
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if fit["mb_1000_frames"] > FIT_LIMIT_MB:  # type: ignore[operator]
+        raise SystemExit(f"A fit of {FIT_FRAMES} frames would need {fit['mb_1000_frames']} MB, more than {FIT_LIMIT_MB}.")
 
 
 if __name__ == "__main__":
