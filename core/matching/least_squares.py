@@ -32,14 +32,14 @@ from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from ..progress import Monitor
 from ..settings import knob
+from .parameter_sets import PARAMETERS, reduced_sets
 
 CHUNK, LARGEST = 512, 1024  # patches that threads do not share; the most that a piece has when they do
 THREADS = 2
 MAX_STEP_PX = 2.0
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
 MIN_CONDITION = 1e-6
-PARAMETERS = 8
-PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "offset", "spread", "textured")  # arrays of a template side
+PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "textured")  # arrays
 UPPER, SYMMETRIC = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a 3×3 matrix: its upper part, and back
 NOISE_ENERGY = 4.0  # of a gradient [grey values² / px²]: less is noise, not texture
 
@@ -64,6 +64,9 @@ class MatchingSettings:
     )
     neighbours: bool = knob(
         True, "What neighbouring points say of the surface enters constrained matching as observations, not as its start alone."
+    )
+    max_rim_sigma_px: float = knob(
+        0.0, "Weak texture is matched without its shape where noise would move the patch's rim by more; 0: never.", unit="px", low=0, high=2
     )
     max_shear: float = knob(0.75, "Largest change of the patch's shape from its start.", low=0.1, high=3.0)
 
@@ -96,6 +99,7 @@ class Matches:
     sigma0: np.ndarray  # (N,) grey values of a patch whose contrast is 50
     correlation: np.ndarray  # (N,)
     iterations: np.ndarray  # (N,)
+    parameters: np.ndarray  # (N,) 8 unknowns, or 6 or 4 where the texture cannot tell the shape
     status: np.ndarray  # (N,) MatchStatus
 
     @property
@@ -211,6 +215,7 @@ class PatchTemplates:
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
         eye = np.eye(6) * MIN_CONDITION
         self.inverse = invert_spd(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
+        self.inverse, self.parameters = reduced_sets(H, self.inverse, image.noise, settings.patch_px / 2, settings.max_rim_sigma_px)
         self.offset: np.ndarray = np.zeros((len(xy), 2))
         self.spread = self.offset
         if of_texture:
@@ -342,6 +347,7 @@ class PatchTemplates:
             sigma0=sigma0,
             correlation=correlation,
             iterations=iterations,
+            parameters=self.parameters,
             status=status,
         )
 
@@ -389,4 +395,4 @@ def _compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray
 def _empty() -> Matches:
     pairs, matrices, z = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
     return Matches(xy=pairs, shape=matrices, covariance=matrices, offset=pairs, spread=pairs, transfer_covariance=matrices, sigma0=z,
-                   correlation=z, iterations=np.zeros(0, np.int16), status=np.zeros(0, np.int8))  # fmt: skip
+                   correlation=z, iterations=z.astype(np.int16), parameters=z.astype(np.int8), status=z.astype(np.int8))  # fmt: skip
