@@ -24,8 +24,8 @@ from ..progress import Monitor
 from ..take import Footage
 from ..without_surface import filled
 
-MOST_FRAMES = 60  # evenly over the take: a frame of four views takes a third of a second
 OUTLINE, BACKGROUND = "outline", "background"
+MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take: a frame of four views takes a third of a second
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,7 +56,8 @@ def silhouettes_of(footage: Footage, body: BodyFit, settings: SkinSettings, outl
     """
     hidden = {e.view: e for e in empty}
     frames = body.motion.frames
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round().astype(int))
+    most = MOST_FRAMES[OUTLINE if outlines else BACKGROUND]
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
     if not outlines and not hidden:
         return Silhouettes()
     found = []
