@@ -43,7 +43,16 @@ def hold(
     shift, left = np.zeros((len(good), 2)), grown.copy()
     gain = grown[held] @ invert_spd(grown[held] + key.covariance[held] + np.eye(2) * 1e-8)
     shift[held] = np.einsum("nij,nj->ni", gain, key.xy[held] - temporal.xy[held])
-    left[held] = (np.eye(2) - gain) @ grown[held]
+    left[held] = not_below((np.eye(2) - gain) @ grown[held], temporal.covariance[held], key.covariance[held])
     shape[held] = key.shape[held]
     renewed = good & ~held
     return Held(shift=shift, key_shape=np.where(renewed[:, None, None], np.eye(2), shape), drift=left, renewed=renewed)
+
+
+def not_below(covariance: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """A covariance (N, 2, 2) after adjustment, not less than the better of the two matches.
+
+    Both matches look at the same new image, whose noise is not averaged away; nor is that of a template that is the same in every frame.
+    """
+    own, first, second = (np.maximum(np.trace(K, axis1=1, axis2=2), 1e-12) for K in (covariance, a, b))
+    return covariance * np.maximum(1.0, np.minimum(first, second) / own)[:, None, None]

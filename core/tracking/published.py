@@ -8,7 +8,8 @@
     verify    |x_s − x_t| ≤ 0.5 px, else once more in a box of 2 r, else stop                                           (5)
 
 Kept: in the reference view the temporal result, elsewhere the mean of both weighted by their covariances, and where the rays meet. There is
-no control of drift: it grows with every frame, and is accounted for in the sigmas. The step in space (step.py) is the other scheme.
+no control of drift: it grows with every frame, as the sigmas say; of curvature, which a patch sees too flat, they know nothing. The step in
+space (step.py) is the other scheme.
 """
 
 from dataclasses import replace

@@ -30,7 +30,7 @@ class TrackingSettings:
     spacing_px: int = knob(8, "Distance between tracked points in the reference image.", unit="px", low=1, high=64)
     box_px: int = knob(
         12,
-        "Scheme “space”: half size of the box searched where no motion is known, then twice as much; two fifths, then all of it else.",
+        "Half size of the box searched where no motion is known, then twice as much; else two fifths, then all of it (one camera: twice).",
         unit="px",
         low=2,
         high=64,

@@ -28,7 +28,7 @@ from ..images.fields import Instants, RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches, patch_offsets
 from ..progress import Monitor
-from .control import hold
+from .control import hold, not_below
 from .neighbours import common_motion, nearest_neighbours
 from .search import search_box
 from .settings import TrackingSettings, TrackStatus
@@ -290,7 +290,7 @@ def weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray,
     xy, K = a.xy.copy(), a.covariance.copy()
     gain = K[rows] @ invert_spd(K[rows] + b.covariance[rows] + np.eye(2) * 1e-8)
     xy[rows] += np.einsum("nij,nj->ni", gain, (b.xy - a.xy)[rows])
-    K[rows] -= gain @ K[rows]
+    K[rows] = not_below(K[rows] - gain @ K[rows], K[rows], b.covariance[rows])
     return xy, K
 
 

@@ -5,6 +5,8 @@ a match of the key template itself, with P the point's covariance against the te
 
     P⁻¹ ← (P + K_t)⁻¹ + K_b⁻¹                                                  (1)
 
+but P is never less than the better of K_t and K_b: both matches look at the same new image, and the template's noise is always the same.
+
 Where the template has become too unlike (its correlation is below a limit), the point's present patch becomes the template, and P is
 added to the drift of the template itself.
 

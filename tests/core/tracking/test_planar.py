@@ -62,7 +62,7 @@ def test_drift_over_a_hundred_frames() -> None:
     assert (held.status == TrackStatus.MEASURED).all()
     assert np.percentile(off[0][-1], 95) < 0.3 and np.median(off[0][-1]) < 0.1 < np.median(off[1][-1])
     z = off[0][5:] / held.sigma_px[5:]
-    assert 0.5 < np.sqrt(np.mean(z**2)) < 1.5
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
 
 
 def test_a_hidden_point_is_taken_up_again() -> None:

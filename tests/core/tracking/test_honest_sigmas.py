@@ -1,0 +1,65 @@
+"""Sigmas of what is tracked in three views against exact motion, and what a hundred frames do to a point."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.images.fields import Instants
+from tricap.core.matching.least_squares import MatchingSettings
+from tricap.core.progress import Monitor
+from tricap.core.tracking.key_points import track_key_points
+from tricap.core.tracking.settings import TrackingSettings, TrackStatus
+from tricap.core.tracking.step import TrackingView
+from tricap.core.tracking.trajectories import assemble
+
+from .test_tracks import errors, moving_plane
+
+FOCAL_PX = 400.0
+
+
+def waving(scenes: Any, i: int) -> Any:
+    """A plane that turns and travels to and fro, by up to 3.5 px a frame."""
+    plane = scenes.Body(half_m=(0.3, 0.25), R=rotation_from_vector(np.array([0.1, 0.25, 0.0])), shortest_m=0.027)
+    turn = rotation_from_vector(np.array([0.05 * np.sin(i / 11), 0.06 * np.sin(i / 9), 0.1 * np.sin(i / 17)]))
+    return plane.moved(turn, [0.06 * np.sin(i / 8), 0.03 * np.sin(i / 6), 0.04 * np.sin(i / 13)])
+
+
+@pytest.mark.parametrize("frames", [12, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("noise", [1.5, 4.0])
+def test_chosen_points(scenes: Any, frames: int, noise: float) -> None:
+    """Twenty-four points are seen in every frame, drift by less than 0.3 px across the line of sight, and have honest sigmas in space."""
+    rig = scenes.three_cameras(width=128, height=96, focal=FOCAL_PX)
+    bodies = [waving(scenes, i) for i in range(frames)]
+    x, y = np.meshgrid(np.linspace(-0.15, 0.15, 6), np.linspace(-0.1, 0.1, 4))
+    own = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    truth = np.stack([own @ b.R.T + b.t for b in bodies])
+    clicks = {str(n): {c.name: c.project(truth[0, n]) for c in rig.cameras} for n in range(len(own))}
+    view = TrackingView(
+        cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7
+    )
+    read = lambda i: [scenes.render(c, [bodies[i]], noise=noise, seed=i) for c in rig.cameras]  # noqa: E731
+    points = track_key_points(read, range(frames), clicks, view, Monitor())
+    assert (points.status == TrackStatus.MEASURED).all()
+    drift_px = np.linalg.norm((points.xyz_m - truth)[..., :2], axis=2) / (scenes.depth_m / FOCAL_PX)
+    assert np.percentile(drift_px[-1], 95) < 0.3 and np.median(drift_px[-1]) < 0.1
+    z = np.linalg.norm(points.xyz_m - truth, axis=2) / points.sigma_m
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
+
+
+@pytest.mark.slow
+def test_points_of_the_surface(tmp_path: Path, scenes: Any) -> None:
+    """Six frames of a plane through the whole of measuring and tracking.
+
+    The depth is the measured surface's, whose sigmas are a third too large on so small a scene (z of 0.7); on recordings of people z is
+    about 1. Too small they must not be.
+    """
+    bodies = moving_plane(scenes, 6)
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=4.0)
+    measured = scenes.measure(take, tmp_path / "out")
+    tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 25.0)
+    error, on_it = errors(bodies, tracks, 0.035)
+    z = (np.linalg.norm(error, axis=2) / tracks.sigma_m)[:, on_it]
+    assert 0.7 < np.sqrt(np.nanmean(z**2)) < 1.25
