@@ -141,7 +141,7 @@ class PartField:
     @cached_property
     def gradient(self) -> np.ndarray:
         """(N, 3) in the world's axes."""
-        return np.asarray(self._pulls @ (-4 * self._W.T))
+        return np.asarray(np.add.reduce(self._bone_gradients, axis=1))
 
     @cached_property
     def shares(self) -> np.ndarray:
@@ -154,18 +154,13 @@ class PartField:
         return np.concatenate([motion, self._to_shape()], axis=1) if shape else motion
 
     @cached_property
-    def _pulls(self) -> np.ndarray:
-        """(N, 3m) w exp(−2d) q."""
-        n, m = self.terms.shape
-        return np.asarray((self._q.reshape(n, 3, m) * self.terms[:, None]).reshape(n, 3 * m))
-
-    @cached_property
     def _bone_gradients(self) -> np.ndarray:
         """(N, k, 3) the part of the gradient that comes from each of the part's bones."""
-        m, k = len(self.part.balls), len(self.part.bones)
+        (n, m), k = self.terms.shape, len(self.part.bones)
+        pulls = (self._q.reshape(n, 3, m) * self.terms[:, None]).reshape(n, 3 * m)
         table = np.zeros((3, m, k, 3))
         table[:, np.arange(m), self.part.bone_of_ball] = -4 * self._W.reshape(3, 3, m).transpose(1, 2, 0)
-        return (self._pulls @ table.reshape(3 * m, 3 * k)).reshape(-1, k, 3)
+        return (pulls @ table.reshape(3 * m, 3 * k)).reshape(-1, k, 3)
 
     def _to_motion(self) -> np.ndarray:
         state, part, n = self.state, self.part, len(self.part.skeleton.base_dofs)

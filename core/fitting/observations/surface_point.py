@@ -54,6 +54,7 @@ class SurfacePoints(FromBlocks):
         parts = tuple(self._weighed(b, rows, state) for b, rows in groups)
         again = replace(self, parts=parts)
         again._last.update(self._last)
+        self._last.clear()
         return again
 
     def _weighed(self, bone: int, rows: np.ndarray, state: BodyState) -> _Scaled:
@@ -81,7 +82,7 @@ class SurfacePoints(FromBlocks):
         return value
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
-        """Derivatives, part by part."""
+        """Derivatives, part by part. The fields are let go: what follows derivatives is a cost at another state."""
         for held in self._held():
             there = self._field(held.bone, held.rows, state)
             value, slope = self._value(there)
@@ -90,6 +91,7 @@ class SurfacePoints(FromBlocks):
             J *= (slope / unit)[:, None]
             if shape:
                 J[:, there.part.of_radii] += (value / unit)[:, None] * np.repeat(held.shares / 2, 2, axis=1)
+            self._last.pop(held.bone, None)
             yield held.rows, there.part.columns(shape), J
 
     @property

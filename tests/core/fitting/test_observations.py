@@ -188,6 +188,17 @@ def test_accelerations_equal_differences_of_their_cost() -> None:
     assert not few.diagonal.any() and smooth.cost(motion[:2]) == 0
 
 
+def test_fields_are_let_go_after_their_derivatives_and_found_again() -> None:
+    rng = np.random.default_rng(6)
+    parameters = _parameters("arm.R")
+    state = parameters.state(_motion(parameters, rng), parameters.vector())
+    points = _cases(parameters, state, rng)[0]
+    before, J = points.residual(state), points.jacobian(state)
+    assert not points._last and np.array_equal(points.residual(state), before) and points._last
+    again = points.scaled(state)
+    assert again._last and not points._last and np.array_equal(again.jacobian(state), J)
+
+
 def test_the_derivative_test_notices_a_wrong_sign() -> None:
     rng = np.random.default_rng(0)
     parameters = _parameters("arm.R")
