@@ -29,7 +29,7 @@ from .silhouettes import silhouette_file, silhouettes, told_by
 from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 from .take import Footage, footage_frames
 
-ALGORITHM = "surface 10"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 11"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 

@@ -7,18 +7,22 @@ import numpy as np
 
 
 def invert_spd(matrices: np.ndarray) -> np.ndarray:
-    """Inverses (N, k, k) of symmetric positive definite matrices (N, k, k), by Gauss–Jordan elimination without pivoting.
+    """Inverses (N, k, k) of symmetric positive definite matrices (N, k, k), by sweeping one pivot after the other, without pivoting.
 
-    A singular matrix gives inf or NaN in its own rows only. Scale the unknowns alike before: nothing is pivoted.
+    Only the lower triangles are worked on. A singular matrix gives inf or NaN in its own rows only. Scale the unknowns alike before.
     """
     M = np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.float64)  # (k, k, N): every step runs over the matrices
+    k = len(M)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for pivot in range(M.shape[0]):
-            inverse = 1 / M[pivot, pivot]
-            row, column = M[pivot] * inverse, M[:, pivot].copy()
-            M -= column[:, None] * row[None]
-            M[pivot], M[:, pivot] = row, -column * inverse
-            M[pivot, pivot] = inverse
+        for p in range(k):
+            inverse = 1 / M[p, p]
+            column = np.concatenate([M[p, :p], M[p:, p]])
+            row = column * inverse
+            for i in (i for i in range(k) if i != p):
+                M[i, : i + 1] -= column[i] * row[: i + 1]
+            M[p, :p], M[p + 1 :, p], M[p, p] = row[:p], row[p + 1 :], -inverse
+        for i in range(k):
+            M[: i + 1, i] = M[i, : i + 1] = -M[i, : i + 1]
     return np.moveaxis(M, -1, 0)
 
 
