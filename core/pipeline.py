@@ -218,7 +218,7 @@ def measure(run: Run, monitor: Monitor) -> None:
     notes = tuple(sorted(done, key=lambda n: n.frame))
     run.measured = MeasuredFrames(footage=run.footage, results=run.results, notes=notes)
     residual = median([n.residual_px for n in notes])
-    for sentence in doubts(run.footage, notes[0].frame, [n.frame for n in notes if not n.points], residual, monitor):
+    for sentence in doubts(run.footage, [n.frame for n in notes], [n.points for n in notes], [n.residual_px for n in notes], monitor):
         run.warn(sentence)
     run.finish_stage(
         "measure",

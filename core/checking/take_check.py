@@ -3,6 +3,8 @@
 import math
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import InputError
 from ..matching.least_squares import MatchingSettings
 from ..progress import Monitor
@@ -18,6 +20,8 @@ from .timing import Film, Offset, estimate_offsets
 from .view_matches import match_views
 
 DOUBTFUL_RESIDUAL_PX = 1.0
+FEWEST_BESIDE = 4  # frames on either side of a step
+STEP, STEP_PX = 2.0, 0.05  # sound takes: medians of two parts differ by a twelfth at most
 SMALL = 0.05  # frames: not worth an interpolation
 SPARE = 0.25  # frames: an offset beyond it spoils a measurement
 UNUSABLE = ("blank view", "identical views", "swapped views", "foreign rig", "no texture")  # after them, timing says nothing
@@ -78,19 +82,46 @@ def causes_of_failure(footage: Footage, monitor: Monitor) -> list[Finding]:
     return sorted(check_footage(footage, monitor)[0], key=lambda finding: not finding.certain)
 
 
-def doubts(footage: Footage, first: int, empty: list[int], residual_px: float, monitor: Monitor) -> list[str]:
-    """What is odd about measured clouds, in sentences: `empty` frames, rays that miss by `residual_px` (median), and the causes.
+def doubts(footage: Footage, frames: list[int], points: list[int], miss_px: list[float], monitor: Monitor) -> list[str]:
+    """What is odd about measured clouds, in sentences, and the causes: frames without points, rays that miss by much (the median of
+    each frame), or by more from some frame on.
 
     Every run has a look at its first frame; one with odd figures is checked throughout.
     """
+    empty = [frame for frame, n in zip(frames, points) if not n]
+    there = [(frame, miss) for frame, n, miss in zip(frames, points, miss_px) if n and math.isfinite(miss)]
+    residual_px = float(np.median([miss for _, miss in there])) if there else 0.0
     said = [f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}."] if empty else []
     if residual_px > DOUBTFUL_RESIDUAL_PX:
         said.append(
             f"The rays of matched points miss each other by {residual_px:.1f} px: "
             "does rig.toml belong to this recording, and were the views in step?"
         )
-    causes = causes_of_failure(footage, monitor) if said else [*first_look(footage, first), *rate_findings(footage)]
+    said += sudden_step([frame for frame, _ in there], np.array([miss for _, miss in there]))
+    causes = causes_of_failure(footage, monitor) if said else [*first_look(footage, frames[0]), *rate_findings(footage)]
     return said + [f"{cause.sentence} {cause.advice}".strip() for cause in causes]
+
+
+def sudden_step(frames: list[int], miss_px: np.ndarray) -> list[str]:
+    """A sentence where the rays' misses (T,) jump in some frame and stay: a view lost a frame there, or a camera was moved.
+
+    The frame is the one whose two sides differ most in their mean logarithm, by what the numbers on either side let it weigh.
+    """
+    if len(frames) < 2 * FEWEST_BESIDE or not (miss_px > 0).all():
+        return []
+    log, n = np.log(miss_px), np.arange(1, len(frames))
+    sums = np.cumsum(log)
+    apart = (sums[-1] - sums[:-1]) / (len(log) - n) - sums[:-1] / n
+    weight = np.abs(apart) * np.sqrt(n * (len(log) - n))
+    weight[: FEWEST_BESIDE - 1] = weight[len(weight) - FEWEST_BESIDE + 1 :] = 0
+    at = int(np.argmax(weight)) + 1
+    before, after = float(np.median(miss_px[:at])), float(np.median(miss_px[at:]))
+    if max(before, after) < STEP * min(before, after) or abs(after - before) < STEP_PX:
+        return []
+    return [
+        f"From frame {frames[at]} on the rays of matched points miss each other by {after:.2g} px, before by {before:.2g} px: "
+        "a view may have lost or doubled a frame there, or a camera was moved; compare the views around it, run the parts apart (--frames)."
+    ]
 
 
 def first_look(footage: Footage, frame: int) -> list[Finding]:

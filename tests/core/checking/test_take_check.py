@@ -12,7 +12,7 @@ import pytest
 
 from tricap.core import commands, pipeline
 from tricap.core.checking.findings import Checked
-from tricap.core.checking.take_check import check_take, doubts
+from tricap.core.checking.take_check import check_take, doubts, sudden_step
 from tricap.core.checking.timing import energy_lags, estimate_offsets
 from tricap.core.errors import InputError
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
@@ -240,6 +240,28 @@ def test_every_run_tells_a_variable_frame_rate(arm_recording: Record, tmp_path: 
     writer.release()
     said = take / "take.toml"
     said.write_text(said.read_text(encoding="utf-8").replace('images = "R/*.png"', 'movie = "r.mp4"'), encoding="utf-8")
-    assert not [s for s in doubts(open_take(read_take(take)), 0, [], 0.1, Monitor()) if "frame rate" in s]
+    assert not [s for s in doubts(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "frame rate" in s]
     (take / "r.mp4").write_bytes(with_a_pause((take / "r.mp4").read_bytes()))
-    assert [s for s in doubts(open_take(read_take(take)), 0, [], 0.1, Monitor()) if "View R has a variable frame rate" in s]
+    assert [s for s in doubts(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "View R has a variable frame rate" in s]
+
+
+def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp_path: Path) -> None:
+    take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
+    said = {}
+    for name in ("sound", "lost"):
+        with pipeline.open_run(take, tmp_path / name, {"growing": {"spacing_px": 8}}) as run:
+            pipeline.measure(run, Monitor())
+        said[name] = [s for s in run.account["warnings"] if "a view may have lost" in s]
+        shots = pictures(take, "R")
+        for here, there in zip(shots[4:], shots[5:]):
+            shutil.copyfile(there, here)
+    assert not said["sound"] and len(said["lost"]) == 1 and said["lost"][0].startswith("From frame 4 on the rays"), said
+
+
+def test_steps_that_are_none() -> None:
+    steady = 0.1 * np.exp(np.random.default_rng(0).normal(0, 0.1, 40))
+    assert not sudden_step(list(range(40)), steady)
+    assert not sudden_step(list(range(40)), steady * np.where(np.arange(40) == 20, 9.0, 1.0)), "one frame is no step"
+    assert not sudden_step(list(range(40)), 0.01 * steady * np.where(np.arange(40) > 20, 3.0, 1.0)), "it harms nobody"
+    assert sudden_step(list(range(10, 50)), steady * np.where(np.arange(40) >= 20, 3.0, 1.0))[0].startswith("From frame 30 on")
+    assert sudden_step(list(range(8)), np.array([0.1] * 4 + [0.3] * 4)) and not sudden_step(list(range(7)), np.array([0.1] * 3 + [0.3] * 4))
