@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -149,7 +150,8 @@ def run_folder(folder: Path) -> list[Path]:
 def done(folder: Path) -> None:
     """What a new run keeps of an earlier one, said in a line."""
     account = {"stages": still_good(Results(folder).read_run(), KEYS)}
-    str(Run(footage=None, settings={}, results=None, keys=KEYS, account=account))  # type: ignore[arg-type]
+    footage = SimpleNamespace(frames=range(2))
+    str(Run(footage=footage, settings={}, results=None, keys=KEYS, account=account))  # type: ignore[arg-type]
 
 
 def tracked(path: Path) -> None:
