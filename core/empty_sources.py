@@ -30,9 +30,8 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
         InputError: an image cannot be read.
         Cancelled: the user asked to stop.
     """
-    chosen = np.unique(np.linspace(0, len(clouds) - 1, min(SAMPLES, len(clouds))).round().astype(int))
-    backgrounds = [still_background([s.read(footage.number(k, clouds[i].frame)) for i in chosen])
-                   for k, s in enumerate(footage.sequences)]
+    frames = np.array([cloud.frame for cloud in clouds])
+    backgrounds = still_backgrounds(footage, frames)
     distances: list[list[np.ndarray]] = [[] for _ in backgrounds]
     if any(b is None for b in backgrounds):
         return []
@@ -44,9 +43,18 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
             empty = _coarse(known[k].shown_by(image)) & ~persons[k] & ~_near(camera, cloud.xyz_m, persons[k].shape)
             far = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) * (STEP_PX / UNIT_PX)
             distances[k].append(np.minimum(far, 255).astype(np.uint8))
-    frames = np.array([cloud.frame for cloud in clouds])
     return [EmptyView(view=view.name, frame=frames, distance=np.stack(d), step_px=STEP_PX, unit_px=UNIT_PX)
             for view, d in zip(footage.take.views, distances)]
+
+
+def still_backgrounds(footage: Footage, frames: np.ndarray) -> list[Background | None]:
+    """The still background of every view, from some of the frames (T,); None where they are too few to tell.
+
+    Raises:
+        InputError: an image cannot be read.
+    """
+    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int))].tolist()
+    return [still_background([s.read(footage.number(k, frame)) for frame in chosen]) for k, s in enumerate(footage.sequences)]
 
 
 def _coarse(mask: np.ndarray) -> np.ndarray:

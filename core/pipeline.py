@@ -50,7 +50,7 @@ from .tracking.contour import ContourSettings
 from .tracking.settings import TrackingSettings, TrackStatus
 from .tracking.trajectories import Trajectories, assemble
 from .tracking.waiting import Guide
-from .without_surface import can_do_without, empty_clouds, empty_views, outline_polygons
+from .without_surface import can_do_without, empty_clouds, empty_views, known_silhouettes
 
 SETTINGS: dict[str, type] = {
     "timing": TimingSettings,
@@ -308,8 +308,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         guided = run.settings["fitting"].track_again and run.measured
         again = _follow(run, monitor, BodyGuide(body, run.footage)) if guided else {}
         run.results.remove("cache/fit")
-        outlines = outline_polygons(run.footage, run.results)
-        run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, empty, monitor)
+        known = known_silhouettes(run.footage, run.results, run.settings["fitting"])
+        run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], *known, monitor)
     except Cancelled as stop:
         run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
         raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from .empty_sources import STEP_PX, UNIT_PX, find_empty
+from .empty_sources import STEP_PX, UNIT_PX, find_empty, still_backgrounds
 from .fitting.fit_input import EmptyView
 from .fitting.settings import FitSettings
+from .images.background import Background
 from .inspection import read_contours
 from .progress import Monitor
 from .results import Results
@@ -42,6 +43,21 @@ def outline_polygons(footage: Footage, results: Results) -> dict[str, dict[int, 
         if polygons:
             found[view.name] = polygons
     return found
+
+
+def known_silhouettes(footage: Footage, results: Results,
+                      settings: FitSettings) -> tuple[dict[str, dict[int, np.ndarray]], dict[str, Background]]:
+    """The outlines, and the still backgrounds of views that have none: what tells the person's silhouette.
+
+    Raises:
+        InputError: an image or a table of contours cannot be read.
+    """
+    outlines = outline_polygons(footage, results)
+    if not settings.use_background or len(outlines) == len(footage.take.views):
+        return outlines, {}
+    backgrounds = still_backgrounds(footage, np.array(footage.frames))
+    names = [view.name for view in footage.take.views]
+    return outlines, {n: b for n, b in zip(names, backgrounds) if b is not None and n not in outlines}
 
 
 def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:

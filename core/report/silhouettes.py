@@ -2,7 +2,7 @@
 
     IoU = |body ∩ person| / |body ∪ person|                                                                (1)
 
-The person is what lies within the outline that `tricap contour` found, or else what hides the still background, in squares of some pixels.
+The person is what lies within the outline that `tricap contour` found, or else the largest region that hides the still background.
 An outline has no holes, so those of the body (between an arm and the trunk) are filled too. The distance is that of the person's outline
 from the nearest point of the body's, the median over the outline.
 """
@@ -17,9 +17,9 @@ from ..body.shape import BodyShape
 from ..body.skin import SkinSettings, body_skin
 from ..errors import InputError
 from ..fitting.body_motion import BodyFit
-from ..fitting.fit_input import EmptyView
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize
+from ..images.background import WINDOW_PX, Background
 from ..progress import Monitor
 from ..take import Footage
 from ..without_surface import filled
@@ -48,28 +48,29 @@ class Silhouettes:
 
 
 def silhouettes_of(footage: Footage, body: BodyFit, settings: SkinSettings, outlines: Mapping[str, Mapping[int, np.ndarray]],
-                   empty: Sequence[EmptyView], monitor: Monitor) -> Silhouettes:
-    """The agreement of the body with the outlines, and in views without one with what hides the still background (`empty`).
+                   backgrounds: Mapping[str, Background], monitor: Monitor) -> Silhouettes:
+    """The agreement of the body with the outlines, and in views without one with what hides the still background.
 
     Raises:
         Cancelled: the user asked to stop.
     """
-    hidden = {e.view: e for e in empty}
     frames = body.motion.frames
     most = MOST_FRAMES[OUTLINE if outlines else BACKGROUND]
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-    if not outlines and not hidden:
+    if not outlines and not backgrounds:
         return Silhouettes()
     found = []
     for n, i in enumerate(chosen.tolist()):
         monitor.step("silhouettes", n, len(chosen))
         frame = int(frames[i])
-        for camera, mask in zip(footage.rig.cameras, body_masks(footage.rig.cameras, body.shape, body.motion.values[i], settings)):
+        images = footage.read(frame) if backgrounds else [None] * len(footage.rig.cameras)
+        masks = body_masks(footage.rig.cameras, body.shape, body.motion.values[i], settings)
+        for camera, mask, image in zip(footage.rig.cameras, masks, images):
             polygon = outlines.get(camera.name, {}).get(frame)
             if polygon is not None:
                 found.append(_agreement(camera.name, frame, mask, filled(polygon, camera.size_px), OUTLINE))
-            elif camera.name in hidden and (far := hidden[camera.name].of_frame(frame)) is not None:
-                found.append(_before_background(camera.name, frame, mask, far == 0, hidden[camera.name].step_px))
+            elif camera.name in backgrounds and image is not None:
+                found.append(_agreement(camera.name, frame, mask, _before(backgrounds[camera.name], image), BACKGROUND))
     return Silhouettes(fits=tuple(found), outlines=outlines)
 
 
@@ -103,14 +104,11 @@ def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
     return [c[:, 0] for c in cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]
 
 
-def _before_background(view: str, frame: int, body: np.ndarray, person: np.ndarray, step_px: int) -> SilhouetteFit:
-    """In squares of `step_px`, with the largest region that hides the background."""
-    h, w = person.shape
-    squares = body[: h * step_px, : w * step_px].reshape(h, step_px, w, step_px).mean(axis=(1, 3)) > 0.5
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(person.astype(np.uint8))
-    largest = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])) if len(stats) > 1 else person
-    fit = _agreement(view, frame, squares, _filled_holes(largest), BACKGROUND)
-    return SilhouetteFit(view=view, frame=frame, iou=fit.iou, distance_px=step_px * fit.distance_px, person=BACKGROUND)
+def _before(background: Background, image: np.ndarray) -> np.ndarray:
+    """The largest region (h, w) of an image that hides the background, without the rim that the comparison in windows adds."""
+    hides = cv2.erode((~background.shown_by(image)).astype(np.uint8), np.ones((WINDOW_PX // 2 * 2 + 1,) * 2, np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(hides)
+    return _filled_holes(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))) if len(stats) > 1 else hides > 0
 
 
 def _agreement(view: str, frame: int, body: np.ndarray, person: np.ndarray, source: str) -> SilhouetteFit:

@@ -11,7 +11,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import SkinSettings
 from tricap.core.errors import InputError
-from tricap.core.fitting.fit_input import EmptyView
+from tricap.core.images.background import Background
 from tricap.core.progress import Monitor
 from tricap.core.report.figures import figure_rows
 from tricap.core.report.pictures import BODY_OUTLINE, PERSON_OUTLINE, body_over_footage
@@ -34,7 +34,7 @@ def _outline(scenes: Any, shift: float = 0.0) -> np.ndarray:
 
 def test_the_silhouette_of_a_body_that_is_known(scenes: Any) -> None:
     outlines = {"C": {0: _outline(scenes), 2: _outline(scenes, 6.0)}}
-    found = silhouettes_of(_footage(scenes), BODY, SkinSettings(), outlines, [], Monitor())
+    found = silhouettes_of(_footage(scenes), BODY, SkinSettings(), outlines, {}, Monitor())
     exact, shifted = found.fits
     assert (exact.view, exact.frame, exact.person) == ("C", 0, "outline") and exact.iou > 0.99 and exact.distance_px < 0.5
     mask = body_masks(scenes.three_cameras().cameras[1:2], SHAPE, MOTION[0], SkinSettings())[0]
@@ -48,14 +48,16 @@ def test_the_silhouette_of_a_body_that_is_known(scenes: Any) -> None:
 
 
 def test_a_silhouette_before_the_background(scenes: Any) -> None:
-    mask = body_masks(scenes.three_cameras().cameras[:1], SHAPE, MOTION[0], SkinSettings())[0]
-    squares = mask[:148].reshape(37, 4, 50, 4).mean(axis=(1, 3)) > 0.5
-    squares[-3:, -3:] = True  # something else that moved
-    far = np.where(squares, 0, 9).astype(np.uint8)[None]
-    empty = EmptyView(view="L", frame=np.array([1]), distance=far, step_px=4, unit_px=0.5)
-    fits = silhouettes_of(_footage(scenes), BODY, SkinSettings(), {}, [empty], Monitor()).fits
-    assert [(f.view, f.frame, f.person) for f in fits] == [("L", 1, "background")] and fits[0].iou == 1.0 and fits[0].distance_px == 0.0
-    assert silhouettes_of(_footage(scenes), BODY, SkinSettings(), {}, [], Monitor()).fits == ()
+    rig = scenes.three_cameras()
+    mask = body_masks(rig.cameras[:1], SHAPE, MOTION[0], SkinSettings())[0]
+    still = np.random.default_rng(0).uniform(60, 90, mask.shape).astype(np.float32)
+    image = np.where(mask, 160.0, still).astype(np.float32)
+    image[2:14, 150:165] = 10.0  # something else that moved
+    footage: Any = SimpleNamespace(rig=rig, frames=range(3), read=lambda frame: [image] * 3)
+    fits = silhouettes_of(footage, BODY, SkinSettings(), {}, {"L": Background(grey=still, noise=1.0)}, Monitor()).fits
+    assert {(f.view, f.person) for f in fits} == {("L", "background")} and len(fits) == 3
+    assert fits[0].iou > 0.9 and fits[0].distance_px <= 1.0
+    assert silhouettes_of(footage, BODY, SkinSettings(), {}, {}, Monitor()).fits == ()
 
 
 def test_outlines_are_drawn_over_the_footage(scenes: Any) -> None:
