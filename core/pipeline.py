@@ -315,18 +315,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.notes[0].frame) if run.measured else error from error
-    states = {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
-    if set(states) - {"fitted"}:
-        run.warn(
-            "Frames in which the body rests partly on prediction: "
-            + ", ".join(f"{n} {w}" for w, n in states.items() if w != "fitted")
-            + "."
-        )
-    if not body.converged:
-        run.warn(
-            f"The adjustment of the body has not settled after {body.iterations} steps: look at the pictures before you use it, "
-            "and raise fitting.sequence_steps."
-        )
+    states = _told_states(run, body)
     run.finish_stage(
         "fit",
         began,
@@ -339,6 +328,17 @@ def fit(run: Run, monitor: Monitor) -> None:
         **({"silhouettes": by_view(run.silhouettes.fits)} if run.silhouettes.fits else {}),
         **({"tracked_again": again} if again else {}),
     )
+
+
+def _told_states(run: Run, body: BodyFit) -> dict[str, int]:
+    """How many frames are in each state; what is doubtful is said."""
+    states = {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
+    doubtful = ", ".join(f"{n} {word}" for word, n in states.items() if word != "fitted")
+    if doubtful:
+        run.warn(f"Frames in which the body rests partly on prediction: {doubtful}.")
+    if not body.converged:
+        run.warn(f"The body has not settled after {body.iterations} steps: look at the pictures, and raise fitting.sequence_steps.")
+    return states
 
 
 def report(run: Run, monitor: Monitor) -> None:
