@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,9 @@ from .calibrating import calibrate_rig, measure_bar, open_bar, write_report
 from .calibration import account
 from .calibration.rig_files import FORMATS, read_any, write_as
 from .calibration.world_choice import WorldChoice, frame_of_clicks
+from .calibration.world_frame import frame_like
 from .errors import InputError
-from .geometry.rig import Rig, write_rig
+from .geometry.rig import read_rig, write_rig
 from .progress import Monitor
 from .tracking.point_tables import read_points
 
@@ -30,6 +32,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar is held level")
     parser.add_argument("--points", type=Path, metavar="FILE",
                         help="CSV of point,view,x,y: the pixels of “origin”, “x” and “y”, which become the world's origin and axes")
+    parser.add_argument("--like", type=Path, metavar="RIG", help="put the cameras where those of the same names stand in this rig.toml")
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for the report: text, JSON, pictures")
     parser.add_argument("--import", dest="source", type=Path, metavar="FILE", help="read another tool's calibration instead of images")
     parser.add_argument("--export", dest="format", choices=sorted(FORMATS), help="write the rig in another tool's format")
@@ -52,10 +55,10 @@ def _convert(args: argparse.Namespace) -> list[str]:
     rig = read_any(args.source)
     world = _world(args)
     if world.floor_frames or world.level_frames:
-        raise InputError("--floor and --level need the bar's images; with --import give --points.")
-    if world.points:
-        frame = frame_of_clicks(rig.cameras, world.points)
-        rig = Rig(cameras=tuple(map(frame.camera, rig.cameras)), metadata={**rig.metadata, "floor": True})
+        raise InputError("--floor and --level need the bar's images; with --import give --points or --like.")
+    if world.points or world.like:
+        frame = frame_like(rig.cameras, world.like.cameras) if world.like else frame_of_clicks(rig.cameras, world.points)
+        rig = replace(rig, cameras=tuple(map(frame.camera, rig.cameras)), metadata={**rig.metadata, "floor": world.on_floor})
     written = write_as(args.out, rig, args.format) if args.format else [args.out]
     if not args.format:
         write_rig(args.out, rig)
@@ -90,7 +93,8 @@ def _world(args: argparse.Namespace) -> WorldChoice:
         table = read_points(args.points, with_views=True)
         for name, view, xy in zip(table.names, table.views, table.xy_px.tolist()):
             points.setdefault(name, {})[view] = xy
-    return WorldChoice(floor_frames=_frames(args.floor, "--floor"), level_frames=_frames(args.level, "--level"), points=points)
+    like = None if args.like is None else read_rig(args.like)
+    return WorldChoice(floor_frames=_frames(args.floor, "--floor"), level_frames=_frames(args.level, "--level"), points=points, like=like)
 
 
 def _frames(text: str | None, flag: str) -> tuple[int, ...]:

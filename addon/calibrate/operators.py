@@ -60,7 +60,8 @@ class Calibrate(JobOperator, bpy.types.Operator):
         length, diameter = (float(f"{value:.7g}") for value in (self.length_m or props.length_m, props.diameter_m))
         mask, interlaced = folders.absolute(props.mask) if props.mask else None, props.interlaced
         focal = props.focal_px if props.focal_px > 0 else None
-        world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level))
+        like = rig_of_scene(context.scene) if props.like_scene else None
+        world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
         live.begin()
 
         def read_and_calibrate(monitor: Monitor) -> Done:

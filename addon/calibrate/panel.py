@@ -19,6 +19,7 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     layout.prop(props, "mask")
     layout.prop(props, "floor", placeholder="frames: 0, 40, 80")
     layout.prop(props, "level", placeholder="frames: 12, 57")
+    layout.prop(props, "like_scene")
     row = layout.row()
     row.scale_y = 1.3
     row.enabled = bool(props.bar)

@@ -28,6 +28,9 @@ class TricapCalibrate(bpy.types.PropertyGroup):
     floor: bpy.props.StringProperty(name="Bar on Floor", description="Frames in which the bar lies on the floor, such as 0, 40, 80; "  # type: ignore[valid-type]
                                     "the floor becomes z = 0. Empty: up is where the cameras' tops are")
     level: bpy.props.StringProperty(name="Bar Level", description="Frames in which the bar is held level, such as 12, 57")  # type: ignore[valid-type]
+    like_scene: bpy.props.BoolProperty(name="Where the Scene's Cameras Are", default=False,  # type: ignore[valid-type]
+                                       description="The new cameras are put where the scene's cameras of the same names stand, "
+                                       "so that a rig calibrated anew does not move the world")
     light: bpy.props.StringProperty(name="Light")  # type: ignore[valid-type]
     verdict: bpy.props.StringProperty(name="Verdict")  # type: ignore[valid-type]
     advice: bpy.props.StringProperty(name="Advice")  # type: ignore[valid-type]

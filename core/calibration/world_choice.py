@@ -1,4 +1,4 @@
-"""Where the user wants the world's frame: on the floor where the bar lay, level with a bar, or through three points that were clicked."""
+"""Where the user wants the world's frame: on the floor under the bar, level with a bar, through three clicked points, or another rig's."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,7 +8,8 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
-from .world_frame import WorldFrame, frame_of_cameras, frame_of_level_bar, frame_of_points, frame_on_floor
+from ..geometry.rig import Rig
+from .world_frame import WorldFrame, frame_like, frame_of_cameras, frame_of_level_bar, frame_of_points, frame_on_floor
 
 POINTS = ("origin", "x", "y")
 CLICK_PX = 5.0  # rays of a clicked point that miss each other by more than twice this contradict each other
@@ -16,20 +17,21 @@ CLICK_PX = 5.0  # rays of a clicked point that miss each other by more than twic
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WorldChoice:
-    """One of the three, or nothing: then up is where the cameras' tops are."""
+    """One of the four, or nothing: then up is where the cameras' tops are."""
 
     floor_frames: tuple[int, ...] = ()  # in which the bar lies on the floor
     level_frames: tuple[int, ...] = ()  # in which the bar is held level
     points: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)  # "origin", "x", "y": pixels [x, y] by view
+    like: Rig | None = None  # cameras of the same names, which stay where they are there
 
     def __post_init__(self) -> None:
-        if sum(map(bool, (self.floor_frames, self.level_frames, self.points))) > 1:
-            raise InputError("The world's frame is given twice; choose the floor, level bars, or three points.")
+        if sum(map(bool, (self.floor_frames, self.level_frames, self.points, self.like))) > 1:
+            raise InputError("The world's frame is given twice; choose the floor, level bars, three points, or another rig's.")
 
     @property
     def on_floor(self) -> bool:
         """Whether z = 0 is the floor, or the plane that the user's points lie in."""
-        return bool(self.floor_frames or self.points)
+        return bool(self.floor_frames or self.points or (self.like is not None and self.like.metadata.get("floor") is True))
 
 
 def frame_of_bar(choice: WorldChoice, cameras: Sequence[Camera], frames: np.ndarray, ends_m: np.ndarray) -> WorldFrame:
@@ -38,6 +40,8 @@ def frame_of_bar(choice: WorldChoice, cameras: Sequence[Camera], frames: np.ndar
     Raises:
         InputError: the frames do not show the bar, or what they show makes no frame.
     """
+    if choice.like is not None:
+        return frame_like(cameras, choice.like.cameras)
     if choice.points:
         return frame_of_clicks(cameras, choice.points)
     for wanted, doing in ((choice.floor_frames, "to lie on the floor"), (choice.level_frames, "to be level")):

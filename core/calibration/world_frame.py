@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..values import frozen
 
+LEAST_ARM_M, OTHERWISE = 0.1, 0.3  # length to which directions count; a rig that differs by more than this part of it is another
 MIN_FLOOR_SPREAD = 0.02  # of the largest extent: points nearer to one line than this have no plane
 
 
@@ -43,6 +44,28 @@ def frame_of_cameras(cameras: Sequence[Camera], points_m: np.ndarray) -> WorldFr
     """The frame that needs nothing but the cameras: their tops are up, they look along +Y, the origin is the middle of the points."""
     up = -np.mean([c.R_cam_world[1] for c in cameras], axis=0)
     return upright(up, cameras, np.median(points_m.reshape(-1, 3), axis=0))
+
+
+def frame_like(cameras: Sequence[Camera], there: Sequence[Camera]) -> WorldFrame:
+    """The frame in which the cameras stand as nearly as can be where cameras of the same names are: centres and axes, without scale.
+
+    Raises:
+        InputError: no name is the same, or the cameras stand otherwise to each other.
+    """
+    other = {camera.name: camera for camera in there}
+    pairs = [(camera, other[camera.name]) for camera in cameras if camera.name in other]
+    if not pairs:
+        raise InputError(f"None of the cameras {', '.join(c.name for c in cameras)} is among {', '.join(other)}; name them alike.")
+    centres = np.array([camera.centre_m for camera, _ in pairs])
+    arm = max(float(np.linalg.norm(np.ptp(centres, axis=0))), LEAST_ARM_M)
+    A, B = (np.concatenate([c.centre_m + arm * np.vstack([np.zeros(3), c.R_cam_world]) for c in each]) for each in zip(*pairs))
+    U, _, Vt = np.linalg.svd((B - B.mean(axis=0)).T @ (A - A.mean(axis=0)))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    frame = WorldFrame(R=R, shift_m=B.mean(axis=0) - R @ A.mean(axis=0))
+    off = np.linalg.norm(frame.points(A) - B, axis=1).max()
+    if off > OTHERWISE * arm:
+        raise InputError(f"The cameras stand otherwise than those of the same names, by {1e3 * off:.0f} mm; were they moved or swapped?")
+    return frame
 
 
 def upright(up: np.ndarray, cameras: Sequence[Camera], origin_m: np.ndarray) -> WorldFrame:

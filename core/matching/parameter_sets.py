@@ -26,9 +26,10 @@ def reduced_sets(H: np.ndarray, inverse: np.ndarray, noise: float, half_px: floa
     for unknowns, needed, kept in SETS:
         variance = np.max([inverse[:, i, i] for i in needed], axis=0)
         rows = np.flatnonzero(np.sqrt(2 * np.maximum(variance, 0.0)) * noise * half_px > limit_px)
-        part = H[np.ix_(rows, kept, kept)]
+        block = np.ix_(rows, np.array(kept), np.array(kept))
+        part = H[block]
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-9))
         both = scale[:, :, None] * scale[:, None, :]
         inverse[rows], count[rows] = 0.0, unknowns
-        inverse[np.ix_(rows, kept, kept)] = invert_spd(part * both + 1e-6 * np.eye(len(kept))) * both
+        inverse[block] = invert_spd(part * both + 1e-6 * np.eye(len(kept))) * both
     return inverse, count

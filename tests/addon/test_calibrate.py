@@ -90,6 +90,20 @@ def test_an_own_camera_of_blender(blender, empty, tmp_path: Path) -> None:
     assert read.project(np.array([1.0, 0.5, 0.0])) == pytest.approx([959.5 + 2666.667 / 5, 539.5 - 2666.667 / 10], abs=1e-3)
 
 
+def test_a_rig_calibrated_anew_stays_where_the_scene_has_it(blender, empty, bar: Path, tmp_path: Path) -> None:
+    empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)
+    cameras = {o["tricap_view"]: o for o in empty.context.scene.objects if o.type == "CAMERA"}
+    for camera in cameras.values():
+        camera.location.x += 3.0
+    empty.context.view_layer.update()
+    there = {name: camera.matrix_world.translation.copy() for name, camera in cameras.items()}
+    empty.context.scene.tricap_calibrate.like_scene = True
+    empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)
+    for o in empty.context.scene.objects:
+        if o.type == "CAMERA":
+            assert (o.matrix_world.translation - there[o["tricap_view"]]).length < 1e-3
+
+
 @pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
 @pytest.mark.parametrize("size", [(1920, 1080, 1.0), (1080, 1920, 1.0), (768, 720, 1.25)], ids=["wide", "upright", "PAL"])
 def test_every_sensor_fit_is_read_as_blender_projects(blender, empty, tmp_path: Path, fit: str, size: tuple[int, int, float]) -> None:

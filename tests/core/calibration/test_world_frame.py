@@ -9,7 +9,14 @@ import pytest
 from tricap.__main__ import main
 from tricap.core.calibrating import calibrate_rig
 from tricap.core.calibration.world_choice import WorldChoice, frame_of_clicks
-from tricap.core.calibration.world_frame import WorldFrame, frame_of_cameras, frame_of_level_bar, frame_of_points, frame_on_floor
+from tricap.core.calibration.world_frame import (
+    WorldFrame,
+    frame_like,
+    frame_of_cameras,
+    frame_of_level_bar,
+    frame_of_points,
+    frame_on_floor,
+)
 from tricap.core.errors import InputError
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
@@ -43,6 +50,33 @@ def test_three_points() -> None:
     assert frame.points(np.array([0.0, 2, 3])).tolist() == pytest.approx([0, 1, 0])
     with pytest.raises(InputError, match="one line"):
         frame_of_points(np.zeros(3), np.array([1.0, 0, 0]), np.array([2.0, 0, 0]))
+
+
+@pytest.mark.parametrize("count", [3, 1])
+def test_cameras_stay_where_others_of_their_names_are(count: int) -> None:
+    moved = WorldFrame(R=rotation_from_vector(np.array([0.4, -1.1, 2.0])), shift_m=np.array([3.0, -1.0, 0.5]))
+    there = [moved.camera(camera) for camera in CAMERAS[:count]]
+    frame = frame_like(CAMERAS, there)
+    check_rigid(frame)
+    np.testing.assert_allclose(frame.R, moved.R, atol=1e-9)
+    np.testing.assert_allclose(frame.shift_m, moved.shift_m, atol=1e-9)
+    with pytest.raises(InputError, match="name them alike"):
+        frame_like(CAMERAS, [replace(there[0], name="X")])
+    if count > 1:
+        with pytest.raises(InputError, match="moved or swapped"):
+            frame_like(CAMERAS, [replace(there[0], name="R"), replace(there[2], name="L")])
+
+
+def test_the_command_keeps_the_world(tmp_path: Path) -> None:
+    moved = WorldFrame(R=rotation_from_vector(np.array([0.4, -1.1, 2.0])), shift_m=np.array([3.0, -1.0, 0.5]))
+    write_rig(tmp_path / "new.toml", Rig(cameras=CAMERAS))
+    write_rig(tmp_path / "old.toml", Rig(cameras=tuple(map(moved.camera, CAMERAS)), metadata={"floor": True}))
+    new, old, out = (str(tmp_path / f"{name}.toml") for name in ("new", "old", "o"))
+    assert main(["calibrate", "--import", new, "--like", old, "--out", out, "--quiet"]) == 0
+    rig = read_rig(tmp_path / "o.toml")
+    assert rig.metadata["floor"] is True
+    for a, b in zip(rig.cameras, map(moved.camera, CAMERAS)):
+        np.testing.assert_allclose(a.centre_m, b.centre_m, atol=1e-9)
 
 
 def test_floor_is_below_the_cameras() -> None:
