@@ -1,7 +1,11 @@
 """When a foot stands: from the motion itself, with hysteresis, separately for heel (the ankle) and ball (the toe's joint).
 
 A joint comes to stand when it is both slow and low, and stands until it is clearly faster or higher: two thresholds, so that noise
-does not make it flicker. Speeds and heights are those of a person with legs of 0.9 m; other sizes are scaled.
+does not make it flicker. Speeds and heights are those of a person with legs of 0.9 m; other sizes are scaled. The foot stands flat as
+long as both do and it does not turn; a heel that lifts rolls about the ball and stands no more.
+
+Feet that somebody has already planted stand without any motion. They stand for just as long as they do so: what is slow before and after
+is their landing and leaving. So a motion whose feet were held keeps them as they are when it is retargeted again.
 """
 
 from collections.abc import Mapping
@@ -14,11 +18,17 @@ from ...settings import knob
 from .mapping import RigMap
 from .rig import Motion
 from .roles import SIDES, sided
-from .turns import unit
+from .turns import angle_of, quaternion_from_matrix, unit
 
 LEG_M = 0.9
 LOW_PERCENTILE = 3.0
 SMOOTH_S = 0.05
+ROCKING_DEG = (3.0, 5.0)  # a foot turned by less against how it stands comes to stand flat; by more, it rolls
+STILL_M = 1e-4  # a joint that stays within this was planted; that of a living foot stirs by more …
+STILL_S = 0.1  # … in this time
+STILL_DEG = 0.05  # a foot that mostly is turned by less was planted
+LEFT_M = 3e-4  # a planted joint has left when it is farther away
+SAMPLES = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +46,12 @@ class FeetSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Contacts:
-    """By side: frames (T,) in which the ankle (heel) and the toe's joint (ball) stand; and the ankles' level on the floor [m]."""
+    """By side: frames (T,) in which the ankle (heel) and the toe's joint (ball) stand, and in which the foot stands flat; and the ankles'
+    level on the floor [m]."""
 
     ankle: Mapping[str, np.ndarray]
     toe: Mapping[str, np.ndarray]
+    flat: Mapping[str, np.ndarray]
     ankle_level_m: float
 
     @property
@@ -55,17 +67,20 @@ def leg_length(rig_joints: Mapping[str, np.ndarray]) -> float:
 
 def find_contacts(motion: Motion, rig_map: RigMap, settings: FeetSettings, leg_m: float) -> Contacts | None:
     """The contacts of both feet; None if the motion has no legs."""
-    ankle, toe, levels = {}, {}, []
+    ankle, toe, flat, levels = {}, {}, {}, []
     for side in SIDES:
         name = rig_map.first(sided("foot", side))
         if name is None or sided("shin", side) not in rig_map.bones:
             continue
-        places = motion.head_m[:, motion.rig.index[name]]
-        ankle[side] = stands(places, motion.fps, settings, leg_m / LEG_M)
-        levels.append(np.percentile(places[ankle[side], 2] if ankle[side].any() else places[:, 2], LOW_PERCENTILE * 5))
-        ball = ball_places(motion, rig_map, side)
-        toe[side] = ankle[side] & False if ball is None else stands(ball, motion.fps, settings, leg_m / LEG_M)
-    return Contacts(ankle=ankle, toe=toe, ankle_level_m=float(np.mean(levels))) if ankle else None
+        foot = motion.rig.index[name]
+        places, ball = motion.head_m[:, foot], ball_places(motion, rig_map, side)
+        heel = stands(places, motion.fps, settings, leg_m / LEG_M)
+        toe[side] = heel & False if ball is None else stands(ball, motion.fps, settings, leg_m / LEG_M)
+        both = heel & toe[side] if toe[side].any() else heel
+        flat[side] = steady(motion.R[:, foot], both)
+        ankle[side] = heel & (flat[side] | ~toe[side])
+        levels.append(np.percentile(places[heel, 2] if heel.any() else places[:, 2], LOW_PERCENTILE * 5))
+    return Contacts(ankle=ankle, toe=toe, flat=flat, ankle_level_m=float(np.mean(levels))) if ankle else None
 
 
 def ball_places(motion: Motion, rig_map: RigMap, side: str) -> np.ndarray | None:
@@ -94,7 +109,40 @@ def stands(places: np.ndarray, fps: float, settings: FeetSettings, scale: float)
     low, high = settings.land_height_m * scale, max(settings.leave_height_m, settings.land_height_m) * scale
     on = hysteresis((speed < slow) & (height < low), (speed > fast) | (height > high))
     shortest = settings.shortest_s * fps
-    return without_short(without_short(on, False, shortest), True, shortest)
+    return planted(places, without_short(without_short(on, False, shortest), True, shortest), STILL_S * fps)
+
+
+def planted(places: np.ndarray, on: np.ndarray, shortest: float) -> np.ndarray:
+    """`on` (T,), but of contacts in which the joint at `places` (T, 3) does not stir at all for `shortest` frames only the part in which it
+    stays there."""
+    result = on.copy()
+    for a, b in runs(on):
+        level = places[a:b, :2]  # the ankle rises and sinks as the foot rolls
+        still = np.append(np.linalg.norm(np.diff(level, axis=0), axis=1) < STILL_M / max(shortest, 1.0), False)
+        if max((last + 1 - first for first, last in runs(still)), default=0) >= max(shortest, 2.0):
+            result[a:b] = False
+            for first, last in runs(still):
+                near = np.linalg.norm(level - level[(first + last) // 2], axis=1) < LEFT_M
+                begin, end = next(span for span in runs(near) if span[0] <= first < span[1])
+                result[a + begin:a + end] |= last > first + 1
+    return result
+
+
+def steady(R: np.ndarray, on: np.ndarray) -> np.ndarray:
+    """Frames (T,) of `on` in which the foot R (T, 3, 3) is turned as in most of that contact."""
+    flat = np.zeros_like(on)
+    for a, b in runs(on):
+        turned = np.degrees(angle_of(R[a + stance(R[a:b])].T @ R[a:b]))
+        little, much = ROCKING_DEG if np.median(turned) > STILL_DEG else (STILL_DEG, STILL_DEG)
+        flat[a:b] = hysteresis(turned < little, turned > much)
+    return flat
+
+
+def stance(R: np.ndarray) -> int:
+    """Which of the rotations (T, 3, 3) most are near to."""
+    some = np.unique(np.linspace(0, len(R) - 1, SAMPLES).round().astype(int))
+    q = quaternion_from_matrix(R[some])
+    return int(some[np.argmax(np.median(np.abs(q @ q.T), axis=1))])
 
 
 def hysteresis(begin: np.ndarray, end: np.ndarray) -> np.ndarray:

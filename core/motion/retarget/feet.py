@@ -6,15 +6,13 @@ c(t) of the root and a place X_k for every contact k, from
     Σ |r(t) + c(t) + ω(t) × h_f(t) + o_f(t) − X_k − s_f(t)|²  +  τ⁴ Σ |c̈(t)|²  +  μ Σ |c(t)|²  +  the like of ω   →  min      (1)
 
 with r the root, ω a small turn of the hips, h_f a hip joint, o_f the ankle seen from the root, and s_f how the ankle moves about the
-standing ball of the foot while the heel lifts. Heights are given: the lowest point of the sole is on the floor. The norm counts angles:
-a displacement e of the ankle turns a leg of length d by e/d across it, but along it, with the knee bent by φ, each of its two bones
-by e·d/(2 l₁ l₂ sin φ)  (4). Of a foot whose heel is lifted mostly the distance from the ball counts, since it can turn: its ankle goes to
-the point next to where the leg has it on the sphere about the standing ball,
+standing ball of the foot while the heel lifts: feet and toes keep the directions that they have in the source, as long as they are not in
+the floor. Heights are given: the lowest point of the sole is on the floor. The norm counts angles: a displacement e of the ankle turns a
+leg of length d by e/d across it, but along it, with the knee bent by φ, each of its two bones by e·d/(2 l₁ l₂ sin φ)  (2). What is left is
+taken up by two bones of known length (3), with the knee in its plane, and let go over a while so that nothing pops.
 
-    a' = B + |a − B|_rest · unit(a − B)                                                                          (2)
-
-and the foot turns with it. What is left is taken up by two bones of known length (3), with the knee in its plane, and let go over a
-while so that nothing pops.
+Nothing is moved that stands already, so what was retargeted returns from another rig: feet may not turn by more than they must, since a
+foot is short, and 10 mm at the ankle are 4° of it.
 """
 
 from collections.abc import Mapping
@@ -22,22 +20,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 
 from ...geometry.rotation import cross_matrix
-from .contacts import Contacts, FeetSettings, runs
+from .contacts import Contacts, FeetSettings, runs, stance
 from .mapping import RigMap
 from .rig import Rig
 from .roles import sided
-from .turns import about, between, matrix_from_vector, rotate, shortest, unit, vector_from_matrix
+from .turns import matrix_from_vector, rotate, shortest, unit, vector_from_matrix
 
 SMOOTH_S = 0.05  # τ: the body's path does not follow the feet's noise
 HOLD = 1e-5  # μ: where nothing stands the path stays as it was
-GIVE = 0.4  # how much counts what a lifted foot can yield to by turning
 TILT = 0.2  # a turn of the hips counts as much less than one of a leg
-BENT = np.radians(8.0)  # a knee is taken to be bent at least as much in (4)
-NEAR = 0.8  # an ankle nearer to the ball than this part of the foot does not tell the foot's direction
-ROLL_M = 0.002  # the ball of a foot that rolls over its toes goes forward by at most this
+RAISED = 0.006  # a swinging foot that would be in the floor by less than this part of the leg's length is raised, not turned
+BENT = np.radians(8.0)  # a knee is taken to be bent at least as much in (2)
 REACH = 0.9995  # a leg is not stretched beyond this part of its length
 STRAIGHT = 0.005  # a knee that is out of the line by less of the thigh's length bends forwards
 
@@ -54,7 +50,6 @@ class Leg:
     ball_m: np.ndarray  # (3,) the toe's joint in the rest pose
     sole_m: np.ndarray  # (K, 3) points under the foot, rest pose
     tip_m: np.ndarray  # (J, 3) points under the toes, rest pose
-    end_m: np.ndarray  # (3,) the foremost of them
 
 
 def find_legs(rig: Rig, rig_map: RigMap, floor_m: float) -> dict[str, Leg]:
@@ -82,8 +77,7 @@ def _leg(rig: Rig, side: str, bones: Mapping[str, tuple[int, ...]], floor_m: flo
     under = np.array([1.0, 1.0, 0.0])
     sole = np.concatenate(skin) if skin else np.array([ankle * under, ball * under]) + (0, 0, low)
     tips = np.concatenate(toes) if toes else np.array([tip * under + (0, 0, low)])
-    return Leg(side=side, **{k: tuple(v) for k, v in bones.items()}, ball_m=ball, sole_m=sole, tip_m=tips,
-               end_m=tips[np.argmax((tips - ankle) @ (unit((ball - ankle) * under)))])
+    return Leg(side=side, **{k: tuple(v) for k, v in bones.items()}, ball_m=ball, sole_m=sole, tip_m=tips)
 
 
 def level_feet(since_rest: np.ndarray, flat: np.ndarray, A: np.ndarray) -> np.ndarray:
@@ -103,30 +97,36 @@ def lock_flat(R: np.ndarray, legs: Mapping[str, Leg], contacts: Contacts, rig: R
     for side, leg in legs.items():
         if side not in contacts.sides:
             continue
-        flat = contacts.ankle[side] & (contacts.toe[side] if contacts.toe[side].any() else True)
-        for bones, on in ((leg.foot, flat), (leg.toe, contacts.toe[side])):
+        for bones, on in ((leg.foot, contacts.flat[side]), (leg.toe, contacts.toe[side])):
             for b in bones:
-                R[:, b] = _held(R[:, b], rig.R_rest[b], on, settings.blend_s * fps)
+                R[:, b] = _held(R[:, b], rig.R_rest[b], runs(on), settings.blend_s * fps)
     return R
 
 
-def _held(R: np.ndarray, R_rest: np.ndarray, on: np.ndarray, blend: float) -> np.ndarray:
-    """In every stretch the mean heading of a level foot; blended in and out outside of it."""
-    held, weight = R.copy(), np.zeros(len(R))
-    time = np.arange(len(R))
-    for a, b in runs(on):
-        middle = R[a + (b - a) // 2] @ R_rest.T
-        up = shortest(middle[:, 2], np.array([0.0, 0.0, 1.0]))
-        level = up @ middle @ R_rest
-        near = fade(np.maximum(np.maximum(a - time, time - b + 1), 0), blend)
-        better = near > weight
-        held[better], weight[better] = level, near[better]
-    return between(R, held, weight)
+def _held(R: np.ndarray, R_rest: np.ndarray, spans: list[tuple[int, int]], blend: float) -> np.ndarray:
+    """In every stretch the heading of a level foot as it mostly stands; before and after it what that takes is let go."""
+    vectors = np.zeros((len(R), 3))
+    for k, (a, b) in enumerate(spans):
+        middle = R[a + stance(R[a:b])] @ R_rest.T
+        level = shortest(middle[:, 2], np.array([0.0, 0.0, 1.0])) @ middle @ R_rest
+        vectors += let_go(vector_from_matrix(level @ np.swapaxes(R[a:b], 1, 2)), spans, k, len(R), blend)
+    return matrix_from_vector(vectors) @ R
 
 
-def fade(distance: np.ndarray, blend: float) -> np.ndarray:
+def let_go(values: np.ndarray, spans: list[tuple[int, int]], k: int, frames: int, blend: float) -> np.ndarray:
+    """`values` (n, …) of stretch k of `spans` over all frames (T, …): smoothly nothing from `blend` frames on before and after it, or from
+    where the next one begins."""
+    a, b = spans[k]
+    time, nearest = np.arange(frames), np.clip(np.arange(frames), a, b - 1)
+    before = a - spans[k - 1][1] + 1 if k else blend
+    after = spans[k + 1][0] - b + 1 if k + 1 < len(spans) else blend
+    weight = fade(np.abs(time - nearest), np.where(time < a, min(before, blend), min(after, blend)))
+    return weight.reshape(-1, *(1,) * (values.ndim - 1)) * values[nearest - a]
+
+
+def fade(distance: np.ndarray, blend: float | np.ndarray) -> np.ndarray:
     """1 at distance 0, smoothly 0 from `blend` on."""
-    x = np.clip(1.0 - distance / max(blend, 1e-9), 0.0, 1.0)
+    x = np.clip(1.0 - distance / np.maximum(blend, 1e-9), 0.0, 1.0)
     return x * x * (3 - 2 * x)
 
 
@@ -150,21 +150,18 @@ def about_ball(leg: Leg, rig: Rig, R: np.ndarray, toe: np.ndarray, begin: int, e
     """s_f (end − begin, 3): how the ankle moves in a contact, about the ball where that stands and not at all where only the heel does."""
     arm = _arm(leg, rig, R)[begin:end]
     step = np.zeros_like(arm)
-    step[1:] = -np.diff(arm, axis=0) * toe[begin + 1:end, None]
+    step[1:] = -np.diff(arm, axis=0) * (toe[begin:end - 1] & toe[begin + 1:end])[:, None]
     return np.cumsum(step, axis=0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stand:
-    """One contact of one foot: frames [begin, end), and where the ankle is in it (n, 3), up to its place X_k in the plane; in which
-    frames (n,) only the ball stands."""
+    """One contact of one foot: frames [begin, end), and where the ankle is in it (n, 3), up to its place X_k in the plane."""
 
     side: str
     begin: int
     end: int
     path_m: np.ndarray
-    lifted: np.ndarray
-    arm_m: np.ndarray  # (n, 3) from the ankle to the ball
 
 
 def find_stands(legs: Mapping[str, Leg], contacts: Contacts, rig: Rig, R: np.ndarray, floor_m: float) -> list[Stand]:
@@ -175,13 +172,12 @@ def find_stands(legs: Mapping[str, Leg], contacts: Contacts, rig: Rig, R: np.nda
         for begin, end in runs(contacts.ankle[side] | contacts.toe[side]):
             path = about_ball(legs[side], rig, R, contacts.toe[side], begin, end)
             path[:, 2] = floor_m - low[begin:end]
-            lifted = ~contacts.ankle[side][begin:end] & bool(np.linalg.norm(legs[side].ball_m - rig.head_m[legs[side].foot[0]]) > 1e-4)
-            stands.append(Stand(side=side, begin=begin, end=end, path_m=path, lifted=lifted, arm_m=_arm(legs[side], rig, R)[begin:end]))
+            stands.append(Stand(side=side, begin=begin, end=end, path_m=path))
     return stands
 
 
 def stiffness(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
-    """W^½ (T, 3, 3): by how much the leg's directions suffer (rad × leg length) from a displacement of the ankle.  (4)"""
+    """W^½ (T, 3, 3): by how much the leg's directions suffer (rad × leg length) from a displacement of the ankle.  (2)"""
     upper = R[:, leg.thigh[0]] @ (rig.R_rest[leg.thigh[0]].T @ (rig.head_m[leg.shin[0]] - rig.head_m[leg.thigh[0]]))
     lower = R[:, leg.shin[0]] @ (rig.R_rest[leg.shin[0]].T @ (rig.head_m[leg.foot[0]] - rig.head_m[leg.shin[0]]))
     area = np.linalg.norm(np.cross(upper, lower), axis=1)  # l₁ l₂ sin φ
@@ -202,24 +198,26 @@ def carry_root(stands: list[Stand], ankles: Mapping[str, np.ndarray], hips: Mapp
         return np.zeros((t, 3)), np.zeros((t, 3)), np.zeros((0, 3))
     frame = np.concatenate([np.arange(s.begin, s.end) for s in stands])
     which = np.repeat(np.arange(k), [s.end - s.begin for s in stands])
-    W = np.concatenate([_say(s) @ stiff[s.side][s.begin:s.end] for s in stands])  # (n, 3, 3)
+    W = np.concatenate([stiff[s.side][s.begin:s.end] for s in stands])  # (n, 3, 3)
     misfit = np.concatenate([s.path_m - ankles[s.side][s.begin:s.end] for s in stands])
-    n = len(frame)
-    row = np.broadcast_to((3 * np.arange(n)[:, None] + np.arange(3))[:, :, None], W.shape)
-    column = np.broadcast_to((3 * frame[:, None] + np.arange(3))[:, None, :], W.shape)
-    at = sparse.csr_matrix((W.ravel(), (row.ravel(), column.ravel())), (3 * n, 3 * t))
-    column = np.broadcast_to((2 * which[:, None] + np.arange(2))[:, None, :], (n, 3, 2))
-    place = sparse.csr_matrix((W[:, :, :2].ravel(), (row[:, :, :2].ravel(), column.ravel())), (3 * n, 2 * k))
     lever = W @ -cross_matrix(np.concatenate([hips[s.side][s.begin:s.end] for s in stands]))  # ω × h = −[h]× ω
-    column = np.broadcast_to((3 * frame[:, None] + np.arange(3))[:, None, :], W.shape)
-    turning = sparse.csr_matrix((lever.ravel(), (row.ravel(), column.ravel())), (3 * n, 3 * t))
+    A = sparse.hstack([_placed(np.concatenate([W, lever], axis=2), 6 * frame[:, None] + np.arange(6), 6 * t),  # c and ω by frame
+                       _placed(-W[:, :, :2], 2 * which[:, None] + np.arange(2), 2 * k)])
     smooth = _roughness(t) * (SMOOTH_S * fps) ** 4
-    own = (TILT * leg_m) ** 2
-    hold = [sparse.kron(smooth + HOLD * sparse.identity(t), sparse.identity(3)),
-            sparse.kron(own * (smooth + sparse.identity(t)), sparse.identity(3)), 1e-9 * sparse.identity(2 * k)]
-    A = sparse.hstack([at, turning, -place])
-    x = spsolve((A.T @ A + sparse.block_diag(hold)).tocsc(), A.T @ np.einsum("nij,nj->ni", W, misfit).ravel())
-    return x[:3 * t].reshape(t, 3), x[3 * t:6 * t].reshape(t, 3), np.column_stack([x[6 * t:].reshape(k, 2), np.zeros(k)])
+    shifts, turns = np.diag([1.0] * 3 + [0.0] * 3), np.diag([0.0] * 3 + [1.0] * 3) * (TILT * leg_m) ** 2
+    hold = sparse.kron(smooth + HOLD * sparse.identity(t), shifts) + sparse.kron(smooth + sparse.identity(t), turns)
+    normal = (A.T @ A + sparse.block_diag([hold, 1e-9 * sparse.identity(2 * k)])).tocsc()
+    solved = splu(normal, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})  # a band with a border
+    x = solved.solve(A.T @ np.einsum("nij,nj->ni", W, misfit).ravel())
+    frames = x[:6 * t].reshape(t, 6)
+    return frames[:, :3], frames[:, 3:], np.column_stack([x[6 * t:].reshape(k, 2), np.zeros(k)])
+
+
+def _placed(blocks: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
+    """Blocks (n, 3, m), one below the other, at their columns (n, m)."""
+    n, _, m = blocks.shape
+    rows = np.broadcast_to(np.arange(3 * n).reshape(n, 3, 1), blocks.shape)
+    return sparse.csr_matrix((blocks.ravel(), (rows.ravel(), np.broadcast_to(columns[:, None, :], blocks.shape).ravel())), (3 * n, width))
 
 
 def _roughness(t: int) -> sparse.csr_matrix:
@@ -228,68 +226,6 @@ def _roughness(t: int) -> sparse.csr_matrix:
         return sparse.csr_matrix((t, t))
     bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(t - 2, t))
     return (bend.T @ bend).tocsr()
-
-
-def _say(stand: Stand) -> np.ndarray:
-    """(n, 3, 3): all of a firm foot counts; of a lifted one what changes its distance from the ball, since it can turn."""
-    n = unit(stand.arm_m)
-    along = n[:, :, None] * n[:, None, :]
-    return np.where(stand.lifted[:, None, None], along + GIVE * (np.eye(3) - along), np.eye(3))
-
-
-def plant(leg: Leg, rig: Rig, R: np.ndarray, stand: Stand, place: np.ndarray, ankle: np.ndarray, floor_m: float, blend: float
-          ) -> tuple[np.ndarray, np.ndarray]:
-    """Ankle (n, 3), and R (n, B, 3, 3) with foot and toes turned, in a contact; `ankle` (T, 3): where the leg has it.  (2)"""
-    own, foot = R[stand.begin:stand.end].copy(), leg.foot[0]
-    pinned, free = stand.path_m + place, ankle[stand.begin:stand.end]
-    if not stand.lifted.any():
-        return pinned, own
-    firm = np.flatnonzero(~stand.lifted)
-    if len(firm):  # what a flat foot lacked is let go while the heel lifts
-        time = np.arange(len(own))
-        nearest = firm[np.abs(time[:, None] - firm).argmin(axis=1)]
-        free = free + fade(np.abs(time - nearest), blend)[:, None] * (pinned - free)[nearest]
-    arm = _arm(leg, rig, own)
-    ball, length = pinned + arm, float(np.linalg.norm(arm[0]))
-    level = np.where(stand.lifted, (rig.head_m[foot][2] - leg.ball_m[2]) / length, -1.0)
-    for _ in range(3):
-        goal = ball + length * _away(ball, free, arm, level)  # (2)
-        own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
-        ball[stand.lifted, 2] += (floor_m - goal[:, 2] - lowest(leg, rig, own))[stand.lifted]
-    if leg.toe:
-        ball = _over_the_tip(leg, rig, own, ball, free, length)
-    goal = ball + length * _away(ball, free, arm, level)
-    own[:, foot] = shortest(arm, ball - goal) @ R[stand.begin:stand.end, foot]
-    return goal, own
-
-
-def _away(ball: np.ndarray, free: np.ndarray, arm: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """From the ball towards the ankle (n, 3), unit vectors; if that is too near the ball to tell, as the foot was. Their height is at
-    least `level`, that of a foot that stands flat: a lifted heel is not pressed into the floor."""
-    lack = np.maximum(NEAR * np.linalg.norm(arm, axis=1) - np.linalg.norm(free - ball, axis=1), 0.0)
-    up = unit(free - ball - lack[:, None] * unit(arm))
-    least = np.maximum(up[:, 2], level)
-    flat = np.sqrt(1.0 - least**2) / np.maximum(np.linalg.norm(up[:, :2], axis=1), 1e-9)
-    return np.column_stack([up[:, :2] * flat[:, None], least])
-
-
-def _over_the_tip(leg: Leg, rig: Rig, own: np.ndarray, ball: np.ndarray, free: np.ndarray, length: float) -> np.ndarray:
-    """The ball (n, 3), raised about the tip of the toes where the foot is too short to reach the ankle; turns the toes in `own`.
-
-    It goes forward thereby, by no more than ROLL_M.
-    """
-    toe = leg.toe[0]
-    back = -own[:, toe] @ (rig.R_rest[toe].T @ (leg.end_m - rig.head_m[toe]))
-    lack = np.linalg.norm(free - ball, axis=1) - length
-    size, toward = np.linalg.norm(back, axis=1), unit(free - ball)
-    axis = unit(np.cross(back, np.broadcast_to((0.0, 0.0, 1.0), back.shape)))
-    lift = np.sum(np.cross(axis, back) * toward, axis=1)  # how far the ball comes nearer per radian
-    steep = np.arctan2(back[:, 2], np.linalg.norm(back[:, :2], axis=1))
-    most = np.maximum(np.arccos(np.clip(np.cos(steep) - ROLL_M / np.maximum(size, ROLL_M), -1.0, 1.0)) - np.maximum(steep, 0.0), 0.0)
-    angle = np.clip(lack / np.maximum(lift, 0.1 * size), 0.0, most) * np.clip(5.0 * lift / size - 0.5, 0.0, 1.0)
-    turn = about(axis, angle)
-    own[:, toe] = turn @ own[:, toe]
-    return ball - back + rotate(turn, back)
 
 
 def step_over(leg: Leg, rig: Rig, R: np.ndarray, ankle: np.ndarray, floor_m: float, swinging: np.ndarray) -> np.ndarray:
@@ -331,24 +267,16 @@ def _turned(R: np.ndarray, bones: tuple[int, ...], vector: np.ndarray) -> np.nda
 
 def ankle_goals(leg: Leg, rig: Rig, R: np.ndarray, stands: list[Stand], places: np.ndarray, ankle: np.ndarray, floor_m: float,
                 blend: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the ankle shall be (T, 3), and R with the foot turned: planted in contacts, let go over `blend` frames, and never so low
-    that the sole is in the floor. `ankle` (T, 3): where the leg has it."""
-    time, moving = np.arange(len(ankle)), (*leg.foot, *leg.toe)
-    off, turn, weight = np.zeros_like(ankle), np.zeros((len(ankle), len(moving), 3)), np.zeros(len(ankle))
-    for stand, place in zip(stands, places):
-        if stand.side != leg.side:
-            continue
-        goal, own = plant(leg, rig, R, stand, place, ankle, floor_m, blend / 2)
-        nearest = np.clip(time, stand.begin, stand.end - 1)
-        near = fade(np.abs(time - nearest), blend)
-        closer, there = near > weight, nearest - stand.begin
-        turned = vector_from_matrix((own @ np.swapaxes(R[stand.begin:stand.end], 2, 3))[:, moving])
-        off[closer] = (near[:, None] * (goal - ankle[stand.begin:stand.end])[there])[closer]
-        turn[closer] = (near[:, None, None] * turned[there])[closer]
-        weight = np.maximum(weight, near)
-    R, goal = R.copy(), ankle + off
-    R[:, moving] = matrix_from_vector(turn) @ R[:, moving]
-    R = step_over(leg, rig, R, goal, floor_m, weight < 1.0)
+    """Where the ankle shall be (T, 3), and R with swinging feet turned where they must: planted in contacts, let go over `blend` frames,
+    and never so low that the sole is in the floor. `ankle` (T, 3): where the leg has it."""
+    own = [(stand, place) for stand, place in zip(stands, places) if stand.side == leg.side]
+    goal, swinging = ankle.copy(), np.ones(len(ankle), dtype=bool)
+    for k, (stand, place) in enumerate(own):
+        pull = stand.path_m + place - ankle[stand.begin:stand.end]
+        goal += let_go(pull, [(s.begin, s.end) for s, _ in own], k, len(ankle), blend)
+        swinging[stand.begin:stand.end] = False
+    leg_m = float(np.linalg.norm(rig.head_m[leg.thigh[0]] - rig.head_m[leg.foot[0]]))
+    R = step_over(leg, rig, R, goal, floor_m - RAISED * leg_m, swinging)
     goal[:, 2] += np.maximum(floor_m - goal[:, 2] - lowest(leg, rig, R), 0.0)
     return goal, R
 

@@ -147,13 +147,11 @@ def _level(source: Motion, source_map: RigMap, aligned: Mapping[str, np.ndarray]
     """Alignments of the feet and toes that stand level when the source's do."""
     level = {}
     for side in contacts.sides:
-        both = contacts.ankle[side] & contacts.toe[side]
-        flat = both if both.any() else contacts.ankle[side]
         for part in ("foot", "toe"):
             role = sided(part, side)
             if role in aligned:
                 b = source.rig.index[source_map.bones[role][-1]]
-                level[role] = feet.level_feet(source.R[:, b] @ source.rig.R_rest[b].T, flat, aligned[role])
+                level[role] = feet.level_feet(source.R[:, b] @ source.rig.R_rest[b].T, contacts.flat[side], aligned[role])
     return level
 
 
