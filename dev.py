@@ -303,11 +303,12 @@ def blender_extension(command: str, *arguments: object) -> None:
         sys.exit(f"Blender's extension tool found a fault ({command}):\n{done.stdout}{done.stderr}")
 
 
-def gui_test(out: str, scripts: list[str]) -> int:
+def gui_test(out: str, scripts: list[str], install: bool) -> int:
     """Tricap in a true Blender window (tests/gui). Debian's Blender has Python 3.14 and a scipy of its own; OpenCV's wheel fits any."""
     with tempfile.TemporaryDirectory() as folder:
         package = build_for_window(Path(folder))
-        return run(venv_program("python"), ROOT / "tests" / "gui" / "run.py", "--package", package, "--out", Path(out).absolute(), *scripts)
+        said = ["--package", package, "--out", Path(out).absolute(), *(["--install"] if install else []), *scripts]
+        return run(venv_program("python"), ROOT / "tests" / "gui" / "run.py", *said)
 
 
 def build_for_window(out: Path) -> Path:
@@ -343,6 +344,7 @@ def parser() -> argparse.ArgumentParser:
     part.add_argument("--save", action="store_true", help="make these results the baseline that later ones are compared with")
     part = commands.add_parser("gui-test", help="the workflow in a true Blender window (set up in .gui; Linux, as root)")
     part.add_argument("--out", default=str(ROOT / "out" / "gui"), help="folder of pictures and logs (default: out/gui)")
+    part.add_argument("--install", action="store_true", help="install debootstrap where it is missing (apt-get)")
     part.add_argument("script", nargs="*", help="only these scripts")
     commands.add_parser("lint", help="style and types")
     return top
@@ -364,7 +366,7 @@ def main() -> int:
     if options.command == "bench":
         return bench(options.stage, options.json, options.save)
     if options.command == "gui-test":
-        return gui_test(options.out, options.script)
+        return gui_test(options.out, options.script, options.install)
     return lint() if options.command == "lint" else 0
 
 

@@ -15,7 +15,7 @@ case "$1 $2 $3" in
     -c*) exit 0 ;;
     "dev.py test --all") {slow} ;;
     "dev.py test ") {quick} ;;
-    "dev.py gui-test ") {window} ;;
+    "dev.py gui-test --install") {window} ;;
 esac
 """
 

@@ -28,10 +28,10 @@ def gui(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
         sys.modules.pop(name, None)
 
 
-def said(gui: ModuleType, root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+def said(gui: ModuleType, root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *more: str) -> str:
     """What is printed, with exit code 0."""
     monkeypatch.setattr(gui.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(sys, "argv", ["run.py", "--package", "none.zip", "--root", str(root)])
+    monkeypatch.setattr(sys, "argv", ["run.py", "--package", "none.zip", "--root", str(root), *more])
     assert gui.main() == 0 and not root.exists()
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1 and lines[0].startswith("gui-test: skipped, for ")
@@ -53,3 +53,23 @@ def test_why_not(gui: ModuleType, lacking: str, why: str, tmp_path: Path, monkey
         told = subprocess.CompletedProcess([], 1, "", "I: x\nE: no network\n")
         monkeypatch.setattr(gui.chroot.subprocess, "run", lambda *_, **__: told)
     assert why in said(gui, tmp_path / "gui" / "blender", capsys, monkeypatch)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no chroots on Windows")
+@pytest.mark.parametrize("asked", [False, True])
+def test_debootstrap_is_installed_only_when_asked(gui: ModuleType, asked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                  capsys: pytest.CaptureFixture[str]) -> None:
+    ran: list[list[str]] = []
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        ran.append(command)
+        return subprocess.CompletedProcess(command, 100, "", "E: no such package\n")
+
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == "debootstrap" else f"/usr/bin/{name}")
+    monkeypatch.setattr(gui.chroot.subprocess, "run", run)
+    line = said(gui, tmp_path / "gui" / "blender", capsys, monkeypatch, *(["--install"] if asked else []))
+    if asked:
+        assert [command[-2:] for command in ran] == [["DPkg::Lock::Timeout=60", "update"], ["--no-install-recommends", "debootstrap"]]
+        assert "debootstrap could not be installed (E: no such package)" in line
+    else:
+        assert not ran and "--install does it" in line

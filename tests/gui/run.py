@@ -23,7 +23,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that Blender and its display end too
     began = time.monotonic()
     try:
-        root = chroot.set_up(options.root)
+        root = chroot.set_up(options.root, install=options.install)
         say(f"{chroot.version(root)} is ready in {root} ({time.monotonic() - began:.0f} s)")
         failed = [path.stem for path in options.scripts if not _passed(root, path.resolve(), options)]
     except chroot.Unavailable as why:
@@ -36,7 +36,7 @@ def main() -> int:
 def _passed(root: Path, script: Path, options: argparse.Namespace) -> bool:
     began, out = time.monotonic(), options.out / script.stem
     code = window.run_script(root, options.package, script, out, options.limit, options.data, _size(script))
-    how = {0: "passed", window.TIMED_OUT: f"stopped after {options.limit:.0f} s"}.get(code, f"failed (exit code {code})")
+    how = {0: "passed", window.TIMED_OUT: "stopped"}.get(code, f"failed (exit code {code})")
     say(f"== {script.stem}: {how} after {time.monotonic() - began:.0f} s")
     if code:
         say((out / "log.txt").read_text(errors="replace").rstrip())
@@ -55,7 +55,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--root", type=Path, default=ROOT / ".gui" / "blender", help="folder of the chroot")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "gui", help="folder for pictures and logs")
     parser.add_argument("--data", type=Path, help="a file or folder for the scripts")
-    parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds for one script")
+    parser.add_argument("--install", action="store_true", help="install debootstrap where it is missing, by the system's package manager")
+    parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds for one script, on a machine that does nothing else")
     parser.add_argument("scripts", nargs="*", type=Path, default=[HERE / f"{name}.py" for name in SCRIPTS])
     return parser
 
