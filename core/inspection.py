@@ -101,6 +101,20 @@ def read_points(out: Path, frame: int, cameras: Sequence[Camera], rows: RowGrid)
     return FramePoints(xyz_m=xyz, sigma_m=sigma, **values)
 
 
+def read_removed(out: Path, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the views (M, K, 2) saw what the surface's filters took out of a frame, and which of `FILTERS` did so, 1 for the first (M,).
+
+    Nothing where the checkpoint is deleted, damaged or of another version.
+    """
+    try:
+        path = Path(out) / "cache" / "surface" / f"{frame:04d}.npz"
+        saved, _ = store.load(path)
+        store.check_layout(path, saved, removed_px=("f", "MK2"), removed_why=("u", "M"))
+    except InputError:
+        return np.zeros((0, 0, 2)), np.zeros(0, dtype=np.uint8)
+    return saved["removed_px"].astype(np.float64), saved["removed_why"]
+
+
 def _add_matches(values: dict[str, np.ndarray], path: Path, xyz: np.ndarray, rows: RowGrid) -> None:
     """Put in what the checkpoint knows of the same points; the user's corrections may have left fewer than it has."""
     try:

@@ -26,7 +26,7 @@ from .matching.seeds import Approximations, sweep_seeds
 from .progress import Monitor
 from .results import Results
 from .silhouettes import silhouette_file, silhouettes, told_by
-from .surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
+from .surface.cloud import PointCloud, SurfaceSettings, point_cloud, why_removed
 from .take import Footage, footage_frames
 
 ALGORITHM = "surface 11"  # part of every key: raise it when the same input gives other numbers
@@ -63,6 +63,8 @@ class MeasuredFrame:
     cloud: PointCloud
     foreground: fg.Foreground
     key: str
+    removed_px: np.ndarray  # (M, K, 2) full-frame pixels of the points that the filters took out
+    removed_why: np.ndarray  # (M,) see `why_removed`
 
 
 def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
@@ -202,11 +204,14 @@ def _measure(
     cover = scan if growing.method == "published" else grow
     field = cover(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
     field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor, pairs=growing.pairs)
-    field = clean_field(_single(field), cameras[ref], ref, surface)
+    whole = _single(field)
+    why = why_removed(whole, cameras[ref], ref, surface)
+    field, removed = whole.select(why == 0), whole.grid.rows.to_frame(whole.xy[why > 0]).astype(np.float32)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):
         raise NothingMeasured(frame)
-    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=replace(where, silhouettes=()), key=key)
+    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=replace(where, silhouettes=()), key=key, removed_px=removed,
+                         removed_why=why[why > 0])
 
 
 def first_seeds(
@@ -311,6 +316,8 @@ def _checkpoint(results: Results, m: MeasuredFrame) -> None:
         "method": np.array(m.foreground.method),
         "grid": np.array([m.field.grid.spacing_px, *m.field.grid.shape, m.field.tried]),
         "limit_px": np.array(m.field.limit_px),
+        "removed_px": m.removed_px,
+        "removed_why": m.removed_why,
     }
     results.save_checkpoint("surface", f"{m.frame:04d}", m.key, arrays)
 
@@ -335,4 +342,6 @@ def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) ->
         **{k.removeprefix("cloud_"): v for k, v in a.items() if k.startswith("cloud_")},
     )
     where = fg.Foreground(depth_range_m=(float(a["where"][0]), float(a["where"][1])), method=str(a["method"]), planes=a["planes"])
-    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key)
+    why = a.get("removed_why", np.zeros(0, dtype=np.uint8))  # earlier versions did not keep it
+    removed = a.get("removed_px", np.zeros((0, field.xy.shape[1], 2), dtype=np.float32))
+    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key, removed_px=removed, removed_why=why)

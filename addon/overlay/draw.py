@@ -72,9 +72,9 @@ def draw_overlays(run: Recording, shown: Any, view: str, frame: int, sheet: Canv
     legend: list[tuple[str, Colour]] = []
     with sheet.image_space():
         if shown.points:
-            legend += _draw_points(run, view, frame, shown.most_sigma_mm, sheet)
+            legend += _draw_points(run, view, frame, shown, sheet)
         if shown.tracks:
-            legend += _draw_tracks(run, view, frame, shown.tail, shown.which)
+            legend += _draw_tracks(run, view, frame, shown)
         if shown.contour:
             legend += _draw_contour(run, view, frame)
         if shown.body and (not playing or run.has(("outline", view, frame))):  # it takes a tenth of a second
@@ -95,26 +95,48 @@ def _is_first(area: bpy.types.Area | None) -> bool:
     return area is None or window is None or area == min(canvas.clip_areas(window), key=lambda a: (a.y, a.x), default=area)
 
 
-def _draw_points(run: Recording, view: str, frame: int, most_mm: float, sheet: Canvas) -> list[tuple[str, Colour]]:
+def _draw_points(run: Recording, view: str, frame: int, shown: Any, sheet: Canvas) -> list[tuple[str, Colour]]:
+    """The points that are there, by sigma, and those that the filters took out: of the other colours, or red."""
+    which, by, legend = shown.which_points, shown.point_filter, []
+    if which != "removed":
+        legend += _draw_sigmas(run, view, frame, shown.most_sigma_mm, sheet)
+    if which != "kept":
+        xy, counts = run.kept(("removed points", view, frame, by), lambda: layers.removed_points(run, view, frame, by))
+        colour = (*(layers.KEPT if which == "before" else layers.REMOVED), 1.0)
+        if len(xy):
+            make = lambda: canvas.point_batch(xy, np.tile(colour, (len(xy), 1)))  # noqa: E731
+            canvas.draw_points(run.kept(("removed batch", view, frame, by, which), make), _point_px(sheet))
+        said = ", ".join(f"{words} {count}" for words, count in counts) or "none in this frame"
+        legend.append((f"{'before the filters also' if which == 'before' else 'removed'}: {said}", colour))
+    return legend
+
+
+def _point_px(sheet: Canvas) -> float:
+    return float(np.clip(1.2 * sheet.zoom, POINT_PX, 9.0))
+
+
+def _draw_sigmas(run: Recording, view: str, frame: int, most_mm: float, sheet: Canvas) -> list[tuple[str, Colour]]:
     found = run.kept(("sigmas", view, frame, most_mm), lambda: layers.sigmas(run, view, frame, most_mm))
     if found is None:
         return [("no points in this frame", BAD)]
     batch = run.kept(("points batch", view, frame, most_mm), lambda: canvas.point_batch(found.xy_px, found.colours))
-    canvas.draw_points(batch, float(np.clip(1.2 * sheet.zoom, POINT_PX, 9.0)))
+    canvas.draw_points(batch, _point_px(sheet))
     return [(f"{len(found.xy_px)} points", WHITE)]
 
 
-def _draw_tracks(run: Recording, view: str, frame: int, length: int, which: str) -> list[tuple[str, Colour]]:
-    history = run.tracks()
+def _draw_tracks(run: Recording, view: str, frame: int, shown: Any) -> list[tuple[str, Colour]]:
+    history, which, by = run.tracks(), shown.which, shown.track_filter
     if history is None:
         return [("no trajectories yet", BAD)]
-    key = ("tails", view, frame, length, which)
-    segments, colours = run.kept(key, lambda: layers.tails(run, view, frame, length, which))
+    key = ("tails", view, frame, shown.tail, which, by)
+    segments, colours = run.kept(key, lambda: layers.tails(run, view, frame, shown.tail, which, by))
+    if not len(segments) and len(history.frames) and frame == history.frames[0]:
+        return [("trajectories begin in this frame; go on to see them", WHITE)]
     if len(segments):
         canvas.draw_lines(run.kept((*key, "batch"), lambda: canvas.line_batch(segments, colours)), LINE_PX)
     if which in ("before", "kept"):
-        return [({"before": "all trajectories", "kept": "kept trajectories"}[which], (*layers.KEPT, 1.0))]
-    reasons = ", ".join(f"{words} {count}" for words, count in layers.removed_here(history, frame)[:4])
+        return [({"before": "trajectories before filters", "kept": "kept trajectories"}[which], (*layers.KEPT, 1.0))]
+    reasons = ", ".join(f"{words} {count}" for words, count in layers.removed_here(history, frame, by)[:4])
     kept = [("kept trajectories", (*layers.KEPT, 1.0))] if which == "both" else []
     return [*kept, (f"removed: {reasons or 'none in this frame'}", (*layers.REMOVED, 1.0))]
 

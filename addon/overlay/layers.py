@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...core.inspection import TrackHistory, patch_boxes
+from ...core.surface.cloud import FILTERS
 from ...core.tracking.settings import TrackStatus
 
 if TYPE_CHECKING:
     from .recording import Recording
 
+ALL = "ALL"  # filters
 KEPT, REMOVED = np.array([0.25, 0.75, 1.0]), np.array([1.0, 0.3, 0.25])
 RAMP = np.array([[0.15, 0.35, 1.0], [0.1, 0.85, 0.9], [0.35, 0.95, 0.3], [1.0, 0.85, 0.15], [1.0, 0.2, 0.15]])
 COMMON = 0.95  # of the points are below the end of the ramp
@@ -56,27 +58,42 @@ def sigmas(recording: "Recording", view: str, frame: int, most_mm: float) -> Sig
     return Sigmas(xy_px=xy[seen], colours=ramp(sigma[seen] / most), most_mm=most)
 
 
-def tails(recording: "Recording", view: str, frame: int, length: int, which: str) -> tuple[np.ndarray, np.ndarray]:
-    """Segments (M, 2, 2) of the trajectories and their colours (M, 4); the older the paler."""
+def removed_points(recording: "Recording", view: str, frame: int, by: str = ALL) -> tuple[np.ndarray, list[tuple[str, int]]]:
+    """Where (M, 2) a view saw the points that a filter of the surface, or any, took out of a frame, and how many each filter did."""
+    xy, why = recording.removed(frame)
+    mine = np.isin(why, np.arange(1, len(FILTERS) + 1)) if by == ALL else why == int(by)
+    if not mine.any():
+        return np.zeros((0, 2)), []
+    seen = xy[mine, list(recording.cameras).index(view)]
+    counts = [(words, int((why[mine] == n).sum())) for n, words in enumerate(FILTERS, 1)]
+    return seen[np.isfinite(seen).all(axis=1)], [(words, count) for words, count in counts if count]
+
+
+def tails(
+    recording: "Recording", view: str, frame: int, length: int, which: str, by: str = ALL
+) -> tuple[np.ndarray, np.ndarray]:
+    """Segments (M, 2, 2) of the trajectories and their colours (M, 4); the older the paler. `by`: as if there were only that filter."""
     history = recording.tracks()
     if history is None:
         return np.zeros((0, 2, 2)), np.zeros((0, 4))
     camera, parts = recording.cameras[view], []
+    removed = history.removed if by == ALL else history.removed & (history.status == TrackStatus[by])
     if which in ("before", "kept", "both"):
-        wanted = history.kept | history.removed if which == "before" else history.kept
+        wanted = history.kept | removed if which == "before" else history.kept
         parts.append((history.tails(camera, frame, length, wanted), KEPT))
     if which in ("removed", "both"):
-        parts.append((history.tails(camera, frame, length, history.removed), REMOVED))
+        parts.append((history.tails(camera, frame, length, removed), REMOVED))
     colours = [np.concatenate([np.broadcast_to(c, (len(age), 3)), (1 - 0.85 * age)[:, None]], axis=1) for (_, _, age), c in parts]
     return np.concatenate([segments for (segments, _, _), _ in parts]), np.concatenate(colours)
 
 
-def removed_here(history: TrackHistory, frame: int) -> list[tuple[str, int]]:
+def removed_here(history: TrackHistory, frame: int, by: str = ALL) -> list[tuple[str, int]]:
     """Why positions of a frame were taken out, and how many of each, the most frequent first."""
     now = np.flatnonzero(history.frames == frame)
     if not len(now):
         return []
     status = history.status[now[0]][history.removed[now[0]]]
+    status = status if by == ALL else status[status == TrackStatus[by]]
     reasons, counts = np.unique(status, return_counts=True)
     return [(TrackStatus(int(reasons[i])).words, int(counts[i])) for i in np.argsort(-counts)]
 

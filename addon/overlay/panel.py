@@ -30,10 +30,15 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
         row = column.row()
         row.prop(shown, "points")
         if shown.points:
+            column.row(align=True).prop(shown, "which_points", expand=True)
+            if shown.which_points != "kept":
+                column.prop(shown, "point_filter")
             column.prop(shown, "most_sigma_mm")
         column.prop(shown, "tracks")
         if shown.tracks:
             column.row(align=True).prop(shown, "which", expand=True)
+            if shown.which != "kept":
+                column.prop(shown, "track_filter")
             column.prop(shown, "tail")
         column.prop(shown, "body")
         column.prop(shown, "contour")

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ...core.errors import InputError
 from ...core.frame_table import FrameTable, read_frame_table
 from ...core.geometry.camera import Camera
 from ...core.images.fields import RowGrid
-from ...core.inspection import FramePoints, TrackHistory, body_outline, read_contours, read_points, read_tracks
+from ...core.inspection import FramePoints, TrackHistory, body_outline, read_contours, read_points, read_removed, read_tracks
 from ...core.matching.least_squares import MatchingSettings
 from ...core.run_json import read_run
 from ...core.settings import from_table
@@ -37,6 +38,11 @@ class Recording:
     def points(self, frame: int) -> FramePoints | None:
         """The points of a frame, if it has any."""
         return self.kept(("points", frame), lambda: read_points(self.out, frame, list(self.cameras.values()), self.rows_at(frame)))
+
+    def removed(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """What the surface's filters took out of a frame."""
+        found: tuple[np.ndarray, np.ndarray] = self.kept(("removed", frame), lambda: read_removed(self.out, frame))
+        return found
 
     def tracks(self) -> TrackHistory | None:
         """All trajectories, if there are any."""

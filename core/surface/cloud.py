@@ -15,6 +15,7 @@ from ..settings import knob
 from ..values import frozen
 from .local_surface import LocalSurface, local_surface
 
+FILTERS = ("other surface", "small island")  # what they find; why a point went is 1 + its filter's number
 REMAINING_BIAS = 0.5  # of the curvature correction
 MAX_CORRECTION_PX = 3.0
 
@@ -73,13 +74,21 @@ class PointCloud:
 
 def clean_field(field: TripletField, camera: Camera, reference: int, settings: SurfaceSettings) -> TripletField:
     """The field without the points that disagree with their neighbours and without small islands."""
-    if not len(field.cell):
-        return field
+    return field.select(why_removed(field, camera, reference, settings) == 0)
+
+
+def why_removed(field: TripletField, camera: Camera, reference: int, settings: SurfaceSettings) -> np.ndarray:
+    """Which of `FILTERS` removes each point (N,) uint8, 1 for the first; 0 where none does."""
+    why = np.zeros(len(field.cell), dtype=np.uint8)
+    if not len(why):
+        return why
     surface = local_surface(field, camera, reference)
     spacing_m = field.grid.spacing_px * surface.depth_m / camera.focal_px
     limit = settings.max_deviation * np.maximum(surface.scatter_m, 0.5 * spacing_m)
     agrees = (np.abs(surface.depth_m - surface.fitted_m) <= limit) & (surface.neighbours >= 3)
-    return _without_islands(field.select(agrees), settings.min_island)
+    why[~agrees] = 1
+    why[agrees] = np.where(_island_size(field.select(agrees)) >= settings.min_island, 0, 2)
+    return why
 
 
 def point_cloud(field: TripletField, grey: np.ndarray, camera: Camera, reference: int, frame: int, settings: SurfaceSettings) -> PointCloud:
@@ -111,9 +120,10 @@ def _corrected(field: TripletField, surface: LocalSurface, camera: Camera, refer
     return field.xyz_m + rays * shift[:, None], field.covariance_m2 + along[:, :, None] * along[:, None, :]
 
 
-def _without_islands(field: TripletField, smallest: int) -> TripletField:
+def _island_size(field: TripletField) -> np.ndarray:
+    """(N,) how many points hang together with each."""
     taken = np.zeros(field.grid.shape, dtype=bool)
     taken.ravel()[field.cell] = True
     islands, _ = label(taken, structure=np.ones((3, 3)))
     size = np.bincount(islands.ravel())
-    return field.select(size[islands.ravel()[field.cell]] >= smallest)
+    return np.asarray(size[islands.ravel()[field.cell]])

@@ -109,6 +109,27 @@ def test_tails_before_and_after_the_filters(run: Any, small_run: SmallRun) -> No
     assert layers.removed_here(run.tracks(), 7) == [("not rigid", 1)] and layers.removed_here(run.tracks(), 70) == []
 
 
+def test_one_filter_at_a_time(run: Any) -> None:
+    layers = module("overlay.layers")
+    history = run.tracks()
+    history.status[5, 1] = TrackStatus.TOO_SHORT  # frame 7
+    both = {by: len(layers.tails(run, "C", 7, 3, "before", by)[0]) for by in (layers.ALL, "TOO_SHORT", "NOT_RIGID", "TOO_FAST")}
+    assert both == {layers.ALL: 6, "TOO_SHORT": 4, "NOT_RIGID": 5, "TOO_FAST": 3}
+    assert layers.removed_here(history, 7, "TOO_SHORT") == [("too short", 1)] and not layers.removed_here(history, 7, "NOT_RIGID")
+
+
+def test_points_before_the_filters_of_the_surface(run: Any, small_run: SmallRun) -> None:
+    layers = module("overlay.layers")
+    xy = np.arange(18.0).reshape(3, 3, 2).astype(np.float32)
+    xy[2, 1] = np.nan  # C did not see it
+    store.save(small_run.out / "cache" / "surface" / "0003.npz", dict(removed_px=xy, removed_why=np.array([1, 2, 2], np.uint8)), {})
+    seen, counts = layers.removed_points(run, "C", 3)
+    assert np.array_equal(seen, xy[:2, 1]) and counts == [("other surface", 1), ("small island", 2)]
+    seen, counts = layers.removed_points(run, "L", 3, "2")
+    assert np.array_equal(seen, xy[1:, 0]) and counts == [("small island", 2)]
+    assert not len(layers.removed_points(run, "L", 4)[0]), "no checkpoint"
+
+
 def test_looking_closer_tells_why(run: Any, small_run: SmallRun) -> None:
     layers = module("overlay.layers")
     wrist = small_run.rig["C"].project(small_run.joints_m["wrist.R"][1])
@@ -186,7 +207,15 @@ def test_it_is_drawn_where_it_is(drawn: Any, run: Any, small_run: SmallRun) -> N
     picture = drawn(points=True, most_sigma_mm=2.0)
     for xy in small_run.rig["C"].project(run.points(3).xyz_m)[:10]:
         assert lit(picture, xy)[1] > 0.8
-    picture = drawn(points=False, body=True)
+    store.save(small_run.out / "cache" / "surface" / "0003.npz",
+               dict(removed_px=np.array([[[10, 9], [12, 9], [14, 9]]], np.float32), removed_why=np.ones(1, np.uint8)), {})
+    assert lit(drawn(), [12, 9]).max() == 0.0
+    assert lit(drawn(which_points="both"), [12, 9])[0] > 0.9 and lit(drawn(which_points="before"), [12, 9])[2] > 0.9
+    picture = drawn(which_points="removed")
+    kept = small_run.rig["C"].project(run.points(3).xyz_m)[:10]
+    assert lit(picture, [12, 9])[0] > 0.9 and not any(lit(picture, xy)[1] > 0.8 for xy in kept)
+    assert lit(drawn(point_filter="2"), [12, 9]).max() == 0.0, "another filter took it out"
+    picture = drawn(points=False, which_points="kept", point_filter="ALL", body=True)
     corners = small_run.rig["C"].project(small_run.joints_m["elbow.R"][1] + 0.1 * np.array([[-1, 0, 0], [1, 0, 0]]))
     for xy in corners:
         assert lit(picture, xy)[0] > 0.8 and lit(picture, xy)[2] < 0.4

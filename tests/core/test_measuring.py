@@ -29,6 +29,7 @@ def same(a: MeasuredFrame, b: MeasuredFrame) -> None:
     p, q = a.foreground, b.foreground
     assert (a.frame, a.key, p.depth_range_m, p.method) == (b.frame, b.key, q.depth_range_m, q.method)
     assert p.planes.tobytes() == q.planes.tobytes()
+    assert a.removed_px.tobytes() == b.removed_px.tobytes() and a.removed_why.tobytes() == b.removed_why.tobytes()
     for one, other, cls in ((a.field, b.field, TripletField), (a.cloud, b.cloud, PointCloud)):
         for f in fields(cls):
             x, y = getattr(one, f.name), getattr(other, f.name)

@@ -1,5 +1,6 @@
 """The measured surface against planes and cylinders that are known exactly: bias, scatter, sigma, curvature, fields, mirrors."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,8 @@ import pytest
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.surface.cloud import PointCloud
+from tricap.core.surface.cloud import PointCloud, SurfaceSettings, why_removed
+from tricap.core.take import open_take, read_take
 
 TILT = rotation_from_vector(np.array([0.1, 0.25, 0.0]))
 
@@ -156,3 +158,21 @@ def test_clouds_and_fields_of_nothing(scenes: Any) -> None:
     assert empty.sigma_m.shape == (0,)
     with pytest.raises(ValueError):
         empty.xyz_m[...] = 1
+
+
+def test_each_filter_says_what_it_took(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
+    """Points moved off a plane disagree with it; a corner that is cut off is a small island; a small limit lets it stand."""
+    footage = open_take(read_take(plane_take))
+    field, ref = scenes.measure(plane_take, tmp_path / "out")[0].field, footage.take.reference
+    camera = footage.rig.cameras[ref]
+    row, column = field.cell // field.grid.shape[1], field.cell % field.grid.shape[1]
+    near = (row - row.min() < 3) & (column - column[row - row.min() < 3].min() < 4)
+    far = row - row.min() > 8
+    kept = field.select(near | far)
+    moved = np.zeros(len(kept.cell), dtype=bool)
+    moved[[len(moved) // 2, len(moved) - 200]] = True
+    shifted = replace(kept, xyz_m=kept.xyz_m * np.where(moved, 1.1, 1.0)[:, None])
+    why = why_removed(shifted, camera, ref, SurfaceSettings(min_island=int(near.sum()) + 1))
+    assert near.sum() >= 6 and (why[moved] == 1).all() and (why[near[near | far]] == 2).all()
+    assert (why[~moved & far[near | far]] == 0).mean() > 0.97
+    assert not (why_removed(kept, camera, ref, SurfaceSettings(min_island=1)) == 2).any()
