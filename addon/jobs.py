@@ -22,6 +22,7 @@ import bpy
 
 from ..core.errors import InputError
 from ..core.progress import Cancelled, Monitor
+from . import status
 
 log = logging.getLogger(__name__)
 
@@ -265,8 +266,7 @@ class JobOperator:
         words = job.stage_words + ("" if job.monitor.cancelled else f" {job.fraction:.0%}  {job.left_words}  (Esc stops)")
         if words != self.shown:  # where drawing is slow, the window has time for its user
             self.shown = words
-            if context.workspace is not None:
-                context.workspace.status_text_set(f"Tricap: {words}")
+            status.tell(context, f"Tricap: {words}")
             redraw(context)
 
     def clear(self, context: bpy.types.Context) -> None:
@@ -279,8 +279,7 @@ class JobOperator:
             self.timer = None
         if self.job in _current:
             _current.remove(self.job)
-        if context.workspace is not None:
-            context.workspace.status_text_set(None)
+        status.tell(context, None)
         redraw(context)
 
 

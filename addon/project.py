@@ -209,7 +209,7 @@ def table(scene: bpy.types.Scene) -> Table:
     """
     props, old = scene.tricap, read_table(folder_of(scene))
     made = dict(old) or new_table([])
-    views = [view_entry(view) | _told(old, view.name) for view in props.views]
+    views = [view_entry(view) for view in props.views]
     made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": views}
     said = props.first_field != "odd" or "first_field" in old  # odd need not be said
     _put(made, "first_field", _first_field(scene) if said else "")
@@ -269,6 +269,8 @@ def show_views(scene: bpy.types.Scene, entries: list[Table], files: dict[str, Pa
         view.name = entry["name"]
         view.images, view.movie = entry.get("images", ""), entry.get("movie", "")
         view.offset_frames = entry.get("offset_frames", 0)
+        view.person = next((key for key in PERSON_SOURCES if key in entry), "")
+        view.person_files = entry.get(view.person, "")
 
 
 def _clip_of(known: bpy.types.MovieClip | None, name: str, path: Path) -> bpy.types.MovieClip:
@@ -291,15 +293,11 @@ def _show_model(scene: bpy.types.Scene, name: str) -> None:
     props.model_file = name if props.model == "own" else ""
 
 
-def _told(old: Table, name: str) -> Table:
-    """What the file says of a view and the scene does not keep: its masks or its background."""
-    entry = next((e for e in old.get("views", []) if e["name"] == name), {})
-    return {key: entry[key] for key in PERSON_SOURCES if key in entry}
-
-
 def view_entry(view: Any) -> Table:
     """What [[views]] says of a view."""
     entry = {"name": view.name, "images": view.images, "movie": view.movie, "offset_frames": view.offset_frames}
+    if view.person:
+        entry[view.person] = view.person_files
     return {key: value for key, value in entry.items() if value or key == "name"}
 
 

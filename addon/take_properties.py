@@ -53,6 +53,8 @@ class View(bpy.types.PropertyGroup):
     clip: bpy.props.PointerProperty(type=bpy.types.MovieClip, name="Clip")  # type: ignore[valid-type]
     images: bpy.props.StringProperty(name="Images")  # type: ignore[valid-type]
     movie: bpy.props.StringProperty(name="Movie")  # type: ignore[valid-type]
+    person: bpy.props.StringProperty(name="Person", options={"HIDDEN"})  # type: ignore[valid-type]  # a key of [[views]] or ""
+    person_files: bpy.props.StringProperty(name="Masks", options={"HIDDEN"})  # type: ignore[valid-type]
     offset_frames: bpy.props.IntProperty(name="Offset", update=_shifted,  # type: ignore[valid-type]
                                          description="Images by which this recorder was switched on earlier than the others")
 

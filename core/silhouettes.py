@@ -12,9 +12,9 @@ import numpy as np
 
 from .errors import InputError
 from .images.background import WINDOW_PX, empty_view
-from .images.sequence import open_sequence, read_image
+from .images.sequence import open_sequence
 from .matching.foreground import Silhouette
-from .person_sources import PERSON_SOURCES
+from .person_sources import PERSON_SOURCES, read_picture
 from .take import Footage
 
 WHITE = 127.0  # brighter pixels of a mask are the person
@@ -35,7 +35,7 @@ def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, fir
         path = silhouette_file(footage, k, frame)
         if path is None:
             continue
-        picture = rows.rows(_of_size(path, view.name, camera.size_px))
+        picture = rows.rows(read_picture(path, view.name, camera.size_px))
         if view.background is not None:
             mask = _unlike(picture, image, rows.step)
         elif 0 < picture.max() <= WHITE:
@@ -76,14 +76,6 @@ def told_by(footage: Footage) -> str:
         for key in PERSON_SOURCES
         if (names := [v.name for v in views if getattr(v, key) is not None])
     )
-
-
-def _of_size(path: Path, view: str, size_px: tuple[int, int]) -> np.ndarray:
-    image = read_image(path)
-    if image.shape[::-1] != size_px:
-        size = f"{image.shape[1]}×{image.shape[0]} pixels, the view {size_px[0]}×{size_px[1]}"
-        raise InputError(f"{path} of view {view} has {size}; make it of the view's own size.")
-    return image
 
 
 def _unlike(background: np.ndarray, image: np.ndarray, row_step: int) -> np.ndarray | None:

@@ -17,7 +17,7 @@ PAPER: Colour = (0.05, 0.05, 0.05, 0.65)
 BODY: Colour = (0.75, 0.75, 0.78, 1.0)
 DONE: Colour = (0.3, 0.9, 0.4, 1.0)
 OPEN: Colour = (0.25, 0.25, 0.28, 1.0)
-FIGURE_PX, MARGIN_PX = 190.0, 12.0
+FIGURE_PX, MARGIN_PX, TIMELINE_PX = 190.0, 12.0, 22.0
 OFFER_PX = 11.0
 
 _handle: list[Any] = []
@@ -80,7 +80,7 @@ def _draw_others(session: ClickSession, view: str, sheet: Canvas) -> None:
         if at is not None:
             place = sheet.to_region(at)
             canvas.draw_lines(canvas.line_batch(canvas.cross(place, 6.0)), 1.5, DONE)
-            canvas.text(name, place[0] + 9, place[1] - 4, DONE, size=10)
+            canvas.text(name, place[0] - 10, place[1] + 18, DONE, size=11)  # above the marker's box and handle
 
 
 def headline(session: ClickSession, view: str) -> str:
@@ -121,7 +121,7 @@ def draw_figure(session: ClickSession, sheet: Canvas) -> None:
     known = [name for name in session.names if name in shape.joints]
     if not known or size < 60:
         return
-    corner = np.array([MARGIN_PX * scale + _left(sheet), MARGIN_PX * scale])
+    corner = np.array([MARGIN_PX * scale + _left(sheet), (MARGIN_PX + TIMELINE_PX) * scale])
     width, foot = shape.width * size + 24 * scale, 18 * scale
     canvas.fill(canvas.rectangle(corner[0], corner[1], width, size + foot + 12 * scale), PAPER)
     base = corner + (12 * scale, foot + 4 * scale)

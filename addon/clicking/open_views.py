@@ -1,4 +1,4 @@
-"""bpy.ops.tricap.open_views(): a workspace of its own with a Clip Editor per view, so that the user's own screens stay as they are."""
+"""bpy.ops.tricap.open_views(show="points"), .back_to_steps(): a workspace of its own with a Clip Editor per view; the user's own stay."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -9,6 +9,9 @@ from .. import project, seeds
 from ..overlay import canvas
 
 NAME = "Tricap Clicks"
+FROM_KEY = "tricap_from"  # of the workspace: the one from which it was opened
+SHOWN = (("nothing", "Nothing", "The footage alone"), ("points", "Points", "The matched points, coloured by sigma"),
+         ("tracks", "Trajectories", "What was followed, and what the filters took out"), ("body", "Body", "The fitted body's outline"))
 MOST_VIEWS = 9
 SOON_S, TRIES = 0.05, 40  # a workspace is shown only after the event that asked for it
 CLOSED = ("OUTLINER", "PROPERTIES")
@@ -21,6 +24,8 @@ class OpenViews(bpy.types.Operator):
     bl_idname = "tricap.open_views"
     bl_label = "Open the Views"
     bl_options = {"UNDO"}
+
+    show: bpy.props.EnumProperty(name="Show", items=SHOWN, description="What to show over the footage")  # type: ignore[valid-type]
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -44,15 +49,49 @@ class OpenViews(bpy.types.Operator):
             (known,) = set(bpy.data.workspaces) - before
             known.name = NAME
         if window.workspace != known:
+            known[FROM_KEY] = window.workspace.name
             window.workspace = known
+        if self.show != "nothing":
+            setattr(context.scene.tricap_overlay, self.show, True)
         if not any(seeds.frames_of(clip) for clip in clips):
             context.scene.frame_set(context.scene.tricap.seed_frame)
         names = [clip.name for clip in clips]
-        bpy.app.timers.register(_waiter(window, names), first_interval=SOON_S)
+        bpy.app.timers.register(_waiter(window, names, switches=self.show != "nothing"), first_interval=SOON_S)
         return {"FINISHED"}
 
 
-def _waiter(window: bpy.types.Window, clip_names: Sequence[str]) -> Callable[[], float | None]:
+class BackToSteps(bpy.types.Operator):
+    """Go back to the workspace from which the views were opened, where Tricap's steps are"""
+
+    bl_idname = "tricap.back_to_steps"
+    bl_label = "Back to the Steps"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only in the views' workspace."""
+        return context.workspace is not None and context.workspace.name == NAME
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Show that workspace; where it is gone, any with a 3-D view."""
+        others = [w for w in bpy.data.workspaces if w.name != NAME]
+        spatial = [w for w in others if any(a.type == "VIEW_3D" for screen in w.screens for a in screen.areas)]
+        known = bpy.data.workspaces.get(context.workspace.get(FROM_KEY, ""))
+        back = known if known in others else next(iter([*spatial, *others]), None)
+        if back is None:
+            self.report({"ERROR"}, "There is no other workspace; add one by the + at the top of the window.")
+            return {"CANCELLED"}
+        context.window.workspace = back
+        return {"FINISHED"}
+
+
+def draw_back(header: bpy.types.Header, context: bpy.types.Context) -> None:
+    """In the header of the first view: the way back."""
+    mine = canvas.clip_areas(context.window)
+    if BackToSteps.poll(context) and mine and context.area == min(mine, key=lambda a: (-a.y, a.x)):
+        header.layout.operator("tricap.back_to_steps", icon="LOOP_BACK")
+
+
+def _waiter(window: bpy.types.Window, clip_names: Sequence[str], *, switches: bool) -> Callable[[], float | None]:
     """A timer that lays out the views once the window shows the workspace, step by step."""
     left, steps = [TRIES], []
 
@@ -63,14 +102,18 @@ def _waiter(window: bpy.types.Window, clip_names: Sequence[str]) -> Callable[[],
         if window.workspace.name != NAME:
             return SOON_S
         if not steps:
-            steps.append(lay_out(window, [bpy.data.movieclips[name] for name in clip_names if name in bpy.data.movieclips]))
+            known = [bpy.data.movieclips[name] for name in clip_names if name in bpy.data.movieclips]
+            steps.append(lay_out(window, known, switches=switches))
         return SOON_S if next(steps[0], None) else None
 
     return wait
 
 
-def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip]) -> Iterator[str]:
-    """A Clip Editor for each clip, in rows, in the place of the largest area. Between the steps Blender gives the new areas their sizes."""
+def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip], *, switches: bool = False) -> Iterator[str]:
+    """A Clip Editor for each clip, in rows, in the place of the largest area; with `switches`, the last one's sidebar is open at Tricap.
+
+    Between the steps Blender gives the new areas their sizes.
+    """
     editors = [a for a in window.screen.areas if a.type == "CLIP_EDITOR"]
     if not editors:
         if not bpy.app.background:  # closing an area without a window ends Blender
@@ -87,7 +130,11 @@ def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip]) -> I
     editors = sorted((a for a in window.screen.areas if a.type == "CLIP_EDITOR"), key=lambda a: (-a.y, a.x))
     for editor, clip in zip(editors, clips):
         _show(editor, clip)
+    if switches:
+        editors[-1].spaces.active.show_region_ui = True
     yield "shown"
+    if switches and not bpy.app.background:
+        next(r for r in editors[-1].regions if r.type == "UI").active_panel_category = "Tricap"
     for area in canvas.clip_areas(window):
         with bpy.context.temp_override(window=window, area=area, region=canvas.window_region(area)):
             bpy.ops.clip.view_all(fit_view=True)
@@ -120,4 +167,4 @@ def _close_others(window: bpy.types.Window) -> None:
             bpy.ops.screen.area_close()
 
 
-CLASSES = (OpenViews,)
+CLASSES = (OpenViews, BackToSteps)

@@ -10,7 +10,7 @@ from ...core import pipeline
 from ...core.body.model_file import BodyModel, joint_depths_m, read_model
 from ...core.errors import InputError
 from ...core.take import JOINTS, Seeds, open_take
-from .. import project, properties, seeds
+from .. import project, properties, seeds, status
 from ..overlay import canvas
 from . import draw
 from .finder import Finder
@@ -26,6 +26,7 @@ class ClickOperator:
 
     session: ClickSession
     timer: Any = None
+    seen = False  # whether views have been on show
     running: ClassVar[list["ClickOperator"]] = []
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
@@ -62,9 +63,13 @@ class ClickOperator:
         """One event."""
         try:
             if event.type == "TIMER":
+                here = any(self._view(area) is not None for area in canvas.clip_areas(context.window))
+                if self.seen and not here:  # its user went elsewhere
+                    return self._end(context)
                 self.follow(context)
-                if self.session.poll():
+                if self.session.poll() or here != self.seen:  # cutting areas wiped the words away
                     self._show(context)
+                self.seen = here
                 return {"PASS_THROUGH"}
             if event.type == "MOUSEMOVE":
                 draw.move_mouse(event.mouse_x, event.mouse_y)
@@ -88,8 +93,7 @@ class ClickOperator:
         if self.timer is not None:
             context.window_manager.event_timer_remove(self.timer)
             self.timer = None
-        if context.workspace is not None:
-            context.workspace.status_text_set(None)
+        status.tell(context, None)
         canvas.redraw_clips(context)
 
     def _act(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -145,8 +149,7 @@ class ClickOperator:
         return self.session.view_of(canvas.clip_of(area))
 
     def _show(self, context: bpy.types.Context) -> None:
-        if context.workspace is not None:
-            context.workspace.status_text_set(f"{self.session.name}    {KEYS}")
+        status.tell(context, f"{self.session.name}    {KEYS}")
         canvas.redraw_clips(context)
 
     def _end(self, context: bpy.types.Context) -> set[str]:
@@ -156,7 +159,7 @@ class ClickOperator:
             return {"FINISHED" if session.changed else "CANCELLED"}
         done = sum(len(session.clicks(name)) > 1 for name in session.names)
         said = f"Frame {session.frame}: {done} of {len(session.names)} are clicked in two views or more."
-        self.report({"INFO"}, f"{said} Go on in the 3-D view (workspace tabs at the top).")  # type: ignore[attr-defined]
+        self.report({"INFO"}, f"{said} Press Back to the Steps, above the left view.")  # type: ignore[attr-defined]
         return {"FINISHED"}
 
 

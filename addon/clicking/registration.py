@@ -18,6 +18,7 @@ def register() -> None:
     """Register everything, in order."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
+    bpy.types.CLIP_HT_header.prepend(open_views.draw_back)
     bpy.app.handlers.load_pre.append(_close_before_load)
     atexit.register(finder.close_all)
 
@@ -28,5 +29,6 @@ def unregister() -> None:
     finder.close_all()
     atexit.unregister(finder.close_all)
     bpy.app.handlers.load_pre.remove(_close_before_load)
+    bpy.types.CLIP_HT_header.remove(open_views.draw_back)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...core.errors import InputError
 from ...core.take_file import take_of_table
-from .. import project
+from .. import project, status
 from ..overlay import canvas, draw, layers, recording
 from ..overlay.operators import pointed
 from . import marks, tables
@@ -32,7 +32,7 @@ class Correct:
             self.report({"ERROR"}, "Press this in the sidebar of a Clip Editor that shows a view: Open the Views makes them.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         Correct.running = True
-        context.workspace.status_text_set(self.hint)
+        status.tell(context, self.hint)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -41,8 +41,7 @@ class Correct:
         Correct.running = False
         marks.show_open("", [])
         draw.show_looked(-1, None)
-        if context.workspace is not None:
-            context.workspace.status_text_set(None)
+        status.tell(context, None)
         canvas.redraw_clips(context)
         return how
 

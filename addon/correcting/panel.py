@@ -56,7 +56,8 @@ class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
             row.template_list("TRICAP_UL_corrections", "", said, "corrections", said, "active", rows=3)
             row.operator("tricap.remove_correction", text="", icon="REMOVE").index = -1
             self._draw_chosen(layout, said)
-            sentence(layout, context, "They take effect when the steps that are now stale are run again.", "INFO")
+            sentence(layout, context, "They take effect when what is now stale is done again:", "INFO")
+            layout.operator("tricap.run", icon="FF", text="Do Everything That Is Missing")
 
     def _draw_chosen(self, layout: bpy.types.UILayout, said: TricapCorrecting) -> None:
         if 0 <= said.active < len(said.corrections) and said.corrections[said.active].kind == "region":

@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import bpy
+from mathutils import Matrix
 
 from ...core.body.fields import POTENTIALS
 from ...core.progress import Monitor
@@ -68,7 +70,10 @@ def put_into_scene(operator: bpy.types.Operator, context: bpy.types.Context, con
     first = scene_build.COLLECTION not in bpy.data.collections
     tell(operator, write_scene(contents, blend, options))
     body = bpy.data.objects.get(armature.NAME)
+    if body is not None and context.scene.tricap_retarget.source is None:
+        context.scene.tricap_retarget.source = body
     if first and body is not None and context.window is not None and not bpy.app.background:
+        _put_aside_cube(operator, context)
         for item in context.selected_objects:
             item.select_set(False)
         body.select_set(True)
@@ -76,6 +81,16 @@ def put_into_scene(operator: bpy.types.Operator, context: bpy.types.Context, con
             region = next(r for r in area.regions if r.type == "WINDOW")
             with context.temp_override(area=area, region=region):
                 bpy.ops.view3d.view_selected()
+
+
+def _put_aside_cube(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
+    """Hide the cube of Blender's start-up file, in which a body stands up to the chest, if nobody touched it."""
+    cube = context.scene.objects.get("Cube")
+    if cube is None or cube.type != "MESH" or cube.matrix_world != Matrix() or cube.modifiers or cube.animation_data or cube.hide_get():
+        return
+    if sorted(tuple(round(x) for x in v.co) for v in cube.data.vertices) == sorted(product((-1, 1), repeat=3)):
+        cube.hide_set(True)
+        operator.report({"INFO"}, "The cube of the start-up file was hidden: the body stands in it.")
 
 
 def tell(operator: bpy.types.Operator, report: SceneReport) -> None:

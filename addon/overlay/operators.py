@@ -3,6 +3,7 @@
 import bpy
 import numpy as np
 
+from .. import status
 from . import canvas, draw, layers, recording
 
 PIXELS = 14.0  # of the screen, around the pointer
@@ -29,7 +30,7 @@ class LookCloser(bpy.types.Operator):
             self.report({"ERROR"}, f"There is nothing to look at: {recording.problem()}")
             return {"CANCELLED"}
         LookCloser.running = True
-        context.workspace.status_text_set("Point at the footage    Click: keep it on show    Esc: end")
+        status.tell(context, "Point at the footage    Click: keep it on show    Esc: end")
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -55,8 +56,7 @@ class LookCloser(bpy.types.Operator):
 
     def _end(self, context: bpy.types.Context, how: set[str]) -> set[str]:
         LookCloser.running = False
-        if context.workspace is not None:
-            context.workspace.status_text_set(None)
+        status.tell(context, None)
         canvas.redraw_clips(context)
         return how
 

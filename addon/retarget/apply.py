@@ -101,7 +101,16 @@ def apply(armature_object: bpy.types.Object, source: Motion, source_map: RigMap,
     armature_object.animation_data.action = written.raw or written.action
     notes += check_played(armature_object, result)
     armature_object.animation_data.action = written.action
-    return Outcome(result=result, written=written, figures=figures, notes=tuple(dict.fromkeys(notes)))
+    return Outcome(result=result, written=written, figures=figures, notes=folded(notes))
+
+
+def folded(notes: Sequence[str]) -> tuple[str, ...]:
+    """The notes once each; what is said of several things ("hips: …", "shin.L: …") in one sentence."""
+    things: dict[str, list[str]] = {}
+    for note in dict.fromkeys(notes):
+        thing, colon, said = note.partition(": ")
+        things.setdefault(said if colon else note, []).append(thing if colon else "")
+    return tuple(f"{', '.join(of)}: {said}" if any(of) else said for said, of in things.items())
 
 
 def check_played(armature_object: bpy.types.Object, result: Retargeted) -> list[str]:

@@ -9,6 +9,7 @@ import bpy
 from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.sources import FILES
+from ..panels import sentence
 from . import properties
 
 
@@ -38,9 +39,9 @@ def _draw_map(layout: bpy.types.UILayout, props: Any) -> None:
     buttons.operator("tricap.retarget_load_map", icon="FILE_FOLDER", text="Load")
     buttons.operator("tricap.retarget_save_map", icon="FILE_TICK", text="Save")
     if props.target is not None and (said := properties.other_lines(props, props.target)):
-        layout.label(text=said, icon="ERROR")
+        sentence(layout, bpy.context, said, "ERROR")
     for line in props.missing.splitlines():
-        layout.label(text=line, icon="INFO")
+        sentence(layout, bpy.context, line, "INFO")
 
 
 def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -73,8 +74,8 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     buttons.operator("tricap.retarget", icon="ARMATURE_DATA")
     buttons.operator("tricap.retarget_preview", text="Preview", icon="HIDE_OFF")
     buttons.operator("tricap.retarget_end_preview", text="", icon="X")
-    for line in props.last.splitlines():
-        layout.label(text=line)
+    for line in props.last.splitlines() if not props.last.startswith("Exported") else ():  # the step says that itself
+        sentence(layout, context, line, "DOT")
 
 
 CLASSES = (TRICAP_UL_map,)

@@ -15,12 +15,14 @@ from ..correcting.panel import draw_dofs
 from ..panels import sentence
 from ..retarget.panel import draw_retarget
 from . import check, states, watch
+from .person import draw_person
 
 KNOBS: dict[str, tuple[tuple[str, str], ...]] = {  # what a person touches; the others are under Advanced
     "surface": (("matching", "patch_px"), ("growing", "spacing_px")),
     "tracks": (("tracking", "smooth_frames"), ("tracking", "min_length")),
     "body": (),
 }
+SHOWS = {"surface": "points", "tracks": "tracks", "body": "body"}  # over the footage
 
 
 def primary(layout: bpy.types.UILayout, operator: str, is_next: bool, **words: Any) -> Any:
@@ -49,6 +51,7 @@ def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
     side.operator("tricap.remove_view", text="", icon="REMOVE")
     side.operator("tricap.move_view", text="", icon="TRIA_UP").up = True
     side.operator("tricap.move_view", text="", icon="TRIA_DOWN").up = False
+    draw_person(layout, context)
     _mend_footage(layout, context, is_next)
     layout.prop(props, "fps")
     layout.prop(props, "interlaced")
@@ -65,7 +68,6 @@ def _begin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Nothing is there: save, add footage, or open a take."""
     props = context.scene.tricap
     if not bpy.data.filepath and not props.take:
-        sentence(layout, context, "Save this file first: the project lies in a folder beside it.", "INFO")
         primary(layout, "wm.save_mainfile", True, text="Save the File", icon="FILE_TICK")
     else:
         primary(layout, "tricap.add_footage", not props.take, icon="FILE_MOVIE")
@@ -125,7 +127,7 @@ def _seeds(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
     layout.prop(props, "model")
     if props.model == "own":
         layout.prop(props, "model_file")
-    layout.prop(props, "seed_frame")
+    layout.prop(props, "seed_frame", text="Click in Frame")
     buttons = layout.column()
     buttons.enabled = project.bound(context.scene)
     primary(buttons, "tricap.click_joints", is_next, icon="WINDOW", text="Open the Views and Click")
@@ -159,11 +161,15 @@ def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) 
 
 def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, operator: str, is_next: bool, icon: str) -> None:
     now = watch.look(context.scene).states
+    column = layout.column()
+    column.use_property_split = False  # the whole width for their names
     for group, name in KNOBS[step]:
-        layout.prop(getattr(context.scene.tricap, group), name)
+        column.prop(getattr(context.scene.tricap, group), name)
     row = layout.column()
     row.enabled = now["cameras"].word == "done"
     primary(row, operator, is_next, icon=icon)
+    if now[step].word in ("done", "stale"):
+        layout.operator("tricap.open_views", icon="SEQUENCE", text="Show It over the Footage").show = SHOWS[step]
 
 
 def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
@@ -188,15 +194,15 @@ def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) 
     if step == "cameras":
         _section(layout, context, "bar", "From a Waved Bar", draw_calibrate)
     if step == "retarget":
-        _section(layout, context, "onto", "Onto a Character", draw_retarget)
+        _section(layout, context, "onto", "Onto a Character", draw_retarget, closed=False)
     if step == "footage":
         _section(layout, context, "where", "Advanced", _where)
     if step in states.STAGE:
         _section(layout, context, f"knobs_{step}", "Advanced", lambda inside, _: _knobs(inside, context, step))
 
 
-def _section(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, title: str, draw: Any) -> None:
-    header, inside = layout.panel(f"tricap_{name}", default_closed=True)
+def _section(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, title: str, draw: Any, *, closed: bool = True) -> None:
+    header, inside = layout.panel(f"tricap_{name}", default_closed=closed)
     header.label(text=title)
     if inside is not None:
         inside.enabled = not context.window_manager.tricap.running
@@ -217,6 +223,7 @@ def _knobs(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) ->
         header, inside = layout.panel(f"tricap_group_{group}", default_closed=True)
         header.label(text=group.capitalize())
         if inside is not None:
+            inside.use_property_split = False  # the whole width for their names
             for field in dataclasses.fields(properties.stages()[group]):
                 if (group, field.name) not in KNOBS[step]:
                     inside.prop(getattr(context.scene.tricap, group), field.name)

@@ -1,5 +1,7 @@
 """bpy.ops.tricap.cameras_from_file(filepath="…"), bpy.ops.tricap.cameras_from_scene()"""
 
+from pathlib import Path
+
 import bpy
 from bpy_extras.io_utils import ImportHelper
 
@@ -22,7 +24,7 @@ class CamerasFromFile(Told, ImportHelper, bpy.types.Operator):
         """Read it and keep a copy as rig.toml in the project."""
         rig = read_any(folders.absolute(self.filepath))
         use_rig(context.scene, rig)
-        return f"{len(rig.cameras)} cameras from {self.filepath}."
+        return f"{len(rig.cameras)} cameras from {Path(self.filepath).name}. Whether they fit the footage, Check tells (step 2)."
 
 
 class CamerasFromScene(Told, bpy.types.Operator):

@@ -12,6 +12,7 @@ from ...core.images.fields import BOTH
 from ...core.images.sequence import open_sequence
 from ...core.take_file import footage_entry, link_footage, read_table, unlink_footage
 from .. import folders, project
+from ..panels import sentence
 from . import watch
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -67,6 +68,11 @@ class AddFootage(Told, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    def draw(self, context: bpy.types.Context) -> None:
+        """Beside the file browser: what to choose."""
+        sentence(self.layout, context, "Movies: choose those of all cameras, with Shift or Ctrl.", "FILE_MOVIE")
+        sentence(self.layout, context, "Images: go into the folder that holds a folder for each camera, and choose nothing.", "FILE_IMAGE")
+
     def do(self, context: bpy.types.Context) -> str:
         """Link the footage into the project and show it as clips."""
         scene = context.scene
@@ -84,13 +90,13 @@ class AddFootage(Told, bpy.types.Operator):
             raise
         if first:
             use_rate_of(scene)
-            scene.frame_start, scene.frame_end = 0, max(0, min(view.clip.frame_duration for view in scene.tricap.views) - 1)
-            scene.frame_set(0)
+            show_frames(scene)
         if lengths_differ(scene, folder):
             use_common_frames(scene, folder)
         if len(entries) > 1:
             project.write(scene)
-        return f"{len(made)} views added: {', '.join(entry['name'] for entry, _ in made)}. Check names and order."
+        names = ", ".join(entry["name"] for entry, _ in made)
+        return f"{len(made)} views added, from left to right: {names}. Where that is not so, unfold step 1."
 
 
 class OpenTake(Told, bpy.types.Operator):
@@ -117,7 +123,10 @@ class OpenTake(Told, bpy.types.Operator):
         folder = folders.take_folder(self.directory, scene)
         if self.directory and scene.tricap.take and folder != folders.absolute(scene.tricap.take):
             scene.tricap.out = ""  # the results of another take
+        first = not project.bound(scene)
         project.open_take(scene, folder)
+        if first:
+            show_frames(scene)
         return f"{folder.name}: {len(scene.tricap.views)} views."
 
 
@@ -224,6 +233,12 @@ def use_rate_of(scene: bpy.types.Scene) -> None:
     rate = next((view.clip.fps for view in scene.tricap.views if view.clip.source == "MOVIE" and view.clip.fps > 0), None)
     if rate:
         scene.tricap.fps = rate
+
+
+def show_frames(scene: bpy.types.Scene) -> None:
+    """The scene's frames are those of the footage, and it shows the one with the clicks."""
+    scene.frame_start, scene.frame_end = 0, max(0, min(view.clip.frame_duration for view in scene.tricap.views) - 1)
+    scene.frame_set(min(scene.tricap.seed_frame, scene.frame_end))
 
 
 def lengths_differ(scene: bpy.types.Scene, folder: Path) -> bool:

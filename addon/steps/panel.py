@@ -4,7 +4,7 @@ import bpy
 
 from ..panels import TricapPanel, sentence
 from . import bodies, watch
-from .states import STEPS, TITLES, State
+from .states import STAGE, STEPS, TITLES, State
 
 ICONS = {"empty": "RADIOBUT_OFF", "ready": "PLAY", "running": "SORTTIME", "done": "CHECKMARK", "stale": "FILE_REFRESH", "failed": "ERROR"}
 
@@ -38,10 +38,11 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         """One step: its number, name and state; unfolded, why it is so and what can be done."""
         state, now = watch.state_of(context, step), watch.look(context.scene)
         header, body = self.layout.panel_prop(context.window_manager.tricap_steps, step)
-        header.label(text=f"{STEPS.index(step) + 1}  {TITLES[STEPS.index(step)]}", icon=ICONS[state.word])
+        is_next = step == now.next and state.word in ("ready", "empty")
+        header.label(text=f"{STEPS.index(step) + 1}  {TITLES[STEPS.index(step)]}", icon=ICONS["ready" if is_next else state.word])
         word = header.row()
         word.alignment, word.alert = "RIGHT", state.word in ("failed", "stale")
-        word.label(text=("next" if step == now.next and state.word in ("ready", "empty") else state.word) + " ")
+        word.label(text=("next" if is_next else state.word) + " ")
         if body is None:
             return
         column = body.column()
@@ -78,7 +79,7 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     else:
         number = STEPS.index(now.next)
         sentence(box, context, f"Next: {number + 1} {TITLES[number]}", "FORWARD")
-    if any(now.states[step].word in ("ready", "stale") for step in ("surface", "tracks", "body")):
+    if now.next in STAGE:
         box.operator("tricap.run", icon="FF", text="Do Everything That Is Missing")
 
 

@@ -3,9 +3,9 @@
 import bpy
 
 from .. import jobs
-from . import cameras, check, export, footage, panel, watch
+from . import cameras, check, export, footage, panel, person, watch
 
-CLASSES = (*footage.CLASSES, *cameras.CLASSES, *check.CLASSES, *export.CLASSES, *panel.CLASSES)
+CLASSES = (*footage.CLASSES, *person.CLASSES, *cameras.CLASSES, *check.CLASSES, *export.CLASSES, *panel.CLASSES)
 
 
 def register() -> None:

@@ -28,6 +28,7 @@ STEPS = ("footage", "cameras", "seeds", "surface", "tracks", "body", "rig", "ret
 TITLES = ("Footage", "Cameras", "Seeds (Joint Clicks)", "Surface", "Tracks", "Body", "Rig", "Retarget and Export")
 STAGE = {"surface": "measure", "tracks": "track", "body": "fit"}  # the stage of core that a step runs
 WRITES = {"surface": "clouds", "tracks": "trajectories.npz", "body": "motion.csv"}
+SAVE_FIRST = "Save this file first: the project lies in a folder beside it. Then add the films of your cameras."
 NEEDED_JOINTS = 2  # the fit's own least number
 INSIDE = ("spine", "chest", "clavicle.L", "clavicle.R")  # in the trunk: hardly anyone can say where
 
@@ -107,10 +108,10 @@ def _or_none(look: Any) -> Any:
 def _footage(scene: bpy.types.Scene, found: _Found) -> State:
     props = scene.tricap
     if not project.bound(scene):
-        if not props.take:
-            return State(word="empty", why="Add the movies or image folders of your cameras.")
-        if (project.existing_folder(scene) / "take.toml").exists():
+        if props.take and (project.existing_folder(scene) / "take.toml").exists():
             return State(word="ready", why="Press Open Take to show its footage.")
+        if not props.take and not bpy.data.filepath:
+            return State(word="empty", why=SAVE_FIRST)
         return State(word="empty", why="Add the movies or image folders of your cameras.")
     folder = project.existing_folder(scene)
     if project.changed_outside(scene):
@@ -236,7 +237,7 @@ def _retarget(scene: bpy.types.Scene, rig: State) -> State:
     said = scene.tricap_retarget.last
     if said:
         word = "stale" if rig.word == "stale" else "done"
-        return State(word=word, why=said.splitlines()[0])
+        return State(word=word, why=said if said.startswith("Exported") else "The character plays the motion.")
     return State(word="ready", why="Put the motion onto your own character, or export it.")
 
 

@@ -33,7 +33,7 @@ def look(scene: bpy.types.Scene) -> Look:
 
 
 def refresh(scene: bpy.types.Scene) -> Look:
-    """Look at everything now. The next step is unfolded when it becomes another one, and what is done is folded."""
+    """Look at everything now. The next step is unfolded when it becomes another one, and what is done is folded, but the last."""
     before, now = _looks.get(scene.name_full), _with_failures(scene, states.compute(scene))
     _looks[scene.name_full], _stamps[scene.name_full] = now, _stamp(scene)
     _changed.clear()
@@ -80,7 +80,7 @@ def _ended(context: bpy.types.Context, step: str, failed: str) -> None:
 
 def _unfold(before: Look | None, now: Look) -> None:
     shown: Mapping[str, Any] = bpy.context.window_manager.tricap_steps
-    if before is not None and before.next and now.states[before.next].word in ("done", "empty"):
+    if before is not None and before.next not in (None, STEPS[-1]) and now.states[before.next].word in ("done", "empty"):
         setattr(shown, before.next, False)
     if now.next:
         setattr(shown, now.next, True)

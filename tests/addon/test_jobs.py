@@ -4,11 +4,13 @@ import importlib
 import sys
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
+ADDON = "bl_ext.user_default.tricap.addon"
 STOP_S = 1.0
 
 
@@ -74,6 +76,27 @@ def test_the_window_gets_its_turn_while_python_computes(jobs: ModuleType) -> Non
     job.cancel_and_join()
     assert sys.getswitchinterval() == before
     assert sorted(waits)[len(waits) // 2] < 0.05
+
+
+def test_words_are_told_in_one_workspace(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    status, told = importlib.import_module(f"{ADDON}.status"), {}
+
+    class Workspace(SimpleNamespace):
+        def status_text_set(self, words: str | None) -> None:
+            told[self.name] = words
+
+    layout, clicks = Workspace(name="Layout"), Workspace(name="Clicks")
+    monkeypatch.setattr(status, "bpy", SimpleNamespace(data=SimpleNamespace(workspaces={"Layout": layout, "Clicks": clicks})))
+    override, meant = lambda workspace: meant.append(workspace.name) or nullcontext(), []
+
+    def showing(workspace: Workspace) -> SimpleNamespace:
+        return SimpleNamespace(workspace=layout, window=SimpleNamespace(workspace=workspace), temp_override=override)
+
+    status.tell(showing(layout), "elbow.R")
+    status.tell(showing(clicks), "wrist.R")
+    assert told == {"Layout": None, "Clicks": "wrist.R"} and meant == ["Layout", "Layout", "Clicks"]
+    status.tell(showing(layout), None)
+    assert told == {"Layout": None, "Clicks": None}
 
 
 def test_cancelling_joins_within_a_second(jobs: ModuleType) -> None:

@@ -94,6 +94,41 @@ def test_what_the_panel_does_not_edit_stays(project: ModuleType, blender: Module
     assert read_table(take)["body"]["model"] == "arm.R"
 
 
+def test_masks_and_backgrounds_of_the_views(project: ModuleType, blender: ModuleType, take: Path, tmp_path: Path) -> None:
+    import cv2
+    import numpy as np
+
+    scene, ops = blender.context.scene, blender.ops.tricap
+    project.open_take(scene, take)
+    size = tuple(scene.tricap.views[0].clip.size)
+    (tmp_path / "painted").mkdir()
+    for name, shape in (("person.png", size[::-1]), ("painted/0.png", size[::-1]), ("small.png", (8, 8))):
+        cv2.imwrite(str(tmp_path / name), np.full(shape, 255, np.uint8))
+
+    def said() -> list[dict[str, str]]:
+        return [{k: v for k, v in view.items() if k in ("mask", "masks", "background")} for view in read_table(take)["views"]]
+
+    assert ops.person_from(kind="mask", view="L", filepath=str(tmp_path / "person.png")) == {"FINISHED"}
+    assert ops.person_from(kind="masks", view="C", filepath=str(tmp_path / "painted" / "0.png")) == {"FINISHED"}
+    scene.tricap.view_index = 2
+    assert ops.person_from(kind="background", filepath=str(tmp_path / "person.png")) == {"FINISHED"}
+    assert said() == [{"mask": "L_mask.png"}, {"masks": "C_masks/*.png"}, {"background": "R_background.png"}]
+    assert (take / "C_masks" / "0.png").exists() and [view.person for view in scene.tricap.views] == ["mask", "masks", "background"]
+    scene.tricap.views[0].name = "left"
+    project.write(scene)
+    assert said()[0] == {"mask": "L_mask.png"}, "a view keeps its mask under another name"
+    other = tmp_path / "other.png"
+    cv2.imwrite(str(other), np.zeros(size[::-1], np.uint8))
+    assert ops.person_from(kind="background", filepath=str(other)) == {"FINISHED"} and said()[2] == {"background": "R_background_2.png"}
+    assert ops.person_from(kind="none", view="C") == {"FINISHED"} and said()[1] == {}
+    for wrong, why in (("small.png", "8×8 pixels"), ("none.png", "none.png")):
+        with pytest.raises(RuntimeError, match=why):
+            ops.person_from(kind="mask", view="C", filepath=str(tmp_path / wrong))
+    with pytest.raises(RuntimeError, match="no view “X”"):
+        ops.person_from(kind="mask", view="X", filepath=str(other))
+    assert said()[1] == {}
+
+
 def test_a_model_of_ones_own_tells_which_joints_to_click(project: ModuleType, blender: ModuleType, take: Path) -> None:
     own = (MODELS / "arm.R.toml").read_text(encoding="utf-8")
     (take / "my arm é.toml").write_text(own, encoding="utf-8")

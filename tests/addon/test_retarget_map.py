@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tricap.addon.retarget.apply import folded
 from tricap.addon.retarget.build import build_armature
 from tricap.core.motion.bvh import write_bvh
 from tricap.core.motion.retarget.mapping import read_preset
@@ -36,6 +37,11 @@ def steered() -> dict[str, Any]:
     follows = {name: rig.names[p] for name, p in zip(rig.names, rig.parents) if p >= 0}
     return {"name": "controls", "bones": {name: name for name in rig.names},
             "steering": {"follows": follows, "properties": {"hips": {"IK_FK": 1.0}}, "skin": {"foot.L": "foot.R"}}}
+
+
+def test_notes_of_the_same_are_told_in_one_sentence() -> None:
+    notes = ["hips: no bone was recognised", "shin.L: no bone was recognised", "it does not travel: no hips", "2 other bones follow"]
+    assert folded([*notes, notes[0]]) == ("hips, shin.L: no bone was recognised", *notes[2:])
 
 
 def test_a_saved_mapping_keeps_its_steering(blender: ModuleType, props: Any, tmp_path: Path) -> None:
@@ -103,4 +109,4 @@ def test_the_editor_is_drawn(blender: ModuleType, props: Any, tmp_path: Path) ->
     assert blender.ops.tricap.retarget_find_map() == {"FINISHED"}
     assert [layout.properties.count("twist") for layout in (empty, drawn())] == [1, 2], "the setting alone; and that of the selected line"
     props.target, props.source, props.file = props.source, None, str(tmp_path / "a.trc")
-    assert any("those of “Target”" in text for text in drawn().texts) and {"up", "unit"} <= set(drawn().properties)
+    assert "those of “Target”" in " ".join(drawn().texts) and {"up", "unit"} <= set(drawn().properties)

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -57,6 +57,12 @@ def new_project(blender: ModuleType, sample: Path, folder: Path) -> Any:
     blender.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
     assert blender.ops.tricap.add_footage(directory=str(folder / "film")) == {"FINISHED"}
     return blender.context.scene
+
+
+def test_an_opened_take_shows_its_frames(blender: ModuleType, sample: Path, tmp_path: Path) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene = opened(blender, sample, tmp_path)
+    assert (scene.frame_start, scene.frame_current, scene.frame_end) == (0, 0, 2)
 
 
 def opened(blender: ModuleType, sample: Path, folder: Path) -> Any:
@@ -348,7 +354,42 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
         assert f"{n}  {title}" in drawn.texts
     assert {"empty": "tricap.open_take", "opened": "tricap.measure", "done": "tricap.export"}[point] in drawn.operators
     if point == "done":
-        assert "Next: 8 Retarget and Export" in " ".join(drawn.texts)
+        assert "Next: 8 Retarget and Export" in " ".join(drawn.texts) and blender.context.scene.tricap_retarget.source.name == "Body"
+        assert drawn.operators.count("tricap.open_views") == 3, "surface, tracks and body can be looked at over the footage"
+    elif point == "empty":
+        assert " ".join(drawn.texts).count("Save this file first") == 1
+        assert drawn.operators[:2] == ["tricap.load_sample", "wm.save_mainfile"]
+
+
+def test_everything_is_offered_only_when_nothing_else_is_next(blender: ModuleType, layout: Any, sample: Path, tmp_path: Path) -> None:
+    panel, watch = (importlib.import_module(f"{NAME}.steps.{name}") for name in ("panel", "watch"))
+    scene = opened(blender, sample, tmp_path)
+    offered = []
+    for model in ("arm.R", "leg.L", "none"):  # clicked; not clicked; no clicks needed
+        scene.tricap.model = model
+        watch.refresh(scene)
+        offered.append("tricap.run" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators)
+    assert offered == [True, False, True]
+
+
+def test_the_untouched_cube_makes_room(blender: ModuleType) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    aside, said = importlib.import_module(f"{NAME}.operators.build_scene"), []
+    operator = SimpleNamespace(report=lambda kind, words: said.append(words))
+
+    def hidden(**change: Any) -> bool:
+        blender.ops.mesh.primitive_cube_add()
+        cube = blender.context.object
+        for name, value in change.items():
+            setattr(cube, name, value)
+        blender.context.view_layer.update()
+        aside._put_aside_cube(operator, blender.context)
+        found = bool(cube.hide_get())
+        blender.data.objects.remove(cube)
+        return found
+
+    assert hidden() and len(said) == 1 and "Cube" not in blender.data.objects
+    assert not hidden(location=(0, 0, 1)) and not hidden(name="House") and len(said) == 1
 
 
 def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, words: Words, sample: Path, tmp_path: Path) -> None:
