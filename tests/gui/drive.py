@@ -32,7 +32,7 @@ HERE = Path(__file__).resolve().parent
 OUT = HERE / "out"
 DATA = HERE / "data"
 STEP_S = 0.02
-LIMIT_S = 30.0
+WORK, WORK_S = 500_000, 0.05  # a piece of work, and how long it takes on a free core of the machine for which the limits were set
 Steps = Iterator[None]
 
 failures: list[str] = []
@@ -76,11 +76,12 @@ def pause(seconds: float) -> Steps:
 
 
 def wait_for(condition: Callable[[], object], seconds: float, what: str) -> Steps:
-    """Until the condition holds; the script ends if that takes longer."""
+    """Until the condition holds; the script ends if that takes longer than `seconds` on a free machine."""
     began = time.monotonic()
     while not condition():
-        if time.monotonic() - began > seconds:
-            need(False, f"{what} (waited {seconds:.0f} s)")
+        waited = time.monotonic() - began
+        if waited > seconds and waited > seconds * slowness():
+            need(False, f"{what} (waited {waited:.0f} s)")
         yield
     say("ok    ", f"{what} ({time.monotonic() - began:.2f} s)")
 
@@ -298,6 +299,32 @@ def pick(area: bpy.types.Area, what: str, owner: bpy.types.bpy_struct, name: str
     need(getattr(owner, name) == value, f"{value} is chosen for {name} (it is {getattr(owner, name)})")
 
 
+def take_item(area: bpy.types.Area, below: str, up_px: float, number: int) -> Steps:
+    """Open the menu that lies up_px above the button whose data path contains `below` (a menu itself does not tell its name), go down to
+    its item of that number by the arrow keys, take it."""
+    button = yield from find(area, below)
+    yield from click(button.x, button.y + up_px * bpy.context.preferences.system.ui_scale)
+    yield from settle()
+    for _ in range(number):
+        yield from key("DOWN_ARROW")
+    yield from shot("menu_items")
+    yield from key("RET")
+    yield from settle()
+
+
+def look_up(area: bpy.types.Area, what: str, name: str) -> Steps:
+    """Choose a thing by its name in the field whose data path contains `what`."""
+    button = yield from find(area, what)
+    yield from click(button.x, button.y)
+    yield from settle()
+    bpy.context.window_manager.clipboard = name
+    yield from key("V", ctrl=True)
+    yield from settle()
+    yield from shot(f"looked_up_{name}")
+    yield from key("RET")
+    yield from settle()
+
+
 def image_place(area: bpy.types.Area, x_px: float, y_px: float) -> tuple[float, float]:
     """Where the centre of a clip's pixel (x right, y down, full frame) is in the window."""
     region, size = region_of(area), area.spaces.active.clip.size
@@ -367,8 +394,14 @@ def write_png(path: Path, picture: np.ndarray) -> None:
 
 
 def slowness() -> float:
-    """How much longer things take because the machine does other work too, 1 on a free one."""
-    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    """How much longer things take than on a free core of the machine for which the limits were set, 1 at least.
+
+    By the load of the machine, and by how long a piece of work takes here and now.
+    """
+    began = time.perf_counter()
+    sum(i * i for i in range(WORK))
+    took = time.perf_counter() - began
+    return max(1.0, os.getloadavg()[0] / len(os.sched_getaffinity(0)), took / WORK_S)
 
 
 class Pulse:
@@ -394,8 +427,9 @@ class Pulse:
 
     def __str__(self) -> str:
         gaps = 1e3 * self.gaps_s()
-        return (f"gaps median {np.median(gaps):.0f} ms, 99 % {np.percentile(gaps, 99):.0f} ms, longest {np.max(gaps):.0f} ms "
-                f"(load of the machine {os.getloadavg()[0]:.1f})")
+        half, most, nearly_all = np.percentile(gaps, [50, 95, 99])
+        return (f"{len(gaps)} gaps: 50 % {half:.0f} ms, 95 % {most:.0f} ms, 99 % {nearly_all:.0f} ms, longest {np.max(gaps):.0f} ms, "
+                f"{(gaps > 100).sum()} over 100 ms (load of the machine {os.getloadavg()[0]:.1f})")
 
 
 # ---- the run ---------------------------------------------------------------------------------------------------------

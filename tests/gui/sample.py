@@ -21,7 +21,7 @@ def steps() -> drive.Steps:
     began = time.monotonic()
     yield from drive.press(area, "tricap.load_sample")
     drive.check(state.running, "the job was started again")
-    yield from drive.wait_for(lambda: not state.running, SAMPLE_S * drive.slowness(), "the sample is made and measured")
+    yield from drive.wait_for(lambda: not state.running, SAMPLE_S, "the sample is made and measured")
     drive.say(f"it took {time.monotonic() - began:.1f} s, load of the machine {os.getloadavg()[0]:.1f}")
     drive.need("Body" in bpy.data.objects, "there is a body")
     yield from moves(bpy.data.objects["Body"])

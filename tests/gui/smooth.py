@@ -1,6 +1,7 @@
 """How long the window is held up while a job runs, and how soon Esc ends it, at each stage.
 
-The window is small: without a graphics card, drawing a large one takes as long as what is to be measured.
+The window is small: without a graphics card, drawing a large one takes as long as what is to be measured. What is asked of the gaps holds
+on a machine that does other work, too: how much longer they are than without a job.
 """
 
 import time
@@ -10,8 +11,10 @@ import drive
 import numpy as np
 
 SIZE = (640, 480)
-GAP_S = 0.1
-ESC_S = 1.0  # also the limit of any single gap: a window that is deaf for longer cannot hear Esc in time
+GAP_S = 0.1  # a person does not notice
+RARELY = 0.01  # of the gaps may be longer
+LONGEST_S = 0.5  # on a machine that does nothing else
+ESC_S = 1.0
 
 
 def steps() -> drive.Steps:
@@ -36,12 +39,19 @@ def steps() -> drive.Steps:
         yield from drive.wait_for(lambda: not state.running, 30, f"Esc ends the job during {stage}")
         took = time.monotonic() - pressed
         drive.check(took < ESC_S * drive.slowness(), f"Esc during {stage} took {took:.2f} s (load {drive.slowness():.1f} of each core)")
-    late = np.percentile(np.concatenate(gaps), 99) - np.percentile(idle.gaps_s(), 99)
-    drive.check(late < GAP_S * drive.slowness(), f"a job holds the window up by {late * 1e3:.0f} ms (99 %)")
-    running = np.concatenate(gaps[: len(seen)])  # what follows the end of the job, the making of the scene, is Blender's own thread's
-    longest = running.max() - idle.gaps_s().max()
-    drive.check(longest < ESC_S * drive.slowness(), f"and at the longest by {longest * 1e3:.0f} ms")
+    judge(np.concatenate(gaps[: len(seen)]), idle.gaps_s())  # the making of the scene, which follows, is Blender's own thread's
     drive.check(len(seen) > 2, f"stopped by Esc in {', '.join(seen)}")
+
+
+def judge(running: np.ndarray, idle: np.ndarray) -> None:
+    """What the gaps with a job are longer than those without."""
+    for share in (95, 99):
+        late = np.percentile(running, share) - np.percentile(idle, share)
+        drive.check(late < GAP_S, f"a job holds the window up by {late * 1e3:.0f} ms ({share} %)")
+    often = (running > GAP_S).mean() - (idle > GAP_S).mean()
+    drive.check(often < RARELY, f"by more than {GAP_S * 1e3:.0f} ms in {often:.2%} of {len(running)} gaps")
+    longest = running.max() - idle.max()
+    drive.check(longest < LONGEST_S * drive.slowness(), f"and at the longest by {longest * 1e3:.0f} ms")
 
 
 def begin() -> None:

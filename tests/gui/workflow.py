@@ -1,18 +1,23 @@
-"""From an empty Blender to a rig that moves, by mouse and keys alone: footage, cameras, clicks, surface, tracks, body, rig; then the
-same numbers by the command line."""
+"""From an empty Blender to a character that moves, by mouse and keys alone: footage, cameras, clicks, surface, tracks, body, rig,
+retargeting, export; then the same numbers by the command line."""
 
+import math
 import random
 import subprocess
 import time
 from pathlib import Path
 
+import addon_utils
 import bpy
 import drive
 from bl_ext.user_default.tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from bl_ext.user_default.tricap.core.take import read_take
+from mathutils import Vector
 
 CLICK_ERROR_PX = 5.0
 LAYOUT, CLICKS = "Layout", "Tricap Clicks"
+EXPORT_UP_PX = 56  # from the field Source to the menu of formats: two rows
+MET_DEG = 0.1  # between a limb of the body and the character's
 COMPARED = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply")
 STAGE_S = 60.0
 Joints = dict[str, dict[str, tuple[float, float]]]
@@ -25,8 +30,11 @@ def steps() -> drive.Steps:
     yield from footage(film, blend)
     yield from cameras(film)
     yield from seeds(joints)
-    yield from body(blend)
-    yield from commands_numbers(blend.with_name("kick_tricap"))
+    yield from body()
+    yield from onto_a_character()
+    yield from exported(blend.with_name("kick.bvh"))
+    yield from saved()
+    yield from commands_numbers(blend.with_name("kick_tricap"), blend.with_name("kick.bvh"))
 
 
 def make_film(film: Path) -> Joints:
@@ -83,7 +91,8 @@ def seeds(wanted: Joints) -> drive.Steps:
     yield from drive.settle(10)
     check_clicks(wanted)
     yield from drive.shot("07_clicked")
-    yield from workspace(LAYOUT)
+    yield from drive.press(clip_areas()[0], "tricap.back_to_steps", "HEADER")
+    yield from drive.wait_for(lambda: drive.window().workspace.name == LAYOUT, 10, "the button leads back to the steps")
 
 
 def beside(rng: random.Random) -> float:
@@ -112,23 +121,12 @@ def check_clicks(wanted: Joints) -> None:
             drive.check(off <= CLICK_ERROR_PX + pixel, f"{name} in {view.name} is clicked {off:.1f} px beside it")
 
 
-def workspace(name: str) -> drive.Steps:
-    """Ctrl + Page Up or Down, as far as needed."""
-    yield from drive.move(*drive.middle(max(drive.window().screen.areas, key=lambda a: a.width * a.height)))
-    for key_name in ("PAGE_UP",) * 12 + ("PAGE_DOWN",) * 12:
-        if drive.window().workspace.name == name:
-            break
-        yield from drive.key(key_name, ctrl=True)
-        yield from drive.settle()
-    drive.need(drive.window().workspace.name == name, f"the workspace {name} is shown")
-
-
-def body(blend: Path) -> drive.Steps:
+def body() -> drive.Steps:
     """Surface, tracks, body, rig, one button each."""
     for operator in ("tricap.measure(", "tricap.track(", "tricap.fit(", "tricap.build_scene("):
         area = yield from drive.sidebar("VIEW_3D", "Tricap")
         yield from drive.press(area, operator)
-        yield from drive.wait_for(lambda: not bpy.context.window_manager.tricap.running, STAGE_S * drive.slowness(), f"{operator}) ends")
+        yield from drive.wait_for(lambda: not bpy.context.window_manager.tricap.running, STAGE_S, f"{operator}) ends")
         yield from drive.shot(f"1_{operator[7:-1]}")
     drive.need("Body" in bpy.data.objects, "there is a body")
     armature, scene = bpy.data.objects["Body"], bpy.context.scene
@@ -141,19 +139,81 @@ def body(blend: Path) -> drive.Steps:
     drive.check(scene.frame_current == scene.frame_end, "the last frame is shown")
     drive.check(path > 0.02, f"from the first frame to the last the wrist moves {path * 1e3:.0f} mm")
     yield from drive.shot("2_moving")
+
+
+def onto_a_character() -> drive.Steps:
+    """The body is the source already; choose the target, press Retarget: the character's arm has the body's directions in every frame."""
+    source, target = bpy.data.objects["Body"], character()
+    area = yield from drive.sidebar("VIEW_3D", "Tricap")
+    drive.check(bpy.context.scene.tricap_retarget.source == source, "the body is chosen as the source")
+    yield from drive.look_up(area, "tricap_retarget.target", target.name)
+    drive.need(bpy.context.scene.tricap_retarget.target == target, "the character is chosen as the target")
+    yield from drive.press(area, "tricap.retarget()")
+    yield from drive.wait_for(lambda: not bpy.context.window_manager.tricap.running, STAGE_S, "the retargeting ends")
+    drive.need(target.animation_data and target.animation_data.action, "the character has an action")
+    scene, off = bpy.context.scene, []
+    for frame in range(scene.frame_start, scene.frame_end + 1):
+        scene.frame_set(frame)
+        off += [direction(source, bone).angle(direction(target, bone)) for bone in ("upper_arm.R", "forearm.R")]
+    worst = math.degrees(max(off))
+    drive.check(worst < MET_DEG, f"over {len(off) // 2} frames the character's arm is off by {worst:.3f}° at most")
+    yield from drive.move(*drive.middle(drive.area_of("VIEW_3D")))
+    yield from drive.key("NUMPAD_PERIOD")
+    yield from drive.settle(20)
+    yield from drive.shot("3_character")
+
+
+def character() -> bpy.types.Object:
+    """A person of Blender's own, Rigify's."""
+    addon_utils.enable("rigify", default_set=True)
+    bpy.ops.object.armature_basic_human_metarig_add()
+    made = bpy.context.object
+    made.name, made.location = "Character", (0.8, 0.0, 0.0)
+    bpy.ops.ed.undo_push(message="Character")
+    return made
+
+
+def direction(armature: bpy.types.Object, bone: str) -> Vector:
+    """Of a posed bone, in the world."""
+    posed = armature.pose.bones[bone]
+    return armature.matrix_world.to_3x3() @ (posed.tail - posed.head)
+
+
+def exported(file: Path) -> drive.Steps:
+    """The motion as BVH, by the menu and the file browser; then all steps are done."""
+    area = yield from drive.sidebar("VIEW_3D", "Tricap")
+    yield from drive.take_item(area, "tricap_retarget.source", EXPORT_UP_PX, 1)
+    yield from drive.choose("export", file.parent, file.name)
+    yield from drive.wait_for(file.is_file, STAGE_S, "the file is written")
+    text = file.read_text()
+    scene = bpy.context.scene
+    drive.check(f"Frames: {scene.frame_end - scene.frame_start + 1}" in text and "forearm.R" in text, "it has all frames, and the arm")
+    yield from drive.settle()
+    yield from drive.shot("4_all_done")
+
+
+def saved() -> drive.Steps:
+    """Ctrl S."""
+    yield from drive.move(*drive.middle(drive.area_of("VIEW_3D")))
     yield from drive.key("S", ctrl=True)
     yield from drive.settle()
     drive.check(not bpy.data.is_dirty, "the file is saved with it")
 
 
-def commands_numbers(project: Path) -> drive.Steps:
-    """`tricap run` on the take.toml that the clicks made gives the same bytes."""
-    out = drive.HERE / "command"
-    began, line = time.monotonic(), [bpy.app.binary_path, "--command", "tricap", "run", str(project), "--out", str(out), "--quiet"]
-    command = subprocess.Popen(line)
-    yield from drive.wait_for(lambda: command.poll() is not None, 3 * STAGE_S * drive.slowness(), "the command line ends")
-    drive.say(f"the command took {time.monotonic() - began:.1f} s, exit code {command.returncode}")
+def commands_numbers(project: Path, bvh: Path) -> drive.Steps:
+    """`tricap run` on the take.toml that the clicks made gives the same bytes, and `tricap export` of its result the same file."""
+    out, file = drive.HERE / "command", drive.HERE / "command.bvh"
+    yield from by_command("run", str(project), "--out", str(out), "--quiet")
+    yield from by_command("export", str(out), "--format", "bvh", "--out", str(file))
+    drive.check(file.read_bytes() == bvh.read_bytes(), "the exported motion is the command line's, byte by byte")
     for name in COMPARED:
         same = (out / name).read_bytes() == (project / "results" / name).read_bytes()
         drive.check(same, f"{name} is the command line's, byte by byte")
     (drive.OUT / "take.toml").write_bytes((project / "take.toml").read_bytes())
+
+
+def by_command(*words: str) -> drive.Steps:
+    """`blender --command tricap …`, beside this Blender."""
+    began, command = time.monotonic(), subprocess.Popen([bpy.app.binary_path, "--command", "tricap", *words])
+    yield from drive.wait_for(lambda: command.poll() is not None, 3 * STAGE_S, f"the command {words[0]} ends")
+    drive.check(command.returncode == 0, f"it took {time.monotonic() - began:.1f} s, exit code {command.returncode}")
