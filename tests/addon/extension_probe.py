@@ -21,8 +21,9 @@ FRAMES = 6
 
 
 def drawn_by(cls: type) -> list[str]:
-    """Who appended to a menu or panel of Blender's."""
-    return [f"{function.__module__}.{function.__qualname__}" for function in getattr(getattr(cls, "draw", None), "_draw_funcs", ())]
+    """Who added to a menu, header or panel of Blender's; its own draw() is kept in the same list."""
+    drawn = getattr(getattr(cls, "draw", None), "_draw_funcs", ())
+    return [f"{function.__module__}.{function.__qualname__}" for function in drawn if function.__qualname__ != f"{cls.__name__}.draw"]
 
 
 def traces() -> dict[str, list[str]]:

@@ -77,7 +77,7 @@ def clicked(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
             yield from drive.shot("1_proposed")
             yield from dragged(session, at)
         yield from drive.key("RET")
-        yield from drive.pause(0.2)
+        yield from drive.wait_for(lambda name=name: not running or session.name != name, 10, "Return goes on")
     drive.check(not running, "after the last joint it ends by itself")
     said = module("addon.project").table(bpy.context.scene)["seeds"]["joints"]
     drive.check({n: set(at) for n, at in said.items()} == {n: {"L", "C", "R"} for n in joints}, "take.toml gets all clicks")
@@ -90,28 +90,27 @@ def dragged(session: Any, at: dict[str, list[float]]) -> drive.Steps:
     yield from drive.move(x + 8, y)
     yield from drive.move(x + 16, y)
     yield from drive.click(x + 16, y)
-    yield from drive.pause(0.3)
-    drive.check(np.linalg.norm(session.clicks()["L"] - before) > 3 and session.name == "elbow.R", "G moves the click while clicking")
+    yield from drive.wait_for(lambda: np.linalg.norm(session.clicks()["L"] - before) > 3, 10, "G moves the click while clicking")
+    drive.check(session.name == "elbow.R", "and it stays the turn of the elbow")
     yield from drive.click(x, y)
     yield from drive.wait_for(lambda: len(session.proposals) == 2, 20, "the proposals follow")
 
 
 def a_keyframe(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
     """A click in another frame is a keyframe; Esc ends, wherever the pointer is; one undo takes it back."""
-    project = module("addon.project")
+    project, running = module("addon.project"), module("addon.clicking.operators").ClickOperator.running
     bpy.context.scene.frame_set(2)
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
     yield from drive.press(area, "tricap.click_joints")
     for view in "LR":
         yield from drive.click(*drive.image_place(views()[view], *joints["shoulder.R"][view]))
     yield from drive.key("ESC")
-    yield from drive.pause(0.3)
+    yield from drive.wait_for(lambda: not running, 10, "Esc ends clicking")
     said = project.table(bpy.context.scene)
     drive.check([k["frame"] for k in said["keyframes"]] == [2], "frame 2 became a keyframe")
     yield from drive.key("Z", ctrl=True)
-    yield from drive.pause(0.5)
-    said = project.table(bpy.context.scene)
-    drive.check("keyframes" not in said and len(said["seeds"]["joints"]) == 3, "one undo takes the keyframe back and leaves the rest")
+    yield from drive.wait_for(lambda: "keyframes" not in project.table(bpy.context.scene), 10, "one undo takes the keyframe back")
+    drive.check(len(project.table(bpy.context.scene)["seeds"]["joints"]) == 3, "and leaves the rest")
 
 
 def watched() -> drive.Steps:
@@ -121,6 +120,7 @@ def watched() -> drive.Steps:
     shown = scene.tricap_overlay
     yield from drive.settle()
     plain = drive.pixels()
+    shown.which_points = "both"
     for name in ("points", "tracks", "graph"):
         setattr(shown, name, True)
         yield from drive.settle()
@@ -131,9 +131,9 @@ def watched() -> drive.Steps:
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
     yield from drive.press(area, "tricap.look_closer")
     yield from drive.move(*track_place("R"))
-    yield from drive.pause(0.3)
-    found = module("addon.overlay.draw").looked(2)
-    drive.need(found is not None, "there is something under the pointer")
+    looked = module("addon.overlay.draw").looked
+    yield from drive.wait_for(lambda: looked(2) is not None, 10, "there is something under the pointer")
+    found = looked(2)
     drive.say(*found.words)
     drive.check(set(found.found) == {"L", "C", "R"}, "its patch is known in all views")
     yield from drive.settle()
@@ -155,15 +155,18 @@ def corrected() -> drive.Steps:
     """A click takes a trajectory out, four a region; both stand in take.toml, and the tracks follow."""
     project = module("addon.project")
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
+    def taken() -> int:
+        return len(bpy.context.scene.tricap_correcting.corrections)
+
     yield from drive.press(area, "tricap.remove_trajectory")
     yield from drive.click(*track_place("R"))
     yield from drive.key("ESC")
-    yield from drive.pause(0.3)
+    yield from drive.wait_for(lambda: taken() == 1, 10, "a trajectory is taken out")
     yield from drive.press(area, "tricap.remove_region")
     for x, y in ((220, 120), (300, 120), (300, 200)):
         yield from drive.click(*drive.image_place(views()["R"], x, y))
     yield from drive.key("RET")
-    yield from drive.pause(0.3)
+    yield from drive.wait_for(lambda: taken() == 2, 10, "a region is taken out")
     yield from drive.shot("4_corrected")
     said = project.table(bpy.context.scene).get("corrections", [])
     drive.check([c["kind"] for c in said] == ["trajectory", "region"], "take.toml gets both corrections")
