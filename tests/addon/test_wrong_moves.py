@@ -208,6 +208,15 @@ def test_the_disk_is_full(scene: ModuleType, take: Path, monkeypatch: pytest.Mon
     assert run(scene, take, take.with_name("results"))() == {"FINISHED"}, "with room again it goes on"
 
 
+def test_nothing_to_retarget_onto_or_to_export(scene: ModuleType, tmp_path: Path) -> None:
+    assert scene.context.scene.tricap_retarget.source.name == "Body"
+    refused(lambda: scene.ops.tricap.retarget(), "Choose the target")
+    scene.context.scene.tricap_retarget.target = scene.data.objects["Body"]
+    refused(lambda: scene.ops.tricap.retarget(), "source and target at once")
+    refused(lambda: scene.ops.tricap.export(kind="bvh", filepath=str(tmp_path / "a.bvh"), out=str(tmp_path / "none")), "no motion", "none")
+    refused(lambda: scene.ops.tricap.export(kind="bvh"), "Choose the file")
+
+
 def test_another_job_is_running(scene: ModuleType, take: Path) -> None:
     """In another process: it holds the folder."""
     lock = importlib.import_module("tricap.core.lock")
