@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from .bar_file import write_bar
 from .calibrating import calibrate_rig, measure_bar, open_bar, write_report
 from .calibration import account
 from .calibration.rig_files import FORMATS, read_any, write_as
@@ -82,6 +83,7 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         write_as(args.out, result.rig, args.format)
     else:
         write_rig(args.out, result.rig)
+        written.append(write_bar(args.out, result.rig, *result.bar))
     if args.json:
         return [json.dumps(account.figures(result.calibration, result.quality, result.verdict), indent=1, ensure_ascii=False)]
     return [result.verdict.sentence, f"To do better: {result.verdict.advice}.", f"Written: {', '.join(map(str, written))}"]

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
+from ...core.bar_file import write_bar
 from ...core.calibrating import BarFootage, CalibratedRig, MeasuredBar, calibrate_rig, measure_bar, open_bar, write_report
 from ...core.calibration.rig_files import FORMATS, read_any, write_as
 from ...core.calibration.world_choice import WorldChoice
@@ -75,7 +76,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
         views = [view.name for view in context.scene.tricap.views] if project.bound(context.scene) else []
         strangers = [name for name in views if name not in result.footage.names]
         if views and not strangers:
-            use_rig(context.scene, result.result.rig)
+            use_rig(context.scene, result.result.rig, result.result.bar)
         files = {name: list(s.files()) for name, s in zip(result.footage.names, result.footage.sequences)}
         tracks = dict(zip(result.footage.names, result.measured.tracks))
         build_cameras(context.scene, result.result.rig, files, tracks, result.result.bar)
@@ -101,10 +102,11 @@ def frame_numbers(text: str) -> tuple[int, ...]:
 
 
 def compute(footage: BarFootage, measured: MeasuredBar, focal_px: float | None, world: WorldChoice, out: Path, monitor: Monitor) -> Done:
-    """The computation, free of bpy: from the measured bar to rig.toml and its report beside it."""
+    """The computation, free of bpy: from the measured bar to rig.toml, with the bar and its report beside it."""
     result = calibrate_rig(measured.observations, monitor, focal_px=focal_px, world=world)
     write_report(out.parent / f"{out.stem}_report", result)
     write_rig(out, result.rig)
+    write_bar(out, result.rig, *result.bar)
     return Done(footage=footage, measured=measured, result=result, written=out)
 
 

@@ -103,6 +103,8 @@ def write_scene(contents: Contents, blend: Path | None = None, options: SceneOpt
     surroundings.add_lights(collection)
     if contents.footage is not None and contents.footage.rig.metadata.get("floor") is True:
         surroundings.add_floor(collection)
+    if contents.bar is not None:
+        counts["positions of the bar"] = _add_bar(collection, contents.frames[0], *contents.bar)
     scene.frame_set(scene.frame_start)
     if blend is not None:
         save_blend(Path(blend))
@@ -209,6 +211,12 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
         if camera is reference:
             scene.camera, scene.active_clip = camera_object, clip
     return len(take.views)
+
+
+def _add_bar(collection: bpy.types.Collection, first: int, frames: np.ndarray, ends_m: np.ndarray) -> int:
+    """The bar as it was waved, in another recording: from the scene's first frame on; not in rendered pictures."""
+    surroundings.add_bar(collection, frames - frames[0] + first, ends_m).hide_render = True
+    return len(frames)
 
 
 def _add_cloud(collection: bpy.types.Collection, contents: Contents, segments: Segments, options: SceneOptions, warnings: list[str]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...core import store
+from ...core.bar_file import read_bar
 from ...core.body.shape import BodyShape, read_body
 from ...core.body.skin_mesh import SkinSettings
 from ...core.errors import InputError
@@ -47,6 +48,7 @@ class Contents:
     motion: MotionTable | None = None
     skin_settings: SkinSettings = field(default_factory=SkinSettings)
     skins: FrameSkins | None = None  # only where they were asked for
+    bar: tuple[np.ndarray, np.ndarray] | None = None  # frames (T,) of its own recording, and ends (T, 2, 3) [m] of the reference bar
     warnings: tuple[str, ...] = ()
 
     @property
@@ -86,7 +88,15 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
                    skin_settings=settings, skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
-                   warnings=tuple(warnings))
+                   bar=_bar(footage, warnings), warnings=tuple(warnings))
+
+
+def _bar(footage: Footage | None, warnings: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
+    try:
+        return read_bar(footage.take.rig_path, footage.rig) if footage is not None else None
+    except InputError as error:
+        warnings.append(f"No reference bar in the scene: {error}")
+        return None
 
 
 def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage | None:

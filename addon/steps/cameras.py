@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy_extras.io_utils import ImportHelper
 
+from ...core.bar_file import write_bar
 from ...core.calibration.rig_files import read_any
 from ...core.geometry.rig import Rig, write_rig
 from .. import folders, project
@@ -41,8 +43,8 @@ class CamerasFromScene(Told, bpy.types.Operator):
         return f"{len(rig.cameras)} cameras of the scene."
 
 
-def use_rig(scene: bpy.types.Scene, rig: Rig) -> None:
-    """Make these the project's cameras, and give the clips their lenses.
+def use_rig(scene: bpy.types.Scene, rig: Rig, bar: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+    """Make these the project's cameras, and give the clips their lenses. `bar`: frames and ends [m] of the bar that gave them.
 
     Raises:
         InputError: a view has no camera of its name, or the project's folder cannot be written to.
@@ -50,6 +52,8 @@ def use_rig(scene: bpy.types.Scene, rig: Rig) -> None:
     found = {view.name: rig[view.name] for view in scene.tricap.views}
     folder = project.write(scene)
     write_rig(folder / "rig.toml", rig)
+    if bar is not None:
+        write_bar(folder / "rig.toml", rig, *bar)
     for view in scene.tricap.views:
         clips.set_lens(view.clip, found[view.name])
 

@@ -4,10 +4,12 @@ A limb of one chain has the field of its bones, F_b = own + parent's + children'
 of a body meet, the sum would bulge and the larger of the two would leave a crease; their fields are joined by the blend of
 constructive solid geometry (Ricci 1973, Comput. J. 16),
 
-    G = (F_b^n + max_q F_q^n)^(1/n) ,   n = 4 ,   q: the bones of the other part next to b                 (1)
+    G = (F_b^n + max_q (w_q F_q)^n)^(1/n) ,   n = 4 ,   q: the bones of the other part next to b           (1)
 
-which is 2^(1/n) of the larger field where both are equal, and the larger field elsewhere: a fillet of 4 mm on a radius of 60 mm. Both
-parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A part ends inside its neighbour:
+with w_q = 1, but of the bones of the part that it grows out of a limb sees each only beside its own length: w_q falls to 0 where the next
+bone's field holds, as it does for that part itself. G is 2^(1/n) of the larger field where both are equal, and the larger field
+elsewhere: a fillet of 4 mm on a radius of 60 mm. Both parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A
+part ends inside its neighbour:
 
     first exit of the ray, beyond the outermost F_b = T, from  min( G/T , F_own/(τ T) ) ≥ 1 ,   τ = 0.4    (2)
 
@@ -26,6 +28,7 @@ from .skin_rays import Rays, smooth
 
 BLEND_POWER = 4.0  # n of (1)
 OWN_SHARE = 0.4  # τ of (2): below ½, or two that reach T together would both stay below it
+BORDER = 0.3  # w_q ends this part of the bone's length beyond its ends
 STEP = 0.05  # march, in units of the reach
 FINE_STEP = 0.02  # … outwards, where a gap between two parts must not be stepped over
 SECANT_STEPS = 7
@@ -124,6 +127,9 @@ class _JoinedField:
     frame: np.ndarray  # (m, 3, 3) columns: a ball's axes in the world over its l
     shift: np.ndarray  # (m, 3) its centre in them
     chosen: np.ndarray  # (K, m) 0 or 1: row 0 the field of the bone, row 1 of its own part alone, then those of other parts
+    head: np.ndarray  # (K − 2, 3) of these
+    along: np.ndarray  # (K − 2, 3) 1/m: their axes over their lengths
+    open_ends: np.ndarray  # (K − 2, 2) whether they go on before their heads, and beyond their tails
 
     @property
     def others(self) -> int:
@@ -132,8 +138,9 @@ class _JoinedField:
 
     def log_ratio(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
         """ln of (2) at ρ (N',) on the rays `which` (N',)."""
-        ln = self._logs(self._terms(self.origin[which] + rho[:, None] * self.direction[which])[1])
-        joined = self._joined(ln, self.fade[which])
+        points = self.origin[which] + rho[:, None] * self.direction[which]
+        ln = self._logs(self._terms(points)[1])
+        joined = self._joined(ln, self._shares(points, self.fade[which]))
         return np.minimum(joined, ln[:, 1] - np.log(OWN_SHARE)) if self.others else joined  # (2)
 
     def log_own(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
@@ -145,7 +152,7 @@ class _JoinedField:
         """−∇G/|∇G| (N, 3) at a point of each ray."""
         q, terms = self._terms(points)
         ln = self._logs(terms)
-        share = np.exp(BLEND_POWER * (ln + np.log(np.column_stack([np.ones((len(ln), 2)), *[self.fade] * self.others]))))
+        share = np.exp(BLEND_POWER * (ln + np.log(np.column_stack([np.ones((len(ln), 2)), self._shares(points, self.fade)]))))
         share[:, 1] = 0.0
         if self.others:
             share[:, 2:] *= share[:, 2:] == share[:, 2:].max(axis=1, keepdims=True)
@@ -160,11 +167,17 @@ class _JoinedField:
     def _logs(self, terms: np.ndarray) -> np.ndarray:
         return np.asarray(np.log(np.maximum(terms @ self.chosen.T, NOTHING) / THRESHOLD))
 
-    def _joined(self, ln: np.ndarray, fade: np.ndarray) -> np.ndarray:
+    def _shares(self, points: np.ndarray, fade: np.ndarray) -> np.ndarray:
+        """How much each field of other parts counts at the points (N, 3): w_q of (1) times `fade` (N,), (N, K − 2)."""
+        t = np.einsum("nki,ki->nk", points[:, None] - self.head, self.along)
+        past = np.maximum(np.where(self.open_ends[:, 0], 0.0, -t), np.where(self.open_ends[:, 1], 0.0, t - 1.0))
+        return np.maximum(fade[:, None] * (1 - smooth(np.maximum(past, 0.0) / BORDER)), NOTHING)
+
+    def _joined(self, ln: np.ndarray, shares: np.ndarray) -> np.ndarray:
         """ln of (1) over T."""
         if not self.others:
             return np.asarray(ln[:, 0])
-        return np.asarray(np.logaddexp(BLEND_POWER * ln[:, 0], BLEND_POWER * (ln[:, 2:].max(axis=1) + np.log(fade))) / BLEND_POWER)
+        return np.asarray(np.logaddexp(BLEND_POWER * ln[:, 0], BLEND_POWER * (ln[:, 2:] + np.log(shares)).max(axis=1)) / BLEND_POWER)
 
 
 def _joined_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays,
@@ -172,7 +185,8 @@ def _joined_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: i
     neighbours, balls, part = shape.skeleton.neighbours, shape.metaballs, parts[index]
     active = active_balls(balls, neighbours, bone)
     masks = [active, active & np.isin(balls.bone_index, part.bones)]
-    masks += [active_balls(balls, neighbours, b) for b in _adjacent(parts, index, bone)]
+    others = _adjacent(parts, index, bone)
+    masks += [active_balls(balls, neighbours, b) for b in others]
     used = np.flatnonzero(np.any(masks, axis=0))
     of, radii = balls.bone_index[used], balls.radii_m[used]
     frame = R[of] / radii[:, None, :]
@@ -180,7 +194,8 @@ def _joined_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: i
     return _JoinedField(
         origin=rays.origin[own], direction=rays.direction[own], fade=fade,
         weight=balls.weight[used], frame=frame, chosen=np.stack(masks)[:, used].astype(np.float64),
-        shift=np.einsum("mi,mij->mj", head[of], frame) + balls.centres_m(shape.lengths_m)[used] / radii)
+        shift=np.einsum("mi,mij->mj", head[of], frame) + balls.centres_m(shape.lengths_m)[used] / radii,
+        head=head[others], along=R[others, :, 1] / shape.lengths_m[others, None], open_ends=_open_ends(parts, part, others))
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
@@ -194,6 +209,17 @@ def _adjacent(parts: tuple[Part, ...], index: int, bone: int) -> list[int]:
     if part.parent is not None and bone in part.junction:
         found += [b for b in parts[part.parent].bones if _near(parts[part.parent], part.attachment, b)]
     return found
+
+
+def _open_ends(parts: tuple[Part, ...], part: Part, others: list[int]) -> np.ndarray:
+    """(K, 2): whether the field of a bone goes on before its head, and beyond its tail; not where its neighbour is one of `others`, too."""
+    above = parts[part.parent].bones if part.parent is not None else ()
+    ends = []
+    for bone in others:
+        k = above.index(bone) if bone in above else 0
+        beside = (above[max(k - 1, 0):k], above[k + 1:k + 2]) if bone in above else ((), ())
+        ends.append([not set(near) & set(others) for near in beside])
+    return np.array(ends, dtype=bool).reshape(-1, 2)
 
 
 def _near(part: Part, attachment: int | None, bone: int) -> bool:

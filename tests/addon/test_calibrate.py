@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tricap.core.bar_file import read_bar
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, waved_bar
 from tricap.core.synthetic.bar_images import BarPictures, write_bar_folder
@@ -38,6 +39,9 @@ def test_footage_becomes_cameras(blender, empty, bar: Path) -> None:
     waved = empty.data.objects["Reference bar"].data
     ends = np.array([v.co for v in waved.vertices]).reshape(-1, 2, 3)
     np.testing.assert_allclose(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), 0.5, atol=1e-3)
+    kept = read_bar(bar.parent / "rig.toml", rig)
+    assert kept is not None
+    np.testing.assert_allclose(kept[1], ends, atol=1e-5)
     assert rig["C"].size_px == tuple(clip.size)
 
 

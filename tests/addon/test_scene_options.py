@@ -106,6 +106,24 @@ def test_the_bar_of_a_calibration_moves(empty: ModuleType) -> None:
     assert not len(world_vertices(empty, bar))
 
 
+def test_the_bar_beside_the_rig_is_in_the_scene(empty: ModuleType, small_run: SmallRun) -> None:
+    """From the scene's first frame on, whatever its own recording counted; one of other cameras is left out and told."""
+    from tricap.addon.scene.build import build_scene
+    from tricap.core.bar_file import bar_path, write_bar
+
+    ends = np.random.default_rng(1).uniform(-1, 1, (3, 2, 3))
+    write_bar(small_run.take / "rig.toml", small_run.rig, np.array([100, 101, 104]), ends)
+    assert build_scene(small_run.out).counts["positions of the bar"] == 3
+    bar, first = empty.data.objects["Reference bar"], empty.context.scene.frame_start
+    for row, frame in ((0, first), (2, first + 4)):
+        empty.context.scene.frame_set(frame)
+        assert np.linalg.norm(world_vertices(empty, bar)[:, None] - ends[row], axis=-1).min(axis=1).max() < 0.01
+    path = bar_path(small_run.take / "rig.toml")
+    path.write_text(path.read_text().replace("from ", "from another "))
+    report = build_scene(small_run.out)
+    assert "Reference bar" not in empty.data.objects and any("another calibration" in warning for warning in report.warnings)
+
+
 @pytest.mark.parametrize("model", ["arm.R", "full"])
 def test_in_t_pose_the_person_moves_the_same(empty: ModuleType, model: str) -> None:
     from tricap.addon.scene.rest_pose import at_rest

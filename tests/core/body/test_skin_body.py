@@ -79,7 +79,7 @@ def test_where_parts_meet_they_have_one_surface_without_a_seam(angles: dict[str,
             angle = np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", n, normals)[both], -1, 1)))
             angles_deg += angle.tolist()
     assert len(angles_deg) > 20
-    assert np.percentile(angles_deg, 95) < SEAM_DEG and max(angles_deg) < 15.0  # measured: 95 % 0…4°, worst 12.6° at one vertex
+    assert max(angles_deg) < SEAM_DEG  # promised; measured: 2.2°
 
 
 @pytest.mark.parametrize("model", [name for name in model_names() if name.startswith(("arm", "leg"))])
