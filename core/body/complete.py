@@ -51,11 +51,12 @@ def _placed(shape: BodyShape, profiles: dict[int, BoneProfile]) -> Metaballs:
         side = -1.0 if name.endswith(".L") else 1.0  # a left bone's x axis is the right one's mirror image
         for ball in arrangement(name):
             along = _on_bone(profile, ball)
-            near = np.array([[side * ball.aside, ball.ahead]])
-            R_x, R_z = profile.across(np.array([along]), near + [[side * 1e-9, 0.0]])[0]  # on the axis too, both sides are alike
+            ahead, behind = profile.across(np.full(2, along), np.array([[1.0, 1.0], [-1.0, -1.0]]))
+            half = (ahead + behind) / 2
+            at = (ahead - behind) / 2 + np.array([side * ball.aside, ball.ahead]) * half  # a calf lies beside its bone
             bone_index.append(b)
-            centre.append([near[0, 0] * R_x / length, along, near[0, 1] * R_z / length])
-            cross = ball.width / VISIBLE * np.array([R_x, R_z])
+            centre.append([at[0] / length, along, at[1] / length])
+            cross = ball.width / VISIBLE * half
             radii.append([cross[0], max(ball.length * _span(profile) * length, ROUND * cross.mean()), cross[1]])
     return Metaballs(bone_index=np.array(bone_index), centre=np.array(centre), radii_m=np.array(radii), weight=np.ones(len(bone_index)))
 

@@ -42,6 +42,8 @@ def default_shape(model: BodyModel) -> BodyShape:
     lengths = np.array([bone.nominal_length_m for bone in model.skeleton.bones])
     has_balls = np.flatnonzero(np.isfinite(model.visible_radii_m).all(axis=(1, 2)))
     balls = three_balls(has_balls, lengths, model.visible_radii_m[has_balls], model.stations[has_balls])
+    aside = model.aside[has_balls].reshape(-1, 2)
+    balls = replace(balls, centre=np.stack([aside[:, 0], balls.centre[:, 1], aside[:, 1]], axis=1))
     chain = stout_chain(model.skeleton, lengths, model.visible_radii_m)
     if chain:
         balls = smoothed(balls, model.skeleton, lengths, chain, model.visible_radii_m, model.stations)

@@ -79,3 +79,23 @@ def test_a_model_made_from_itself_is_refused(text: str, tmp_path: Path) -> None:
     _own(tmp_path, "b.toml", 'mirror_of = "a.toml"')
     with pytest.raises(InputError, match="made from|no body model"):
         read_model(_own(tmp_path, "a.toml", text))
+
+
+def test_calves_lie_behind_and_outside_of_their_bones() -> None:
+    shape = default_shape(read_model("full"))
+    names, balls = [bone.name for bone in shape.skeleton.bones], shape.metaballs
+    for side, outwards in (("R", -1.0), ("L", 1.0)):
+        b = names.index(f"shin.{side}")
+        mine = balls.bone_index == b
+        world = (balls.centre[mine] * [1, 0, 1]) @ shape.skeleton.bones[b].R_rest.T  # the person faces -Y, the right side is -X
+        mass = np.prod(balls.radii_m[mine][:, [0, 2]], axis=1)
+        centre = mass @ world / mass.sum()
+        assert centre[1] == pytest.approx(0.0485, abs=0.004) and outwards * centre[0] == pytest.approx(0.019, abs=0.002)
+    assert not balls.centre[balls.bone_index == names.index("thigh.L")][:, [0, 2]].any()
+
+
+def test_a_model_whose_balls_lie_aside_of_nothing_is_refused(tmp_path: Path) -> None:
+    text = model_files("leg.R")[0].read_text()
+    (tmp_path / "mine.toml").write_text(text.replace("[-0.015, 0.022]]", "]"))
+    with pytest.raises(InputError, match="lacks something or holds a wrong value"):
+        read_model(tmp_path / "mine.toml")
