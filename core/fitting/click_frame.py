@@ -10,6 +10,7 @@ from ..progress import Monitor
 from .cloud_points import CloudPoints
 from .conditions import Conditions
 from .inverse_kinematics import inverse_kinematics, other_postures
+from .lost_limbs import found_again
 from .observations import Observation
 from .problem import linearise
 from .segmentation import crop
@@ -44,6 +45,19 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     if best is None or (best_support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
         raise InputError(f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
                          "rig, or click in a frame where the limb was measured.")
+    return _with_lost_limbs(fit, points, best, best_support)
+
+
+def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_support: float) -> Solution:
+    """The solution, or one from where a limb without points explains points that nothing else does.
+
+    Clicks from a short base leave a limb's depth open: bent towards the cameras and away from them look alike.
+    """
+    for start in found_again(fit, points, best.motion[0], best.vector):
+        solution = fit_posture_and_shape(fit, points, start, best.vector)
+        support = fit.support(fit.click, points, solution.motion[0], solution.vector)
+        if support > best_support + fit.settings.min_points / 4:
+            best, best_support = solution, support
     return best
 
 

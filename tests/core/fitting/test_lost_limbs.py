@@ -1,16 +1,20 @@
 """An arm that is not where it was predicted is found among the points that nothing else explains."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
+from tricap.core.fitting.click_frame import _with_lost_limbs
 from tricap.core.fitting.cloud_points import CloudPoints
 from tricap.core.fitting.fit_input import FitInput
 from tricap.core.fitting.lost_limbs import found_again
 from tricap.core.fitting.sequence import conditions
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.solver import Scales, Solution
 
 from .limb_scene import front_rig, measured_cloud, surface
 
@@ -68,3 +72,20 @@ def test_a_forearm_is_found_whose_upper_arm_was_never_lost(standing) -> None:
     moved = np.flatnonzero(np.abs(found - before) > 1e-9)
     assert {shape.skeleton.dof_names[i] for i in moved} <= {"shoulder.R twist", "elbow.R flexion", "elbow.R twist"}
     assert not found_again(fit, points_of(shape, bent, seen), before, vector)
+
+
+def test_at_the_click_frame_a_forearm_bent_the_wrong_way_is_found(standing) -> None:
+    fit, shape, before = standing
+    layout, bent = shape.skeleton.layout, before.copy()
+    for name, degrees in (("shoulder.R twist", 40.0), ("elbow.R flexion", 95.0)):
+        bent[layout[name]] = np.radians(degrees)
+    elsewhere = [i for i, c in enumerate(fit.clicked[0].joint) if shape.skeleton.joint_names[c] not in (WRIST, "knuckles.R")]
+    clicks = replace(fit.clicked[0], cameras=tuple(fit.clicked[0].cameras[i] for i in elsewhere), joint=fit.clicked[0].joint[elsewhere],
+                     xy_px=fit.clicked[0].xy_px[elsewhere])
+    fit, points = replace(fit, clicked={0: clicks}), points_of(shape, bent, {"chest": 100, "upper_arm.R": 80, "forearm.R": 80})
+    wrong = Solution(motion=before[None], vector=fit.parameters.vector(shape), cost=1.0, scales=Scales(), iterations=1, converged=True)
+    support = fit.support(0, points, before, wrong.vector)
+    found = _with_lost_limbs(fit, points, wrong, support)
+    true, now = (joint_positions(shape.skeleton, shape.lengths_m, m)[WRIST] for m in (bent, found.motion[0]))
+    assert np.linalg.norm(now - true) < 0.05 and fit.support(0, points, found.motion[0], found.vector) > support + 25
+    assert _with_lost_limbs(fit, points, found, support + 1000) is found
