@@ -9,9 +9,9 @@
 
 Points, outlines and keypoints are each enough alone.
 
-A body is not made of metaballs. What it differs, it differs in every frame, so forty frames tell no more of the shape than one does: in
-step 4 what is known of the shape beforehand (radii from the model, bone lengths from the click frame) weighs as much against the points
-as it would in a single frame (`shared_frames`).
+A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is known of the shape beforehand
+(radii from the model, bone lengths from the click frame) weigh as much against the points of so many frames as against those of one. By
+default it counts once: a click frame's lengths err by more than a body differs from its balls, and postures that change tell of them.
 """
 
 from collections.abc import Mapping

@@ -10,6 +10,7 @@ from .problem import Linearised, Problem, Scales, cost, first_scales, linearise
 START_DAMPING, LARGEST_DAMPING = 1e-3, 1e8
 STEP_DONE = 1e-4  # rad, m, relative
 COST_DONE = 1e-4
+SIGMAS_DONE = 0.03  # root mean square over the parameters: as much as a step gains, (0.03 σ)² each, is not worth another
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,7 +49,8 @@ def solve(problem: Problem, motion: np.ndarray, vector: np.ndarray, *, steps: in
             done = _at_minimum(lin)
             break
         size = max(float(np.abs(new[0] - motion).max()), float(np.abs(new[1] - vector).max()))
-        done = size < STEP_DONE or (lin.cost - new[2]) < COST_DONE * lin.cost
+        parameters = motion.size + len(problem.free_shape)
+        done = size < STEP_DONE or (lin.cost - new[2]) < max(COST_DONE * lin.cost, SIGMAS_DONE**2 * parameters)
         motion, vector, last = new
         scales = lin.scales(scales)
     converged = done and bool(np.isfinite(last))
