@@ -95,13 +95,13 @@ def test_starts_thirty_degrees_off_all_converge(make_scene) -> None:
     points = thinned(scene.clouds[0], KNOWN.voxel_m)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, KNOWN.length_sigma)
     rng, good = np.random.default_rng(0), 0
-    for _ in range(60):
+    for _ in range(200):
         start = clicked.motion[0].copy()
         start[3:] += np.radians(rng.uniform(-30, 30, 5))
         solution = fit_posture_and_shape(fit, points, start, clicked.vector)
         X = fit.parameters.state(solution.motion[0], solution.vector).joint_jacobian[0]
         good += np.linalg.norm(X - scene.joints_m[0], axis=1).max() < 0.012
-    assert good == 60
+    assert good == 200
 
 
 def test_mirrored_scene_gives_the_mirrored_fit(make_scene) -> None:
