@@ -1,8 +1,9 @@
 """Which groups of muscles and fat shape each bone's surface, as balls beside the bone: the tables of the complete model.
 
-Places and sizes are shares of the half width there, from the middle of the section: `aside` along the bone's x axis (for bones of the right side; mirrored on the
-left), `ahead` along its z axis, `width` of the ball's own visible radius. `along` and `length` (its l along the bone) are fractions of the
-bone. The arrangement is that of surface anatomy (after the plates of Gray, 1918); the sizes are starting values for a fit.
+Places and sizes are shares of the half width there, from the middle of the section: `aside` along the bone's x axis (for bones of the
+right side; mirrored on the left), `ahead` along its z axis, `width` of the ball's own visible radius. `along` and `length` (its l along the
+bone) are fractions of the bone. The arrangement is that of surface anatomy (after the plates of Gray, 1918); the sizes are starting values
+for a fit.
 """
 
 from dataclasses import dataclass

@@ -9,9 +9,9 @@
 
 Points, outlines and keypoints are each enough alone.
 
-A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is known of the shape beforehand
-(radii from the model, bone lengths from the click frame) weigh as much against the points of so many frames as against those of one. By
-default it counts once: a click frame's lengths err by more than a body differs from its balls, and postures that change tell of them.
+A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is known of the shape
+beforehand (radii from the model, bone lengths from the click frame) weigh as much against the points of so many frames as against those of
+one. By default it counts once: a click frame's lengths err by more than a body differs from its balls, and other postures tell of them.
 """
 
 from collections.abc import Mapping
