@@ -41,6 +41,8 @@ class BuildScene(JobOperator, bpy.types.Operator):
                                   description="Pieces of each edge of the skin, by B-spline patches")
     exact_skin: bpy.props.BoolProperty(name="Exact Skin", default=False,  # type: ignore[valid-type]
                                        description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file")
+    one_skin: bpy.props.BoolProperty(name="Skin in One Piece", default=False,  # type: ignore[valid-type]
+                                     description="Also the skin as one watertight mesh without borders, bound to the armature")
     implicit: bpy.props.BoolProperty(name="Implicit Surface", default=False,  # type: ignore[valid-type]
                                      description="Also the surface of the exact field in the middle frame, to check skins against")
     field: bpy.props.EnumProperty(name="Field", items=[(name, name.capitalize(), "") for name in POTENTIALS],  # type: ignore[valid-type]
@@ -59,7 +61,7 @@ class BuildScene(JobOperator, bpy.types.Operator):
         """Build the scene from what was read."""
         options = SceneOptions(rest_pose=self.rest_pose, detail=self.detail, exact_skin=self.exact_skin, colour=self.colour,
                                simplify_deg=math.degrees(self.simplify), arrows=self.arrows, implicit=self.implicit,
-                               field=self.field)
+                               field=self.field, one_skin=self.one_skin)
         put_into_scene(self, context, result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         return {"FINISHED"}
 

@@ -19,7 +19,7 @@ from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
 from ...core.stages import STAGES
-from . import action, armature, cameras, clips, implicit, metaballs, skin, surroundings
+from . import action, armature, cameras, clips, implicit, metaballs, one_skin, skin, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import at_rest
@@ -38,6 +38,7 @@ class SceneOptions:
 
     detail: int = 1  # the skin's level of detail: pieces of each edge
     exact_skin: bool = False  # also the skin of every frame, as the run found it: a mesh cache beside the .blend
+    one_skin: bool = False  # also the skin of the rest pose as one watertight mesh
     implicit: bool = False  # also the implicit surface itself, in the middle frame
     field: str = EXPONENTIAL.name  # of its balls, one of core.body.fields.POTENTIALS
     rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
@@ -308,6 +309,11 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
         skin_object.hide_set(True)  # it lies in the metaballs' or the exact skin's surface
         skin_object.hide_render = True
         counts["skin faces"] = len(skin_object.data.polygons)
+    if options.one_skin:
+        whole = one_skin.add_one_skin(collection, armature_object, shape)
+        whole.hide_set(True)
+        whole.hide_render = True
+        counts["faces of the skin in one piece"] = len(whole.data.polygons)
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
         counts["frames of motion"] = len(motion.frames)

@@ -13,8 +13,8 @@ from ...core.progress import Monitor
 SPACING_M = 0.005
 
 
-def implicit_surface(shape: BodyShape, motion: np.ndarray, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL
-                     ) -> tuple[np.ndarray, np.ndarray]:
+def implicit_surface(shape: BodyShape, motion: np.ndarray, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL,
+                     spacing_m: float = SPACING_M) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) and quads (K, 4) of the surface F = ½ of the body in one posture, `motion` (D,) rad and metres.
 
     To 0.4 mm, from a grid of 5 mm.
@@ -24,11 +24,11 @@ def implicit_surface(shape: BodyShape, motion: np.ndarray, monitor: Monitor | No
         Cancelled: the monitor was cancelled.
     """
     openvdb = _openvdb()
-    sampled = field_grid(shape, motion, SPACING_M, monitor, potential)
+    sampled = field_grid(shape, motion, spacing_m, monitor, potential)
     grid = openvdb.FloatGrid()
     grid.copyFromArray(THRESHOLD - sampled.values)  # a level set: negative inside
     points, quads = grid.convertToQuads(0.0)
-    return sampled.origin_m + SPACING_M * points, quads
+    return sampled.origin_m + spacing_m * points, quads
 
 
 def add_implicit(collection: bpy.types.Collection, surface: tuple[np.ndarray, np.ndarray], frame: int, potential: Potential = EXPONENTIAL

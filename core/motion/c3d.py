@@ -144,7 +144,7 @@ def read_c3d(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
     if len(data) < 2 * BLOCK or data[1] != 0x50 or data[0] < 2:
-        raise InputError(f"{path} is not a C3D file.")
+        raise InputError(f"{path} is not a C3D file; export it again.")
     try:
         return _read(data, path, rotation, unit)
     except (struct.error, IndexError, ValueError, KeyError, UnicodeDecodeError) as error:

@@ -78,6 +78,33 @@ def test_the_implicit_surface_is_that_of_the_field(empty: ModuleType, small_run:
         build_scene(small_run.out, options=SceneOptions(implicit=True, field="Shan"))
 
 
+def test_the_skin_in_one_piece(empty: ModuleType) -> None:
+    """Closed, in one piece, faces outwards, on the surface; the shares of the bones go over the borders of the parts without a jump."""
+    import bmesh
+
+    from tricap.addon.scene import armature, one_skin
+    from tricap.core.body import one_skin as core
+
+    shape = default_shape(read_model("full"))
+    body = armature.add_armature(empty.context.scene.collection, shape)
+    whole = one_skin.add_one_skin(empty.context.scene.collection, body, shape)
+    mesh = bmesh.new()
+    mesh.from_mesh(whole.data)
+    assert all(edge.is_manifold and edge.is_contiguous for edge in mesh.edges) and mesh.calc_volume(signed=True) > 0.03
+    assert len(mesh.verts) - len(mesh.edges) + len(mesh.faces) == 2  # one surface without handles
+    mesh.free()
+    points = np.array([v.co for v in whole.data.vertices])
+    rest = np.zeros(len(shape.skeleton.dof_names))
+    assert np.linalg.norm(core.onto_surface(shape, rest, points) - points, axis=1).max() < 3e-4
+    weights = np.zeros((len(points), len(whole.vertex_groups)))
+    for vertex in whole.data.vertices:
+        for member in vertex.groups:
+            weights[vertex.index, member.group] = member.weight
+    assert np.abs(weights.sum(axis=1) - 1).max() < 0.05
+    ends = np.array([edge.vertices for edge in whole.data.edges])
+    assert np.abs(weights[ends[:, 0]] - weights[ends[:, 1]]).max() < 0.3
+
+
 def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:
     from tricap.addon.scene.build import build_scene
     from tricap.core.geometry.rig import Rig, write_rig
