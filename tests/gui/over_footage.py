@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import display
 import drive
 import numpy as np
 
@@ -68,7 +69,7 @@ def clicked(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
     session = running[0].session
     for name, at in joints.items():
         drive.check(session.name == name, f"it is the turn of {name}")
-        yield from drive.click(*drive.image_place(views()["L"], *at["L"]))
+        yield from drive.click(*display.image_place(views()["L"], *at["L"]))
         yield from drive.wait_for(lambda: len(session.proposals) == 2, 20, f"{name} is proposed in the other views")
         for view, offer in session.proposals.items():
             away = float(np.linalg.norm(offer.xy_px - at[view]))
@@ -85,7 +86,7 @@ def clicked(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
 
 def dragged(session: Any, at: dict[str, list[float]]) -> drive.Steps:
     """G moves the click, and the proposals follow; Backspace and a click put it back."""
-    before, (x, y) = session.clicks()["L"].copy(), drive.image_place(views()["L"], *at["L"])
+    before, (x, y) = session.clicks()["L"].copy(), display.image_place(views()["L"], *at["L"])
     yield from drive.key("G")
     yield from drive.move(x + 8, y)
     yield from drive.move(x + 16, y)
@@ -103,7 +104,7 @@ def a_keyframe(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
     yield from drive.press(area, "tricap.click_joints")
     for view in "LR":
-        yield from drive.click(*drive.image_place(views()[view], *joints["shoulder.R"][view]))
+        yield from drive.click(*display.image_place(views()[view], *joints["shoulder.R"][view]))
     yield from drive.key("ESC")
     yield from drive.wait_for(lambda: not running, 10, "Esc ends clicking")
     said = project.table(bpy.context.scene)
@@ -119,15 +120,20 @@ def watched() -> drive.Steps:
     scene.frame_set(2)
     shown = scene.tricap_overlay
     yield from drive.settle()
-    plain = drive.pixels()
+    plain = display.pixels()
     shown.which_points = "both"
     for name in ("points", "tracks", "graph"):
         setattr(shown, name, True)
         yield from drive.settle()
-        drive.check((drive.pixels() != plain).any(axis=2).sum() > 500, f"{name} are seen")
+        drive.check((display.pixels() != plain).any(axis=2).sum() > 500, f"{name} are seen")
         yield from drive.shot(f"2_{name}")
         setattr(shown, name, False)
-    shown.tracks = True
+    with bpy.context.temp_override(window=drive.window()):
+        bpy.ops.tricap.open_views(show="tracks")
+    yield from drive.wait_for(lambda: drive.region_of(views()["R"], "UI").width > 1, 20, "the views open with the switches beside them")
+    drive.check(shown.tracks, "and with the trajectories")
+    yield from drive.shot("2_opened_with_tracks")
+    views()["R"].spaces.active.show_region_ui = False
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
     yield from drive.press(area, "tricap.look_closer")
     yield from drive.move(*track_place("R"))
@@ -148,7 +154,7 @@ def track_place(view: str) -> tuple[float, float]:
     xy, status = history.at(run.cameras[view], 2)
     near = np.linalg.norm(xy[:, None] - points.xy_px[None, :, list(run.cameras).index(view)], axis=2).min(axis=1)
     row = int(np.flatnonzero((status == 1) & (near < 2))[5])
-    return drive.image_place(views()[view], *xy[row])
+    return display.image_place(views()[view], *xy[row])
 
 
 def corrected() -> drive.Steps:
@@ -164,7 +170,7 @@ def corrected() -> drive.Steps:
     yield from drive.wait_for(lambda: taken() == 1, 10, "a trajectory is taken out")
     yield from drive.press(area, "tricap.remove_region")
     for x, y in ((220, 120), (300, 120), (300, 200)):
-        yield from drive.click(*drive.image_place(views()["R"], x, y))
+        yield from drive.click(*display.image_place(views()["R"], x, y))
     yield from drive.key("RET")
     yield from drive.wait_for(lambda: taken() == 2, 10, "a region is taken out")
     yield from drive.shot("4_corrected")

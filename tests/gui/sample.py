@@ -4,6 +4,7 @@ import os
 import time
 
 import bpy
+import display
 import drive
 
 ESC_S = 1.0
@@ -37,7 +38,7 @@ def stopped_by_esc(area: bpy.types.Area) -> drive.Steps:
     yield from drive.key("ESC")
     yield from drive.wait_for(lambda: not bpy.context.window_manager.tricap.running, 30, "Esc ends the job")
     took = time.monotonic() - pressed
-    drive.check(took < ESC_S * drive.slowness(), f"Esc took {took:.2f} s")
+    drive.check(took < ESC_S * display.slowness(), f"Esc took {took:.2f} s")
     drive.check(set(bpy.data.objects.keys()) == before, "the scene is as it was")
     yield from drive.settle()
     drive.check(any("Stopped" in line for line in drive.reports()), "the message says that it was stopped")

@@ -7,11 +7,13 @@ on a machine that does other work, too: how much longer they are than without a 
 import time
 
 import bpy
+import display
 import drive
 import numpy as np
 
 SIZE = (640, 480)
 GAP_S = 0.1  # a person does not notice
+BUSY = 2.0  # jobs for each core: from there on the window waits longer for its turn than for Python
 RARELY = 0.01  # of the gaps may be longer
 LONGEST_S = 0.5  # on a machine that does nothing else
 ESC_S = 1.0
@@ -19,13 +21,13 @@ ESC_S = 1.0
 
 def steps() -> drive.Steps:
     yield from drive.sidebar("VIEW_3D", "Tricap")
-    with drive.Pulse() as idle:
+    with display.Pulse() as idle:
         yield from drive.pause(5)
     drive.say("without a job:", idle)
     state, seen, gaps = bpy.context.window_manager.tricap, [], []
     for _ in range(20):
         begin()
-        with drive.Pulse() as busy:
+        with display.Pulse() as busy:
             yield from drive.wait_for(lambda: state.stage not in ("", "Starting", *seen) or not state.running, 200, "another stage")
             stage = state.stage
             yield from drive.pause(1.5)
@@ -38,20 +40,21 @@ def steps() -> drive.Steps:
         yield from drive.key("ESC")
         yield from drive.wait_for(lambda: not state.running, 30, f"Esc ends the job during {stage}")
         took = time.monotonic() - pressed
-        drive.check(took < ESC_S * drive.slowness(), f"Esc during {stage} took {took:.2f} s (load {drive.slowness():.1f} of each core)")
+        drive.check(took < ESC_S * display.slowness(), f"Esc during {stage} took {took:.2f} s (load {display.slowness():.1f} of each core)")
     judge(np.concatenate(gaps[: len(seen)]), idle.gaps_s())  # the making of the scene, which follows, is Blender's own thread's
     drive.check(len(seen) > 2, f"stopped by Esc in {', '.join(seen)}")
 
 
 def judge(running: np.ndarray, idle: np.ndarray) -> None:
     """What the gaps with a job are longer than those without."""
+    most = GAP_S * max(1.0, display.slowness() / BUSY)
     for share in (95, 99):
         late = np.percentile(running, share) - np.percentile(idle, share)
-        drive.check(late < GAP_S, f"a job holds the window up by {late * 1e3:.0f} ms ({share} %)")
+        drive.check(late < most, f"a job holds the window up by {late * 1e3:.0f} ms ({share} %)")
     often = (running > GAP_S).mean() - (idle > GAP_S).mean()
     drive.check(often < RARELY, f"by more than {GAP_S * 1e3:.0f} ms in {often:.2%} of {len(running)} gaps")
     longest = running.max() - idle.max()
-    drive.check(longest < LONGEST_S * drive.slowness(), f"and at the longest by {longest * 1e3:.0f} ms")
+    drive.check(longest < LONGEST_S * display.slowness(), f"and at the longest by {longest * 1e3:.0f} ms")
 
 
 def begin() -> None:

@@ -27,7 +27,7 @@ def run_script(root: Path, package: Path, script: Path, out: Path, limit_s: floa
     """
     with _shared_folder(root) as folder:
         inside = Path("/") / folder.relative_to(root)
-        for source in (DRIVER, script, *script.parent.glob("[a-z]*.py")):
+        for source in (*DRIVER.parent.glob("[a-z]*.py"), script, *script.parent.glob("[a-z]*.py")):
             shutil.copy(source, folder)
         if data is not None:
             (shutil.copytree if data.is_dir() else shutil.copy)(data, folder / "data" / data.name)
@@ -104,6 +104,6 @@ def _ended(blender: "subprocess.Popen[bytes]", limit_s: float) -> int:
             return blender.wait(1.0)
         except subprocess.TimeoutExpired:
             now = time.monotonic()
-            spent += (now - before) / max(1.0, os.getloadavg()[0] / len(os.sched_getaffinity(0)))
+            spent += (now - before) / max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
             before = now
     return TIMED_OUT

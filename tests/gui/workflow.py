@@ -9,6 +9,7 @@ from pathlib import Path
 
 import addon_utils
 import bpy
+import display
 import drive
 from bl_ext.user_default.tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from bl_ext.user_default.tricap.core.take import read_take
@@ -83,7 +84,7 @@ def seeds(wanted: Joints) -> drive.Steps:
     for name, at in wanted.items():
         for area in clip_areas():
             x, y = at[view_of(area)]
-            yield from drive.click(*drive.image_place(area, x + beside(rng), y + beside(rng)))
+            yield from drive.click(*display.image_place(area, x + beside(rng), y + beside(rng)))
             yield from drive.pause(0.5)
             if name == "elbow.R" and area == clip_areas()[0]:
                 yield from drive.pause(3)
@@ -114,7 +115,7 @@ def check_clicks(wanted: Joints) -> None:
     """Each joint is clicked in each view, as close as it was meant to be; one screen pixel more is allowed."""
     for view in bpy.context.scene.tricap.views:
         size, tracks, areas = view.clip.size, view.clip.tracking.tracks, {view_of(a): a for a in clip_areas()}
-        pixel = 1 / drive.pixel_of(areas[view.name])
+        pixel = 1 / display.pixel_of(areas[view.name])
         for name, at in wanted.items():
             co = tracks[name].markers[0].co if name in tracks else (0.0, 0.0)
             off = max(abs(co[0] * size[0] - 0.5 - at[view.name][0]), abs((1 - co[1]) * size[1] - 0.5 - at[view.name][1]))
