@@ -78,7 +78,8 @@ def draw_next(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         sentence(box, context, "Everything is done. Play the animation with the space bar.", "CHECKMARK")
     else:
         number = STEPS.index(now.next)
-        sentence(box, context, f"Next: {number + 1} {TITLES[number]}", "FORWARD")
+        plays = ". The space bar plays the motion." if now.next == STEPS[-1] else ""
+        sentence(box, context, f"Next: {number + 1} {TITLES[number]}{plays}", "FORWARD")
     if now.next in STAGE:
         box.operator("tricap.run", icon="FF", text="Do Everything That Is Missing")
 
