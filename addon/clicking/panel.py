@@ -45,7 +45,7 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         if scene.frame_current == first:
             layout.label(text=f"Frame {first}: the first clicks", icon="KEYTYPE_KEYFRAME_VEC")
         else:
-            layout.label(text=f"Frame {scene.frame_current}: clicks add a keyframe", icon="KEYTYPE_EXTREME_VEC")
+            layout.label(text=f"Frame {scene.frame_current}: for a keyframe", icon="KEYTYPE_EXTREME_VEC")
             layout.operator("tricap.go_to_frame", text=f"To the First Clicks ({first})").frame = first
 
     def _draw_joints(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
