@@ -7,7 +7,8 @@
 
 (2) with A = 1 is the rule q_t = R_rest,t⁻¹ R_rest,s q_s R_rest,s⁻¹ R_rest,t of equal rest poses; A makes it hold for any two. By (4) the
 directions of limbs agree exactly; feet get A by their heading only, since what matters of a foot is that its sole is level. Torso
-parts keep their rest posture: A = A_body. Chains of another number of bones get D interpolated along their length.
+parts keep their rest posture: A = A_body. Of chains that bend, the bones of the shorter one go to the bones of the longer one that end
+nearest to theirs, so that they return; what lies between gets D interpolated along the length.
 """
 
 from collections.abc import Mapping, Sequence
@@ -114,7 +115,7 @@ def turn(motion: Motion, source_map: RigMap, target: Rig, target_map: RigMap, al
     for role, A in aligned.items():
         nodes = _nodes(motion.rig, source_map, role, since_rest)
         chain = [target.index[name] for name in target_map.bones[role]]
-        fractions = _fractions(target, chain) if part_of(role) in SPREAD else np.ones(len(chain))
+        fractions = _spread_over(nodes[0][1:], _fractions(target, chain)) if part_of(role) in SPREAD else np.ones(len(chain))
         for bone, fraction in zip(chain, fractions):
             wanted[bone] = _at(nodes, fraction) @ A @ target.R_rest[bone]
     _point(motion, source_map, target, target_map, wanted)
@@ -149,6 +150,23 @@ def _fractions(rig: Rig, chain: list[int]) -> np.ndarray:
     if length.sum() < 1e-9 or (length < 1e-9).any():
         length = np.ones(len(chain))
     return np.cumsum(length) / length.sum()
+
+
+def _spread_over(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Where on the source's chain each of the target's bones has its rotation from; both by where their bones end (0…1]."""
+    if len(target) < len(source):
+        return source[_partners(target, source)]
+    partners = _partners(source, target)
+    return np.asarray(np.interp(target, np.concatenate([[0.0], target[partners]]), np.concatenate([[0.0], source])))
+
+
+def _partners(few: np.ndarray, many: np.ndarray) -> list[int]:
+    """Which of `many` rising numbers goes with each of `few`: the nearest, each once, in order; the last with the last."""
+    partners: list[int] = []
+    for i, place in enumerate(few):
+        first, stop = partners[-1] + 1 if partners else 0, len(many) - (len(few) - 1 - i)
+        partners.append(first + int(np.abs(many[first:stop] - place).argmin()))
+    return partners[:-1] + [len(many) - 1]
 
 
 def _at(nodes: Nodes, fraction: float) -> np.ndarray:

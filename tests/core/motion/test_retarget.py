@@ -65,6 +65,31 @@ def test_there_and_back_again(other: str) -> None:
     np.testing.assert_allclose(rise, np.broadcast_to((0.0, 0.0, rise[0, 0, 2]), rise.shape), atol=1e-6)
 
 
+@pytest.mark.parametrize("own", [1, 3])
+def test_spines_return_from_one_of_as_many_bones_or_more(own: int) -> None:
+    """Cut at other places; of a spine on one of fewer bones only some can return."""
+    mine = in_three(person(roll_seed=1), 0.2, 0.5) if own == 3 else person(roll_seed=1)
+    source, rig = flail(mine), in_three(person(size=0.7), 0.4, 0.9)
+    maps = find_map(source.rig), find_map(rig)
+    assert (len(maps[0].bones["spine"]), len(maps[1].bones["spine"])) == (own, 3)
+    there = retarget(source, maps[0], rig, maps[1], feet_settings=OFF)
+    back = retarget(there.motion, maps[1], source.rig, maps[0], feet_settings=OFF)
+    assert np.degrees(angle_of(transposed(source.R) @ back.motion.R)).max() < BACK_DEG
+
+
+def in_three(rig: Rig, first: float, second: float) -> Rig:
+    """The spine cut at two parts of its length."""
+    b = rig.index["spine"]
+    cuts = rig.head_m[b] + np.array([[0.0], [first], [second], [1.0]]) * (rig.tail_m[b] - rig.head_m[b])
+    after = np.where(rig.parents >= b, rig.parents + 2, rig.parents)[b + 1:]
+    return Rig(names=(*rig.names[:b], "spine", "spine_2", "spine_3", *rig.names[b + 1:]),
+               parents=np.concatenate([rig.parents[:b + 1], [b, b + 1], after]),
+               R_rest=np.insert(rig.R_rest, [b, b], rig.R_rest[b], axis=0),
+               head_m=np.concatenate([rig.head_m[:b], cuts[:3], rig.head_m[b + 1:]]),
+               tail_m=np.concatenate([rig.tail_m[:b], cuts[1:], rig.tail_m[b + 1:]]),
+               connected=np.zeros(len(rig.names) + 2, dtype=bool), inherits_rotation=np.ones(len(rig.names) + 2, dtype=bool))
+
+
 def split_limbs(rig: Rig, *, beside: bool) -> Rig:
     """Forearms, shins, upper arms and thighs with a twist bone on their outer half; or cut in two, what follows hanging on the second."""
     names, parents = list(rig.names), list(rig.parents)
