@@ -269,9 +269,10 @@ def adjust(
     unit_px: float = 0.1,
     max_iterations: int = 15,
     tolerance: float = CONVERGED,
+    damping: float = DAMPING,
 ) -> Adjusted:
     """Levenberg–Marquardt on (2) from a start; `used` (N, C, 2) says which image points take part."""
-    damping, iterations, converged = DAMPING, 0, False
+    iterations, converged = 0, False
     v = residuals(network, xy_px)
     weight, cost = weights_of(v, cauchy_px, used)
     cost += pseudo_cost(network, unknowns, unit_px)
