@@ -11,7 +11,7 @@ import numpy as np
 
 from .body.model_file import read_model
 from .body.skeleton import Skeleton
-from .fitting.fit_input import EmptyView
+from .fitting.fit_input import EmptyView, Packed
 from .geometry.camera import Camera
 from .images.background import Background, still_background
 from .progress import Monitor
@@ -32,7 +32,7 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
     """
     frames = np.array([cloud.frame for cloud in clouds])
     backgrounds = still_backgrounds(footage, frames)
-    distances: list[list[np.ndarray]] = [[] for _ in backgrounds]
+    distances = [Packed() for _ in backgrounds]
     if any(b is None for b in backgrounds):
         return []
     known = [b for b in backgrounds if b is not None]
@@ -43,7 +43,7 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
             empty = _coarse(known[k].shown_by(image)) & ~persons[k] & ~_near(camera, cloud.xyz_m, persons[k].shape)
             far = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) * (STEP_PX / UNIT_PX)
             distances[k].append(np.minimum(far, 255).astype(np.uint8))
-    return [EmptyView(view=view.name, frame=frames, distance=np.stack(d), step_px=STEP_PX, unit_px=UNIT_PX)
+    return [EmptyView(view=view.name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
             for view, d in zip(footage.take.views, distances)]
 
 

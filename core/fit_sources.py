@@ -37,12 +37,13 @@ def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Traj
     Raises:
         InputError: a table of contours or keypoints cannot be read.
     """
-    take = footage.take
+    take, frames = footage.take, [c.frame for c in clouds]
     return FitInput(
         rig=footage.rig,
         model=str(take.body_model),
         clouds=clouds,  # type: ignore[arg-type]
-        time_s=np.array([c.frame for c in clouds]) / take.fps,
+        frames=frames,
+        time_s=np.array(frames) / take.fps,
         clicks=clicks_in(footage),
         click_frame=take.seeds.frame,
         trajectories=trajectories,  # type: ignore[arg-type]

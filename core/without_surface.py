@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from .empty_sources import STEP_PX, UNIT_PX, find_empty, still_backgrounds
-from .fitting.fit_input import EmptyView
+from .fitting.fit_input import EmptyView, Packed
 from .fitting.settings import FitSettings
 from .images.background import Background
 from .inspection import read_contours
@@ -86,8 +86,8 @@ def outside_outlines(footage: Footage, outlines: dict[str, dict[int, np.ndarray]
     """Where the views show no part of the person: outside of the outline."""
     found = []
     for name, polygons in outlines.items():
-        tables = [_distances(filled(xy, footage.rig[name].size_px)) for xy in polygons.values()]
-        found.append(EmptyView(view=name, frame=np.array(list(polygons)), distance=np.stack(tables), step_px=STEP_PX, unit_px=UNIT_PX))
+        tables = Packed(_distances(filled(xy, footage.rig[name].size_px)) for xy in polygons.values())
+        found.append(EmptyView(view=name, frame=np.array(list(polygons)), distance=tables, step_px=STEP_PX, unit_px=UNIT_PX))
     return found
 
 

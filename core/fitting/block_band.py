@@ -56,12 +56,44 @@ class NormalEquations:
         s = np.linalg.solve(schur, self.h - np.einsum("tds,td->s", self.border, free)) if len(self.h) else np.zeros(0)
         return free - V @ s, s
 
-    def covariance(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Blocks of the inverse: pose (T, D, D), pose with shape (T, D, S), shape (S, S)."""
+    def covariance(self, shape: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Blocks of the inverse: pose (T, D, D), pose with shape (T, D, S), shape (S, S).
+
+        With a covariance of the `shape` from elsewhere, what the poses are for it.
+        """
         V = Factor(self, 0.0).solve(self.border)
-        shape = np.linalg.inv(self.corner - np.einsum("tds,tdr->sr", self.border, V)) if len(self.h) else self.corner
+        if shape is None:
+            shape = np.linalg.inv(self.corner - np.einsum("tds,tdr->sr", self.border, V)) if len(self.h) else self.corner
         mixed = -V @ shape
         return inverse_blocks(self) - mixed @ V.transpose(0, 2, 1), mixed, shape
+
+
+def reversed_in_time(equations: NormalEquations) -> NormalEquations:
+    """The same equations with the last frame first."""
+    e = equations
+    return NormalEquations(diagonal=e.diagonal[::-1], next1=e.next1[::-1].transpose(0, 2, 1), next2=e.next2[::-1].transpose(0, 2, 1),
+                           border=e.border[::-1], corner=e.corner, g=e.g[::-1], h=e.h)
+
+
+def eliminated(equations: NormalEquations, frames: int) -> NormalEquations:
+    """What is left of the equations when the first `frames` are eliminated; `frames` is at most T − 2."""
+    e = equations
+    A, C, border, g = e.diagonal.copy(), e.next1.copy(), e.border.copy(), e.g.copy()
+    corner, h, D = e.corner.copy(), e.h.copy(), e.g.shape[1]
+    for t in range(frames):
+        below = np.concatenate([C[t], e.next2[t]])  # what couples frames t + 1 and t + 2 (rows) with t
+        K = np.linalg.solve(A[t], np.concatenate([below.T, border[t], g[t][:, None]], axis=1))
+        ahead, shape, free = K[:, : 2 * D], K[:, 2 * D : -1], K[:, -1]
+        less = below @ ahead
+        A[t + 1] -= less[:D, :D]
+        A[t + 2] -= less[D:, D:]
+        C[t + 1] -= less[D:, :D]
+        border[t + 1 : t + 3] -= (below @ shape).reshape(2, D, -1)
+        g[t + 1 : t + 3] -= (below @ free).reshape(2, D)
+        corner -= border[t].T @ shape
+        h -= border[t].T @ free
+    return NormalEquations(diagonal=A[frames:], next1=C[frames:], next2=e.next2[frames:], border=border[frames:], corner=corner,
+                           g=g[frames:], h=h)
 
 
 class Factor:

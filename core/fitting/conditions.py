@@ -1,7 +1,7 @@
 """What stays the same throughout one fit: the model, the clicks, what is believed beforehand, and how points become observations."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
@@ -46,6 +46,12 @@ class Conditions:
     silhouettes: Silhouettes
     empty: EmptyViews
     limbs: LimbsApart
+
+    def stretch(self, frames: Sequence[int]) -> "Conditions":
+        """The same for some of the frames, which count from 0 then; only `click` stays the index in the recording."""
+        parts = {name: getattr(self, name).stretch(frames) for name in ("tracks", "silhouettes", "empty")}
+        clicked = {i: self.clicked[t] for i, t in enumerate(frames) if t in self.clicked}
+        return replace(self, clicked=clicked, **parts)
 
     def beliefs(self, state: BodyState) -> list[Observation]:
         """What is known of any posture: limits, beliefs, and that limbs are no ghosts."""

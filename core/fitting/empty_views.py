@@ -3,6 +3,9 @@
 Only limbs whose posture must be seen: a hand that the model holds straight would pull its forearm.
 """
 
+from collections.abc import Sequence
+from copy import copy
+
 import numpy as np
 
 from .fit_input import FitInput
@@ -26,6 +29,12 @@ class EmptyViews:
         self._fraction = np.tile(ALONG, len(limbs))
         self._given, self._sigma_px = (given.empty if settings.use_background else ()), settings.empty_sigma_px
         self._rig, self._frames = given.rig, given.frames
+
+    def stretch(self, frames: Sequence[int]) -> "EmptyViews":
+        """Those of some of the frames."""
+        part = copy(self)
+        part._frames = [self._frames[t] for t in frames]
+        return part
 
     def observe(self, t: int) -> list[EmptySpace]:
         """What is empty in frame index `t`; nothing where that is not known."""

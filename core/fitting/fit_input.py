@@ -1,7 +1,9 @@
 """What a fit is made from, in one value: clouds, trajectories, contours, clicks, keypoints, and what the user knows about the joints."""
 
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import overload
 
 import numpy as np
 
@@ -50,6 +52,33 @@ class JointPlaces:
             raise ValueError("every place needs its joint")
 
 
+class Packed(Sequence[np.ndarray]):
+    """Small images (h, w) uint8 of one size, compressed: a long recording has many, and they are mostly flat."""
+
+    def __init__(self, images: Iterable[np.ndarray] = ()) -> None:
+        self._images: list[bytes] = []
+        self._size = (0, 0)
+        for image in images:
+            self.append(image)
+
+    def append(self, image: np.ndarray) -> None:
+        """One more."""
+        self._size = image.shape
+        self._images.append(zlib.compress(np.ascontiguousarray(image, dtype=np.uint8), 1))
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[np.ndarray]: ...
+    def __getitem__(self, index: int | slice) -> np.ndarray | list[np.ndarray]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return np.frombuffer(zlib.decompress(self._images[index]), np.uint8).reshape(self._size)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class EmptyView:
     """How far every place of a view is from the nearest pixel that may show the person: 0 inside the person's outline.
@@ -59,13 +88,12 @@ class EmptyView:
 
     view: str
     frame: np.ndarray  # (T,) the take's frame numbers
-    distance: np.ndarray  # (T, h, w) uint8
+    distance: Packed  # T of (h, w)
     step_px: int
     unit_px: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frame", frozen(self.frame, (None,), np.int64, "frame"))
-        object.__setattr__(self, "distance", frozen(self.distance, (len(self.frame), None, None), np.uint8, "distance"))
+        object.__setattr__(self, "frame", frozen(self.frame, (len(self.distance),), np.int64, "frame"))
 
     def of_frame(self, frame: int) -> np.ndarray | None:
         """(h, w) of one frame; None if it is not known."""
@@ -89,6 +117,7 @@ class FitInput:
     empty: Sequence[EmptyView] = ()
     locked: Sequence[str] = ()  # degrees of freedom that are held at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # rad, by degree of freedom
+    frames: Sequence[int] = ()  # the take's numbers (T); without them they are read from the clouds
 
     def __post_init__(self) -> None:
         times = np.asarray(self.time_s, dtype=np.float64)
@@ -96,11 +125,7 @@ class FitInput:
             raise InputError(f"The fit needs a growing time for each of the {len(self.clouds)} frames; "
                              "check the frame rate and the frames of the take.")
         object.__setattr__(self, "time_s", frozen(times, times.shape))
+        object.__setattr__(self, "frames", [int(f) for f in self.frames or (cloud.frame for cloud in self.clouds)])
         for frame in self.clicks:
             if frame not in self.frames:
                 raise InputError(f"The joints are clicked in frame {frame}, which was not measured; measure it, or click in another frame.")
-
-    @property
-    def frames(self) -> list[int]:
-        """The take's frame numbers (T)."""
-        return [int(cloud.frame) for cloud in self.clouds]

@@ -6,6 +6,7 @@ keeps the prediction, and the next is tried from both. A limb that nothing shows
 and is looked for in a wider and wider gate, so that it is found where it comes out.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,15 +25,15 @@ from .way import KEEP_EVERY, Kept, Way
 
 LOST_SUPPORT = 0.6  # a frame with a smaller share of its neighbour's support is tried again
 COASTING = 5  # after so many frames without points the prediction stands still
-REACH_M = 0.20  # of the points looked at in one frame; half of it is kept for the adjustment of the sequence
+REACH_M = 0.20  # of the points looked at in one frame
 MOST_POINTS = 1000  # of a frame: enough for a start of the adjustment over the sequence
 SLOWING = 0.7  # per frame, of what is not seen
 WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per frame, and at most
 
 
-def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first: Solution, tracks: MaterialTracks | None,
-           monitor: Monitor, kept: Kept | None = None) -> tuple[np.ndarray, list[CloudPoints], np.ndarray]:
-    """Motion (T, D) of all frames, the points near the body in each, and where each DOF (T, D) was seen."""
+def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, first: Solution, tracks: MaterialTracks | None,
+           monitor: Monitor, kept: Kept | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Motion (T, D) of all frames, and where each DOF (T, D) was seen."""
     fit, T = replace(fit, priors=lasting(fit.priors, time_s)), len(points)  # the frame before has said them already
     motion = np.full((T, first.motion.shape[1]), np.nan)
     motion[fit.click] = first.motion[0]
@@ -50,8 +51,7 @@ def follow(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, first
             kept.save(way.arrays())
     if tracks is not None:
         tracks.forget()  # a fit that went on from a checkpoint knows less of them
-    states = fit.parameters.states(way.motion, first.vector)
-    return way.motion, [crop(p, state, REACH_M / 2) for p, state in zip(points, states)], way.known
+    return way.motion, way.known
 
 
 def _step(fit: Conditions, way: Way, t: int, direction: int, points: CloudPoints, time_s: np.ndarray, first: Solution,

@@ -5,6 +5,7 @@ the hip: the sigmas say so, and gross errors lose their weight.
 """
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -26,6 +27,12 @@ class JointTracks:
         self._crowding = max(1.0, LASTS_S / step)
         self._tables = [(table, np.array([self._names.index(j) if j in self._names else -1 for j in table.joint], dtype=np.intp))
                         for table in given.keypoints]
+
+    def stretch(self, frames: Sequence[int]) -> "JointTracks":
+        """Those of some of the frames."""
+        part = copy(self)
+        part._frames = [self._frames[t] for t in frames]
+        return part
 
     def observe(self, t: int) -> list[Observation]:
         """What is known of the joints in frame index `t`."""

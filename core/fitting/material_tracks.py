@@ -1,6 +1,7 @@
 """Trajectories as the fit sees them: for each pair of successive frames the points that were seen in both, thinned, on their limbs."""
 
 from collections.abc import Sequence
+from copy import copy
 from functools import partial
 from typing import Protocol
 
@@ -42,6 +43,14 @@ class MaterialTracks:
         self._surface, self._settings = surface, settings
         self._held = HeldSegments()
         self._pairs = [self._pair(t) for t in range(len(frames) - 1)]
+
+    def stretch(self, frames: Sequence[int]) -> "MaterialTracks":
+        """Those of some of the frames; whose each point is is asked anew."""
+        part, none = copy(self), (np.zeros(0, dtype=np.intp), np.zeros(0))
+        part._xyz, part._sigma = [self._xyz[t] for t in frames], [self._sigma[t] for t in frames]
+        part._pairs = [self._pairs[a] if b == a + 1 else none for a, b in zip(frames, frames[1:])]
+        part.forget()
+        return part
 
     def steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
         """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`; None: not yet known)."""

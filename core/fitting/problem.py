@@ -10,10 +10,10 @@ linearisation. Holding the shape while the pose is solved is choosing an empty s
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
-from .acceleration import Acceleration
 from .block_band import NormalEquations
 from .observations import Block, FromBlocks, MaterialSteps, Observation
 from .robust import robust_scale, robust_weights, variance_factor
@@ -41,6 +41,16 @@ class Scales:
         return replace(self, **found)
 
 
+class Smoothness(Protocol):
+    """What ties the frames of a motion (T, D) as a sum of squares that is quadratic in it."""
+
+    def cost(self, motion: np.ndarray) -> float:
+        """The sum of squares."""
+
+    def add_to(self, equations: NormalEquations, motion: np.ndarray) -> None:
+        """Add the normal equations."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Problem:
     """An adjustment. `observe(t, state)` gives frame t's observations, `observe_step(t, a, b)` those from frame t to t + 1."""
@@ -51,7 +61,7 @@ class Problem:
     of_shape: Sequence[Observation] = ()
     of_shape_weight: float = 1.0
     free_shape: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    smoothness: Acceleration | None = None
+    smoothness: Smoothness | None = None
     held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))  # DOFs that keep their values
     robust: str = "geman-mcclure"
     robust_width: float = 3.0

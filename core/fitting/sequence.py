@@ -7,6 +7,8 @@
    Frames whose residuals stay suspicious begin once more from between their neighbours.
 5. Where the complete model is asked for: it is made from that body (`body.complete`), and step 4 is done again with its radii.
 
+A recording of more than `AT_ONCE` frames is adjusted stretch by stretch, so that memory does not grow with its length (`_in_stretches`).
+
 Points, outlines and keypoints are each enough alone.
 
 A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is known of the shape
@@ -14,7 +16,7 @@ beforehand (radii from the model, bone lengths from the click frame) weigh as mu
 one. By default it counts once: a click frame's lengths err by more than a body differs from its balls, and other postures tell of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,17 +29,18 @@ from .acceleration import Acceleration, typical_acceleration
 from .body_motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from .click_frame import clicked_lengths, fit_click_frame
 from .clicks import enough, read_clicks
-from .cloud_points import CloudPoints, thinned
-from .conditions import Conditions
+from .cloud_points import CloudPoints, ThinnedClouds
+from .conditions import NO_SHAPE, Conditions
 from .empty_views import EmptyViews
 from .fit_input import FitInput
 from .frame_to_frame import follow
+from .handed_over import HandedOver, Tied, hand_over
 from .inverse_kinematics import clicked_stature, dof_priors, lasting
 from .joint_tracks import JointTracks
 from .limbs_apart import LimbsApart
 from .material_tracks import MaterialTracks
 from .observations import Observation
-from .problem import Problem, linearise, variance_factors
+from .problem import Problem, Scales, linearise, variance_factors
 from .robust import robust_scale
 from .segmentation import HeldSegments
 from .settings import FitSettings
@@ -45,6 +48,7 @@ from .silhouettes import Silhouettes
 from .solver import Solution, solve
 from .standing_feet import StandingFeet
 from .state import BodyState, ShapeParameters, free_bones
+from .stretches import AT_ONCE, Looked, Recording, joined, near, outwards, sample
 from .way import Kept
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
@@ -67,27 +71,87 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
     fit = conditions(given, settings)
-    points = []
-    for i, cloud in enumerate(given.clouds):
-        monitor.step("thin the clouds", i, len(given.clouds))
-        points.append(thinned(cloud, settings.voxel_m))
+    points: Sequence[CloudPoints] = ThinnedClouds(given.clouds, settings.voxel_m)
+    if len(points) <= AT_ONCE:
+        points = _read(points, monitor)
     first = fit_click_frame(fit, points[fit.click], monitor)
     tracks = None
     if given.trajectories is not None and settings.use_trajectories:
         tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
-    motion, points, known = follow(fit, points, given.time_s, first, tracks, monitor, kept)
+    motion, known = follow(fit, points, given.time_s, first, tracks, monitor, kept)
     sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
-    lengths = clicked_lengths(fit, points[fit.click], first)
-    feet = _standing(fit, motion, first.vector, given.time_s)
-    problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths, feet)
-    solution = solve(problem, motion, first.vector, steps=settings.sequence_steps, monitor=monitor, stage="adjust the sequence")
-    solution = _begun_anew(fit, points, given.time_s, solution, problem, monitor)
-    if settings.balls == "complete":
-        fit = _completed(fit, solution)
-        problem = _whole_sequence(fit, points, given.time_s, sigma, tracks, lengths, feet)
-        solution = solve(problem, solution.motion, fit.parameters.vector(), steps=settings.sequence_steps, scales=solution.scales,
+    every = Recording(fit=fit, frames=given.frames, points=points, time_s=given.time_s, sigma=sigma, tracks=tracks,
+                      lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
+                      feet=_standing(fit, motion, first.vector, given.time_s))
+    return (_at_once if len(points) <= AT_ONCE else _in_stretches)(every, motion, first.vector, monitor)
+
+
+def _read(points: Sequence[CloudPoints], monitor: Monitor) -> list[CloudPoints]:
+    read = []
+    for i in range(len(points)):
+        monitor.step("thin the clouds", i, len(points))
+        read.append(points[i])
+    return read
+
+
+def _at_once(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> BodyFit:
+    """All frames in one adjustment, from a motion (T, D) and a shape vector (S,)."""
+    frames = range(len(motion))
+    part, problem, solution = _adjusted(every.stretch(frames, motion, vector), motion, vector, monitor)
+    covariance = _covariance(problem, solution, _factors(part, problem, solution))
+    return _result(part, _looked(part, solution, covariance, frames), covariance[2], [solution])
+
+
+def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> tuple[Recording, Problem, Solution]:
+    """Postures and shape together; the recording comes back with the complete model where that was asked for."""
+    steps = part.fit.settings.sequence_steps
+    problem = _whole_sequence(part)
+    solution = solve(problem, motion, vector, steps=steps, monitor=monitor, stage="adjust the sequence")
+    solution = _begun_anew(part.fit, part.points, part.time_s, solution, problem, monitor)
+    if part.fit.settings.balls == "complete":
+        part = replace(part, fit=_completed(part.fit, solution))
+        problem = _whole_sequence(part)
+        solution = solve(problem, solution.motion, part.fit.parameters.vector(), steps=steps, scales=solution.scales,
                          monitor=monitor, stage="refine the complete model")
-    return _result(fit, points, given.time_s, solution, problem)
+    return part, problem, solution
+
+
+def _in_stretches(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> BodyFit:
+    """As `_at_once`, with memory for `AT_ONCE` frames and two margins only.
+
+    First the shape, from blocks of frames all over the recording: since a body differs from its model in every frame alike, more would not
+    tell more of it. Then, with that shape held, the postures. Their covariances count what is not known of the shape.
+    """
+    motion, frames = motion.copy(), sample(len(motion), every.fit.click)
+    part, problem, first = _adjusted(every.stretch(frames, motion, vector), motion[frames], vector, monitor)
+    shape, vector = _covariance(problem, first, _factors(part, problem, first))[2], first.vector
+    every = replace(every, fit=replace(every.fit, parameters=part.fit.parameters, settings=part.fit.settings))
+    del part, problem  # their points
+    looked, solutions = _postures(every, motion, vector, shape, monitor)
+    return _result(every, looked, shape, [first, *solutions])
+
+
+def _postures(every: Recording, motion: np.ndarray, vector: np.ndarray, shape: np.ndarray,
+              monitor: Monitor) -> tuple[Looked, list[Solution]]:
+    """The postures from a motion (T, D), with a held shape (S,) of covariance (S, S), stretch after stretch from the click frame on."""
+    looked, solutions, plan = dict[int, Looked](), list[Solution](), outwards(len(motion), every.fit.click)
+    motion, behind = motion.copy(), dict[int, list[HandedOver]]()
+    for k, (own, around, direction) in enumerate(plan):
+        part, told = every.stretch(around, motion, vector), monitor.part("adjust the postures", k, len(plan))
+        known, honest = behind.get(direction, (None, None))
+        problem = _whole_sequence(part, known)
+        held = replace(problem, free_shape=NO_SHAPE)
+        solution = solve(held, motion[around], vector, steps=part.fit.settings.sequence_steps, monitor=told)
+        solution = _begun_anew(part.fit, part.points, part.time_s, solution, held, told)
+        local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, held, solution)
+        covariance = _covariance(_whole_sequence(part, honest), solution, factors, shape)
+        motion[own], looked[own.start] = solution.motion[local], _looked(part, solution, covariance, local)
+        solutions.append(solution)
+        for way in {1, -1} if direction == 0 else {direction}:
+            if own.stop < len(motion) if way > 0 else own.start > 0:
+                behind[way] = [hand_over(problem, solution, local, beside, part.time_s, part.sigma, ahead=way > 0, understated=understated)
+                               for beside, understated in ((known, None), (honest, factors))]
+    return joined([looked[start] for start in sorted(looked)]), solutions
 
 
 def _standing(fit: Conditions, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
@@ -144,10 +208,10 @@ def _loosest(fit: Conditions) -> np.ndarray:
     return sigma
 
 
-def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, sigma: np.ndarray, tracks: MaterialTracks | None,
-                    lengths: tuple[np.ndarray, np.ndarray], feet: StandingFeet | None) -> Problem:
-    s = fit.settings
-    priors = lasting(fit.priors, time_s)
+def _whole_sequence(every: Recording, beside: HandedOver | None = None) -> Problem:
+    """The adjustment of postures and shape, with what frames beside these say."""
+    fit, points, feet = every.fit, every.points, every.feet
+    priors = lasting(fit.priors, every.time_s)
 
     held = HeldSegments()
 
@@ -155,12 +219,14 @@ def _whole_sequence(fit: Conditions, points: list[CloudPoints], time_s: np.ndarr
         return [*fit.seen_surface(t, points[t], state, held=held), *fit.joints(t), *fit.empty.observe(t), *priors,
                 *fit.limbs.observe(state), *(feet.observe(t) if feet is not None else [])]
 
-    problem = fit.problem(observe, "shape", Acceleration(time_s=time_s, sigma=sigma))
-    return replace(problem, of_shape=fit.of_shape(lengths), of_shape_weight=_shared_weight(points, s),
-                   observe_step=None if tracks is None else tracks.steps)
+    problem = fit.problem(observe, "shape", Acceleration(time_s=every.time_s, sigma=every.sigma))
+    if beside is not None:
+        problem = replace(problem, smoothness=Tied(acceleration=Acceleration(time_s=every.time_s, sigma=every.sigma), beside=beside))
+    return replace(problem, of_shape=fit.of_shape(every.lengths), of_shape_weight=_shared_weight(points, fit.settings),
+                   observe_step=None if every.tracks is None else every.tracks.steps)
 
 
-def _shared_weight(points: list[CloudPoints], settings: FitSettings) -> float:
+def _shared_weight(points: Sequence[CloudPoints], settings: FitSettings) -> float:
     """By how much T frames tell less of the shape than T times one frame: 1 for noise of the points alone, T for the model's error."""
     sigmas = np.concatenate([p.sigma_m for p in points])
     own = (float(np.median(sigmas)) if len(sigmas) else 0.0) ** 2 + 1e-12
@@ -168,7 +234,7 @@ def _shared_weight(points: list[CloudPoints], settings: FitSettings) -> float:
     return (own + frames * model) / (own + model)
 
 
-def _begun_anew(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem,
+def _begun_anew(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem,
                 monitor: Monitor) -> Solution:
     """The solution, or that from where frames with suspicious residuals stand between the others, if it explains more of those frames."""
     sigma0 = np.array([_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
@@ -198,39 +264,52 @@ def _strange(sigma0: np.ndarray) -> np.ndarray:
     return np.asarray(np.nan_to_num(sigma0) > SUSPICIOUS * usual)
 
 
-def _result(fit: Conditions, points: list[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem) -> BodyFit:
-    parameters, skeleton = fit.parameters, fit.model.skeleton
-    pose, mixed, shape = _covariance(fit, points, problem, solution)
-    T, J = len(points), len(skeleton.joint_names)
-    joints, joint_sigma = np.empty((T, J, 3)), np.empty((T, J))
-    sigma0 = np.array([_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
-    counts, outline = np.zeros((2, T, len(skeleton.bones)), dtype=np.int64), [np.zeros(0)]
-    for t in range(T):
-        state = parameters.state(solution.motion[t], solution.vector)
-        joints[t], A = state.joint_jacobian
+def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, np.ndarray, np.ndarray], frames: range) -> Looked:
+    """What is told of some of the frames that were adjusted."""
+    fit, points, (pose, mixed, shape) = part.fit, part.points, covariance
+    skeleton = fit.model.skeleton
+    n, J, B = len(frames), len(skeleton.joint_names), len(skeleton.bones)
+    joints, joint_sigma = np.empty((n, J, 3)), np.empty((n, J))
+    sigma0 = np.array([_sigma0(fit, t, points[t], solution) for t in frames])
+    counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
+    for i, t in enumerate(frames):
+        state = fit.parameters.state(solution.motion[t], solution.vector)
+        joints[i], A = state.joint_jacobian
         K = np.block([[pose[t], mixed[t]], [mixed[t].T, shape]])
-        joint_sigma[t] = np.sqrt(np.einsum("jia,ab,jib->j", A, K, A, optimize=True) / 3)
-        counts[0, t] = np.bincount(fit.surface(points[t], state).bone, minlength=len(skeleton.bones))
-        counts[1, t] = fit.evidence(t, points[t], state)
+        joint_sigma[i] = np.sqrt(np.einsum("jia,ab,jib->j", A, K, A, optimize=True) / 3)
+        counts[0, i] = np.bincount(fit.surface(points[t], state).bone, minlength=B)
+        counts[1, i] = fit.evidence(t, points[t], state)
         outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
-    motion = BodyMotion(frames=np.array([p.frame for p in points]), time_s=time_s, dof_names=skeleton.dof_names, values=solution.motion,
-                        covariance=pose, joint_names=skeleton.joint_names, joints_m=joints, joint_sigma_m=joint_sigma,
-                        status=_statuses(fit, counts[1], sigma0), sigma0=sigma0)
-    return BodyFit(shape=parameters.shape(solution.vector, np.sqrt(np.diag(shape))), motion=motion, iterations=solution.iterations,
-                   converged=solution.converged, points=counts[0], outline_m=np.concatenate(outline))
+    return Looked(values=solution.motion[frames], covariance=pose[frames], joints_m=joints, joint_sigma_m=joint_sigma, sigma0=sigma0,
+                  points=counts[0], evidence=counts[1], outline_m=np.concatenate(outline))
 
 
-def _covariance(fit: Conditions, points: list[CloudPoints], problem: Problem,
-                solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks of the covariance: pose (T, D, D), pose with shape (T, D, S), shape (S, S)."""
-    lin = linearise(problem, solution.motion, solution.vector, solution.scales)
-    found = variance_factors(problem, lin, solution.scales)
-    own = [p.sigma_m for p in points if len(p.sigma_m)]
-    wider = _wider(fit.settings, float(np.median(np.concatenate(own))) if own else 0.0)
-    understated = replace(found, points=wider * found.points, contours=wider * found.contours, steps=wider * found.steps)
-    pose, mixed, shape = linearise(problem, solution.motion, solution.vector, solution.scales, understated).equations.covariance()
+def _result(every: Recording, looked: Looked, shape: np.ndarray, solutions: Sequence[Solution]) -> BodyFit:
+    """The body of all frames; `shape` (S, S) is its covariance, and the last of the solutions has its shape."""
+    fit, skeleton = every.fit, every.fit.model.skeleton
+    motion = BodyMotion(frames=np.array(every.frames), time_s=every.time_s, dof_names=skeleton.dof_names, values=looked.values,
+                        covariance=looked.covariance, joint_names=skeleton.joint_names, joints_m=looked.joints_m,
+                        joint_sigma_m=looked.joint_sigma_m, status=_statuses(fit, looked.evidence, looked.sigma0), sigma0=looked.sigma0)
+    return BodyFit(shape=fit.parameters.shape(solutions[-1].vector, np.sqrt(np.diag(shape))), motion=motion,
+                   iterations=max(s.iterations for s in solutions), converged=all(s.converged for s in solutions), points=looked.points,
+                   outline_m=looked.outline_m)
+
+
+def _covariance(problem: Problem, solution: Solution, understated: Scales,
+                shape: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Blocks of the covariance: pose (T, D, D), pose with shape (T, D, S), shape (S, S); the last may be given."""
+    lin = linearise(problem, solution.motion, solution.vector, solution.scales, understated)
+    pose, mixed, shape = lin.equations.covariance(shape)
     pose[:, problem.held] = pose[:, :, problem.held] = mixed[:, problem.held] = 0.0
     return pose, mixed, shape
+
+
+def _factors(part: Recording, problem: Problem, solution: Solution) -> Scales:
+    """By how much the variances of what was seen are understated."""
+    found = variance_factors(problem, linearise(problem, solution.motion, solution.vector, solution.scales), solution.scales)
+    own = [p.sigma_m for p in part.points if len(p.sigma_m)]
+    wider = _wider(part.fit.settings, float(np.median(np.concatenate(own))) if own else 0.0)
+    return replace(found, points=wider * found.points, contours=wider * found.contours, steps=wider * found.steps)
 
 
 def _wider(settings: FitSettings, own_m: float) -> float:

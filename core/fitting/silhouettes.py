@@ -5,7 +5,8 @@ nobody's when it is further from every limb than the gate, when it meets the lim
 faces the other way than the limb.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from .state import BodyState
 SPACING_M = 0.012  # of the rays, at the body
 BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders, the crown and the tips of the feet, where the parts' fields meet
 OUTLINE_PATCHES = 3  # an outline that follows a wrong edge does so for about this many patches of the model's error, in all views alike
+MOST_FRAMES = 500  # whose rays are kept: more than are adjusted at once
 ALIKE = float(np.cos(np.radians(40.0)))  # views that look in directions closer than this show the same outline
 
 
@@ -44,11 +46,19 @@ class Silhouettes:
         self._frames = given.frames
         self._rays: dict[int, Rays | None] = {}
 
+    def stretch(self, frames: Sequence[int]) -> "Silhouettes":
+        """Those of some of the frames; their rays are made when they are asked for."""
+        part = copy(self)
+        part._frames, part._rays = [self._frames[t] for t in frames], {}
+        return part
+
     def observe(self, t: int, state: BodyState, held: HeldSegments | None = None,
                 wide: np.ndarray | float = 1.0) -> list[SilhouetteRays]:
         """The rays of frame index `t` that touch a limb of the body near its state; `wide` (B,) or for all multiplies the gate."""
         if t not in self._rays:
             self._rays[t] = self._of_frame(t, state)
+            if len(self._rays) > MOST_FRAMES:
+                del self._rays[next(iter(self._rays))]
         rays = self._rays[t]
         if rays is None:
             return []

@@ -3,6 +3,7 @@ whenever it stands, on either foot. World: Z up, and the floor is level; where i
 """
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -30,6 +31,12 @@ class StandingFeet:
                 self.stands[:, j] = _stands(joints_m[:, j], time_s)
             heights = joints_m[:, mine, 2][self.stands[:, mine]]
             self.level_m[mine] = np.median(heights) if len(heights) else 0.0
+
+    def stretch(self, frames: Sequence[int]) -> "StandingFeet":
+        """Those of some of the frames."""
+        part = copy(self)
+        part.stands = self.stands[frames]
+        return part
 
     def observe(self, t: int) -> list[FootOnFloor]:
         """The joints that stand in frame index `t`."""

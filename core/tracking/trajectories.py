@@ -14,7 +14,10 @@ from .settings import TrackingSettings, TrackStatus
 from .tracked import TrackedFrame
 
 SMOOTH_FRAMES = 7
+LOOKED_THROUGH_EVERY = 500  # frames, for points that the table will not hold
 MOST_CELLS = 4_000_000  # frames times trajectories of one table: filtering it takes about 2 GB
+
+Seen = tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # frame, identity, xyz_m, sigma_m, ended, reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -58,8 +61,13 @@ def assemble(steps: Iterable[TrackedFrame], fps: float, smooth_frames: int = SMO
 
     Of a long recording only the longest trajectories are taken, as many as a table of `most_cells` frames times trajectories can hold.
     """
-    seen = [(s.frame, s.identity, s.xyz_m, np.sqrt(np.trace(s.covariance_m2, axis1=1, axis2=2)), s.ended, s.reason) for s in steps]
-    length = np.bincount(np.concatenate([identity for _, identity, *_ in seen])) if seen else np.zeros(0, dtype=np.int64)
+    seen, born = list[Seen](), 0
+    for s in steps:
+        seen.append((s.frame, s.identity, s.xyz_m, np.sqrt(np.trace(s.covariance_m2, axis1=1, axis2=2)), s.ended, s.reason))
+        born = max(born, int(s.identity.max(initial=-1)) + 1)
+        if len(seen) % LOOKED_THROUGH_EVERY == 0:
+            seen = _promising(seen, most_cells)
+    length = np.bincount(np.concatenate([identity for _, identity, *_ in seen] or [np.zeros(0, dtype=np.int64)]), minlength=born)
     T, N = len(seen), min(len(length), max(1, most_cells // max(1, len(seen))))
     column = np.full(len(length), -1)
     column[np.sort(np.argsort(-length, kind="stable")[:N])] = np.arange(N)
@@ -72,6 +80,19 @@ def assemble(steps: Iterable[TrackedFrame], fps: float, smooth_frames: int = SMO
         status[t, gone[gone >= 0]] = reason[gone >= 0]
     frames = np.array([frame for frame, *_ in seen], dtype=np.int32)
     return replace(with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames), omitted=len(length) - N)
+
+
+def _promising(seen: list[Seen], most_cells: int) -> list[Seen]:
+    """The same frames without the points that ended long ago and are not among the longest, which are all that the table can hold."""
+    if sum(len(identity) for _, identity, *_ in seen) <= most_cells:
+        return seen
+    length = np.bincount(np.concatenate([identity for _, identity, *_ in seen]))
+    keep = np.zeros(len(length), dtype=bool)
+    keep[np.argsort(-length, kind="stable")[: max(1, most_cells // len(seen))]] = True
+    for _, identity, *_ in seen[-LOOKED_THROUGH_EVERY:]:
+        keep[identity] = True
+    return [(frame, identity[keep[identity]], xyz[keep[identity]], sigma[keep[identity]], ended, reason)
+            for frame, identity, xyz, sigma, ended, reason in seen]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -131,14 +131,14 @@ def run(table: dict[str, Any]) -> Iterator[Row]:
 
 
 def memory(rows: list[dict[str, Any]]) -> Iterator[Row]:
-    """The peak of the longest clip that was run, in which a kept picture or cloud a frame would show, and what a fit of 1,000 frames needs.
+    """The peak of the longest clip that was run, in which a kept picture or cloud a frame would show, and what a fit of 20 minutes needs.
 
     What 20 minutes need rests on small differences of the peaks: the benchmark itself prints it.
     """
     for row in rows:
         frames, peak = max((int(n), mb) for n, mb in row["peak_mb"].items())
         if row["stage"] == "fit":
-            yield Row("memory", "1,000 frames of a body, fit [MB]", row["mb_1000_frames"], "memory", "")
+            yield Row("memory", "20 minutes of a body, fit [MB]", row["mb_20_minutes"], "memory", "")
         else:
             yield Row("memory", f"{frames} frames, {row['stage']} [MB]", peak, "memory", "")
 

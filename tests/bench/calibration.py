@@ -1,7 +1,7 @@
 """Calibration: accuracy against the Cramér–Rao bound, speed, memory, random rigs, targets, and peers on the same data in the same run.
 
-Peers are no dependencies: give the Python that has them (gtsam, pycolmap, aniposelib) in the environment variable TRICAP_PEERS; without it they are
-said to be missing. CPU seconds are those of one BLAS thread.
+Peers are no dependencies: give the Python that has them (gtsam, pycolmap, aniposelib) in the environment variable TRICAP_PEERS; without it
+they are said to be missing. CPU seconds are those of one BLAS thread.
 """
 
 import os

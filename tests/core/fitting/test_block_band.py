@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tricap.core.fitting.block_band import NormalEquations
+from tricap.core.fitting.block_band import NormalEquations, eliminated, reversed_in_time
 
 
 def _random(T: int, D: int, S: int, seed: int) -> tuple[NormalEquations, np.ndarray, np.ndarray]:
@@ -43,6 +43,17 @@ def test_solution_and_inverse_blocks_equal_dense_algebra(T: int, S: int) -> None
         assert np.allclose(pose[t], inverse[rows, rows], rtol=1e-7, atol=1e-11)
         assert np.allclose(mixed[t], inverse[rows, T * D:], rtol=1e-7, atol=1e-11)
     assert np.allclose(shape, inverse[T * D:, T * D:], rtol=1e-7, atol=1e-11)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_what_is_left_after_elimination_has_the_same_solution(backwards: bool) -> None:
+    T, D, S = 6, 4, 3
+    e, _, _ = _random(T, D, S, seed=1)
+    x, s = e.solve()
+    left = reversed_in_time(eliminated(reversed_in_time(e), T - 2)) if backwards else eliminated(e, T - 2)
+    two, shape = left.solve()
+    assert np.allclose(two, x[:2] if backwards else x[-2:], rtol=1e-7, atol=1e-10) and np.allclose(shape, s, rtol=1e-7, atol=1e-10)
+    assert np.allclose(left.covariance()[2], e.covariance()[2], rtol=1e-7)
 
 
 def test_equations_without_information_are_refused() -> None:

@@ -11,7 +11,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import limb_skin
 from tricap.core.errors import InputError
-from tricap.core.fitting.fit_input import EmptyView, FitInput, JointPlaces
+from tricap.core.fitting.fit_input import EmptyView, FitInput, JointPlaces, Packed
 from tricap.core.fitting.limbs_apart import LimbsApart
 from tricap.core.fitting.observations import MotionPrior
 from tricap.core.fitting.problem import Problem
@@ -45,7 +45,7 @@ def _empty(scene, step_px: int = 4) -> list[EmptyView]:
             outside = (raster.image(np.ones(len(raster.sample)), 0.0) == 0).astype(np.uint8)
             far = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_5)[step_px // 2 :: step_px, step_px // 2 :: step_px]
             tables.append(np.minimum(2 * far, 255).astype(np.uint8))
-        found.append(EmptyView(view=camera.name, frame=np.arange(len(tables)), distance=np.stack(tables), step_px=step_px, unit_px=0.5))
+        found.append(EmptyView(view=camera.name, frame=np.arange(len(tables)), distance=Packed(tables), step_px=step_px, unit_px=0.5))
     return found
 
 

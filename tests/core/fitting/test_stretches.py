@@ -1,0 +1,45 @@
+"""A long recording is adjusted in stretches: as good as at once, with sigmas as honest, and nothing is kept of a stretch but its result."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tricap.core.fitting import sequence, stretches
+from tricap.core.fitting.cloud_points import ThinnedClouds
+from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
+
+KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.005)
+
+
+def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three stretches, of which two hand over to the left and to the right; what tracks tell of a twist reaches all of them."""
+    scene = make_scene(frames=24, seed=2)
+    given = FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={10: scene.clicks}, click_frame=10, time_s=scene.time_s,
+                     trajectories=scene.trajectories)
+    whole = fit_sequence(given, KNOWN)
+    for module in (sequence, stretches):
+        monkeypatch.setattr(module, "AT_ONCE", 9)
+    monkeypatch.setattr(stretches, "MARGIN", 4)
+    pieces = fit_sequence(given, KNOWN)
+    assert np.array_equal(pieces.motion.frames, whole.motion.frames) and pieces.motion.status == whole.motion.status
+    off = np.linalg.norm(pieces.motion.joints_m - whole.motion.joints_m, axis=2) / whole.motion.joint_sigma_m
+    assert np.median(off) < 0.2 and off.max() < 1.0  # 36 frames in two stretches, two seeds: 0.05–0.09 and 0.19–0.47
+    ratio = pieces.motion.sigma / whole.motion.sigma
+    assert 0.9 < np.median(ratio) < 1.1 and ratio.max() < 1.4  # 1.00, 1.12
+
+
+def test_points_are_read_when_they_are_asked_for_and_not_kept() -> None:
+    cloud = SimpleNamespace(frame=7, xyz_m=np.zeros((3, 3)), normals=np.zeros((3, 3)), covariance_m2=np.tile(np.eye(3), (3, 1, 1)))
+    points = ThinnedClouds([cloud], 0.01)
+    assert len(points) == 1 and points[0].frame == 7 and points[0] is not points[0]
+
+
+def test_spans_cover_every_frame_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for frames in (1, 299, 300, 301, 1000):
+        found = stretches.spans(frames)
+        assert [t for span in found for t in span] == list(range(frames)) and max(map(len, found)) <= stretches.AT_ONCE
+    assert stretches.sample(1000, 500) == sorted(set(stretches.sample(1000, 500))) and 500 in stretches.sample(1000, 500)
+    order = stretches.outwards(1000, 600)
+    assert [direction for *_, direction in order] == [0, 1, -1, -1] and 600 in order[0][0]
+    assert sorted(t for own, *_ in order for t in own) == list(range(1000)) and all(set(own) <= set(around) for own, around, _ in order)
