@@ -12,6 +12,7 @@ from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
 KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.005)
 
 
+@pytest.mark.slow
 def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three stretches, of which two hand over to the left and to the right; what tracks tell of a twist reaches all of them."""
     scene = make_scene(frames=24, seed=2)
