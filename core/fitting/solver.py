@@ -8,6 +8,7 @@ from ..progress import Monitor
 from .problem import Linearised, Problem, Scales, cost, first_scales, linearise
 
 START_DAMPING, LARGEST_DAMPING = 1e-3, 1e8
+POOR, GOOD = 0.25, 0.5  # gain of a step over what was foreseen
 STEP_DONE = 1e-4  # rad, m, relative
 COST_DONE = 1e-4
 SIGMAS_DONE = 0.03  # root mean square over the parameters: as much as a step gains, (0.03 σ)² each, is not worth another
@@ -81,6 +82,14 @@ def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector
         new_vector[problem.free_shape] += ds
         value = cost(problem, lin, motion + dx, new_vector)
         if value <= lin.cost:
-            return (motion + dx, new_vector, value), max(damping / 10, 1e-9)
+            foreseen = float(np.sum(dx * lin.equations.g) + ds @ lin.equations.h)
+            return (motion + dx, new_vector, value), _next_damping(damping, lin.cost - value, foreseen)
         damping *= 10
     return None, damping
+
+
+def _next_damping(damping: float, gain: float, foreseen: float) -> float:
+    """Less after a step that gained what was foreseen, more after one that gained far less (Madsen, Nielsen & Tingleff 2004)."""
+    if gain < POOR * foreseen:
+        return damping * 10
+    return max(damping / 10, 1e-9) if gain > GOOD * foreseen else damping

@@ -15,7 +15,7 @@ from tricap.core.fitting.observations import MotionPrior
 from tricap.core.fitting.problem import Problem
 from tricap.core.fitting.sequence import _statuses, conditions, fit_sequence
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.solver import solve
+from tricap.core.fitting.solver import _next_damping, solve
 from tricap.core.fitting.state import ShapeParameters, free_bones
 
 from .limb_scene import front_rig, surface
@@ -157,3 +157,10 @@ def test_a_partial_frame_can_be_suspect(make_scene) -> None:
     counts[4] = 0
     sigma0 = np.array([1.0, 1.1, 1.0, 5.0, np.nan])
     assert _statuses(fit, counts, sigma0) == ("fitted", "partial", "fitted", "suspect", "bridged")
+
+
+def test_a_step_that_gains_less_than_foreseen_makes_the_next_one_shorter() -> None:
+    assert _next_damping(1e-3, gain=1.0, foreseen=10.0) == pytest.approx(1e-2)
+    assert _next_damping(1e-3, gain=4.0, foreseen=10.0) == pytest.approx(1e-3)
+    assert _next_damping(1e-3, gain=9.0, foreseen=10.0) == pytest.approx(1e-4)
+    assert _next_damping(1e-9, gain=9.0, foreseen=10.0) == pytest.approx(1e-9)
