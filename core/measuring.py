@@ -21,15 +21,16 @@ from .matching.constraints import constrain
 from .matching.grid import TemplateGrid, template_grid
 from .matching.growing import GrowingSettings, TripletField, grow
 from .matching.least_squares import MatchingSettings
+from .matching.middle import in_doubt
 from .matching.scanning import scan
 from .matching.seeds import Approximations, sweep_seeds
 from .progress import Monitor
 from .results import Results
 from .silhouettes import silhouette_file, silhouettes, told_by
-from .surface.cloud import PointCloud, SurfaceSettings, point_cloud, why_removed
+from .surface.cloud import IN_DOUBT, PointCloud, SurfaceSettings, point_cloud, why_removed
 from .take import Footage, footage_frames
 
-ALGORITHM = "surface 11"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 12"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
@@ -188,17 +189,7 @@ def _measure(
         where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, person, monitor)
     else:
         where = fg.after(cameras[ref].to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
-        seeds = sweep_seeds(
-            images.spline,
-            cameras,
-            ref,
-            grid,
-            matching,
-            spacing_px=growing.seed_spacing_px,
-            depth_range_m=where.depth_range_m,
-            monitor=monitor,
-            pairs=growing.pairs,
-        )
+        seeds = _swept(footage, images, grid, matching, growing, where.depth_range_m, monitor)
     told = told_by(footage)
     where = replace(where, silhouettes=person, method=f"{where.method}, {told}" if told else where.method)
     cover = scan if growing.method == "published" else grow
@@ -206,12 +197,44 @@ def _measure(
     field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor, pairs=growing.pairs)
     whole = _single(field)
     why = why_removed(whole, cameras[ref], ref, surface)
+    clean = np.flatnonzero(why == 0)
+    why[clean[in_doubt(whole.select(clean), images.spline, cameras, ref, matching)]] = IN_DOUBT
     field, removed = whole.select(why == 0), whole.grid.rows.to_frame(whole.xy[why > 0]).astype(np.float32)
     cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
     if before is None and not len(cloud.xyz_m):
         raise NothingMeasured(frame)
-    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=replace(where, silhouettes=()), key=key, removed_px=removed,
-                         removed_why=why[why > 0])
+    return MeasuredFrame(
+        frame=frame,
+        field=field,
+        cloud=cloud,
+        foreground=replace(where, silhouettes=()),
+        key=key,
+        removed_px=removed,
+        removed_why=why[why > 0],
+    )
+
+
+def _swept(
+    footage: Footage,
+    images: FrameImages,
+    grid: TemplateGrid,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    depth_range_m: tuple[float, float] | None,
+    monitor: Monitor,
+) -> Approximations:
+    """The automatic seeds of a frame within a range of depths."""
+    return sweep_seeds(
+        images.spline,
+        footage.rig.cameras,
+        footage.take.reference,
+        grid,
+        matching,
+        spacing_px=growing.seed_spacing_px,
+        depth_range_m=depth_range_m,
+        monitor=monitor,
+        pairs=growing.pairs,
+    )
 
 
 def first_seeds(
@@ -243,17 +266,7 @@ def _first_foreground(
     cameras, ref, take = footage.rig.cameras, footage.take.reference, footage.take
 
     def sweep(depth_range_m: tuple[float, float] | None) -> Approximations:
-        found = sweep_seeds(
-            images.spline,
-            cameras,
-            ref,
-            grid,
-            matching,
-            spacing_px=growing.seed_spacing_px,
-            depth_range_m=depth_range_m,
-            monitor=monitor,
-            pairs=growing.pairs,
-        )
+        found = _swept(footage, images, grid, matching, growing, depth_range_m, monitor)
         xyz = cameras[ref].points_at_depth(take.rows_at(frame).to_frame(found.xy[:, ref]), found.depth_m)
         beside = fg.Foreground(depth_range_m=(0.0, np.inf), method="", silhouettes=person).excludes(xyz, np.zeros((len(xyz), 3, 3)))
         return Approximations(**{f.name: getattr(found, f.name)[~beside] for f in fields(Approximations)})

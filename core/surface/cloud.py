@@ -15,7 +15,8 @@ from ..settings import knob
 from ..values import frozen
 from .local_surface import LocalSurface, local_surface
 
-FILTERS = ("other surface", "small island")  # what they find; why a point went is 1 + its filter's number
+FILTERS = ("other surface", "small island", "depth in doubt")  # what they find; why a point went is 1 + its filter's number
+IN_DOUBT = 3  # told by the images (matching/middle.py)
 REMAINING_BIAS = 0.5  # of the curvature correction
 MAX_CORRECTION_PX = 3.0
 
@@ -78,7 +79,7 @@ def clean_field(field: TripletField, camera: Camera, reference: int, settings: S
 
 
 def why_removed(field: TripletField, camera: Camera, reference: int, settings: SurfaceSettings) -> np.ndarray:
-    """Which of `FILTERS` removes each point (N,) uint8, 1 for the first; 0 where none does."""
+    """Which of the first two `FILTERS` removes each point (N,) uint8, 1 for the first; 0 where neither does."""
     why = np.zeros(len(field.cell), dtype=np.uint8)
     if not len(why):
         return why

@@ -14,6 +14,7 @@ from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
 from tricap.core.matching.growing import GrowingSettings, TripletField, grow, rounds_of_larger_patches
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
+from tricap.core.matching.middle import believed, depth_doubt, in_doubt
 from tricap.core.matching.multi_image import match_multi_image
 from tricap.core.matching.object_space import Epipolar, SurfacePrior, match_surface
 from tricap.core.matching.seeds import sweep_seeds
@@ -201,6 +202,66 @@ def test_points_on_which_two_ways_of_matching_disagree_are_rejected(surfaces: Mo
     found = constrain(replace(field, xyz_m=mixed), scene.images, scene.rig, 1, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
     assert not np.isin(field.cell[chosen], found.cell).any()
     assert np.isin(np.delete(kept.cell, np.arange(0, len(kept.cell), 25)), found.cell).mean() > 0.97
+
+
+def edge(surfaces: ModuleType, behind_m: float = 0.03) -> Any:
+    """A plane that faces the rig, whose right half lies farther away."""
+
+    def hit(origin: np.ndarray, rays: np.ndarray) -> Any:
+        near, far = ((z - origin[2]) / rays[..., 2] for z in (surfaces.DISTANCE_M, surfaces.DISTANCE_M + behind_m))
+        x = origin[0] + rays[..., 0] * near
+        t = np.where(x < 0, near, far)
+        X = origin + rays * t[..., None]
+        return np.where(np.abs(X[..., 1]) < 0.2, t, np.nan), X[..., 0], X[..., 1] + 0.13 * (x >= 0)
+
+    def distance_m(X: np.ndarray) -> np.ndarray:
+        near = np.where(X[..., 0] < 0.002, X[..., 2] - surfaces.DISTANCE_M, np.inf)
+        far = X[..., 2] - surfaces.DISTANCE_M - behind_m
+        return np.where(np.abs(near) < np.abs(far), near, far)
+
+    return surfaces.Surface(hit=hit, distance_m=distance_m, normal=lambda X: np.broadcast_to((0.0, 0.0, -1.0), X.shape))
+
+
+def test_points_between_two_surfaces_are_left_out(surfaces: ModuleType) -> None:
+    """Along the edge of something nearer, patches hold both surfaces; their points lie between them, and their middles tell."""
+    scene = Scene(surfaces, edge(surfaces), "strong")
+    field = scene.grown()
+
+    found = constrain(field, scene.images, scene.rig, 1, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
+    kept = found.select(~in_doubt(found, scene.images, scene.rig, 1, SETTINGS))
+    bad, left = (np.abs(scene.surface.distance_m(f.xyz_m)) > 0.01 for f in (found, kept))
+    assert bad.sum() >= 10
+    assert left.sum() <= 0.75 * bad.sum()
+    assert (~left).sum() > 0.98 * (~bad).sum()
+    unconstrained = replace(SETTINGS, constraint="none")
+    assert not in_doubt(found, scene.images, scene.rig, 1, unconstrained).any()
+
+
+def test_doubt_about_depth(plane: Scene) -> None:
+    """Points off the surface are known by their middles; where most points are worse, more is believed."""
+    sigma = np.full(len(plane.xy), 0.001)
+    seen = np.ones((len(plane.xy), 2), dtype=bool)
+
+    def doubt(shift_px: float) -> np.ndarray:
+        planes = plane.theta[:, :3] + np.array([shift_px / 210, 0.0, 0.0])  # f · base = 210 px m
+        return depth_doubt(plane.images, plane.rig, 1, RowGrid(), plane.xy, planes, sigma, SETTINGS, speed=210.0, seen=seen)
+
+    right, wrong = doubt(0.0), doubt(2.0)
+    assert np.quantile(right, 0.95) < 0.008
+    assert np.median(wrong) > 0.9 * 2.0 / 210 * 1.4**2
+    assert believed(right).mean() > 0.97
+    assert not believed(np.concatenate([right, wrong]))[len(right) :].mean() > 0.1
+    assert believed(np.full(5, 0.5)).all()
+    flat = [SplineImage(np.full((240, 320), 90.0)) for _ in range(3)]
+    nothing = depth_doubt(flat, plane.rig, 1, RowGrid(), plane.xy, plane.theta[:, :3], sigma, SETTINGS, speed=210.0, seen=seen)
+    assert nothing == pytest.approx(np.hypot(0.5 / 210 / plane.theta[:, 0] ** 2, 0.001))
+
+
+def test_doubt_about_nothing(plane: Scene) -> None:
+    none, nowhere = np.zeros(0), np.zeros((0, 2))
+    planes, seen = np.zeros((0, 3)), np.ones((0, 2), dtype=bool)
+    doubt = depth_doubt(plane.images, plane.rig, 1, RowGrid(), nowhere, planes, none, SETTINGS, speed=210.0, seen=seen)
+    assert believed(doubt).shape == (0,)
 
 
 def test_larger_patches_only_where_pixels_are_small(plane: Scene) -> None:
