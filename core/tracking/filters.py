@@ -8,8 +8,10 @@ voxels       as published: in each time step the velocity must agree with the me
              |v − v̄| ≤ max(3 · 1.4826 MAD, 0.15 |v̄| + 60 mm/s)                                                              (1)
 rigid        a limb that rotates has no common velocity, so here the point must go where the rigid motion of its neighbours takes it,
              over one step and over longer spans, in which what slides slowly gets far enough to be seen:
-             |X_{i+s} − X̂_{i+s}| ≤ max(√s d, 2 √(σ_i² + σ_{i+s}² + (1 + h) spread²)) ,  h: leverage of X̂             (2)
+             |X_{i+s} − X̂_{i+s}| ≤ max(√s d, 3.5 c √(σ_i² + σ_{i+s}² + (1 + h) spread²)) ,  h: leverage of X̂         (2)
              X̂ from all neighbours or from those whose distance to the point stayed (neighbours.py), whichever is nearer.
+             Much of a sigma is alike in a point's frames and in its neighbours and does not show here: c is the part that does, from
+             the median of all points over the same span.
 
              Neighbours that scatter by more than √s d have no common motion and say nothing; a trajectory of which they say nothing
              in most of its steps, though others have neighbours that do, is removed: alone, at an outline, it proves nothing.
@@ -27,8 +29,10 @@ import numpy as np
 from .neighbours import common_motion, nearest_neighbours, same_distance
 from .settings import TrackingSettings, TrackStatus
 
-SPANS = ((1, 1), (4, 2), (10, 5))  # frames, and every how many frames a span begins
-SIGMAS = 2.0  # of the summed variance of all three coordinates
+SPANS = ((1, 1), (4, 2), (10, 2))  # frames, and every how many frames a span begins
+SIGMAS = 3.5  # of the summed variance of all three coordinates, as the recording shows it
+MEDIAN_OF_CHI = 0.888  # of three coordinates, in units of the root of their summed variance
+SMALLEST_SCALE, SCALE_POINTS = 0.35, 20  # of c in (2); fewer points do not tell it
 MIN_MEMBERS = 5
 MOST_SPREAD = 1.0  # of √s d: neighbours that scatter more have no common motion
 MIN_SUPPORT = 0.5  # of a trajectory's steps must be confirmed
@@ -136,13 +140,17 @@ def ask_neighbours(before_m: np.ndarray, after_m: np.ndarray, sigma_m: np.ndarra
     rows, there = nearest_neighbours(before_m, before_m, settings.neighbourhood_m, same=True)
     slack = np.sqrt(span) * 1e-3 * settings.max_deviation_mm
     sigma = np.nan_to_num(sigma_m)
+    scale: float | None = None
 
     def ask(i: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        nonlocal scale
         goal = common_motion(before_m[i], before_m[rows[i]], after_m[rows[i]], weight, slack / 2)
-        limit = np.maximum(slack, SIGMAS * np.sqrt(sigma[i] ** 2 + (1 + goal.leverage) * goal.spread_m**2))
-        with np.errstate(invalid="ignore"):
-            near = np.linalg.norm(after_m[i] - goal.xyz_m, axis=1) <= limit
         alike = (goal.members >= MIN_MEMBERS) & (goal.spread_m <= MOST_SPREAD * slack)
+        away = np.linalg.norm(after_m[i] - goal.xyz_m, axis=1)
+        expected = np.sqrt(sigma[i] ** 2 + (1 + goal.leverage) * goal.spread_m**2)
+        scale = scale or _scale(away[alike], expected[alike])
+        with np.errstate(invalid="ignore"):
+            near = away <= np.maximum(slack, SIGMAS * scale * expected)
         return np.where(alike, np.where(near, Answer.CONFIRMED, Answer.DEVIATES), Answer.UNKNOWN)
 
     answer = np.full(len(before_m), Answer.UNKNOWN)
@@ -155,6 +163,13 @@ def ask_neighbours(before_m: np.ndarray, after_m: np.ndarray, sigma_m: np.ndarra
         again = ask(rest, weight)
         answer[rest] = np.where(again == Answer.UNKNOWN, answer[rest], again)
     return answer
+
+
+def _scale(away_m: np.ndarray, expected_m: np.ndarray) -> float:
+    """c of (2): what of the expected deviations (n,) the points show."""
+    if len(away_m) < SCALE_POINTS:
+        return 1.0
+    return float(np.clip(np.median(away_m / np.maximum(expected_m, 1e-9)) / MEDIAN_OF_CHI, SMALLEST_SCALE, 1.0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

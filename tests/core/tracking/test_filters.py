@@ -83,6 +83,17 @@ def test_planted_false_trajectories_are_caught(kind: str) -> None:
     assert precision >= 0.95 and recall >= 0.95, (precision, recall)
 
 
+def test_sigmas_that_do_not_show_in_motion_hide_nothing() -> None:
+    """What is alike in all frames makes a sigma large, and no motion; how much shows, the other points tell."""
+    random = np.random.default_rng(3)
+    x, which, _ = planted("slide", legs(random), random)
+    raw = recording(x, random)
+    large = replace(raw, sigma_m=8 * raw.sigma_m)
+    verdict = against_neighbours(large.xyz_m, large.sigma_m, SETTINGS, lambda done, total: None) == TrackStatus.NOT_RIGID
+    assert verdict.any(axis=0)[which].mean() >= 0.9
+    assert np.delete(verdict.any(axis=0), which).mean() < 0.05
+
+
 def test_the_published_voxels_keep_true_ones_and_miss_slow_ones() -> None:
     """Why they are not the default: within a voxel the velocities of a rotating limb differ by more than that of what slides on it."""
     random = np.random.default_rng(0)
