@@ -24,7 +24,7 @@ class Surface:
     normal: Callable[[np.ndarray], np.ndarray]
 
 
-def cameras() -> list[Camera]:
+def cameras(focal_px: float = FOCAL_PX) -> list[Camera]:
     """Left, centre, right, turned towards a point DISTANCE_M before the centre; with distortion."""
     made = []
     for name, x in (("L", -BASE_M), ("C", 0.0), ("R", BASE_M)):
@@ -33,7 +33,7 @@ def cameras() -> list[Camera]:
         z /= np.linalg.norm(z)
         side = np.cross([0.0, 1.0, 0.0], z)
         R = np.stack([side / np.linalg.norm(side), np.cross(z, side / np.linalg.norm(side)), z])
-        matrix = np.array([[FOCAL_PX, 0, WIDTH / 2 + 3.3], [0, FOCAL_PX, HEIGHT / 2 - 2.1], [0, 0, 1]])
+        matrix = np.array([[focal_px, 0, WIDTH / 2 + 3.3], [0, focal_px, HEIGHT / 2 - 2.1], [0, 0, 1]])
         made.append(
             Camera(
                 name=name,
@@ -82,6 +82,27 @@ def cylinder(radius_m: float) -> Surface:
     return Surface(hit=hit, distance_m=lambda X: np.hypot(X[..., 0], X[..., 2] - axis[1]) - radius_m, normal=normal)
 
 
+def sphere(radius_m: float) -> Surface:
+    """A sphere whose front is DISTANCE_M away."""
+    centre = np.array([0.0, 0.0, DISTANCE_M + radius_m])
+
+    def hit(origin: np.ndarray, rays: np.ndarray) -> Hit:
+        o = origin - centre
+        a, b = (rays * rays).sum(-1), rays @ o
+        under = b * b - a * (o @ o - radius_m**2)
+        t = np.where(under > 0, (-b - np.sqrt(np.maximum(under, 0))) / a, np.nan)
+        n = (origin + rays * t[..., None] - centre) / radius_m
+        return t, radius_m * np.arctan2(n[..., 0], -n[..., 2]), radius_m * np.arcsin(np.clip(n[..., 1], -1, 1))
+
+    def distance_m(X: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(X - centre, axis=-1) - radius_m
+
+    def normal(X: np.ndarray) -> np.ndarray:
+        return (X - centre) / np.linalg.norm(X - centre, axis=-1, keepdims=True)
+
+    return Surface(hit=hit, distance_m=distance_m, normal=normal)
+
+
 def texture(kind: str, seed: int) -> np.ndarray:
     """Grey values (TEXELS, TEXELS): "strong" cloth, "weak" skin, or "repetitive" checks of 16 mm with a little of their own."""
     random = np.random.default_rng(seed)
@@ -98,15 +119,17 @@ def texture(kind: str, seed: int) -> np.ndarray:
     return 120 + 25 * (np.sin(i)[:, None] + np.sin(i)[None, :]) / np.sqrt(2) + 5 * blurred(4.0)
 
 
-def render(surface: Surface, kind: str, *, noise: float = 2.0, seed: int = 0) -> tuple[list[Camera], list[np.ndarray]]:
-    """The cameras and their images (h, w) of whole grey values, with unlike gains and offsets."""
-    rig, look = cameras(), SplineImage(texture(kind, seed))
+def render(
+    surface: Surface, kind: str, *, noise: float = 2.0, seed: int = 0, focal_px: float = FOCAL_PX
+) -> tuple[list[Camera], list[np.ndarray]]:
+    """The cameras and their images (h, w) of whole grey values, with unlike gains and offsets. The texture's grain is one in pixels."""
+    rig, look, texel_m = cameras(focal_px), SplineImage(texture(kind, seed)), TEXEL_M * FOCAL_PX / focal_px
     random = np.random.default_rng(seed + 1000)
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
     images = []
     for camera, gain, offset in zip(rig, (0.9, 1.0, 1.1), (8.0, 0.0, -6.0)):
         depth, a, b = surface.hit(camera.centre_m, camera.rays(np.stack([x, y], axis=-1)))
-        grey = look.sample(*(np.nan_to_num(c / TEXEL_M + TEXELS / 2).astype(np.float32) for c in (a, b)))
+        grey = look.sample(*(np.nan_to_num(c / texel_m + TEXELS / 2).astype(np.float32) for c in (a, b)))
         grey = np.where(np.isfinite(depth), grey, BACKGROUND)
         images.append(np.rint(np.clip(gain * grey + offset + noise * random.standard_normal(grey.shape), 0, 255)).astype(np.float32))
     return rig, images
