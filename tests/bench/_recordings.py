@@ -18,7 +18,7 @@ from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
 from tricap.core.matching.growing import GrowingSettings, TripletField, grow
 from tricap.core.matching.least_squares import MatchingSettings, match_patches
-from tricap.core.matching.middle import without_doubtful
+from tricap.core.matching.middle import in_doubt
 from tricap.core.matching.seeds import sweep_seeds
 from tricap.core.progress import Monitor
 from tricap.core.surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
@@ -47,7 +47,8 @@ def measured(
     )
     field = grow(images, rig, reference, grid, seeds, matching, growing, foreground=where, monitor=monitor)
     field = constrain(field, images, rig, reference, matching, foreground=where, monitor=monitor)
-    field = without_doubtful(clean_field(field, rig[reference], reference, surface), images, rig, reference, matching)
+    field = clean_field(field, rig[reference], reference, surface)
+    field = field.select(~in_doubt(field, images, rig, reference, matching))
     return point_cloud(field, grey[reference], rig[reference], reference, 0, surface), field
 
 
