@@ -151,7 +151,9 @@ def load_steps(steps: int) -> Iterator[Row]:
         grey = [read_grey(folder / f"{camera}_{step}.jpg") for camera in ("201", "202")]
         cloud, field = measured(rig, grey, 0, (0.2, 0.5), matching, growing, SurfaceSettings())
         around, radius = fitted_cylinder(cloud.xyz_m * 1e3)
-        row = {"what": f"cylinder, step {step}", "points": len(cloud.xyz_m), "radius [mm]": radius, "scatter, RMS [mm]": _rms([around])}
+        near = np.abs(around) < 1
+        row = {"what": f"cylinder, step {step}", "points": len(around), "radius [mm]": radius}
+        row |= {"RMS of those within 1 mm": _rms([around[near]]), "beyond 1 mm": float(1 - near.mean())}
         if before is not None:
             row["found from the step before"] = _found_again(*before, grey[0])
         before = (grey[0], field.xy[:, 0])
