@@ -171,7 +171,7 @@ def test_each_filter_says_what_it_took(plane_take: Path, tmp_path: Path, scenes:
     kept = field.select(near | far)
     moved = np.zeros(len(kept.cell), dtype=bool)
     moved[[len(moved) // 2, len(moved) - 200]] = True
-    shifted = replace(kept, xyz_m=np.where(moved[:, None], camera.centre_m + 1.1 * (kept.xyz_m - camera.centre_m), kept.xyz_m))
+    shifted = replace(kept, xyz_m=np.where(moved[:, None], camera.centre_m + 1.3 * (kept.xyz_m - camera.centre_m), kept.xyz_m))
     why = why_removed(shifted, camera, ref, SurfaceSettings(min_island=int(near.sum()) + 1))
     assert near.sum() >= 6 and (why[moved] == 1).all() and (why[near[near | far]] == 2).all()
     assert (why[~moved & far[near | far]] == 0).mean() > 0.97
