@@ -28,6 +28,7 @@ from .view_matches import Features, PairMatches, alike, eight_bits, epipolar_mis
 
 FRAMES = 6  # looked at for the part of a frame
 MOST_LAG = 50
+BANDS = 8  # of rows, for the sigma of (4)
 FEWEST = 10  # moving matches
 LEAST = 0.3  # part of the moving matches that must fit
 FARTHEST = 0.95  # frames that (2) reaches; what lies beyond belongs to another L
@@ -306,14 +307,21 @@ def _readout(e: np.ndarray, s: float, b: float, frame: np.ndarray) -> tuple[floa
             return np.nan, np.inf
         unknowns += np.linalg.solve(normal, -(A * w[:, None]).T @ v)
         unknowns[:2] = np.clip(unknowns[:2], -1, 1)
-    return float(unknowns[0]), _sigma(A, w, v, frame)
+    band = np.floor(BANDS * (y + 0.5))  # what one part of the body shows otherwise than another, it shows in all frames, at its rows
+    return float(unknowns[0]), max(_sigma(A, w, v, frame), _sigma(A, w, v, band))
 
 
 def _sigma(A: np.ndarray, w: np.ndarray, v: np.ndarray, frame: np.ndarray) -> float:
-    """Sigma of the first unknown: the larger one of the adjustment's and of the scatter between frames, whose matches err alike."""
-    inverse = np.linalg.inv((A * w[:, None]).T @ A)
-    gradient = A * (w * v)[:, None]
-    each = np.stack([gradient[frame == f].sum(axis=0) for f in np.unique(frame)])
-    between = inverse @ (each.T @ each) @ inverse * len(each) / max(len(each) - 1, 1)
-    within = inverse * float((w * v**2).sum() / max(w.sum() - 2, 1))
-    return float(np.sqrt(max(between[0, 0], within[0, 0])))
+    """Sigma of the first unknown: the larger one of the adjustment's and of what leaving out single frames (or other groups) does."""
+    normal, gradient = (A * w[:, None]).T @ A, A * (w * v)[:, None]
+    changes = [0.0]  # of the first unknown when a group is left out: the jackknife (Tukey 1958)
+    for f in np.unique(frame):
+        own = frame == f
+        rest = normal - (A[own] * w[own, None]).T @ A[own]
+        if np.linalg.cond(rest) > 1e9:
+            return np.inf
+        changes.append(float(np.linalg.solve(rest, gradient[own].sum(axis=0))[0]))
+    k = len(changes) - 1
+    between = (k - 1) / k * float(np.square(changes).sum())
+    within = float(np.linalg.inv(normal)[0, 0] * (w * v**2).sum() / max(w.sum() - 2, 1))
+    return float(np.sqrt(max(between, within)))
