@@ -14,6 +14,7 @@ from .calibration.world_choice import WorldChoice, frame_of_clicks
 from .calibration.world_frame import frame_like
 from .errors import InputError
 from .geometry.rig import read_rig, write_rig
+from .images.fields import BOTH, INTERLACE
 from .progress import Monitor
 from .tracking.point_tables import read_points
 
@@ -25,7 +26,9 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the rig to write, such as rig.toml")
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
-    parser.add_argument("--interlaced", choices=("none", "odd", "even"), default="none", help="which lines to keep of interlaced video")
+    parser.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none",
+                        help="which lines to keep of interlaced video; both: as two frames, the odd lines' and the even lines'")
+    parser.add_argument("--first-field", choices=("odd", "even"), default="odd", help="of both: which lines were exposed first")
     parser.add_argument("--mask", type=Path, metavar="PATH",
                         help="image that is black where no target can be, or a folder of them named like the cameras")
     parser.add_argument("--target-diameter", type=float, metavar="M", help="diameter of the bar's targets in metres, if known")
@@ -73,7 +76,7 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if args.focal_px is not None and not 10 < args.focal_px < 1e6:
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
     world = _world(args)
-    footage = open_bar(args.bar, args.interlaced, args.mask)
+    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field)
     measured = measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter)
     result = calibrate_rig(measured.observations, monitor, focal_px=args.focal_px, world=world)
     written = [args.out]

@@ -22,7 +22,7 @@ from .calibration.targets import Targets, find_targets
 from .calibration.world_choice import WorldChoice, frame_of_bar
 from .errors import InputError
 from .geometry.rig import Rig
-from .images.fields import row_grid
+from .images.fields import Instants, instants
 from .images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, Sequence, open_sequence, read_image
 from .progress import Monitor
 
@@ -39,13 +39,19 @@ class BarFootage:
     folder: Path
     names: tuple[str, ...]
     sequences: tuple[Sequence, ...]
-    interlaced: str = "none"
+    interlaced: str = "none"  # or "odd", "even", "both"
     masks: tuple[np.ndarray | None, ...] = ()  # of each view (h, w), False where no target can be; empty: none
+    first_field: str = "odd"  # of "both"
+
+    @property
+    def instants(self) -> Instants:
+        """Which rows of which image show a frame: an image, or one of its two fields where both are measured."""
+        return instants(self.interlaced, self.first_field)
 
     @property
     def count(self) -> int:
         """Number of frames that all views have."""
-        return min(s.count for s in self.sequences)
+        return min(s.count for s in self.sequences) * self.instants.per_image
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -56,8 +62,10 @@ class MeasuredBar:
     observations: BarObservations
 
 
-def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None) -> BarFootage:
+def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, first_field: str = "odd") -> BarFootage:
     """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
+
+    With `interlaced` "both" each image shows the bar at two instants, in the `first_field` at the first.
 
     `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one.
 
@@ -90,7 +98,9 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None) -
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"The views in {folder} have different numbers of frames ({said}); trim them to the same instants.")
     masks = () if mask is None else _masks(Path(mask), names)
-    return BarFootage(folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, masks=masks)
+    return BarFootage(
+        folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, masks=masks, first_field=first_field
+    )
 
 
 def _masks(path: Path, names: list[str]) -> tuple[np.ndarray | None, ...]:
@@ -143,13 +153,13 @@ def _measure_view(
     footage: BarFootage, view: int, monitor: Monitor, note: Note | None, diameter: float
 ) -> tuple[BarTrack, tuple[int, int]]:
     """The bar's track in one view, and the size of its images; `diameter` of the targets as a part of the bar's length, 0: unknown."""
-    name, sequence, rows = footage.names[view], footage.sequences[view], row_grid(footage.interlaced)
+    name, sequence = footage.names[view], footage.sequences[view]
     mask = footage.masks[view] if footage.masks else None
     found: list[Targets] = []
     size, whole = (0, 0), 0
     for n in range(footage.count):
         monitor.step(f"targets {name}", n, footage.count)
-        image = sequence.read(n)
+        image, rows = sequence.read(footage.instants.image(n)), footage.instants.rows(n)
         if n and image.shape[::-1] != size:
             raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
         size = (image.shape[1], image.shape[0])
@@ -164,7 +174,7 @@ def _measure_view(
         if note is not None:
             note(name, len(found), whole)
     monitor.step(f"targets {name}", footage.count, footage.count)
-    return track_bar(found, float(size[0]), diameter / np.sqrt(rows.step)), size
+    return track_bar(found, float(size[0]), diameter / np.sqrt(footage.instants.first.step)), size
 
 
 def _in_frame(targets: Targets, xy_px: np.ndarray) -> Targets:

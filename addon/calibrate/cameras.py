@@ -9,7 +9,6 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...core.calibration.target_tracks import BarTrack
 from ...core.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.geometry.rig import Rig
@@ -22,7 +21,7 @@ EXACT = "tricap_exact"
 SAME = 2e-6  # relative: what single precision leaves of a number
 
 
-def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]], tracks: dict[str, BarTrack],
+def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]], tracks: dict[str, np.ndarray],
                   bar: tuple[np.ndarray, np.ndarray] | None = None) -> list[bpy.types.Object]:
     """Cameras in a collection of their own, with their footage behind them and the measured targets as tracks over it.
 
@@ -55,9 +54,9 @@ def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]]
     return made
 
 
-def add_tracks(clip: bpy.types.MovieClip, track: BarTrack, size_px: tuple[int, int]) -> None:
-    """The measured targets as two tracks of the clip; the clip's own frames count from 1."""
-    uv = axes.uv_from_pixel(track.xy_px, size_px)
+def add_tracks(clip: bpy.types.MovieClip, xy_px: np.ndarray, size_px: tuple[int, int]) -> None:
+    """The measured targets (T, 2, 2) as two tracks of the clip; the clip's own frames count from 1."""
+    uv = axes.uv_from_pixel(xy_px, size_px)
     for end in range(2):
         seen = np.flatnonzero(np.isfinite(uv[:, end]).all(axis=1))
         made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(seen[0]) + 1 if len(seen) else 1)

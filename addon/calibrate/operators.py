@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ...core.bar_file import write_bar
@@ -31,6 +32,19 @@ class Done:
     measured: MeasuredBar
     result: CalibratedRig
     written: Path
+
+    @property
+    def tracks(self) -> dict[str, np.ndarray]:
+        """The targets (T, 2, 2) by view, one frame an image as the clips show them: of both fields the first."""
+        per = self.footage.instants.per_image
+        return {name: track.xy_px[::per] for name, track in zip(self.footage.names, self.measured.tracks)}
+
+    @property
+    def bar(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frames (T,) and ends (T, 2, 3) [m] of the bar, one frame an image likewise."""
+        (frames, ends), per = self.result.bar, self.footage.instants.per_image
+        first = frames % per == 0
+        return frames[first] // per, ends[first]
 
 
 class Calibrate(JobOperator, bpy.types.Operator):
@@ -59,14 +73,15 @@ class Calibrate(JobOperator, bpy.types.Operator):
         folders.check_writable(out.parent)
         # Blender keeps single precision; what was typed is the shortest decimal that is stored alike.
         length, diameter = (float(f"{value:.7g}") for value in (self.length_m or props.length_m, props.diameter_m))
-        mask, interlaced = folders.absolute(props.mask) if props.mask else None, props.interlaced
+        mask = folders.absolute(props.mask) if props.mask else None
+        interlaced, first_field = props.interlaced, props.first_field
         focal = props.focal_px if props.focal_px > 0 else None
         like = rig_of_scene(context.scene) if props.like_scene else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
         live.begin()
 
         def read_and_calibrate(monitor: Monitor) -> Done:
-            footage = open_bar(folder, interlaced, mask)
+            footage = open_bar(folder, interlaced, mask, first_field)
             return compute(footage, measure_bar(footage, length, monitor, live.note, diameter or None), focal, world, out, monitor)
 
         return read_and_calibrate
@@ -76,10 +91,9 @@ class Calibrate(JobOperator, bpy.types.Operator):
         views = [view.name for view in context.scene.tricap.views] if project.bound(context.scene) else []
         strangers = [name for name in views if name not in result.footage.names]
         if views and not strangers:
-            use_rig(context.scene, result.result.rig, result.result.bar)
+            use_rig(context.scene, result.result.rig, result.bar)
         files = {name: list(s.files()) for name, s in zip(result.footage.names, result.footage.sequences)}
-        tracks = dict(zip(result.footage.names, result.measured.tracks))
-        build_cameras(context.scene, result.result.rig, files, tracks, result.result.bar)
+        build_cameras(context.scene, result.result.rig, files, result.tracks, result.bar)
         verdict, props = result.result.verdict, context.scene.tricap_calibrate
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)

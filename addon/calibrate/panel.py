@@ -2,6 +2,7 @@
 
 import bpy
 
+from ...core.images.fields import BOTH
 from ..panels import sentence
 from . import live
 
@@ -14,6 +15,8 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     layout.prop(props, "bar")
     layout.prop(props, "length_m")
     layout.prop(props, "interlaced")
+    if props.interlaced == BOTH:
+        layout.prop(props, "first_field")
     layout.prop(props, "focal_px")
     layout.prop(props, "diameter_m")
     layout.prop(props, "mask")

@@ -3,6 +3,7 @@
 import bpy
 
 from .. import jobs
+from ..take_properties import FIELDS, LINES
 from . import operators, world
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -15,9 +16,10 @@ class TricapCalibrate(bpy.types.PropertyGroup):
                                   description="Folder with a folder of images, or a movie, of the waved bar per camera")
     length_m: bpy.props.FloatProperty(name="Bar Length", default=0.5, min=0.0, soft_max=5.0, unit="LENGTH",  # type: ignore[valid-type]
                                       precision=4, description="Distance between the middles of the bar's two targets")
-    interlaced: bpy.props.EnumProperty(name="Interlaced", default="none",  # type: ignore[valid-type]
-                                       items=[("none", "None", "Progressive"), ("odd", "Odd", "Keep the 1st, 3rd, … line"),
-                                              ("even", "Even", "Keep the 2nd, 4th, … line")])
+    interlaced: bpy.props.EnumProperty(name="Lines", default="none",  # type: ignore[valid-type]
+                                       items=[(name, *told) for name, told in LINES.items()],
+                                       description="Which lines of interlaced video are measured")
+    first_field: bpy.props.EnumProperty(name="First Field", items=FIELDS, description="Which field is the earlier one")  # type: ignore[valid-type]
     focal_px: bpy.props.FloatProperty(name="Rough Focal Length [px]", default=0.0, min=0.0,  # type: ignore[valid-type]
                                       description="In pixels, if it is known; 0: it is found")
     diameter_m: bpy.props.FloatProperty(name="Target Diameter", default=0.0, min=0.0, soft_max=0.2, unit="LENGTH",  # type: ignore[valid-type]

@@ -30,6 +30,7 @@ def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dic
         "predicted_error_m": quality.predicted.rms_m,
         "predicted_length_error_m": quality.predicted.length_rms_m,
         "held_out_lengths": _length_figures(quality.held_out),
+        "held_out_lengths_untested": _length_figures(quality.held_out_untested),
         "used_lengths": _length_figures(quality.used_lengths),
         "direction_scatter": quality.scatter.tolist(),
         "mirrored_sum_of_squares": _finite(quality.mirror),
@@ -52,6 +53,7 @@ def _length_figures(lengths: Lengths) -> dict[str, Any]:
         "bars": len(lengths.residual_m),
         "mean_m": _finite(lengths.mean_m),
         "rms_m": _finite(lengths.rms_m),
+        "median_m": _finite(lengths.median_m),
         "drift_m": [_finite(d) for d in lengths.drift_m],
     }
 
@@ -110,8 +112,9 @@ def page(calibration: Calibration, quality: Quality, verdict: Verdict) -> str:
         f"Predicted error in space {1e3 * quality.predicted.rms_m:.3f} mm RMS, largest {1e3 * quality.predicted.sigma_m.max():.3f} mm; "
         f"of a bar's length {1e3 * quality.predicted.length_rms_m:.3f} mm.",
         _length_line("Bars left out of the adjustment", quality.held_out),
+        _length_line("The same with bars that were taken for blunders though their rays meet", quality.held_out_untested),
         _length_line("Bars of the adjustment", quality.used_lengths),
-        f"{quality.rejected} bars that two cameras saw whole were rejected as blunders and are in neither figure.",
+        f"{quality.rejected} bars that two cameras saw whole were rejected as blunders.",
         f"Two cameras at least see {100 * quality.seen_by_two:.0f} % of the volume; "
         f"the bar came through {100 * quality.visited:.0f} % of it.",
         f"Scatter of the bar's directions {quality.scatter.round(3).tolist()} (smallest: 0.05 is good, 0 fails); "
@@ -127,8 +130,8 @@ def page(calibration: Calibration, quality: Quality, verdict: Verdict) -> str:
 def _length_line(label: str, lengths: Lengths) -> str:
     drift = ", ".join(f"{1e3 * d:+.2f}" for d in lengths.drift_m)
     return (
-        f"{label}: {len(lengths.residual_m)} lengths, mean {1e3 * lengths.mean_m:+.3f} mm, RMS {1e3 * lengths.rms_m:.3f} mm, "
-        f"drift over the volume in x, y, z {drift} mm."
+        f"{label}: {len(lengths.residual_m)} lengths, mean {1e3 * lengths.mean_m:+.3f} mm, median {1e3 * lengths.median_m:.3f} mm, "
+        f"RMS {1e3 * lengths.rms_m:.3f} mm, drift over the volume in x, y, z {drift} mm."
     )
 
 

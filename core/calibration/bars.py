@@ -22,10 +22,18 @@ MAX_FLIPPED_CAMERAS = 9  # beyond this many cameras orders are compared with the
 def with_bars(network: Network, observations: BarObservations, tolerance_px: float = DOUBTFUL_PX) -> tuple[Network, np.ndarray]:
     """The cameras of `network` with the bar positions of `observations`, and which image points (N, C, 2) fit them.
 
-    An end that fewer than two cameras see takes no part. Ends that the cameras disagree on are intersected from the pair of cameras that
-    most of the others agree with. A bar of a wrong length loses the end that fewer rays agree on, or both.
+    As `met_ends`; a bar of a wrong length loses the end that fewer rays agree on, or both.
     """
-    cameras = network.cameras(observations.names, observations.size_px)
+    ends, used = met_ends(network.cameras(observations.names, observations.size_px), observations, tolerance_px)
+    return _bars(network, ends, _of_right_length(ends, used, network.length_m))
+
+
+def met_ends(cameras: tuple[Camera, ...], observations: BarObservations, tolerance_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays of the ends meet (N, 2, 3), and which image points (N, C, 2) lie within the tolerance, whatever the length.
+
+    An end that fewer than two cameras see takes no part. Ends that the cameras disagree on are intersected from the pair of cameras that
+    most of the others agree with.
+    """
     seen = observations.seen
     used = seen & (seen.sum(axis=1, keepdims=True) >= 2)
     N = len(seen)
@@ -44,8 +52,7 @@ def with_bars(network: Network, observations: BarObservations, tolerance_px: flo
         better = trial_cost < cost[doubtful]
         X[doubtful[better]], cost[doubtful[better]] = trial[better], trial_cost[better]
     ends = X.reshape(N, 2, 3)
-    used = _fitting(cameras, observations, ends, used, tolerance_px)
-    return _bars(network, ends, _of_right_length(ends, used, network.length_m))
+    return ends, _fitting(cameras, observations, ends, used, tolerance_px)
 
 
 def _rays(camera: Camera, xy: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
     predicted 3-D error      (`precision`) at a grid over the box in which the bar was waved
     held-out lengths         five times a fifth of the positions is left out, the rest adjusted, the left-out ends intersected    (1)
+                             of the bars that passed the test for blunders, and of all whose rays meet: the test knows the length
     direction scatter        eigenvalues of mean(d dᵀ); the smallest decides whether the focal lengths are determined            (2)
     mirrored solution        depth reversed about the volume's middle and adjusted anew; it must fit much worse                   (3)
 
@@ -16,9 +17,11 @@ from ..geometry.camera import Camera
 from ..geometry.camera_derivatives import INTERIOR
 from ..geometry.intersection import forward_intersection
 from ..progress import Monitor
+from .bars import met_ends
 from .bundle import Network, adjust
+from .observations import BarObservations
 from .precision import PredictedError, predicted_error
-from .self_calibration import Calibration
+from .self_calibration import GROSS, Calibration
 
 FOLDS = 5
 CELLS = (8, 6)
@@ -47,6 +50,11 @@ class Lengths:
         return float(np.sqrt(np.mean(self.residual_m**2))) if len(self.residual_m) else np.nan
 
     @property
+    def median_m(self) -> float:
+        """Median of the magnitudes."""
+        return float(np.median(np.abs(self.residual_m))) if len(self.residual_m) else np.nan
+
+    @property
     def drift_m(self) -> np.ndarray:
         """(3,) change of the length from one end of the volume to the other along x, y, z, by a regression."""
         if len(self.residual_m) < 8:
@@ -63,6 +71,7 @@ class Quality:
     box_m: np.ndarray  # (2, 3) smallest and largest corner
     used_lengths: Lengths
     held_out: Lengths
+    held_out_untested: Lengths  # with the bars that were taken for blunders though their rays meet
     scatter: np.ndarray  # (3,) eigenvalues, ascending
     missing_direction: np.ndarray  # (3,) world, along which the bar points least
     coverage: np.ndarray  # (C, 6, 8) image points in each cell
@@ -89,7 +98,7 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     box = np.percentile(ends, [1, 99], axis=0)
     values, axes = np.linalg.eigh(_scatter(network, used))
     monitor.step("quality", 0, 3)
-    held_out = held_out_lengths(calibration)
+    held_out, untested = held_out_lengths(calibration)
     monitor.step("quality", 1, 3)
     mirror = mirrored(calibration)
     monitor.step("quality", 2, 3)
@@ -106,8 +115,9 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
         visited=_visited(network.ends_m[whole].reshape(-1, 3), box),
         seen_by_two=len(predicted.xyz_m) / (2 * len(tests)),
         rejected=int(((observations.complete.sum(axis=1) >= 2) & ~whole).sum()),
-        used_lengths=_lengths(calibration, cameras, np.ones(len(used), dtype=bool)),
+        used_lengths=_lengths(observations, used, cameras, np.ones(len(used), dtype=bool)),
         held_out=held_out,
+        held_out_untested=untested,
         scatter=values,
         missing_direction=axes[:, 0],
         coverage=np.stack([_cells(observations.xy_px[:, c][used[:, c]], observations.size_px[c]) for c in range(len(cameras))]),
@@ -140,9 +150,8 @@ def test_bars(box_m: np.ndarray, length_m: float) -> np.ndarray:
     return np.stack([points, points + inward * length_m], axis=1)
 
 
-def _lengths(calibration: Calibration, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
-    """Lengths of the positions `which` (N,) from their ends, each intersected by itself.  (1)"""
-    observations, used = calibration.observations, calibration.used
+def _lengths(observations: BarObservations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
+    """Lengths of the positions `which` (N,) from their ends' image points `used` (N, C, 2), each end intersected by itself.  (1)"""
     rows = np.flatnonzero(which & (used.sum(axis=1) >= 2).all(axis=1))
     xy = np.where(used[rows][..., None], observations.xy_px[rows], np.nan)
     xy = np.moveaxis(xy, 2, 1).reshape(2 * len(rows), len(cameras), 2)
@@ -152,24 +161,30 @@ def _lengths(calibration: Calibration, cameras: tuple[Camera, ...], which: np.nd
     return Lengths(residual_m=residual[fine], middle_m=ends.mean(axis=1)[fine], frames=observations.frames[rows][fine])
 
 
-def held_out_lengths(calibration: Calibration) -> Lengths:
-    """Lengths of all positions, each from cameras adjusted without it.  (1)"""
+def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
+    """Lengths of the positions, each from cameras adjusted without it: of those that are used, and of all whose rays meet.  (1)"""
     observations = calibration.observations
-    parts = []
+    parts, untested = [], []
     for fold in range(FOLDS):
         out = np.arange(len(calibration.used)) % FOLDS == fold
-        rest = observations.part(~out)
-        network = _of_positions(calibration.network, ~out)
         done = adjust(
-            network,
-            rest.xy_px,
+            _of_positions(calibration.network, ~out),
+            observations.part(~out).xy_px,
             calibration.used[~out],
             calibration.unknowns,
             unit_px=calibration.sigma0_px,
             max_iterations=6,
             tolerance=1e-2,
         )
-        parts.append(_lengths(calibration, done.network.cameras(observations.names, observations.size_px), out))
+        cameras = done.network.cameras(observations.names, observations.size_px)
+        parts.append(_lengths(observations, calibration.used, cameras, out))
+        left = observations.part(out)
+        _, meet = met_ends(cameras, left, GROSS * calibration.sigma0_px)
+        untested.append(_lengths(left, meet, cameras, np.ones(len(meet), dtype=bool)))
+    return _together(parts), _together(untested)
+
+
+def _together(parts: list[Lengths]) -> Lengths:
     return Lengths(
         residual_m=np.concatenate([p.residual_m for p in parts]),
         middle_m=np.concatenate([p.middle_m for p in parts]),

@@ -45,6 +45,18 @@ def test_footage_becomes_cameras(blender, empty, bar: Path) -> None:
     assert rig["C"].size_px == tuple(clip.size)
 
 
+def test_both_fields_are_shown_image_by_image(blender, empty, bar: Path, tmp_path: Path) -> None:
+    """The bar stands in both fields of these images, so twice as many frames are measured as the clip has."""
+    props = empty.context.scene.tricap_calibrate
+    props.bar, props.length_m, props.interlaced = str(bar), 0.5, "both"
+    assert empty.ops.tricap.calibrate(out=str(tmp_path / "rig.toml")) == {"FINISHED"}
+    kept = read_bar(tmp_path / "rig.toml", read_rig(tmp_path / "rig.toml"))
+    assert kept is not None and len(kept[0]) > 60 and kept[0].max() == 79
+    track = empty.data.movieclips["Bar C"].tracking.tracks[0].markers
+    assert 20 < len(track) <= 41 and max(m.frame for m in track) <= 41
+    assert len(empty.data.objects["Reference bar"].data.vertices) <= 2 * 40
+
+
 def test_a_mistake_is_told_and_changes_nothing(blender, empty, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="no folder"):
         empty.ops.tricap.calibrate(bar=str(tmp_path / "none"), length_m=0.5)

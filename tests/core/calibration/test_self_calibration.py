@@ -8,6 +8,7 @@ import pytest
 from tricap.core.calibrating import calibrate_rig
 from tricap.core.calibration.bundle import Unknowns
 from tricap.core.calibration.precision import predicted_error, with_left_out
+from tricap.core.calibration.quality import held_out_lengths
 from tricap.core.calibration.self_calibration import calibrate
 from tricap.core.errors import InputError
 from tricap.core.geometry.camera_derivatives import INTERIOR
@@ -141,6 +142,19 @@ def test_the_report_knows_how_good_it_is() -> None:
     assert done.quality.held_out.rms_m < 3e-3 and len(done.quality.held_out.residual_m) > 150
     up = np.mean([c.R_cam_world[1] for c in done.rig.cameras], axis=0)
     assert up @ [0, 0, -1] > 0.99  # the cameras' y axes point down, which is -Z
+
+
+def test_left_out_bars_are_also_told_without_the_test_that_knows_their_length() -> None:
+    """Seven bars have a bright spot 20 mm beyond one end: its rays meet, so only the length tells them."""
+    waved = waved_bar(benchmark_cameras(), 120, np.random.default_rng(5), BarNoise(sigma_px=0.05, gross=0.0, missing=0.0))
+    ends, xy, longer = waved.ends_m, waved.xy_px.copy(), np.arange(4, 120, 17)
+    beyond = ends[longer, 0] + 0.02 * (ends[longer, 0] - ends[longer, 1]) / waved.length_m
+    xy[longer, :, 0] = np.stack([c.project(beyond) for c in waved.cameras], axis=1)
+    tested, every = held_out_lengths(calibrate(observed(replace(waved, xy_px=xy)), Monitor()))
+    assert not np.isin(longer, tested.frames).any() and tested.rms_m < 0.4e-3
+    assert set(longer) <= set(every.frames) and len(every.frames) >= len(tested.frames) + len(longer)
+    off = every.residual_m[np.isin(every.frames, longer)]
+    assert np.allclose(off, 0.02, atol=2e-3) and every.median_m < 0.4e-3 < every.rms_m
 
 
 @pytest.mark.slow
