@@ -57,14 +57,14 @@ class Packed(Sequence[np.ndarray]):
 
     def __init__(self, images: Iterable[np.ndarray] = ()) -> None:
         self._images: list[bytes] = []
-        self._size = (0, 0)
+        self._size: tuple[int, ...] = (0, 0)
         for image in images:
             self.append(image)
 
     def append(self, image: np.ndarray) -> None:
         """One more."""
         self._size = image.shape
-        self._images.append(zlib.compress(np.ascontiguousarray(image, dtype=np.uint8), 1))
+        self._images.append(zlib.compress(image.astype(np.uint8).tobytes(), 1))
 
     def __len__(self) -> int:
         return len(self._images)
