@@ -312,16 +312,18 @@ def _readout(e: np.ndarray, s: float, b: float, frame: np.ndarray) -> tuple[floa
 
 
 def _sigma(A: np.ndarray, w: np.ndarray, v: np.ndarray, frame: np.ndarray) -> float:
-    """Sigma of the first unknown: the larger one of the adjustment's and of what leaving out single frames (or other groups) does."""
+    """Sigma of the first unknown: the larger one of the adjustment's and, of more than one, of what leaving out single frames does.
+
+    In the place of frames other groups may stand.
+    """
     normal, gradient = (A * w[:, None]).T @ A, A * (w * v)[:, None]
-    changes = [0.0]  # of the first unknown when a group is left out: the jackknife (Tukey 1958)
-    for f in np.unique(frame):
+    changes, groups = list[float](), np.unique(frame)  # of the first unknown, when a group is left out: the jackknife (Tukey 1958)
+    for f in groups if len(groups) > 1 else ():
         own = frame == f
         rest = normal - (A[own] * w[own, None]).T @ A[own]
         if np.linalg.cond(rest) > 1e9:
             return np.inf
         changes.append(float(np.linalg.solve(rest, gradient[own].sum(axis=0))[0]))
-    k = len(changes) - 1
-    between = (k - 1) / k * float(np.square(changes).sum())
+    between = (1 - 1 / len(groups)) * float(np.square(changes).sum())
     within = float(np.linalg.inv(normal)[0, 0] * (w * v**2).sum() / max(w.sum() - 2, 1))
     return float(np.sqrt(max(between, within)))
