@@ -14,6 +14,7 @@ Points, outlines and keypoints are each enough alone.
 A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is known of the shape
 beforehand (radii from the model, bone lengths from the click frame) weigh as much against the points of so many frames as against those of
 one. By default it counts once: a click frame's lengths err by more than a body differs from its balls, and other postures tell of them.
+One ellipsoid a bone differs far from a body, and in every frame alike: there it counts for all frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -230,7 +231,9 @@ def _shared_weight(points: Sequence[CloudPoints], settings: FitSettings) -> floa
     """By how much T frames tell less of the shape than T times one frame: 1 for noise of the points alone, T for the model's error."""
     sigmas = np.concatenate([p.sigma_m for p in points])
     own = (float(np.median(sigmas)) if len(sigmas) else 0.0) ** 2 + 1e-12
-    model, frames = settings.model_sigma_m**2, min(float(len(points)), settings.shared_frames)
+    model, frames = settings.model_sigma_m**2, float(len(points))
+    if settings.balls != "one":
+        frames = min(frames, settings.shared_frames)
     return (own + frames * model) / (own + model)
 
 

@@ -11,7 +11,7 @@ START_DAMPING, LARGEST_DAMPING = 1e-3, 1e8
 POOR, GOOD = 0.25, 0.5  # gain of a step over what was foreseen
 STEP_DONE = 1e-4  # rad, m, relative
 COST_DONE = 1e-4
-SIGMAS_DONE = 0.03  # root mean square over the parameters: as much as a step gains, (0.03 σ)² each, is not worth another
+SIGMAS_DONE = 0.01  # root mean square over the parameters: as much as a step gains, (0.01 σ)² each, is not worth another
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
