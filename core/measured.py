@@ -5,12 +5,13 @@ a frame is measured.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
 
 from .errors import InputError
+from .lazy import Lazy
 from .measuring import MeasuredFrame, read_checkpoint
 from .results import Results
 from .surface.cloud import PointCloud
@@ -69,22 +70,6 @@ class MeasuredFrames(Sequence[MeasuredFrame]):
         """The usual distance by which rays were allowed to miss."""
         return float(np.median([n.limit_px for n in self.notes]))
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Clouds(Sequence[PointCloud]):
-    """The clouds of measured frames, each read and corrected when it is asked for."""
-
-    measured: MeasuredFrames
-    corrected: Callable[[PointCloud], PointCloud] = field(default=lambda cloud: cloud)
-
-    def __len__(self) -> int:
-        return len(self.measured)
-
-    @overload
-    def __getitem__(self, index: int) -> PointCloud: ...
-    @overload
-    def __getitem__(self, index: slice) -> "Clouds": ...
-    def __getitem__(self, index: int | slice) -> "PointCloud | Clouds":
-        if isinstance(index, slice):
-            return Clouds(measured=self.measured[index], corrected=self.corrected)
-        return self.corrected(self.measured[index].cloud)
+    def clouds(self, corrected: Callable[[PointCloud], PointCloud]) -> Sequence[PointCloud]:
+        """The frames' clouds, each read and corrected when it is asked for."""
+        return Lazy(self, lambda measured: corrected(measured.cloud))

@@ -33,7 +33,7 @@ from .images.enhance import EnhanceSettings
 from .images.retime import TimingSettings
 from .matching.growing import GrowingSettings
 from .matching.least_squares import MatchingSettings
-from .measured import Clouds, MeasuredFrames, note_of
+from .measured import MeasuredFrames, note_of
 from .measuring import NothingMeasured, measure_frames
 from .motion.ply import write_mesh
 from .motion.tables import write_joints, write_motion
@@ -88,7 +88,7 @@ class Run:
     @property
     def clouds(self) -> Sequence[PointCloud]:
         """The clouds in the order of time, as the user corrected them; without points where nothing was measured."""
-        return Clouds(measured=self.measured, corrected=self.corrected) if self.measured else empty_clouds(self.footage)
+        return self.measured.clouds(self.corrected) if self.measured else empty_clouds(self.footage)
 
     def corrected(self, cloud: PointCloud) -> PointCloud:
         """A cloud without what the user took out."""

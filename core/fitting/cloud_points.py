@@ -1,8 +1,7 @@
 """What the fit takes from a cloud: finite points, thinned to one per voxel, with a sigma along the surface normal."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, overload
+from typing import Protocol
 
 import numpy as np
 
@@ -61,26 +60,6 @@ def thinned(cloud: Cloud, voxel_m: float) -> CloudPoints:
     length = np.linalg.norm(mean[1], axis=1, keepdims=True)
     normals = mean[1] / np.where(length > 0.3, length, np.inf)
     return CloudPoints(frame=int(cloud.frame), xyz_m=mean[0], normals=normals, sigma_m=mean[2][:, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class ThinnedClouds(Sequence[CloudPoints]):
-    """The thinned points of all frames; a cloud is read and thinned when it is asked for, and not kept."""
-
-    clouds: Sequence[Cloud]
-    voxel_m: float
-
-    def __len__(self) -> int:
-        return len(self.clouds)
-
-    @overload
-    def __getitem__(self, index: int) -> CloudPoints: ...
-    @overload
-    def __getitem__(self, index: slice) -> "ThinnedClouds": ...
-    def __getitem__(self, index: int | slice) -> "CloudPoints | ThinnedClouds":
-        if isinstance(index, slice):
-            return ThinnedClouds(self.clouds[index], self.voxel_m)
-        return thinned(self.clouds[index], self.voxel_m)
 
 
 def _sigma_along(normals: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -19,18 +19,20 @@ One ellipsoid a bone differs far from a body, and in every frame alike: there it
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ..body.complete import complete_shape
 from ..body.model_file import read_model, with_limits
 from ..body.shape import default_shape, one_ball_shape, scaled_shape
+from ..lazy import Lazy
 from ..progress import Monitor
 from .acceleration import Acceleration, typical_acceleration
 from .body_motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from .click_frame import clicked_lengths, fit_click_frame
 from .clicks import enough, read_clicks
-from .cloud_points import CloudPoints, ThinnedClouds
+from .cloud_points import CloudPoints, thinned
 from .conditions import NO_SHAPE, Conditions
 from .empty_views import EmptyViews
 from .fit_input import FitInput
@@ -72,7 +74,7 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
     fit = conditions(given, settings)
-    points: Sequence[CloudPoints] = ThinnedClouds(given.clouds, settings.voxel_m)
+    points: Sequence[CloudPoints] = Lazy(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
     if len(points) <= AT_ONCE:
         points = _read(points, monitor)
     first = fit_click_frame(fit, points[fit.click], monitor)

@@ -1,12 +1,9 @@
 """A long recording is adjusted in stretches: as good as at once, with sigmas as honest, and nothing is kept of a stretch but its result."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from tricap.core.fitting import sequence, stretches
-from tricap.core.fitting.cloud_points import ThinnedClouds
 from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
 
 KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.005)
@@ -28,12 +25,6 @@ def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.Monkey
     assert np.median(off) < 0.2 and off.max() < 1.0  # 36 frames in two stretches, two seeds: 0.05–0.09 and 0.19–0.47
     ratio = pieces.motion.sigma / whole.motion.sigma
     assert 0.9 < np.median(ratio) < 1.1 and ratio.max() < 1.4  # 1.00, 1.12
-
-
-def test_points_are_read_when_they_are_asked_for_and_not_kept() -> None:
-    cloud = SimpleNamespace(frame=7, xyz_m=np.zeros((3, 3)), normals=np.zeros((3, 3)), covariance_m2=np.tile(np.eye(3), (3, 1, 1)))
-    points = ThinnedClouds([cloud], 0.01)
-    assert len(points) == 1 and points[0].frame == 7 and points[0] is not points[0]
 
 
 def test_spans_cover_every_frame_once(monkeypatch: pytest.MonkeyPatch) -> None:
