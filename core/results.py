@@ -141,18 +141,18 @@ class Results:
 
 
 class KeptFit:
-    """The checkpoint of a fit under way (`fitting.way.Kept`): cache/fit/way.npz."""
+    """The checkpoints of a fit under way (`fitting.way.Kept`): cache/fit."""
 
     def __init__(self, results: Results, key: str) -> None:
         self._results, self._key = results, key
 
-    def load(self) -> dict[str, np.ndarray] | None:
-        """What an interrupted fit of the same input left."""
-        return self._results.load_checkpoint("fit", "way", self._key)
+    def load(self, name: str) -> dict[str, np.ndarray] | None:
+        """What an interrupted fit of the same input left under a name."""
+        return self._results.load_checkpoint("fit", name, self._key)
 
-    def save(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep this instead."""
-        self._results.save_checkpoint("fit", "way", self._key, arrays)
+    def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep this under a name, instead of what was."""
+        self._results.save_checkpoint("fit", name, self._key, arrays)
 
 
 def _written(folder: Path) -> list[Path]:

@@ -17,6 +17,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,23 +77,27 @@ def tiny_take(folder: Path) -> Path:
     return folder
 
 
-def command(take: Path, out: Path, tell: "Tell") -> None:
+def command(take: Path, out: Path, tell: "Tell", in_stretches: bool = False) -> None:
     """Driver: `tricap run`, with body.blend where there is bpy."""
     from tricap.__main__ import main
 
     tell(Monitor)
+    if in_stretches:
+        short_stretches("tricap")
     sets = [f"--set={group}.{name}={value}" for group, table in SETTINGS.items() for name, value in table.items()]
     code = main(["run", str(take), "--out", str(out), *sets])
     if code:
         raise SystemExit(code)
 
 
-def operator(take: Path, out: Path, tell: "Tell") -> None:
+def operator(take: Path, out: Path, tell: "Tell", in_stretches: bool = False) -> None:
     """Driver: bpy.ops.tricap.run in a Blender without window."""
     bpy, addon_utils = importlib.import_module("bpy"), importlib.import_module("addon_utils")
     addon_utils.extensions_refresh()
     assert addon_utils.enable(EXTENSION, default_set=True) is not None
     tell(importlib.import_module(f"{EXTENSION}.core.progress").Monitor)
+    if in_stretches:
+        short_stretches(EXTENSION)
     for group, table in SETTINGS.items():
         for name, value in table.items():
             setattr(getattr(bpy.context.scene.tricap, group), name, value)
@@ -100,9 +105,21 @@ def operator(take: Path, out: Path, tell: "Tell") -> None:
         raise SystemExit(3)
 
 
+def short_stretches(package: str) -> None:
+    """The fit is done in stretches of two frames, as that of a long clip is in longer ones."""
+    sequence, stretches = (importlib.import_module(f"{package}.core.fitting.{name}") for name in ("sequence", "stretches"))
+    vars(sequence)["AT_ONCE"] = vars(stretches)["AT_ONCE"] = 3
+    vars(stretches)["MARGIN"] = 2
+
+
 Tell = Callable[[type], None]  # makes a Monitor class tell its stages to the parent
 Driver = Callable[[Path, Path, Tell], None]
-DRIVERS: dict[str, Driver] = {"tricap run": command, "operator": operator}
+DRIVERS: dict[str, Driver] = {
+    "tricap run": command,
+    "operator": operator,
+    "tricap run, in stretches": partial(command, in_stretches=True),
+    "operator, in stretches": partial(operator, in_stretches=True),
+}
 
 
 def start(driver: Driver, take: Path, out: Path, moment: Moment | None = None) -> Ended:

@@ -39,7 +39,7 @@ def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, f
     motion[fit.click] = first.motion[0]
     at_click = _unseen(fit, fit.click, points[fit.click], first.motion[0], first.vector, np.zeros(len(fit.model.skeleton.bones)))
     way = Way(motion=motion, known=np.ones(motion.shape, dtype=bool), unseen=at_click, seen=[fit.click])
-    way = way.goes_on(kept.load() if kept else None)
+    way = way.goes_on(kept.load("way") if kept else None)
     ahead, back = [(t, 1) for t in range(fit.click + 1, T)], [(t, -1) for t in range(fit.click - 1, -1, -1)]
     for t, direction in [*ahead, *back][way.done - 1 :]:
         monitor.step("fit frame after frame", way.done, T)
@@ -48,7 +48,7 @@ def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, f
         _step(fit, way, t, direction, points[t], time_s, first, tracks)
         way.done += 1
         if kept is not None and way.done % KEEP_EVERY == 0:
-            kept.save(way.arrays())
+            kept.save("way", way.arrays())
     if tracks is not None:
         tracks.forget()  # a fit that went on from a checkpoint knows less of them
     return way.motion, way.known

@@ -35,6 +35,7 @@ from .clicks import enough, read_clicks
 from .cloud_points import CloudPoints, thinned
 from .conditions import NO_SHAPE, Conditions
 from .empty_views import EmptyViews
+from .finished import NOTHING_BEHIND, Behind, Ended, FoundShape, Stretch
 from .fit_input import FitInput
 from .frame_to_frame import follow
 from .handed_over import HandedOver, Tied, hand_over
@@ -65,7 +66,7 @@ FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in 
 def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None, kept: Kept | None = None) -> BodyFit:
     """Shape and motion of the person. Frames without points are bridged and say so in their status. Time is linear in frames.
 
-    With `kept`, the work frame after frame is kept there from time to time, and gone on with.
+    With `kept`, the work frame after frame is kept there from time to time, and so is each stretch that is done; both are gone on with.
 
     Raises:
         InputError: the model or a degree of freedom is unknown, clicks are missing or contradict each other, or the limb has no points
@@ -86,7 +87,9 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
     every = Recording(fit=fit, frames=given.frames, points=points, time_s=given.time_s, sigma=sigma, tracks=tracks,
                       lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
                       feet=_standing(fit, motion, first.vector, given.time_s))
-    return (_at_once if len(points) <= AT_ONCE else _in_stretches)(every, motion, first.vector, monitor)
+    if len(points) <= AT_ONCE:
+        return _at_once(every, motion, first.vector, monitor)
+    return _in_stretches(every, motion, first.vector, monitor, kept)
 
 
 def _read(points: Sequence[CloudPoints], monitor: Monitor) -> list[CloudPoints]:
@@ -100,61 +103,81 @@ def _read(points: Sequence[CloudPoints], monitor: Monitor) -> list[CloudPoints]:
 def _at_once(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> BodyFit:
     """All frames in one adjustment, from a motion (T, D) and a shape vector (S,)."""
     frames = range(len(motion))
-    part, problem, solution = _adjusted(every.stretch(frames, motion, vector), motion, vector, monitor)
+    part, problem, (*_, solution) = _adjusted(every.stretch(frames, motion, vector), motion, vector, monitor)
     covariance = _covariance(problem, solution, _factors(part, problem, solution))
-    return _result(part, _looked(part, solution, covariance, frames), covariance[2], [solution])
+    return _result(part, _looked(part, solution, covariance, frames), solution.vector, covariance[2], [Ended.of(solution)])
 
 
-def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> tuple[Recording, Problem, Solution]:
-    """Postures and shape together; the recording comes back with the complete model where that was asked for."""
+def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> tuple[Recording, Problem, list[Solution]]:
+    """Postures and shape together; where the complete model was asked for, a second solution, and the recording comes back with it."""
     steps = part.fit.settings.sequence_steps
     problem = _whole_sequence(part)
     solution = solve(problem, motion, vector, steps=steps, monitor=monitor, stage="adjust the sequence")
-    solution = _begun_anew(part.fit, part.points, part.time_s, solution, problem, monitor)
+    solutions = [_begun_anew(part.fit, part.points, part.time_s, solution, problem, monitor)]
     if part.fit.settings.balls == "complete":
-        part = replace(part, fit=_completed(part.fit, solution))
+        part = replace(part, fit=_completed(part.fit, solutions[0].vector))
         problem = _whole_sequence(part)
-        solution = solve(problem, solution.motion, part.fit.parameters.vector(), steps=steps, scales=solution.scales,
-                         monitor=monitor, stage="refine the complete model")
-    return part, problem, solution
+        solutions.append(solve(problem, solutions[0].motion, part.fit.parameters.vector(), steps=steps, scales=solutions[0].scales,
+                               monitor=monitor, stage="refine the complete model"))
+    return part, problem, solutions
 
 
-def _in_stretches(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> BodyFit:
+def _in_stretches(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor, kept: Kept | None) -> BodyFit:
     """As `_at_once`, with memory for `AT_ONCE` frames and two margins only.
 
     First the shape, from blocks of frames all over the recording: since a body differs from its model in every frame alike, more would not
     tell more of it. Then, with that shape held, the postures. Their covariances count what is not known of the shape.
     """
-    motion, frames = motion.copy(), sample(len(motion), every.fit.click)
-    part, problem, first = _adjusted(every.stretch(frames, motion, vector), motion[frames], vector, monitor)
-    shape, vector = _covariance(problem, first, _factors(part, problem, first))[2], first.vector
-    every = replace(every, fit=replace(every.fit, parameters=part.fit.parameters, settings=part.fit.settings))
-    del part, problem  # their points
-    looked, solutions = _postures(every, motion, vector, shape, monitor)
-    return _result(every, looked, shape, [first, *solutions])
+    found = FoundShape.loaded(kept)
+    if found is None:
+        found = _shape_of_blocks(every, motion, vector, monitor)
+        found.save(kept)
+    if every.fit.settings.balls == "complete":
+        every = replace(every, fit=_completed(every.fit, found.simplified))
+    looked, ends = _postures(every, motion, found, monitor, kept)
+    return _result(every, looked, found.vector, found.covariance, [found.ended, *ends])
 
 
-def _postures(every: Recording, motion: np.ndarray, vector: np.ndarray, shape: np.ndarray,
-              monitor: Monitor) -> tuple[Looked, list[Solution]]:
-    """The postures from a motion (T, D), with a held shape (S,) of covariance (S, S), stretch after stretch from the click frame on."""
-    looked, solutions, plan = dict[int, Looked](), list[Solution](), outwards(len(motion), every.fit.click)
-    motion, behind = motion.copy(), dict[int, list[HandedOver]]()
+def _shape_of_blocks(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> FoundShape:
+    """The shape from some blocks of a motion (T, D)."""
+    frames = sample(len(motion), every.fit.click)
+    part, problem, solutions = _adjusted(every.stretch(frames, motion, vector), motion[frames], vector, monitor)
+    last = solutions[-1]
+    covariance = _covariance(problem, last, _factors(part, problem, last))[2]
+    return FoundShape(simplified=solutions[0].vector, vector=last.vector, covariance=covariance, ended=Ended.of(last))
+
+
+def _postures(every: Recording, motion: np.ndarray, shape: FoundShape, monitor: Monitor, kept: Kept | None) -> tuple[Looked, list[Ended]]:
+    """The postures from a motion (T, D), with the shape held, stretch after stretch from the click frame on."""
+    done, behind, plan = dict[int, Stretch](), dict[int, Behind](), outwards(len(motion), every.fit.click)
     for k, (own, around, direction) in enumerate(plan):
-        part, told = every.stretch(around, motion, vector), monitor.part("adjust the postures", k, len(plan))
-        known, honest = behind.get(direction, (None, None))
-        problem = _whole_sequence(part, known)
-        held = replace(problem, free_shape=NO_SHAPE)
-        solution = solve(held, motion[around], vector, steps=part.fit.settings.sequence_steps, monitor=told)
-        solution = _begun_anew(part.fit, part.points, part.time_s, solution, held, told)
-        local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, held, solution)
-        covariance = _covariance(_whole_sequence(part, honest), solution, factors, shape)
-        motion[own], looked[own.start] = solution.motion[local], _looked(part, solution, covariance, local)
-        solutions.append(solution)
-        for way in {1, -1} if direction == 0 else {direction}:
-            if own.stop < len(motion) if way > 0 else own.start > 0:
-                behind[way] = [hand_over(problem, solution, local, beside, part.time_s, part.sigma, ahead=way > 0, understated=understated)
-                               for beside, understated in ((known, None), (honest, factors))]
-    return joined([looked[start] for start in sorted(looked)]), solutions
+        stretch = Stretch.loaded(kept, own, around)
+        if stretch is None:
+            told = monitor.part("adjust the postures", k, len(plan))
+            stretch = _stretch(every, (own, around, direction), motion, shape, behind.get(direction, NOTHING_BEHIND), told)
+            stretch.save(kept, own, around)
+        done[own.start] = stretch
+        behind.update(stretch.behind)
+    ends = [stretch.ended for stretch in done.values()]
+    return joined([done.pop(start).looked for start in sorted(done)]), ends
+
+
+def _stretch(every: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: FoundShape, behind: Behind,
+             monitor: Monitor) -> Stretch:
+    """One of `outwards`, from a motion (T, D) of all frames, with what the stretches behind handed over."""
+    own, around, direction = place
+    part = every.stretch(around, motion, shape.vector)
+    problem = _whole_sequence(part, behind.known)
+    held = replace(problem, free_shape=NO_SHAPE)
+    solution = solve(held, motion[around], shape.vector, steps=part.fit.settings.sequence_steps, monitor=monitor)
+    solution = _begun_anew(part.fit, part.points, part.time_s, solution, held, monitor)
+    local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, held, solution)
+    covariance = _covariance(_whole_sequence(part, behind.honest), solution, factors, shape.covariance)
+    told = partial(hand_over, problem, solution, local, time_s=part.time_s, sigma=part.sigma)
+    ways = [way for way in ({1, -1} if direction == 0 else {direction}) if (own.stop < len(motion) if way > 0 else own.start > 0)]
+    return Stretch(looked=_looked(part, solution, covariance, local), ended=Ended.of(solution),
+                   behind={way: Behind(known=told(beside=behind.known, ahead=way > 0),
+                                       honest=told(beside=behind.honest, ahead=way > 0, understated=factors)) for way in ways})
 
 
 def _standing(fit: Conditions, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
@@ -165,9 +188,8 @@ def _standing(fit: Conditions, motion: np.ndarray, vector: np.ndarray, time_s: n
     return StandingFeet(joints, fit.model.skeleton.joint_names, time_s)
 
 
-def _completed(fit: Conditions, solution: Solution) -> Conditions:
-    """The same conditions for the complete model of the body that was found."""
-    vector = solution.vector
+def _completed(fit: Conditions, vector: np.ndarray) -> Conditions:
+    """The same conditions for the complete model of the body that was found (S,)."""
     shape = complete_shape(fit.parameters.shape(vector, np.full(len(vector), np.nan)))
     return replace(fit, parameters=ShapeParameters(shape, fit.settings.weights), settings=replace(fit.settings, radius_sigma=MUSCLE_SIGMA))
 
@@ -289,14 +311,14 @@ def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, n
                   points=counts[0], evidence=counts[1], outline_m=np.concatenate(outline))
 
 
-def _result(every: Recording, looked: Looked, shape: np.ndarray, solutions: Sequence[Solution]) -> BodyFit:
-    """The body of all frames; `shape` (S, S) is its covariance, and the last of the solutions has its shape."""
+def _result(every: Recording, looked: Looked, vector: np.ndarray, covariance: np.ndarray, ends: Sequence[Ended]) -> BodyFit:
+    """The body of all frames, with the shape vector (S,) of a covariance (S, S), and how the adjustments ended."""
     fit, skeleton = every.fit, every.fit.model.skeleton
     motion = BodyMotion(frames=np.array(every.frames), time_s=every.time_s, dof_names=skeleton.dof_names, values=looked.values,
                         covariance=looked.covariance, joint_names=skeleton.joint_names, joints_m=looked.joints_m,
                         joint_sigma_m=looked.joint_sigma_m, status=_statuses(fit, looked.evidence, looked.sigma0), sigma0=looked.sigma0)
-    return BodyFit(shape=fit.parameters.shape(solutions[-1].vector, np.sqrt(np.diag(shape))), motion=motion,
-                   iterations=max(s.iterations for s in solutions), converged=all(s.converged for s in solutions), points=looked.points,
+    return BodyFit(shape=fit.parameters.shape(vector, np.sqrt(np.diag(covariance))), motion=motion,
+                   iterations=max(end.iterations for end in ends), converged=all(end.converged for end in ends), points=looked.points,
                    outline_m=looked.outline_m)
 
 

@@ -10,13 +10,13 @@ KEEP_EVERY = 25  # frames: some seconds of work
 
 
 class Kept(Protocol):
-    """Where a fit keeps its work, under a key of all that it depends on."""
+    """Where a fit keeps its work, each part by its name, under a key of all that it depends on."""
 
-    def load(self) -> Mapping[str, np.ndarray] | None:
-        """What was kept, if anything was."""
+    def load(self, name: str) -> Mapping[str, np.ndarray] | None:
+        """What was kept under a name, if anything was."""
 
-    def save(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep this instead."""
+    def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep this under a name, instead of what was."""
 
 
 @dataclass(kw_only=True)

@@ -1,4 +1,5 @@
-"""How many killed runs are survived: `dev.py bench resume` kills 200 runs (about 15 minutes), half by each driver.
+"""How many killed runs are survived: `dev.py bench resume` kills 200 runs (about 15 minutes), a quarter by each
+driver, with the fit at once and in stretches.
 
     python tests/bench/resume.py [--moments 200] [--seed 0] [--json FILE]
 """

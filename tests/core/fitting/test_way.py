@@ -1,11 +1,12 @@
-"""A fit that was stopped while it followed the body goes on from what it kept, and ends with the same bytes."""
+"""A fit that was stopped goes on from what it kept, and ends with the same bytes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tricap.core.fitting import frame_to_frame
+from tricap.core.fitting import frame_to_frame, sequence, stretches
 from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
 from tricap.core.progress import Cancelled, Monitor
 from tricap.core.results import KeptFit, Results
@@ -64,3 +65,41 @@ def test_what_was_kept_of_another_take_is_not_used(given: FitInput, tmp_path: Pa
     with pytest.raises(Cancelled):
         fit_sequence(given, SETTINGS, monitor, KeptFit(Results(tmp_path / "out"), "another"))
     assert monitor.frames == 0
+
+
+class StoppedStretches(Monitor):
+    """Notes what is begun of an adjustment in stretches, and stops the fit where the n-th is begun."""
+
+    def __init__(self, at: int | None = None) -> None:
+        super().__init__()
+        self.at, self.begun = at, list[str]()
+
+    def step(self, stage: str, done: float, total: float) -> None:
+        if stage == "adjust the sequence" and done == 0:
+            self._begin("shape")
+
+    def part(self, stage: str, index: int, count: int) -> Monitor:
+        self._begin(f"{index + 1} of {count}")
+        return Monitor()
+
+    def _begin(self, what: str) -> None:
+        if len(self.begun) == self.at:
+            raise Cancelled("Stopped by the test.")
+        self.begun.append(what)
+
+
+@pytest.mark.parametrize("balls", ["three", pytest.param("complete", marks=pytest.mark.slow)])
+def test_a_fit_in_stretches_goes_on_with_the_next(given: FitInput, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, balls: str) -> None:
+    """Stopped after the shape, and after the second of three stretches."""
+    for module in (sequence, stretches):
+        monkeypatch.setattr(module, "AT_ONCE", 3)
+    monkeypatch.setattr(stretches, "MARGIN", 2)
+    settings = replace(SETTINGS, balls=balls, sequence_steps=2)
+    whole = arrays(fit_sequence(given, settings, monitor := StoppedStretches()))
+    assert monitor.begun == ["shape", "1 of 3", "2 of 3", "3 of 3"]
+    for stopped_at in (1, 3):
+        kept = KeptFit(Results(tmp_path / str(stopped_at)), "key")
+        with pytest.raises(Cancelled):
+            fit_sequence(given, settings, StoppedStretches(stopped_at), kept)
+        assert arrays(fit_sequence(given, settings, again := StoppedStretches(), kept)) == whole
+        assert again.begun == monitor.begun[stopped_at:]
