@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ from scipy.spatial import cKDTree
 
 from . import pipeline, store
 from .arguments import frame_range, overrides
+from .contour_table import HEAD, contour_rows
 from .errors import InputError
 from .images.sequence import read_image
 from .inspection import body_outline
 from .measuring import NothingMeasured
 from .progress import Monitor
 from .settings import nearest_name
+from .surface.cloud import PointCloud
 from .tracking.contour import (
     Contour,
     ContourSettings,
@@ -30,6 +32,7 @@ from .tracking.contour import (
 )
 from .tracking.point_tables import read_polygon
 
+ALGORITHM = "contours 1"  # part of the checkpoints' keys: raise it when the same input gives other numbers
 BACKGROUND_SIGMAS, OPENING_PX, CLOSING_PX = 4.0, 1, 3
 SHADOW_PX, SHADOW_SCATTER, DARKEST_SHADOW = 7, 0.06, 0.6  # window, and what a shadow leaves of the light
 CLOSING_CELLS, ONE_PIECE = (2, 3, 4, 6), 0.9
@@ -116,16 +119,45 @@ def _track_if_possible(job: pipeline.Run, monitor: Monitor, own_start: bool) -> 
 
 
 def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
-    contours = dict(track_contour(job, view, monitor, start))
-    path = job.results.path("contours", f"{name}.csv")
-    store.write_text(path, _table(contours))
+    path, seen = job.results.path("contours", f"{name}.csv"), list[float]()
+    with store.written(path) as file:
+        file.write(HEAD.encode())
+        for frame, contour in track_contour(job, view, monitor, start, KeptContours(job, view, start)):
+            file.write(contour_rows(frame, contour).encode())
+            seen.append(contour.seen.mean())
+    job.results.remove(f"cache/{_checkpoints(view)}")
     job.account["stages"].pop("fit", None)  # the body is to be fitted again
     job.results.write_run(job.account)
-    seen = float(np.mean([c.seen.mean() for c in contours.values()]))
-    return f"{path}: the outline in {len(contours)} frames, {100 * seen:.0f} % of its vertices on an edge."
+    return f"{path}: the outline in {len(seen)} frames, {100 * float(np.mean(seen)):.0f} % of its vertices on an edge."
 
 
-def track_contour(job: pipeline.Run, view: int, monitor: Monitor, start: Start) -> Iterator[tuple[int, Contour]]:
+class KeptContours:
+    """Checkpoints of the contours of a view, one a frame, with a key of all that the first and the following depend on."""
+
+    def __init__(self, job: pipeline.Run, view: int, start: Start) -> None:
+        self._results, self._stage = job.results, _checkpoints(view)
+        begun = [b"" if a is None else np.ascontiguousarray(a).tobytes() for a in (start.polygon, start.background)]
+        body = sorted(job.results.path("skin").glob("*.ply")) if start.body else []
+        tracked = "tracked" if job.trajectories is not None else "followed in the images"
+        self._key = store.digest(ALGORITHM, job.keys["track"], repr(job.settings["contour"]), tracked, *begun, *body)
+
+    def load(self, frame: int) -> Contour | None:
+        """That of a frame, if it was found before."""
+        kept = self._results.load_checkpoint(self._stage, f"{frame:04d}", self._key)
+        return None if kept is None else Contour(**{f.name: kept[f.name] for f in fields(Contour)})
+
+    def save(self, frame: int, contour: Contour) -> None:
+        """Keep that of a frame."""
+        arrays = {f.name: getattr(contour, f.name) for f in fields(Contour)}
+        self._results.save_checkpoint(self._stage, f"{frame:04d}", self._key, arrays)
+
+
+def _checkpoints(view: int) -> str:
+    return f"contour{view}"
+
+
+def track_contour(job: pipeline.Run, view: int, monitor: Monitor, start: Start,
+                  kept: KeptContours | None = None) -> Iterator[tuple[int, Contour]]:
     """(frame, contour) of one view; each predicted by the projected trajectories inside the last one that had any, or else by points that
     are followed in the images.
 
@@ -135,32 +167,69 @@ def track_contour(job: pipeline.Run, view: int, monitor: Monitor, start: Start) 
     Raises:
         InputError: there is nothing to start from.
     """
-    camera, tracks, settings = job.footage.rig.cameras[view], job.trajectories, job.settings["contour"]
-    base: Contour | None = None  # in frame number `last`, of the image `before`
-    last, before = 0, np.zeros((0, 0))
+    follower = _Follower(job, view, start)
     for i, cloud in enumerate(job.clouds):
         monitor.step("contours", i, len(job.clouds))
-        grey = job.footage.take.rows_at(cloud.frame).whole(job.footage.read(cloud.frame)[view])
-        own = np.zeros((0, 2))
-        if start.body:
-            own = _of_body(body_outline(job.results.folder, cloud.frame, camera), settings)
-        elif start.background is not None:
-            own = _before_background(grey, start.background, settings)
-        elif start.polygon is None:
-            own = _outline(grey, camera.project(cloud.xyz_m), settings)
-        if base is None:
-            predicted = own if start.polygon is None else resampled(start.polygon, settings.spacing_px)
-            if len(predicted) < 8:
-                raise InputError(f"There is no outline to start from in frame {cloud.frame}; give one with --polygon.")
-        else:
-            places = carried_points(base.xy_px, before, grey) if tracks is None else (
-                camera.project(tracks.xyz_m[last]), camera.project(tracks.xyz_m[i]))
-            carried = predict_contour(base.xy_px, *places)
-            predicted = _renewed(carried, own)
-        contour = relax_contour(predicted, grey, settings)
-        if base is None or (contour.seen.any() if tracks is None else tracks.seen[i].any()):
-            base, last, before = contour, i, grey
+        contour = kept.load(cloud.frame) if kept is not None else None
+        if contour is None:
+            contour = follower.found(i, cloud)
+            if kept is not None:
+                kept.save(cloud.frame, contour)
+        follower.goes_on(i, cloud.frame, contour)
         yield cloud.frame, contour
+
+
+class _Follower:
+    """The contour from frame to frame: `base` is the last that had something to go by, in frame index `last` of number `frame`."""
+
+    def __init__(self, job: pipeline.Run, view: int, start: Start) -> None:
+        self._job, self._view, self._start = job, view, start
+        self._camera, self._tracks, self._settings = job.footage.rig.cameras[view], job.trajectories, job.settings["contour"]
+        self._base: Contour | None = None
+        self._last, self._frame = 0, 0
+        self._image: tuple[int, np.ndarray] | None = None  # the one that was read last, with its frame
+
+    def goes_on(self, index: int, frame: int, contour: Contour) -> None:
+        """The next contour begins with this one, unless nothing was seen in its frame."""
+        if self._base is None or (contour.seen.any() if self._tracks is None else self._tracks.seen[index].any()):
+            self._base, self._last, self._frame = contour, index, frame
+
+    def found(self, index: int, cloud: PointCloud) -> Contour:
+        """The contour in the frame of a cloud.
+
+        Raises:
+            InputError: there is nothing to start from.
+        """
+        places = None if self._base is None else self._moved(self._base, index, cloud.frame)
+        grey = self._grey(cloud.frame)
+        own = self._own(grey, cloud)
+        if self._base is not None and places is not None:
+            return relax_contour(_renewed(predict_contour(self._base.xy_px, *places), own), grey, self._settings)
+        predicted = own if self._start.polygon is None else resampled(self._start.polygon, self._settings.spacing_px)
+        if len(predicted) < 8:
+            raise InputError(f"There is no outline to start from in frame {cloud.frame}; give one with --polygon.")
+        return relax_contour(predicted, grey, self._settings)
+
+    def _moved(self, base: Contour, index: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points (N, 2), (N, 2) of the view in the frame of the last contour, and in this one."""
+        if self._tracks is not None:
+            return self._camera.project(self._tracks.xyz_m[self._last]), self._camera.project(self._tracks.xyz_m[index])
+        return carried_points(base.xy_px, self._grey(self._frame), self._grey(frame))
+
+    def _own(self, grey: np.ndarray, cloud: PointCloud) -> np.ndarray:
+        """The outline (V, 2) that a frame shows by itself; none where the contour began with a polygon."""
+        if self._start.body:
+            return _of_body(body_outline(self._job.results.folder, cloud.frame, self._camera), self._settings)
+        if self._start.background is not None:
+            return _before_background(grey, self._start.background, self._settings)
+        return _outline(grey, self._camera.project(cloud.xyz_m), self._settings) if self._start.polygon is None else np.zeros((0, 2))
+
+    def _grey(self, frame: int) -> np.ndarray:
+        """The view's image in a frame."""
+        if self._image is None or self._image[0] != frame:
+            footage = self._job.footage
+            self._image = frame, footage.take.rows_at(frame).whole(footage.read(frame)[self._view])
+        return self._image[1]
 
 
 def _before_background(grey: np.ndarray, background: np.ndarray, settings: ContourSettings) -> np.ndarray:
@@ -216,11 +285,3 @@ def _renewed(predicted: np.ndarray, outline: np.ndarray) -> np.ndarray:
         return predicted
     there, back = (cKDTree(b).query(a)[0] for a, b in ((predicted, outline), (outline, predicted)))
     return outline if max(np.quantile(there, AGREEING), np.quantile(back, AGREEING)) > APART_PX else predicted
-
-
-def _table(contours: dict[int, Contour]) -> str:
-    lines = ["frame,vertex,x,y,normal_x,normal_y,sigma,on_edge"]
-    for frame, c in contours.items():
-        rows = np.column_stack([c.xy_px, c.normal, c.sigma_px])
-        lines += [f"{frame},{v}," + ",".join(f"{x:.4f}" for x in row) + f",{int(c.seen[v])}" for v, row in enumerate(rows)]
-    return "\n".join(lines) + "\n"

@@ -1,15 +1,15 @@
 """Where the fit's input comes from: the take's clicks and limits, the run's clouds and trajectories, contours/*.csv in OUT, keypoints."""
 
-import csv
-import io
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import radians
 from pathlib import Path
 
 import numpy as np
 
+from .contour_table import ContourTable
 from .errors import InputError
-from .fitting.fit_input import ClickedAt, EmptyView, FitInput, JointPlaces, ViewContours
+from .fitting.fit_input import ClickedAt, EmptyView, FitInput, JointPlaces, Outline
 from .keypoint_sources import KeypointSource
 from .motion.c3d import read_c3d
 from .motion.keypoints_json import natural_order, read_keypoints
@@ -27,7 +27,6 @@ OURS = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist", "thigh": "
         "clavicle": "clavicle", "hips": "pelvis", "neck": "neck"}  # of the roles that retargeting reads in names
 LOOSE = {"toe.L": 2.0, "toe.R": 2.0, "neck": 2.0, "pelvis": 2.0}  # where detectors mean another place than we do: times the sigma
 LEAST_CONFIDENCE = 0.2
-COLUMNS = ("frame", "x", "y", "normal_x", "normal_y", "sigma", "on_edge")
 
 
 def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results,
@@ -84,25 +83,34 @@ def _with_joints(take: Take) -> list[Seeds]:
     return [s for s in (*take.keyframes, take.seeds) if s.joints]
 
 
-def read_contours(results: Results, views: Sequence[str]) -> list[ViewContours]:
-    """The outlines that `tricap contour` wrote, the vertices on an edge only.
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class EdgesOfTable:
+    """The outlines of a table (`fitting.fit_input.Outlines`): the vertices on an edge only, read when they are asked for."""
+
+    view: str
+    table: ContourTable
+
+    def of_frame(self, frame: int) -> Outline | None:
+        """The outline in a frame; None without one.
+
+        Raises:
+            InputError: its rows are damaged.
+        """
+        found = self.table.get(frame)
+        if found is None:
+            return None
+        rows = np.flatnonzero(found.seen)
+        return (found.xy_px[rows], found.normal[rows], found.sigma_px[rows]) if len(rows) else None
+
+
+def read_contours(results: Results, views: Sequence[str]) -> list[EdgesOfTable]:
+    """The outlines that `tricap contour` wrote, of the views that have one.
 
     Raises:
-        InputError: a table cannot be read.
+        InputError: a table is damaged.
     """
-    found = []
-    for view in views:
-        path = results.path("contours", f"{view}.csv")
-        if not path.exists():
-            continue
-        try:
-            rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
-            table = np.array([[float(row[name]) for name in COLUMNS] for row in rows]).reshape(-1, len(COLUMNS))
-        except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-            raise InputError(f"{path} is no table of contours ({error}); run `tricap contour` for view {view} again.") from error
-        table = table[(table[:, 6] > 0) & np.isfinite(table).all(axis=1)]
-        found.append(ViewContours(view=view, frame=table[:, 0], xy_px=table[:, 1:3], normal=table[:, 3:5], sigma_px=table[:, 5]))
-    return found
+    tables = [(view, ContourTable(results.path("contours", f"{view}.csv"))) for view in views]
+    return [EdgesOfTable(view=view, table=table) for view, table in tables if table]
 
 
 def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:

@@ -3,8 +3,6 @@
 Nothing is computed anew here but projections. What lies only in the checkpoints (patches, residuals) is missing once they are deleted.
 """
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,24 +198,3 @@ def _smoothed(loop: np.ndarray) -> np.ndarray:
     """A closed chain of pixels (M, 2) without its stairs."""
     weights = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
     return sum(w * np.roll(loop, k, axis=0) for k, w in zip(range(-2, 3), weights))  # type: ignore[return-value]
-
-
-def read_contours(path: Path) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """contours/VIEW.csv: vertices (M, 2) and whether they lie on an edge (M,), by frame; empty where there is no such file.
-
-    Raises:
-        InputError: the file is damaged.
-    """
-    if not Path(path).is_file():
-        return {}
-    try:
-        rows = [
-            (int(r["frame"]), float(r["x"]), float(r["y"]), int(r["on_edge"]))
-            for r in csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8")))
-        ]
-        table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
-        raise InputError(f"{path} is damaged; run `tricap contour` again.") from error
-    if not np.isfinite(table).all() or (np.abs(table) > 1e9).any():
-        raise InputError(f"{path} is damaged; run `tricap contour` again.")
-    return {int(f): (table[table[:, 0] == f, 1:3], table[table[:, 0] == f, 3] > 0) for f in np.unique(table[:, 0])}

@@ -58,7 +58,8 @@ class Results:
             InputError: another run is at work in it.
         """
         with locked(self.folder):
-            for folder in (self.folder, *(self.path(name) for name in ("clouds", "skin", "report")), *self.path("cache").glob("*/")):
+            ours = [self.path(name) for name in ("clouds", "skin", "report", "contours")]
+            for folder in (self.folder, *ours, *self.path("cache").glob("*/")):
                 for path in [*folder.glob(".*.part"), *folder.glob(".*.part.blend")]:
                     self.remove(str(path.relative_to(self.folder)))
             yield self

@@ -11,9 +11,10 @@ import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -41,13 +42,24 @@ def write_bytes(path: Path, data: bytes) -> None:
     Raises:
         InputError: the folder cannot be written to, or the disk is full.
     """
+    with written(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def written(path: Path) -> Iterator[BinaryIO]:
+    """A file to be written piece by piece; it has its name once the block has ended well, and is not there otherwise.
+
+    Raises:
+        InputError: the folder cannot be written to, or the disk is full.
+    """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(data)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             os.chmod(name, 0o644)
@@ -158,8 +170,21 @@ def digest(*parts: bytes | str | Path) -> str:
     total = hashlib.sha256()
     for part in parts:
         try:
-            data = part.read_bytes() if isinstance(part, Path) else part.encode() if isinstance(part, str) else part
+            for piece in _file(part) if isinstance(part, Path) else _bytes(part.encode() if isinstance(part, str) else part):
+                total.update(piece)
         except OSError as error:
             raise InputError(f"Cannot read {part!s}: {error.strerror or error}; put it back and run again.") from error
-        total.update(len(data).to_bytes(8, "little") + data)
     return total.hexdigest()[:16]
+
+
+def _bytes(data: bytes) -> Iterator[bytes]:
+    yield len(data).to_bytes(8, "little")
+    yield data
+
+
+def _file(path: Path) -> Iterator[bytes]:
+    """The same of a file's content, in pieces."""
+    with path.open("rb") as file:
+        yield os.fstat(file.fileno()).st_size.to_bytes(8, "little")
+        while piece := file.read(1 << 20):
+            yield piece

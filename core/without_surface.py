@@ -1,15 +1,15 @@
 """Recordings whose surface cannot be measured (views far apart, a person without texture) or need not be: what a body can rest on then."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 
+from .contour_table import ContourTable, Polygons
 from .empty_sources import STEP_PX, UNIT_PX, find_empty, still_backgrounds
 from .fitting.fit_input import EmptyView, Packed
 from .fitting.settings import FitSettings
 from .images.background import Background
-from .inspection import read_contours
 from .progress import Monitor
 from .results import Results
 from .surface.cloud import PointCloud
@@ -30,23 +30,19 @@ def empty_clouds(footage: Footage) -> list[PointCloud]:
                        xy_px=np.zeros((0, views, 2)), residual_px=np.zeros(0)) for frame in footage.frames]
 
 
-def outline_polygons(footage: Footage, results: Results) -> dict[str, dict[int, np.ndarray]]:
+def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[int, np.ndarray]]:
     """The polygon (V, 2) px that `tricap contour` found about the person, by view and frame; views without one are left out.
 
     Raises:
         InputError: a table of contours is damaged.
     """
-    found: dict[str, dict[int, np.ndarray]] = {}
-    for view in footage.take.views:
-        polygons = {frame: xy for frame, (xy, _) in read_contours(results.path("contours", f"{view.name}.csv")).items()
-                    if frame in footage.frames and len(xy) >= LEAST_CORNERS and np.isfinite(xy).all()}
-        if polygons:
-            found[view.name] = polygons
-    return found
+    tables = {view.name: ContourTable(results.path("contours", f"{view.name}.csv")) for view in footage.take.views}
+    polygons = {name: Polygons(table, footage.frames, LEAST_CORNERS) for name, table in tables.items()}
+    return {name: found for name, found in polygons.items() if found}
 
 
 def known_silhouettes(footage: Footage, results: Results,
-                      settings: FitSettings) -> tuple[dict[str, dict[int, np.ndarray]], dict[str, Background]]:
+                      settings: FitSettings) -> tuple[dict[str, Mapping[int, np.ndarray]], dict[str, Background]]:
     """The outlines, and the still backgrounds of views that have none: what tells the person's silhouette.
 
     Raises:
@@ -82,7 +78,7 @@ def empty_views(footage: Footage, results: Results, clouds: Sequence[PointCloud]
     return outside_outlines(footage, outlines) + [empty for empty in others if empty.view not in outlines]
 
 
-def outside_outlines(footage: Footage, outlines: dict[str, dict[int, np.ndarray]]) -> list[EmptyView]:
+def outside_outlines(footage: Footage, outlines: Mapping[str, Mapping[int, np.ndarray]]) -> list[EmptyView]:
     """Where the views show no part of the person: outside of the outline."""
     found = []
     for name, polygons in outlines.items():

@@ -16,10 +16,11 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
 from tricap.core.checking.run_check import check_run
+from tricap.core.contour_table import ContourTable
 from tricap.core.errors import InputError
 from tricap.core.geometry.rig import read_rig, write_rig
 from tricap.core.images.sequence import open_sequence
-from tricap.core.inspection import read_contours, read_tracks
+from tricap.core.inspection import read_tracks
 from tricap.core.motion import bvh, c3d, keypoints_json, points_csv, tables, trc
 from tricap.core.motion.markers import Markers
 from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
@@ -252,7 +253,7 @@ READERS: dict[str, tuple[Make, Read]] = {
     "run.json": (run_folder, lambda f: Results(f).read_run()),
     "what a run keeps": (run_folder, done),
     "trajectories": (written("trajectories_raw.npz", tracked), looked_at),
-    "contours": (text("C.csv", CONTOURS), lambda f: read_contours(f / "C.csv")),
+    "contours": (text("C.csv", CONTOURS), lambda f: list(ContourTable(f / "C.csv").values())),
     "check of a run": (run_folder, lambda f: check_run(f, Monitor())),
     "trc": (written("a.trc", lambda p: trc.write_trc(p, points())), lambda f: trc.read_trc(f / "a.trc")),
     "c3d": (written("a.c3d", lambda p: c3d.write_c3d(p, points())), lambda f: c3d.read_c3d(f / "a.c3d")),

@@ -142,12 +142,11 @@ def _draw_tracks(run: Recording, view: str, frame: int, shown: Any) -> list[tupl
 
 
 def _draw_contour(run: Recording, view: str, frame: int) -> list[tuple[str, Colour]]:
-    found = run.contour(view).get(frame)
+    found = run.contour(view, frame)
     if found is None:
         return [("no contour here", BAD)]
-    xy, on_edge = found
-    segments = canvas.chain(xy, closed=True)
-    for mine, colour in ((on_edge, CONTOUR), (~on_edge, NO_EDGE)):
+    segments = canvas.chain(found.xy_px, closed=True)
+    for mine, colour in ((found.seen, CONTOUR), (~found.seen, NO_EDGE)):
         if mine.any():
             batch = run.kept(("contour batch", view, frame, bool(colour is CONTOUR)), lambda mine=mine: canvas.line_batch(segments[mine]))
             canvas.draw_lines(batch, 1.5, colour)

@@ -54,7 +54,7 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
     def _draw_contour(self, layout: bpy.types.UILayout, context: bpy.types.Context, run: recording.Recording) -> None:
         clip = context.space_data.clip
         view = recording.view_of(clip) if clip is not None else ""
-        if view in run.cameras and not run.contour(view):
+        if view in run.cameras and not run.contours(view):
             row = layout.row()
             row.enabled = not context.window_manager.tricap.running
             row.operator("tricap.follow_contours", icon="MOD_OUTLINE").view = view

@@ -1,7 +1,7 @@
 """The run whose results are shown: its folder, cameras and what was read from it, kept until the files change. No drawing in here."""
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,15 +9,17 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...core.contour_table import ContourTable
 from ...core.errors import InputError
 from ...core.frame_table import FrameTable, read_frame_table
 from ...core.geometry.camera import Camera
 from ...core.images.fields import RowGrid
-from ...core.inspection import FramePoints, TrackHistory, body_outline, read_contours, read_points, read_removed, read_tracks
+from ...core.inspection import FramePoints, TrackHistory, body_outline, read_points, read_removed, read_tracks
 from ...core.matching.least_squares import MatchingSettings
 from ...core.run_json import read_run
 from ...core.settings import from_table
 from ...core.take import open_take, read_take
+from ...core.tracking.contour import Contour
 from .. import folders, project
 
 KEPT = 48  # things of single frames
@@ -52,9 +54,13 @@ class Recording:
         """The fitted body's outline."""
         return self.kept(("outline", view, frame), lambda: body_outline(self.out, frame, self.cameras[view])) or []
 
-    def contour(self, view: str) -> dict[int, Any]:
-        """The tracked contours of a view by frame."""
-        return self.kept(("contour", view), lambda: read_contours(self.out / "contours" / f"{view}.csv")) or {}
+    def contours(self, view: str) -> Mapping[int, Contour]:
+        """The tracked contours of a view, by frame."""
+        return self.kept(f"contours of {view}", lambda: ContourTable(self.out / "contours" / f"{view}.csv")) or {}
+
+    def contour(self, view: str, frame: int) -> Contour | None:
+        """The tracked contour in a frame, if there is one."""
+        return self.kept(("contour", view, frame), lambda: self.contours(view).get(frame))  # type: ignore[no-any-return]
 
     def table(self) -> FrameTable | None:
         """How good the frames are, if a run wrote that."""

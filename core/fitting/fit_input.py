@@ -1,9 +1,10 @@
 """What a fit is made from, in one value: clouds, trajectories, contours, clicks, keypoints, and what the user knows about the joints."""
 
+import tempfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import overload
+from typing import IO, Protocol, overload
 
 import numpy as np
 
@@ -13,12 +14,27 @@ from ..values import frozen
 from .cloud_points import Cloud
 from .material_tracks import Trajectories
 
+IN_MEMORY = 1 << 24  # bytes of packed images; more are kept in a file
 ClickedAt = Mapping[str, Mapping[str, Sequence[float]]]  # joint -> view -> (x, y) full-frame pixels
+
+
+Outline = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices (V, 2) px full frame; normals (V, 2) outwards; sigmas (V,) px along them
+
+
+class Outlines(Protocol):
+    """The outline of the person in one view, over frames."""
+
+    @property
+    def view(self) -> str:
+        """The view's name."""
+
+    def of_frame(self, frame: int) -> Outline | None:
+        """That of a frame of the take; None without one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ViewContours:
-    """The outline of the person in one view, over frames: V vertices."""
+    """Outlines that are held in memory: V vertices of all frames."""
 
     view: str
     frame: np.ndarray  # (V,) the take's frame numbers
@@ -31,6 +47,11 @@ class ViewContours:
         object.__setattr__(self, "frame", frozen(self.frame, (v,), np.int64, "frame"))
         for name, shape in dict(xy_px=(v, 2), normal=(v, 2), sigma_px=(v,)).items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+
+    def of_frame(self, frame: int) -> Outline | None:
+        """See `Outlines`."""
+        rows = np.flatnonzero(self.frame == frame)
+        return (self.xy_px[rows], self.normal[rows], self.sigma_px[rows]) if len(rows) else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -53,21 +74,31 @@ class JointPlaces:
 
 
 class Packed(Sequence[np.ndarray]):
-    """Small images (h, w) uint8 of one size, compressed: a long recording has many, and they are mostly flat."""
+    """Small images (h, w) uint8 of one size, compressed: they are mostly flat. Those of a long recording lie in a temporary file."""
 
     def __init__(self, images: Iterable[np.ndarray] = ()) -> None:
-        self._images: list[bytes] = []
+        self._file: IO[bytes] = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY)
+        self._ends: list[int] = [0]
         self._size: tuple[int, ...] = (0, 0)
         for image in images:
             self.append(image)
 
     def append(self, image: np.ndarray) -> None:
-        """One more."""
+        """One more.
+
+        Raises:
+            InputError: there is no room for it.
+        """
         self._size = image.shape
-        self._images.append(zlib.compress(image.astype(np.uint8).tobytes(), 1))
+        try:
+            self._file.seek(self._ends[-1])
+            self._ends.append(self._ends[-1] + self._file.write(zlib.compress(image.astype(np.uint8).tobytes(), 1)))
+        except OSError as error:
+            place = tempfile.gettempdir()
+            raise InputError(f"Cannot write to {place}: {error.strerror or error}. Free some space there, or set TMPDIR.") from error
 
     def __len__(self) -> int:
-        return len(self._images)
+        return len(self._ends) - 1
 
     @overload
     def __getitem__(self, index: int) -> np.ndarray: ...
@@ -76,7 +107,9 @@ class Packed(Sequence[np.ndarray]):
     def __getitem__(self, index: int | slice) -> np.ndarray | list[np.ndarray]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        return np.frombuffer(zlib.decompress(self._images[index]), np.uint8).reshape(self._size)
+        start, end = self._ends[:-1][index], self._ends[1:][index]
+        self._file.seek(start)
+        return np.frombuffer(zlib.decompress(self._file.read(end - start)), np.uint8).reshape(self._size)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -112,7 +145,7 @@ class FitInput:
     clicks: Mapping[int, ClickedAt] = field(default_factory=dict)
     click_frame: int | None = None  # where the fit begins; None: where most joints are known
     trajectories: Trajectories | None = None
-    contours: Sequence[ViewContours] = ()
+    contours: Sequence[Outlines] = ()
     keypoints: Sequence[JointPlaces] = ()
     empty: Sequence[EmptyView] = ()
     locked: Sequence[str] = ()  # degrees of freedom that are held at their rest value

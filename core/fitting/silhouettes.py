@@ -78,9 +78,8 @@ class Silhouettes:
 
     def _of_frame(self, t: int, state: BodyState) -> Rays | None:
         ahead = np.array([camera.R_cam_world[2] for camera, _ in self._tables]).reshape(-1, 3)
-        parts = [_view_rays(camera, table.xy_px[rows], table.normal[rows], table.sigma_px[rows], state.head_m.mean(axis=0),
-                            int((ahead @ camera.R_cam_world[2] > ALIKE).sum()))
-                 for camera, table in self._tables if len(rows := np.flatnonzero(table.frame == self._frames[t]))]
+        parts = [_view_rays(camera, *outline, state.head_m.mean(axis=0), int((ahead @ camera.R_cam_world[2] > ALIKE).sum()))
+                 for camera, table in self._tables if (outline := table.of_frame(self._frames[t])) is not None]
         if not parts:
             return None
         columns: Mapping[str, np.ndarray] = {name: np.concatenate([getattr(p, name) for p in parts])

@@ -271,10 +271,11 @@ def test_a_real_run_is_looked_at_and_corrected(blender: ModuleType, empty: Modul
     status = run.tracks().status[:, number]
     assert set(status[np.isfinite(run.tracks().xyz_m[:, number, 0])]) == {TrackStatus.REMOVED_BY_USER}
     assert ops.follow_contours(view="C") == {"FINISHED"} and scene.tricap_overlay.contour
-    outline, on_edge = module("overlay.recording").current(scene).contour("C")[1]
+    contour = module("overlay.recording").current(scene).contour("C", 1)
+    outline, on_edge = contour.xy_px, contour.seen
     assert len(outline) > 50 and on_edge.mean() > 0.4
     scene.tricap.contour.spacing_px = 8.0
     assert ops.follow_contours(view="C") == {"FINISHED"}
-    assert len(module("overlay.recording").current(scene).contour("C")[1][0]) == pytest.approx(len(outline) / 2, rel=0.1)
+    assert len(module("overlay.recording").current(scene).contour("C", 1).xy_px) == pytest.approx(len(outline) / 2, rel=0.1)
     with pytest.raises(RuntimeError, match="no body"):
         ops.follow_contours(view="C", from_body=True)

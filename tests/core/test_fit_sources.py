@@ -141,7 +141,9 @@ def test_contours_are_read_where_they_stand_on_an_edge(tmp_path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("frame,vertex,x,y,normal_x,normal_y,sigma,on_edge\n3,0,1,2,0,1,0.4,1\n3,1,5,6,1,0,3,0\n")
     found = read_contours(results, ["L", "C"])
-    assert [c.view for c in found] == ["C"] and found[0].frame.tolist() == [3] and found[0].xy_px.tolist() == [[1.0, 2.0]]
+    xy, normal, sigma = found[0].of_frame(3)
+    assert [c.view for c in found] == ["C"] and (xy.tolist(), normal.tolist(), sigma.tolist()) == ([[1.0, 2.0]], [[0.0, 1.0]], [0.4])
+    assert found[0].of_frame(2) is None
     path.write_text("frame,x\n1,a\n")
     with pytest.raises(InputError, match="tricap contour"):
         read_contours(results, ["C"])

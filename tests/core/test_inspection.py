@@ -9,7 +9,7 @@ import pytest
 
 from tricap.core import pipeline, store
 from tricap.core.errors import InputError
-from tricap.core.inspection import body_outline, patch_boxes, read_contours, read_points, read_tracks
+from tricap.core.inspection import body_outline, patch_boxes, read_points, read_tracks
 from tricap.core.motion.ply import write_mesh
 from tricap.core.take import Footage
 from tricap.core.tracking.settings import TrackStatus
@@ -99,17 +99,5 @@ def test_trajectories_that_no_run_wrote(tmp_path: Path, name: str, array: np.nda
     with pytest.raises(InputError, match="trajectories_raw.npz (is damaged|holds no)"):
         read_tracks(tmp_path)
 
-
-def test_contours_by_frame(tmp_path: Path) -> None:
-    path = tmp_path / "C.csv"
-    assert read_contours(path) == {}
-    path.write_text("frame,vertex,x,y,normal_x,normal_y,sigma,on_edge\n3,0,1.5,2,0,1,0.2,1\n3,1,2.5,2,0,1,3,0\n5,0,9,9,0,1,0.2,1\n")
-    found = read_contours(path)
-    assert list(found) == [3, 5] and found[3][0].tolist() == [[1.5, 2], [2.5, 2]] and found[3][1].tolist() == [True, False]
-    head = "frame,vertex,x,y,on_edge\n"
-    for row in (f"1{'0' * 400},0,1,2,1", "1,0,nan,2,1", "1,0,1e300,2,1", "1,0,\0,2,1", "1,2"):
-        path.write_text(f"{head}{row}\n")
-        with pytest.raises(InputError, match="damaged"):
-            read_contours(path)
 
 

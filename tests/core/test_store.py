@@ -140,3 +140,21 @@ def test_the_layout_of_what_is_read(tmp_path: Path) -> None:
             store.check_layout(tmp_path / "a.npz", sound | {name: wrong}, **layout)
     with pytest.raises(InputError, match="a.npz holds no frames"):
         store.check_layout(tmp_path / "a.npz", {"xyz_m": sound["xyz_m"]}, **layout)
+
+
+def test_a_file_written_piece_by_piece_appears_when_it_is_whole(tmp_path: Path) -> None:
+    with store.written(tmp_path / "a" / "x.csv") as file:
+        file.write(b"1\n")
+        assert not (tmp_path / "a" / "x.csv").exists()
+        file.write(b"2\n")
+    assert (tmp_path / "a" / "x.csv").read_bytes() == b"1\n2\n"
+    with pytest.raises(InputError, match="no outline"), store.written(tmp_path / "a" / "x.csv") as file:
+        file.write(b"3\n")
+        raise InputError("There is no outline.")
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["x.csv"] and (tmp_path / "a" / "x.csv").read_bytes() == b"1\n2\n"
+
+
+def test_the_digest_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
+    data = bytes(range(256)) * 9000  # more than one piece
+    (tmp_path / "x").write_bytes(data)
+    assert store.digest(tmp_path / "x", "y") == store.digest(data, "y") != store.digest(data + b"y")

@@ -11,6 +11,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import limb_skin
 from tricap.core.errors import InputError
+from tricap.core.fitting import fit_input
 from tricap.core.fitting.fit_input import EmptyView, FitInput, JointPlaces, Packed
 from tricap.core.fitting.limbs_apart import LimbsApart
 from tricap.core.fitting.observations import MotionPrior
@@ -226,3 +227,12 @@ def test_views_from_around_are_witnesses_of_their_own(make_scene) -> None:
         given = _given(scene, rig=Rig(cameras=cameras), contours=outlines(scene))
         crowding.append(max(np.max(o.crowding) for o in Silhouettes(given, read_model("arm.R").surface, FitSettings()).observe(0, state)))
     assert crowding[0] > 2 * crowding[1] > 2
+
+
+def test_packed_images_come_back_from_memory_and_from_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    for in_memory in (1 << 24, 100):
+        monkeypatch.setattr(fit_input, "IN_MEMORY", in_memory)
+        images = [np.random.default_rng(i).integers(0, 255, (7, 9)).astype(np.uint8) for i in range(12)]
+        packed = Packed(images)
+        assert len(packed) == 12 and all(np.array_equal(packed[i], images[i]) for i in (11, 0, -1, 5, 5))
+        assert [i.tolist() for i in packed[2:4]] == [i.tolist() for i in images[2:4]]

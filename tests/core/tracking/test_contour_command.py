@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from tricap.core.commands import main
-from tricap.core.contour_command import Start, _before_background, track_contour
+from tricap.core.contour_command import KeptContours, Start, _before_background, track_contour
 from tricap.core.errors import InputError
 from tricap.core.images.fields import RowGrid
 from tricap.core.motion.ply import write_mesh
 from tricap.core.progress import Monitor
+from tricap.core.results import Results
 from tricap.core.tracking.contour import Contour, ContourSettings
 
 HALF_M = (0.2, 0.15)
@@ -139,3 +140,22 @@ def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[
     (tmp_path / "p.csv").write_text("x,y\n1,2\n3,4\n5,1\n")
     assert main(["contour", str(take), "--view", "C", "L", "--polygon", str(tmp_path / "p.csv"), *out]) == 2
     assert "one --view" in capsys.readouterr().err
+
+
+def test_a_stopped_contour_goes_on_with_the_same_vertices(tmp_path: Path, scenes: Any) -> None:
+    """From the fourth frame on, also where the images are followed, from one that is read again; what has other settings is not used."""
+    for tracked in (True, False):
+        recorded = Recorded(scenes, tmp_path / str(tracked), black=(3,))
+        if not tracked:
+            recorded.job.trajectories = None
+        recorded.job.results, recorded.job.keys = Results(tmp_path / f"out {tracked}"), {"track": "1"}
+        start = Start(polygon=outline_of(scenes, recorded.bodies[0])[::400])
+        whole = recorded.contours(start)
+        begun = track_contour(recorded.job, 1, Monitor(), start, KeptContours(recorded.job, 1, start))
+        assert [next(begun)[0] for _ in range(4)] == [0, 1, 2, 3]
+        kept = KeptContours(recorded.job, 1, start)
+        assert kept.load(3) is not None and kept.load(4) is None
+        again = [c for _, c in track_contour(recorded.job, 1, Monitor(), start, kept)]
+        assert all(np.array_equal(a.xy_px, b.xy_px) and np.array_equal(a.sigma_px, b.sigma_px) for a, b in zip(whole, again, strict=True))
+        recorded.job.settings = {"contour": ContourSettings(spacing_px=8.0)}
+        assert KeptContours(recorded.job, 1, start).load(3) is None
