@@ -17,8 +17,9 @@ import cv2
 
 from . import batch_command, calibrate_command, check_command, contour_command, fields_command, pipeline, points_command, track2d_command
 from .arguments import frame_range, overrides, pictured
+from .bar_file import read_bar, write_bar
+from .calibration.rig_files import read_any
 from .errors import InputError
-from .geometry.rig import read_rig
 from .images.fields import BOTH, INTERLACE
 from .progress import Cancelled, Monitor
 from .take import open_take, read_take
@@ -78,7 +79,7 @@ def _new_command(commands: Any) -> None:
     new.add_argument("--views", nargs="+", required=True, metavar="NAME=FILE", help="movies or image folders, in the order of the cameras")
     new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="which lines to measure of interlaced video")
     new.add_argument("--fps", type=float, default=25.0, metavar="F", help="frames per second")
-    new.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml to copy into the take")
+    new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or another tool's calibration")
     new.add_argument("--model", default=None, metavar="NAME", help="body model, such as arm.R")
     new.set_defaults(run=_new)
 
@@ -165,12 +166,14 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
     table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
-    if args.rig:
-        rig = read_rig(args.rig)
+    rig = read_any(args.rig) if args.rig else None
+    if rig:
         for view in take.views:
             rig[view.name]
-    make_take(folder, table, links, args.rig)
-    note = "" if args.rig else " Copy or calibrate rig.toml into it."
+    make_take(folder, table, links, rig)
+    if rig and (bar := read_bar(args.rig, rig)):
+        write_bar(folder / "rig.toml", rig, *bar)
+    note = "" if rig else " Copy or calibrate rig.toml into it."
     return [f"{folder}: a take of {len(views)} views.{note}"]
 
 

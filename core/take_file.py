@@ -13,6 +13,7 @@ from typing import Any
 
 from . import store
 from .errors import InputError
+from .geometry.rig import Rig, write_rig
 from .images.sequence import IMAGE_ENDINGS
 from .take import FORMAT, VERSION, Take, take_of_text
 
@@ -112,8 +113,8 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
     return entry, (target, source)
 
 
-def make_take(folder: Path, table: Table, links: Sequence[Link], rig: Path | None = None) -> None:
-    """Make a take's folder: its footage linked, or copied where links cannot be made, take.toml, and a copy of the rig's file.
+def make_take(folder: Path, table: Table, links: Sequence[Link], rig: Rig | None = None) -> None:
+    """Make a take's folder: its footage linked, or copied where links cannot be made, take.toml, and rig.toml.
 
     Raises:
         InputError: something cannot be written; what was made goes again.
@@ -122,7 +123,7 @@ def make_take(folder: Path, table: Table, links: Sequence[Link], rig: Path | Non
     made = link_footage(folder, links)
     try:
         if rig:
-            store.write_bytes(folder / "rig.toml", rig.read_bytes())
+            write_rig(folder / "rig.toml", rig)
         store.write_text(folder / "take.toml", toml_text(table))
     except (OSError, InputError) as error:
         unlink_footage(made)

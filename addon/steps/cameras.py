@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 from bpy_extras.io_utils import ImportHelper
 
-from ...core.bar_file import write_bar
+from ...core.bar_file import bar_path, read_bar, write_bar
 from ...core.calibration.rig_files import read_any
 from ...core.geometry.rig import Rig, write_rig
 from .. import folders, project
@@ -24,8 +24,9 @@ class CamerasFromFile(Told, ImportHelper, bpy.types.Operator):
 
     def do(self, context: bpy.types.Context) -> str:
         """Read it and keep a copy as rig.toml in the project."""
-        rig = read_any(folders.absolute(self.filepath))
-        use_rig(context.scene, rig)
+        path = folders.absolute(self.filepath)
+        rig = read_any(path)
+        use_rig(context.scene, rig, read_bar(path, rig))
         return f"{len(rig.cameras)} cameras from {Path(self.filepath).name}. Whether they fit the footage, Check tells (step 2)."
 
 
@@ -52,6 +53,7 @@ def use_rig(scene: bpy.types.Scene, rig: Rig, bar: tuple[np.ndarray, np.ndarray]
     found = {view.name: rig[view.name] for view in scene.tricap.views}
     folder = project.write(scene)
     write_rig(folder / "rig.toml", rig)
+    bar_path(folder / "rig.toml").unlink(missing_ok=True)  # that of the cameras before
     if bar is not None:
         write_bar(folder / "rig.toml", rig, *bar)
     for view in scene.tricap.views:

@@ -66,7 +66,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         offsets = estimate_offsets(footage, monitor, film)
         lonely = [n for k, n in enumerate(names) if max(len(p.xi_px) for p in pairs if k in (p.i, p.j)) < ENOUGH]
         found += [_lonely(name) for name in lonely]
-        found += [timing_finding(o) for o in offsets if o.significant or (o.method == "energy" and o.late_frames)]
+        found += [timing_finding(o) for o in offsets if o.doubtful]
         found += [rolling_finding(o) for o in offsets if o.rolls]
         found += stale_finding({o.view: o.miss_px for o in offsets if math.isfinite(o.miss_px)})
         figures["offsets"] = {o.view: o.to_table() for o in offsets}

@@ -60,6 +60,11 @@ class Offset:
         return self.method == "rays" and abs(self.late_frames) > max(0.05, 4 * self.sigma_frames) and self.effect_px > 0.1
 
     @property
+    def doubtful(self) -> bool:
+        """Significant, or told from the motion's rhythm alone by more than that can err."""
+        return self.significant or (self.method == "energy" and abs(self.late_frames) > self.sigma_frames)
+
+    @property
     def rolls(self) -> bool:
         """Whether its rows are read out otherwise than the reference view's, by more than noise and than what matters."""
         readout = abs(self.readout_frames)

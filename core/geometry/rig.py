@@ -64,11 +64,16 @@ def read_rig(path: Path) -> Rig:
     if len(set(names)) < len(names):
         raise InputError(f"The rig {path} names two cameras alike ({', '.join(names)}); give each its own name.")
     tables = [entry for key, entry in table.items() if key.startswith("cam")]
-    sigmas = {c.name: _sigmas(entry["sigma"], c.name, path) for c, entry in zip(cameras, tables) if "sigma" in entry}
+    sigmas = {c.name: sigmas_of(entry["sigma"], c.name, path) for c, entry in zip(cameras, tables) if "sigma" in entry}
     return Rig(cameras=cameras, metadata=metadata, sigmas=sigmas)
 
 
-def _sigmas(table: Any, name: str, path: Path) -> dict[str, float]:
+def sigmas_of(table: Any, name: str, path: Path) -> dict[str, float]:
+    """A camera's table “sigma”, checked.
+
+    Raises:
+        InputError: it is no table of standard deviations.
+    """
     numbers = table.values() if isinstance(table, dict) else [None]
     if not all(isinstance(v, (int, float)) and math.isfinite(v) and v >= 0 for v in numbers):
         raise InputError(f"“sigma” of camera “{name}” of the rig {path} must be a table of standard deviations, such as {{f = 0.12}}.")

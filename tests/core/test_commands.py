@@ -15,7 +15,10 @@ import numpy as np
 import pytest
 
 from tricap.core import commands, pipeline, take_file
+from tricap.core.bar_file import read_bar, write_bar
+from tricap.core.calibration.rig_files import write_as
 from tricap.core.errors import InputError
+from tricap.core.geometry.rig import read_rig
 from tricap.core.progress import Cancelled, Monitor
 from tricap.core.take import open_take, read_take
 
@@ -254,6 +257,17 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
     assert "is a take already" in capfd.readouterr().err
 
 
+def test_new_takes_cameras_of_another_tool_and_the_bar_beside_them(take: Path, tmp_path: Path) -> None:
+    rig = read_rig(take / "rig.toml")
+    write_as(tmp_path / "camera_array.toml", rig, "caliscope")
+    write_bar(tmp_path / "camera_array.toml", rig, np.arange(2), np.ones((2, 2, 3)))
+    argv = ["new", str(tmp_path / "new"), "--views", *(f"{v}={take / v}" for v in "LCR")]
+    assert commands.main([*argv, "--rig", str(tmp_path / "camera_array.toml")]) == 0
+    made = open_take(read_take(tmp_path / "new")).rig
+    assert np.allclose([c.t_cam_world_m for c in made.cameras], [c.t_cam_world_m for c in rig.cameras])
+    assert (bar := read_bar(tmp_path / "new" / "rig.toml", made)) is not None and np.allclose(bar[1], 1.0)
+
+
 def test_new_takes_footage_that_lies_in_the_folder_already(take: Path) -> None:
     (take / "take.toml").unlink()
     assert commands.main(["new", str(take), "--views", *(f"{v}={take / v}" for v in "LCR")]) == 0
@@ -271,9 +285,9 @@ NEW_FAULTS = {
     "name with quotes": (["L={t}/L", 'C"\nx={t}/C'], [], "a character in its name"),
     "fps": (["L={t}/L", "C={t}/C"], ["--fps", "nan"], "`fps` of"),
     "fps 0": (["L={t}/L", "C={t}/C"], ["--fps", "0"], "`fps` of"),
-    "rig missing": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/none.toml"], "Cannot read the rig"),
+    "rig missing": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/none.toml"], "none.toml is missing"),
     "rig of others": (["L={t}/L", "X={t}/C"], ["--rig", "{t}/rig.toml"], "The rig has no camera “X”"),
-    "rig is none": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/L/0000.png"], "is not a TOML file"),
+    "rig is none": (["L={t}/L", "C={t}/C"], ["--rig", "{t}/L/0000.png"], "is of no known kind"),
 }
 
 

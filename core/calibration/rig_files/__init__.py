@@ -55,7 +55,7 @@ def _read(path: Path) -> Rig:
         )
     if ending in (".yml", ".yaml"):
         return opencv_files.read(path)
-    raise InputError(f"{path} is of no known kind; give a file or folder of {', '.join(sorted(FORMATS))}.")
+    raise InputError(f"{path} is of no known kind; give rig.toml, or a file or folder of {', '.join(sorted(FORMATS))}.")
 
 
 def write_as(path: Path, rig: Rig, name: str) -> list[Path]:

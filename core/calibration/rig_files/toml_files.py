@@ -15,7 +15,7 @@ import numpy as np
 from ... import store
 from ...errors import InputError
 from ...geometry.camera import Camera
-from ...geometry.rig import Rig
+from ...geometry.rig import Rig, sigmas_of
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
 from .reading import five, make_camera, numbers, text_of
 from .refit import plain
@@ -24,7 +24,7 @@ UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 
 def read(path: Path) -> Rig:
-    """Read any of the three layouts.
+    """Read any of the three layouts; from rig.toml also what the calibration said of itself, and its sigmas.
 
     Raises:
         InputError: it is none of them, or a camera is incomplete.
@@ -38,14 +38,12 @@ def read(path: Path) -> Rig:
     if unit not in UNITS_M:
         raise InputError(f"{path} is in an unknown unit “{unit}”; write one of {', '.join(UNITS_M)} under [metadata].")
     entries = table["cameras"] if isinstance(table.get("cameras"), dict) else table
-    cameras = [
-        _camera(key, entry, path, UNITS_M[unit])
-        for key, entry in entries.items()
-        if isinstance(entry, dict) and "matrix" in entry and entry.get("rotation") is not None
-    ]
+    finished = {k: e for k, e in entries.items() if isinstance(e, dict) and "matrix" in e and e.get("rotation") is not None}
+    cameras = {key: _camera(key, entry, path, UNITS_M[unit]) for key, entry in finished.items()}
     if not cameras:
         raise InputError(f"{path} holds no calibrated camera with matrix, rotation and translation; choose the file of the finished rig.")
-    return Rig(cameras=tuple(cameras))
+    sigmas = {cameras[k].name: sigmas_of(e["sigma"], cameras[k].name, path) for k, e in finished.items() if "sigma" in e}
+    return Rig(cameras=tuple(cameras.values()), metadata=metadata if isinstance(metadata, dict) else {}, sigmas=sigmas)
 
 
 def _camera(key: str, entry: dict[str, Any], path: Path, unit_m: float) -> Camera:

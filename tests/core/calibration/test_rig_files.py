@@ -51,6 +51,13 @@ def test_what_is_written_is_read_again(name: str, tmp_path: Path) -> None:
     assert distance(rig, by_name) < TOLERANCE_PX.get(name, FITTED_PX)
 
 
+def test_our_own_file_keeps_its_sigmas_and_what_it_says_of_itself(tmp_path: Path) -> None:
+    rig = Rig(cameras=benchmark_cameras(), metadata={"unit": "m", "bar_length_m": 0.5}, sigmas={"C": {"f": 0.12}})
+    write_rig(tmp_path / "rig.toml", rig)
+    again = read_any(tmp_path / "rig.toml")
+    assert again.sigmas == rig.sigmas and again.metadata == rig.metadata and distance(rig, again) < 1e-9
+
+
 @pytest.mark.parametrize("name", ["anipose", "caliscope", "opencv", "easymocap", "colmap", "agisoft"])
 def test_cameras_without_shear_are_exact(name: str, tmp_path: Path) -> None:
     rig = Rig(cameras=tuple(without_shear(c) for c in benchmark_cameras()))

@@ -13,7 +13,7 @@ import pytest
 from tricap.core import commands, pipeline
 from tricap.core.checking.findings import Checked
 from tricap.core.checking.take_check import check_take, doubts, sudden_step
-from tricap.core.checking.timing import energy_lags, estimate_offsets
+from tricap.core.checking.timing import Offset, energy_lags, estimate_offsets
 from tricap.core.errors import InputError
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
@@ -201,6 +201,11 @@ def test_whole_frames_from_the_motion_alone() -> None:
         lags, correlation = energy_lags(motion[10:50], 3 * motion[10 - lag : 50 - lag] + 2)
         assert lags[0] == lag and correlation > 0.99
     assert energy_lags(motion[:40], np.ones(40))[1] == 0
+
+
+def test_a_fraction_of_a_frame_is_no_finding_where_only_whole_frames_are_told() -> None:
+    late = {lag: Offset(view="R", late_frames=lag, sigma_frames=0.5, method="energy") for lag in (0.0, 0.15, -1.0)}
+    assert [lag for lag, offset in late.items() if offset.doubtful] == [-1.0]
 
 
 def test_exit_codes_and_json(arm_recording: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
