@@ -12,7 +12,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ...core.body.fields import EXPONENTIAL, potential_named
 from ...core.errors import InputError
@@ -23,11 +22,10 @@ from . import action, armature, cameras, clips, implicit, metaballs, one_skin, s
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import at_rest
-from .segments import Segments
 from .trajectories import add_arrows, add_trajectories, sparser
 
 COLLECTION = "Tricap"
-NEAR_M = 0.03  # a cloud's point has the speed of a tracked point within this distance
+SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder it was built from
 KEYS_KEY = "tricap_keys"  # and the keys of the stages that had been done (core/stages.py)
 
@@ -94,10 +92,9 @@ def write_scene(contents: Contents, blend: Path | None = None, options: SceneOpt
     set_time(scene, contents)
     warnings, counts = list(contents.warnings), {}
     counts["cameras"] = _add_cameras(scene, collection, contents, opened, warnings)
-    segments = Segments(contents)
-    counts["cloud points"] = _add_cloud(collection, contents, segments, options, warnings)
+    counts["cloud points"] = _add_cloud(collection, contents, options, warnings)
     if contents.trajectories is not None:
-        counts["trajectories"] = _add_trajectories(collection, contents.trajectories, segments, options, warnings)
+        counts["trajectories"] = _add_trajectories(collection, contents, contents.trajectories, options, warnings)
     counts |= _add_body(collection, contents, warnings, options, blend)
     if surface is not None:
         implicit.add_implicit(collection, *surface, potential_named(options.field))
@@ -220,50 +217,43 @@ def _add_bar(collection: bpy.types.Collection, first: int, frames: np.ndarray, e
     return len(frames)
 
 
-def _add_cloud(collection: bpy.types.Collection, contents: Contents, segments: Segments, options: SceneOptions, warnings: list[str]
-               ) -> int:
+def _add_cloud(collection: bpy.types.Collection, contents: Contents, options: SceneOptions, warnings: list[str]) -> int:
     whole = sum(len(ply.xyz_m) for ply in contents.clouds.values())
     every = -(-whole // options.most_points) or 1
     if every > 1:
         where = contents.out / "clouds"
         warnings.append(f"The scene's cloud is one in {every} of {whole} points, so that it stays quick; all are in {where}.")
-    shown = [_cloud_points(frame, ply, every, contents.trajectories, segments) for frame, ply in contents.clouds.items()]
+    shown = [_cloud_points(frame, ply, every, contents) for frame, ply in contents.clouds.items()]
     if shown:
-        segments.name(add_cloud(collection, shown, options.colour))
+        _name_segments(add_cloud(collection, shown, options.colour), contents)
     return sum(len(cloud.xyz_m) for cloud in shown)
 
 
-def _cloud_points(frame: int, ply: Ply, every: int, trajectories: Mapping[str, np.ndarray] | None, segments: Segments) -> CloudPoints:
-    xyz = ply.xyz_m[::every]
+def _cloud_points(frame: int, ply: Ply, every: int, contents: Contents) -> CloudPoints:
+    xyz, ready = ply.xyz_m[::every], contents.ready
     names = ("sigma", "nx", "ny", "nz", "intensity")
     column = {name: ply.vertex[name][::every] if name in ply.vertex else np.zeros(len(xyz)) for name in names}
     normals = np.stack([column[name] for name in ("nx", "ny", "nz")], axis=-1)
     return CloudPoints(frame=frame, xyz_m=xyz, sigma_m=column["sigma"], normals=normals, intensity=column["intensity"],
-                       velocity_m_s=_velocity_nearby(frame, xyz, trajectories), segment=segments.of(frame, xyz))
+                       velocity_m_s=ready.velocity_m_s[frame][::every], segment=ready.segment[frame][::every])
 
 
-def _add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], segments: Segments, options: SceneOptions,
+def _add_trajectories(collection: bpy.types.Collection, contents: Contents, arrays: Mapping[str, np.ndarray], options: SceneOptions,
                       warnings: list[str]) -> int:
-    shown, every = sparser(arrays, options.most_points)
+    assert contents.ready.track_segment is not None
+    shown, every = sparser({**arrays, "segment": contents.ready.track_segment}, options.most_points)
     if every > 1:
         warnings.append(f"The scene shows one in {every} of {arrays['xyz_m'].shape[1]} trajectories, so that it stays quick.")
-    add_trajectories(collection, shown, segments)
+    _name_segments(add_trajectories(collection, shown), contents)
     if options.arrows:
         add_arrows(collection, shown)
     return int(shown["xyz_m"].shape[1])
 
 
-def _velocity_nearby(frame: int, xyz: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
-    """Velocity (N, 3) of the nearest tracked point of the frame; 0 where none is near."""
-    at = np.flatnonzero(trajectories["frames"] == frame) if trajectories is not None else np.zeros(0, dtype=int)
-    if trajectories is None or not len(at) or not len(xyz):
-        return np.zeros((len(xyz), 3))
-    place, velocity = trajectories["xyz_m"][at[0]], trajectories["velocity_m_s"][at[0]]
-    known = np.isfinite(place).all(axis=1) & np.isfinite(velocity).all(axis=1)
-    if not known.any():
-        return np.zeros((len(xyz), 3))
-    distance, nearest = cKDTree(place[known]).query(xyz, distance_upper_bound=NEAR_M)
-    return np.where(np.isfinite(distance)[:, None], velocity[known][np.minimum(nearest, known.sum() - 1)], 0.0)
+def _name_segments(thing: bpy.types.Object, contents: Contents) -> None:
+    """Say on an object which bone each number is."""
+    if contents.ready.bones:
+        thing[SEGMENTS_KEY] = list(contents.ready.bones)
 
 
 def _implicit_surface(contents: Contents, options: SceneOptions, monitor: Monitor | None
@@ -296,7 +286,8 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
     flesh = metaballs.add_metaballs(collection, armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
-        skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings)
+        found = contents.ready.skin if shape is measured_shape else None
+        skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, found)
         if contents.skins is not None and blend is not None:
             other = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
             for part in flesh:

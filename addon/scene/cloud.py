@@ -1,6 +1,6 @@
 """The point clouds of all frames as ONE mesh object of points; geometry nodes show the current frame's.
 
-Named attributes on the points: frame and segment (int, see `segments`), sigma [m], intensity and speed [m/s] (float), normal and velocity
+Named attributes on the points: frame and segment (int, see `ready`), sigma [m], intensity and speed [m/s] (float), normal and velocity
 [m/s] (vector).
 """
 

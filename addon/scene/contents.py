@@ -22,6 +22,7 @@ from ...core.progress import Monitor
 from ...core.run_json import read_run
 from ...core.settings import from_table
 from ...core.take import Footage, open_take, read_take
+from .ready import Ready, find_ready
 
 DEFAULT_FPS = 25.0
 
@@ -48,6 +49,7 @@ class Contents:
     motion: MotionTable | None = None
     skin_settings: SkinSettings = field(default_factory=SkinSettings)
     skins: FrameSkins | None = None  # only where they were asked for
+    ready: Ready = field(default_factory=Ready)
     bar: tuple[np.ndarray, np.ndarray] | None = None  # frames (T,) of its own recording, and ends (T, 2, 3) [m] of the reference bar
     warnings: tuple[str, ...] = ()
 
@@ -86,8 +88,9 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     motion = _motion(out / "motion.csv", shape, warnings)
     monitor.step("reading results", 3, 3)
     settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
+    ready = find_ready(clouds, trajectories, shape, motion, settings, monitor)
     return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
-                   skin_settings=settings, skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
+                   skin_settings=settings, ready=ready, skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
                    bar=_bar(footage, warnings), warnings=tuple(warnings))
 
 

@@ -26,13 +26,14 @@ PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, 
 
 
 def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape, detail: int = 1,
-             settings: SkinSettings = SkinSettings()) -> bpy.types.Object:  # noqa: B008  frozen
+             settings: SkinSettings = SkinSettings(), found: Skin | None = None) -> bpy.types.Object:  # noqa: B008  frozen
     """The skin of the rest pose, bound to the armature, sampled as the run's settings say; `detail` cuts its B-spline patches finer.
+    It may have been found before.
 
     Raises:
         InputError: the body has no metaballs.
     """
-    skin = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
+    skin = found or body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
     skin = refined(skin, detail) if detail > 1 else skin
     skin_object = _mesh_object(collection, NAME, skin)
     skin_object.parent = armature_object

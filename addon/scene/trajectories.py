@@ -1,7 +1,7 @@
 """The trajectories of all tracked points as ONE mesh of edges; geometry nodes show the trail behind the current frame.
 
 A point that was seen in two successive frames gives an edge. Named attributes on the points: frame, track and segment (int, see
-`segments`), sigma [m] and speed [m/s] (float), velocity [m/s] (vector).
+`ready`), sigma [m] and speed [m/s] (float), velocity [m/s] (vector).
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,6 @@ import numpy as np
 
 from . import nodes, paint
 from .cloud import write
-from .segments import Segments
 
 NAME, ARROWS_NAME = "Trajectories", "Velocities"
 ARROW_S = 0.1  # an arrow shows the way of this time
@@ -21,8 +20,9 @@ TRAIL_RADIUS_M = 0.0006
 REDDEST_SPEED_M_S = 2.0  # the speed that is painted reddest
 
 
-def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray], segments: Segments) -> bpy.types.Object:
-    """One object from the arrays of trajectories.npz: frames (T,), xyz_m (T, N, 3) with NaN = not seen, velocity_m_s, sigma_m (T, N)."""
+def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
+    """One object from the arrays of trajectories.npz and the bones of their points: frames (T,), xyz_m (T, N, 3) with NaN = not seen,
+    velocity_m_s, sigma_m (T, N), segment (T, N)."""
     xyz, frames = arrays["xyz_m"], arrays["frames"]
     seen = np.isfinite(xyz).all(axis=-1)  # (T, N)
     row, track = np.nonzero(seen)
@@ -41,13 +41,12 @@ def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.n
     velocity = np.nan_to_num(arrays["velocity_m_s"][seen])
     write(mesh, "speed", "FLOAT", np.linalg.norm(velocity, axis=-1))
     write(mesh, "velocity", "FLOAT_VECTOR", velocity)
-    write(mesh, "segment", "INT", np.concatenate([segments.of(int(f), X[s]) for f, X, s in zip(frames, xyz, seen)] or [row]))
+    write(mesh, "segment", "INT", arrays["segment"][seen])
     mesh.update()
     material = paint.heat_material(NAME, "speed", REDDEST_SPEED_M_S)
     mesh.materials.append(material)
     trail_object = bpy.data.objects.new(NAME, mesh)
     collection.objects.link(trail_object)
-    segments.name(trail_object)
     trail_object.modifiers.new("Trail", "NODES").node_group = trail_group(material)
     return trail_object
 

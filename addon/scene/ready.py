@@ -1,0 +1,108 @@
+"""What the scene shows that takes a while to find and needs no Blender: found on the worker thread, so that the window waits for little.
+
+Which bone of the fitted body each point belongs to, how fast the nearest tracked point is, and the skin of the rest pose.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...core.body.shape import BodyShape
+from ...core.body.skin import Skin, body_skin
+from ...core.body.skin_mesh import SkinSettings
+from ...core.errors import InputError
+from ...core.fitting.cloud_points import CloudPoints
+from ...core.fitting.segmentation import segment
+from ...core.fitting.state import ShapeParameters
+from ...core.motion.ply import Ply
+from ...core.motion.tables import MotionTable
+from ...core.progress import Monitor
+
+NOBODY = -1
+GATE_M = 0.04  # a point further from every limb's surface is nobody's
+NEAR_M = 0.03  # a cloud's point has the speed of a tracked point within this distance
+STAGE = "preparing the scene"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Ready:
+    """Of each cloud by frame: the velocities (N, 3) [m/s], 0 = unknown, and the numbers (N,) of the bones; numbers (T, N) of the tracks."""
+
+    bones: tuple[str, ...] = ()  # names by number; none without a posture in any frame
+    velocity_m_s: Mapping[int, np.ndarray] = field(default_factory=dict)
+    segment: Mapping[int, np.ndarray] = field(default_factory=dict)
+    track_segment: np.ndarray | None = None
+    skin: Skin | None = None  # None: the body has no metaballs
+
+
+def find_ready(clouds: Mapping[int, Ply], trajectories: Mapping[str, np.ndarray] | None, shape: BodyShape | None,
+               motion: MotionTable | None, settings: SkinSettings, monitor: Monitor) -> Ready:
+    """All of it.
+
+    Raises:
+        Cancelled: the monitor was cancelled.
+    """
+    segments, velocity, owner = _Segments(shape, motion), {}, {}
+    for i, (frame, ply) in enumerate(clouds.items()):
+        monitor.step(STAGE, i, len(clouds) + 1)
+        xyz = ply.xyz_m
+        velocity[frame], owner[frame] = velocity_nearby(frame, xyz, trajectories), segments.of(frame, xyz)
+    monitor.step(STAGE, len(clouds), len(clouds) + 1)
+    return Ready(bones=segments.names, velocity_m_s=velocity, segment=owner, skin=_rest_skin(shape, settings),
+                 track_segment=None if trajectories is None else _of_tracks(segments, trajectories))
+
+
+def velocity_nearby(frame: int, xyz_m: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
+    """Velocity (N, 3) of the nearest tracked point of the frame; 0 where none is near."""
+    at = np.flatnonzero(trajectories["frames"] == frame) if trajectories is not None else np.zeros(0, dtype=int)
+    if trajectories is None or not len(at) or not len(xyz_m):
+        return np.zeros((len(xyz_m), 3))
+    place, velocity = trajectories["xyz_m"][at[0]], trajectories["velocity_m_s"][at[0]]
+    known = np.isfinite(place).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    if not known.any():
+        return np.zeros((len(xyz_m), 3))
+    distance, nearest = cKDTree(place[known]).query(xyz_m, distance_upper_bound=NEAR_M)
+    return np.where(np.isfinite(distance)[:, None], velocity[known][np.minimum(nearest, known.sum() - 1)], 0.0)
+
+
+def _of_tracks(segments: "_Segments", arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The bones (T, N) of trajectories, `NOBODY` where they were not seen."""
+    seen = np.isfinite(arrays["xyz_m"]).all(axis=-1)
+    found = np.full(seen.shape, NOBODY)
+    for row, frame, xyz, mine in zip(found, arrays["frames"].tolist(), arrays["xyz_m"], seen):
+        row[mine] = segments.of(frame, xyz[mine])
+    return found
+
+
+def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> Skin | None:
+    try:
+        return None if shape is None else body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
+    except InputError:
+        return None
+
+
+class _Segments:
+    """The bones of points in any frame; nobody's where the frame has no posture."""
+
+    def __init__(self, shape: BodyShape | None, motion: MotionTable | None) -> None:
+        self.names: tuple[str, ...] = ()
+        self._states = {}
+        if shape is not None and motion is not None:
+            parameters = ShapeParameters(shape)
+            known = np.isfinite(motion.values).all(axis=1)
+            states = parameters.states(motion.values[known], parameters.vector(shape))
+            self.names = tuple(bone.name for bone in shape.skeleton.bones)
+            self._states = dict(zip(motion.frames[known].tolist(), states))
+        self._whole = np.tile([0.0, 1.0], (len(self.names), 1))
+
+    def of(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
+        """Numbers (N,) of the bones to which points (N, 3) of a frame belong, `NOBODY` where none is near."""
+        owner = np.full(len(xyz_m), NOBODY)
+        if frame in self._states and len(xyz_m):
+            unknown = np.zeros((len(xyz_m), 3))
+            points = CloudPoints(frame=frame, xyz_m=np.asarray(xyz_m, dtype=np.float64), normals=unknown, sigma_m=unknown[:, 0])
+            rows, bones = segment(points, self._states[frame], self._whole, GATE_M)
+            owner[rows] = bones
+        return owner
