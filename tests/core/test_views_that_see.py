@@ -111,3 +111,30 @@ def test_the_test_of_rays_knows_their_number(four_views: Path, tmp_path: Path, s
         for limit in (0.0, 3.0)
     ]
     assert 0.85 * sizes[1] < sizes[0] < sizes[1]
+
+
+def fan(scenes: Any, count: int) -> Rig:
+    """So many cameras in a row, 0.8 m from the first to the last, that look at the same point."""
+    template, cameras = scenes.three_cameras()["C"], []
+    values = {name: getattr(template, name) for name in Camera.__dataclass_fields__}
+    for i, x in enumerate(np.linspace(-0.4, 0.4, count)):
+        ahead = np.array([-x, 0.0, scenes.depth_m]) / np.hypot(x, scenes.depth_m)
+        right = np.cross([0.0, 1.0, 0.0], ahead)
+        R = np.stack([right, np.cross(ahead, right), ahead])
+        cameras.append(Camera(**values | dict(name=f"V{i}", R_cam_world=R, t_cam_world_m=-R @ np.array([x, 0.0, 0.0]))))
+    return Rig(cameras=tuple(cameras))
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_from_two_to_eight_cameras(tmp_path: Path, scenes: Any, plane: Any, count: int) -> None:
+    """Measured, tracked and reported; eight views see more precisely than two."""
+    frames = [[plane.moved(np.eye(3), [0.004 * i, 0.0, 0.0])] for i in range(2)]
+    take = scenes.write_take(tmp_path / "take", fan(scenes, count), frames)
+    made = pipeline.run(take, tmp_path / "out", {"growing": {"spacing_px": 9}})
+    for cloud, (body,) in zip(made.clouds, frames):
+        assert len(cloud.xyz_m) > 150 and cloud.rays.max() == count and np.median(cloud.rays) > count / 2
+        assert np.median(np.abs(body.distance_m(cloud.xyz_m))) < (1.0e-3 if count == 2 else 0.4e-3)
+    assert made.trajectories is not None and made.trajectories.seen.all(axis=0).sum() > 60
+    steps = np.diff(made.trajectories.xyz_m, axis=0)[0]
+    assert np.median(np.linalg.norm(steps - [0.004, 0, 0], axis=1)) < 1.5e-3
+    assert (tmp_path / "out" / "report" / "report.html").is_file()
