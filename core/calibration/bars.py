@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from ..geometry.camera import Camera
+from ..geometry.small_matrices import invert_spd
 from .bundle import Network
 from .epipolar import sampson
 from .observations import BarObservations
@@ -62,12 +63,12 @@ def _rays(camera: Camera, xy: np.ndarray) -> np.ndarray:
 
 def _meeting_points(centres: np.ndarray, rays: list[np.ndarray], used: np.ndarray) -> np.ndarray:
     """(M, 3); far away where fewer than two rays are used.  (1)"""
-    A, b = np.tile(np.eye(3) * 1e-9, (len(used), 1, 1)), np.zeros((len(used), 3))
+    A, b = np.tile(np.eye(3)[..., None] * 1e-9, len(used)), np.zeros((3, len(used)))
     for c, d in enumerate(rays):
-        across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * used[:, c, None, None]
+        across = (np.eye(3)[..., None] - d.T[:, None] * d.T) * used[:, c]
         A += across
-        b += across @ centres[c]
-    return np.linalg.solve(A, b[..., None])[..., 0]
+        b += centres[c] @ across
+    return np.einsum("nij,jn->ni", invert_spd(np.moveaxis(A, -1, 0)), b)
 
 
 def _cost(

@@ -65,18 +65,21 @@ class Camera:
         return self._image(p), jacobian
 
     def directions(self, xy_px: np.ndarray) -> np.ndarray:
-        """Rays in the camera's frame (…, 3) with z = 1, the inverse of (2)–(5) by Newton's method."""
+        """Rays in the camera's frame (…, 3) with z = 1, the inverse of (2)–(5) by Newton's method; not finite where there is none."""
         xy = np.asarray(xy_px, dtype=np.float64)
         inverse = np.linalg.inv(self._pixel_matrix())
         target = (xy - self.matrix[:2, 2]) @ inverse.T
-        ab = target.copy()
-        for _ in range(UNDISTORT_STEPS):
-            residual = self._distort(ab[..., 0], ab[..., 1]) - target
-            J = self._distortion_jacobian(ab[..., 0], ab[..., 1])
-            ab -= np.linalg.solve(J, residual[..., None])[..., 0]
-            if np.nanmax(np.abs(residual), initial=0.0) < UNDISTORT_TOLERANCE:
-                break
-        return np.concatenate([ab, np.ones_like(ab[..., :1])], axis=-1)
+        a, b = (np.ascontiguousarray(target[..., n]) for n in (0, 1))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for _ in range(UNDISTORT_STEPS):
+                residual = self._distort(a, b) - target
+                u, v = residual[..., 0], residual[..., 1]
+                aa, cross, bb = self._distortion_derivatives(a, b)
+                determinant = aa * bb - cross * cross
+                a, b = a - (bb * u - cross * v) / determinant, b - (aa * v - cross * u) / determinant
+                if np.nanmax(np.abs(residual), initial=0.0) < UNDISTORT_TOLERANCE:
+                    break
+        return np.stack([a, b, np.ones_like(a)], axis=-1)
 
     def rays(self, xy_px: np.ndarray) -> np.ndarray:
         """Ray directions in the world (…, 3), scaled so that depth z_cam = 1 per unit."""
@@ -112,13 +115,17 @@ class Camera:
         return np.stack([a * L + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), b * L + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b], axis=-1)  # (4)
 
     def _distortion_jacobian(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        aa, cross, bb = self._distortion_derivatives(a, b)
+        return np.stack([aa, cross, cross, bb], axis=-1).reshape(*a.shape, 2, 2)
+
+    def _distortion_derivatives(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """∂a'/∂a, ∂a'/∂b = ∂b'/∂a and ∂b'/∂b."""
         k1, k2, p1, p2, k3 = self.distortions
         r2 = a * a + b * b
         L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         dL = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # dL/da = a dL, dL/db = b dL
         cross = a * b * dL + 2 * p1 * a + 2 * p2 * b
-        rows = [L + a * a * dL + 2 * p1 * b + 6 * p2 * a, cross, cross, L + b * b * dL + 6 * p1 * b + 2 * p2 * a]
-        return np.stack(rows, axis=-1).reshape(*a.shape, 2, 2)
+        return L + a * a * dL + 2 * p1 * b + 6 * p2 * a, cross, L + b * b * dL + 6 * p1 * b + 2 * p2 * a
 
 
 def _ahead(p: np.ndarray) -> np.ndarray:

@@ -57,9 +57,15 @@ def image_with_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple
 
     `interior` (…, 10), `xyz_cam_m` (…, M, 3) before the cameras (z > 0).
     """
+    image, J, G = columns_of_derivatives(interior, np.moveaxis(xyz_cam_m, -1, -2))
+    return np.moveaxis(image, -1, -2), np.moveaxis(J, -1, -3).swapaxes(-1, -2), np.moveaxis(G, -1, -3)
+
+
+def columns_of_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same with the points last, so that all work runs over them: from (…, 3, M) the pixels (…, 2, M), (…, 10, 2, M), (…, 2, 3, M)."""
     f, cx, cy, k1, k2, k3, p1, p2, b1, b2 = np.moveaxis(interior, -1, 0)[..., None]
-    w = 1 / xyz_cam_m[..., 2]
-    a, b = xyz_cam_m[..., 0] * w, xyz_cam_m[..., 1] * w
+    w = 1 / xyz_cam_m[..., 2, :]
+    a, b = xyz_cam_m[..., 0, :] * w, xyz_cam_m[..., 1, :] * w
     aa, bb, ab2 = a * a, b * b, 2 * a * b
     r2 = aa + bb
     L = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -67,25 +73,33 @@ def image_with_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple
     b1_ = b * L + p1 * (r2 + 2 * bb) + p2 * ab2
     fs, fb = f * (1 + b1), f * b2
     x0 = (1 + b1) * a1 + b2 * b1_
-    J = np.zeros((*a.shape, 2, 10))
-    J[..., 0, 0], J[..., 1, 0] = x0, b1_
-    J[..., 0, 1] = J[..., 1, 2] = 1.0
-    radial_x, radial_y = fs * a + fb * b, f * b
-    for column, power in ((3, r2), (4, r2 * r2), (5, r2 * r2 * r2)):
-        J[..., 0, column], J[..., 1, column] = radial_x * power, radial_y * power
-    J[..., 0, 6], J[..., 1, 6] = fs * ab2 + fb * (r2 + 2 * bb), f * (r2 + 2 * bb)
-    J[..., 0, 7], J[..., 1, 7] = fs * (r2 + 2 * aa) + fb * ab2, f * ab2
-    J[..., 0, 8], J[..., 0, 9] = f * a1, f * b1_
+    J = np.zeros((*a.shape[:-1], len(INTERIOR), 2, a.shape[-1]))
+    x, y = J[..., 0, :], J[..., 1, :]
+    x[..., 0, :], y[..., 0, :] = x0, b1_
+    x[..., 1, :] = y[..., 2, :] = 1.0
+    x[..., 3, :], y[..., 3, :] = (fs * a + fb * b) * r2, f * b * r2
+    for column in (4, 5):
+        np.multiply(J[..., column - 1, :, :], r2[..., None, :], out=J[..., column, :, :])
+    x[..., 6, :], y[..., 6, :] = fs * ab2 + fb * (r2 + 2 * bb), f * (r2 + 2 * bb)
+    x[..., 7, :], y[..., 7, :] = fs * (r2 + 2 * aa) + fb * ab2, f * ab2
+    x[..., 8, :], x[..., 9, :] = f * a1, f * b1_
     dL = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
     cross = a * b * dL + 2 * p1 * a + 2 * p2 * b
     da_a, db_b = L + aa * dL + 2 * p1 * b + 6 * p2 * a, L + bb * dL + 6 * p1 * b + 2 * p2 * a
-    G = np.empty((*a.shape, 2, 3))
-    G[..., 0, 0], G[..., 0, 1] = (fs * da_a + fb * cross) * w, (fs * cross + fb * db_b) * w
-    G[..., 1, 0], G[..., 1, 1] = f * cross * w, f * db_b * w
-    G[..., 2] = -(a[..., None] * G[..., 0] + b[..., None] * G[..., 1])
-    return np.stack([f * x0 + cx, f * b1_ + cy], axis=-1), J, G
+    G = np.empty((*a.shape[:-1], 2, 3, a.shape[-1]))
+    G[..., 0, 0, :], G[..., 0, 1, :] = (fs * da_a + fb * cross) * w, (fs * cross + fb * db_b) * w
+    G[..., 1, 0, :], G[..., 1, 1, :] = f * cross * w, f * db_b * w
+    G[..., 2, :] = -(a[..., None, :] * G[..., 0, :] + b[..., None, :] * G[..., 1, :])
+    return np.stack([f * x0 + cx, f * b1_ + cy], axis=-2), J, G
 
 
 def exterior_derivatives(G: np.ndarray, xyz_cam_m: np.ndarray) -> np.ndarray:
     """Derivatives (…, 2, 6) of pixels to turn and shift (6), from those to the point in the camera's frame (…, 2, 3).  (7)"""
     return np.concatenate([-G @ cross_matrix(xyz_cam_m), G], axis=-1)
+
+
+def columns_of_exterior(G: np.ndarray, xyz_cam_m: np.ndarray) -> np.ndarray:
+    """The same with the points last: (…, 6, 2, M) from (…, 2, 3, M) and (…, 3, M)."""
+    x, y, z = (xyz_cam_m[..., None, n, :] for n in range(3))
+    gx, gy, gz = (G[..., n, :] for n in range(3))
+    return np.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx, gx, gy, gz], axis=-3)  # −g [X]× = X × g
