@@ -69,7 +69,7 @@ class Camera:
         xy = np.asarray(xy_px, dtype=np.float64)
         inverse = np.linalg.inv(self._pixel_matrix())
         target = (xy - self.matrix[:2, 2]) @ inverse.T
-        a, b = (np.ascontiguousarray(target[..., n]) for n in (0, 1))
+        a, b = target[..., 0], target[..., 1]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             for _ in range(UNDISTORT_STEPS):
                 residual = self._distort(a, b) - target

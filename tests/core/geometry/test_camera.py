@@ -72,6 +72,13 @@ def test_rays_are_the_inverse_of_the_projection(skew: float, affinity: tuple[flo
     assert np.allclose(c.centre_m + 2.5 * c.rays(xy), c.points_at_depth(xy, 2.5))
 
 
+def test_one_pixel_has_the_ray_that_it_has_among_many() -> None:
+    c = camera()
+    xy = np.array([[100.0, 500.0], [700.0, 20.0]])
+    assert c.directions(xy[1]).shape == (3,) and (c.directions(xy[1]) == c.directions(xy)[1]).all()
+    assert c.rays(xy[None]).shape == (1, 2, 3)
+
+
 def test_what_lies_behind_or_is_nan_has_no_image() -> None:
     c = camera()
     behind = c.centre_m - c.rays(np.array([380.0, 290.0]))
