@@ -10,7 +10,7 @@ from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.sources import FILES
 from ..panels import sentence
-from . import properties
+from . import preview, properties
 
 
 class TRICAP_UL_map(bpy.types.UIList):
@@ -71,9 +71,11 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     layout.prop(props, "strip")
     buttons = layout.row(align=True)
     buttons.scale_y = 1.3
+    buttons.enabled = props.target is not None and (props.source is not None or bool(props.file))
     buttons.operator("tricap.retarget", icon="ARMATURE_DATA")
     buttons.operator("tricap.retarget_preview", text="Preview", icon="HIDE_OFF")
-    buttons.operator("tricap.retarget_end_preview", text="", icon="X")
+    if bpy.data.collections.get(preview.NAME) is not None:
+        buttons.operator("tricap.retarget_end_preview", text="", icon="X")
     for line in props.last.splitlines() if not props.last.startswith("Exported") else ():  # the step says that itself
         sentence(layout, context, line, "DOT")
 

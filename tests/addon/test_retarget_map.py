@@ -110,3 +110,15 @@ def test_the_editor_is_drawn(blender: ModuleType, props: Any, tmp_path: Path) ->
     assert [layout.properties.count("twist") for layout in (empty, drawn())] == [1, 2], "the setting alone; and that of the selected line"
     props.target, props.source, props.file = props.source, None, str(tmp_path / "a.trc")
     assert "those of “Target”" in " ".join(drawn().texts) and {"up", "unit"} <= set(drawn().properties)
+
+
+def test_a_preview_can_be_ended_while_there_is_one(blender: ModuleType, props: Any) -> None:
+    panel, ops = importlib.import_module("bl_ext.user_default.tricap.addon.retarget.panel"), blender.ops.tricap
+
+    def offered() -> bool:
+        layout = Layout()
+        panel.draw_retarget(layout, blender.context)
+        return "tricap.retarget_end_preview" in layout.operators
+
+    assert not offered() and ops.retarget_preview() == {"FINISHED"} and offered()
+    assert ops.retarget_end_preview() == {"FINISHED"} and not offered()
