@@ -29,7 +29,6 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--turntable", metavar="FILE.mp4", type=Path, help="also a movie of a turn around the body")
     parser.add_argument("--frame", metavar="N", type=int, help="the frame of preview, turntable, implicit surface (default: middle)")
     parser.add_argument("--detail", metavar="N", type=int, default=1, choices=range(1, 9), help="level of detail of the skin, 1 to 8")
-    parser.add_argument("--one-skin", action="store_true", help="also the skin as one watertight mesh, bound to the armature")
     parser.add_argument("--exact-skin", action="store_true", help="also the run's skin of every frame, as FILE.pc2 beside the .blend")
     parser.add_argument("--implicit", action="store_true", help="also the implicit surface itself in the middle frame, for checking")
     parser.add_argument("--field", choices=tuple(POTENTIALS), default=EXPONENTIAL.name,
@@ -62,7 +61,7 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
         look_through()
         contents = read_contents(args.out, monitor, skins=args.exact_skin)
-        options = SceneOptions(detail=args.detail, exact_skin=args.exact_skin, one_skin=args.one_skin, rest_pose=args.rest_pose,
+        options = SceneOptions(detail=args.detail, exact_skin=args.exact_skin, rest_pose=args.rest_pose,
                                simplify_deg=args.simplify, colour=args.colour, arrows=args.arrows, implicit=args.implicit,
                                field=args.field, frame=args.frame)
         report = write_scene(contents, args.blend, options, monitor)

@@ -38,11 +38,9 @@ class BuildScene(JobOperator, bpy.types.Operator):
     rest_pose: bpy.props.EnumProperty(name="Rest Pose", items=[(pose, f"{pose}-pose", "") for pose in POSES],  # type: ignore[valid-type]
                                       description="In A-pose every channel is a number of motion.csv")
     detail: bpy.props.IntProperty(name="Skin Detail", default=1, min=1, max=8,  # type: ignore[valid-type]
-                                  description="Pieces of each edge of the skin, by B-spline patches")
+                                  description="Pieces of each edge of the skin")
     exact_skin: bpy.props.BoolProperty(name="Exact Skin", default=False,  # type: ignore[valid-type]
                                        description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file")
-    one_skin: bpy.props.BoolProperty(name="Skin in One Piece", default=False,  # type: ignore[valid-type]
-                                     description="Also the skin as one watertight mesh without borders, bound to the armature")
     implicit: bpy.props.BoolProperty(name="Implicit Surface", default=False,  # type: ignore[valid-type]
                                      description="Also the surface of the exact field in the middle frame, to check skins against")
     field: bpy.props.EnumProperty(name="Field", items=[(name, name.capitalize(), "") for name in POTENTIALS],  # type: ignore[valid-type]
@@ -61,7 +59,7 @@ class BuildScene(JobOperator, bpy.types.Operator):
         """Build the scene from what was read."""
         options = SceneOptions(rest_pose=self.rest_pose, detail=self.detail, exact_skin=self.exact_skin, colour=self.colour,
                                simplify_deg=math.degrees(self.simplify), arrows=self.arrows, implicit=self.implicit,
-                               field=self.field, one_skin=self.one_skin)
+                               field=self.field)
         put_into_scene(self, context, result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         return {"FINISHED"}
 

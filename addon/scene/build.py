@@ -18,7 +18,7 @@ from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
 from ...core.stages import STAGES
-from . import action, armature, cameras, clips, implicit, metaballs, one_skin, skin, surroundings
+from . import action, armature, cameras, clips, implicit, metaballs, skin, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import at_rest
@@ -36,7 +36,6 @@ class SceneOptions:
 
     detail: int = 1  # the skin's level of detail: pieces of each edge
     exact_skin: bool = False  # also the skin of every frame, as the run found it: a mesh cache beside the .blend
-    one_skin: bool = False  # also the skin of the rest pose as one watertight mesh
     implicit: bool = False  # also the implicit surface itself, in the middle frame
     field: str = EXPONENTIAL.name  # of its balls, one of core.body.fields.POTENTIALS
     rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
@@ -286,25 +285,18 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
     flesh = metaballs.add_metaballs(collection, armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
-        found = contents.ready.skin if shape is measured_shape else None
-        skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, found)
+        found = contents.ready.skin if shape is measured_shape and options.detail == 1 else None
+        shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, found)
         if contents.skins is not None and blend is not None:
-            other = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
-            for part in flesh:
-                part.hide_set(True)
-                part.hide_render = True
-            counts["exact skin faces"] = len(other.data.polygons)
+            shown = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
+            counts["exact skin faces"] = len(shown.data.polygons)
     except InputError as error:
         warnings.append(f"No polygonal skin in the scene: {error}")
     else:
-        skin_object.hide_set(True)  # it lies in the metaballs' or the exact skin's surface
-        skin_object.hide_render = True
+        for other in {*flesh, skin_object} - {shown}:  # they lie in the surface of the one that is shown
+            other.hide_set(True)
+            other.hide_render = True
         counts["skin faces"] = len(skin_object.data.polygons)
-    if options.one_skin:
-        whole = one_skin.add_one_skin(collection, armature_object, shape)
-        whole.hide_set(True)
-        whole.hide_render = True
-        counts["faces of the skin in one piece"] = len(whole.data.polygons)
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
         counts["frames of motion"] = len(motion.frames)

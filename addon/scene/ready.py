@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...core.body.one_skin import OneSkin, one_skin
 from ...core.body.shape import BodyShape
-from ...core.body.skin import Skin, body_skin
 from ...core.body.skin_mesh import SkinSettings
 from ...core.errors import InputError
 from ...core.fitting.cloud_points import CloudPoints
@@ -34,7 +34,7 @@ class Ready:
     velocity_m_s: Mapping[int, np.ndarray] = field(default_factory=dict)
     segment: Mapping[int, np.ndarray] = field(default_factory=dict)
     track_segment: np.ndarray | None = None
-    skin: Skin | None = None  # None: the body has no metaballs
+    skin: OneSkin | None = None  # None: the body has no metaballs
 
 
 def find_ready(clouds: Mapping[int, Ply], trajectories: Mapping[str, np.ndarray] | None, shape: BodyShape | None,
@@ -76,9 +76,9 @@ def _of_tracks(segments: "_Segments", arrays: Mapping[str, np.ndarray]) -> np.nd
     return found
 
 
-def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> Skin | None:
+def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> OneSkin | None:
     try:
-        return None if shape is None else body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
+        return None if shape is None else one_skin(shape, settings)
     except InputError:
         return None
 

@@ -1,20 +1,22 @@
-"""The polygonal skin: core's skin as quads with texture coordinates, bound to the armature, and on request exact in every frame.
+"""The polygonal skin: one closed mesh of quads with texture coordinates, bound to the armature, and on request exact in every frame.
 
-The armature deforms the skin of the rest pose by blending bones. The exact skin is the run's own, the implicit surface of every frame's
-posture found anew, as a mesh cache beside the .blend (PC2, Blender's Mesh Cache modifier): shape keys would put 120 MB into a file of
-1,000 frames.
+The armature deforms the skin of the rest pose by blending bones, keeping volumes. The exact skin is the run's own, the implicit
+surface of every frame's posture found anew, as a mesh cache beside the .blend (PC2, Blender's Mesh Cache modifier): shape keys would
+put 120 MB into a file of 1,000 frames.
 """
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from ...core import store
+from ...core.body.one_skin import OneSkin, one_skin
 from ...core.body.shape import BodyShape
-from ...core.body.skin import Skin, SkinSettings, body_skin
-from ...core.body.skin_patches import corner_uv, refined
+from ...core.body.skin import SkinSettings, body_skin
+from ...core.body.skin_patches import corner_uv
 from ...core.errors import InputError
 from . import paint
 from .contents import FrameSkins
@@ -22,23 +24,21 @@ from .contents import FrameSkins
 NAME, EXACT_NAME = "Skin", "Exact skin"
 CACHE_MODIFIER = "Every frame"
 SKIN_COLOUR = (0.80, 0.52, 0.41)
+STEPS = 2000  # a weight is written in so many steps: coarser ones fold the inside of a sharply bent elbow
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
 
 def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape, detail: int = 1,
-             settings: SkinSettings = SkinSettings(), found: Skin | None = None) -> bpy.types.Object:  # noqa: B008  frozen
-    """The skin of the rest pose, bound to the armature, sampled as the run's settings say; `detail` cuts its B-spline patches finer.
+             settings: SkinSettings = SkinSettings(), found: OneSkin | None = None) -> bpy.types.Object:  # noqa: B008  frozen
+    """The skin of the rest pose as one closed mesh, bound to the armature, sampled as the run's settings say; `detail` cuts it finer.
     It may have been found before.
 
     Raises:
         InputError: the body has no metaballs.
     """
-    skin = found or body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
-    skin = refined(skin, detail) if detail > 1 else skin
-    skin_object = _mesh_object(collection, NAME, skin)
-    skin_object.parent = armature_object
-    _bind(skin_object, skin)
-    skin_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    skin = found or one_skin(shape, settings, detail)
+    skin_object = _mesh_object(collection, NAME, skin.vertices_m, skin.faces, skin.uv)
+    bind(skin_object, armature_object, skin.bone_names, skin.weights)
     return skin_object
 
 
@@ -56,30 +56,38 @@ def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: Fr
     held = np.searchsorted(skins.frames, np.arange(first, last + 1), side="right") - 1
     head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(rest.vertices_m), float(first), 1.0, len(held))
     store.write_bytes(cache, head + skins.vertices_m[held].tobytes())
-    skin_object = _mesh_object(collection, EXACT_NAME, rest)
+    skin_object = _mesh_object(collection, EXACT_NAME, rest.vertices_m, rest.faces, corner_uv(rest))
+    if len(rest.part_sizes) > 1:  # where parts overlap, shade by the surface they share
+        skin_object.data.normals_split_custom_set_from_vertices(rest.normals.tolist())
     modifier = skin_object.modifiers.new(CACHE_MODIFIER, "MESH_CACHE")
     modifier.cache_format, modifier.filepath = "PC2", str(cache)
     modifier.frame_start = float(first)
     return skin_object
 
 
-def _mesh_object(collection: bpy.types.Collection, name: str, skin: Skin) -> bpy.types.Object:
+def _mesh_object(collection: bpy.types.Collection, name: str, vertices_m: np.ndarray, faces: np.ndarray, uv: np.ndarray
+                 ) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(name)
-    mesh.from_pydata(skin.vertices_m.tolist(), [], skin.faces.tolist())
+    mesh.from_pydata(vertices_m.tolist(), [], faces.tolist())
     mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
     layer = mesh.uv_layers.new(name="UVMap")
-    layer.data.foreach_set("uv", corner_uv(skin).astype(np.float32).ravel())
+    layer.data.foreach_set("uv", uv.astype(np.float32).ravel())
     mesh.materials.append(paint.plain_material(name, SKIN_COLOUR))
     mesh.update()
-    if len(skin.part_sizes) > 1:  # where parts overlap, shade by the surface they share
-        mesh.normals_split_custom_set_from_vertices(skin.normals.tolist())
     skin_object = bpy.data.objects.new(name, mesh)
     collection.objects.link(skin_object)
     return skin_object
 
 
-def _bind(skin_object: bpy.types.Object, skin: Skin) -> None:
-    for bone, weights in zip(skin.bone_names, skin.weights.T):
+def bind(skin_object: bpy.types.Object, armature_object: bpy.types.Object, bone_names: Sequence[str], weights: np.ndarray) -> None:
+    """Let the armature deform the object, keeping volumes, by the bones' shares in its vertices (V, B), written in steps."""
+    skin_object.parent = armature_object
+    for bone, share in zip(bone_names, weights.T):
+        level = np.round(STEPS * share).astype(int)
+        if not level.any():
+            continue
         group = skin_object.vertex_groups.new(name=bone)
-        for weight in np.unique(weights[weights > 0]):  # all vertices of a contour have the same weight
-            group.add(np.flatnonzero(weights == weight).tolist(), float(weight), "REPLACE")
+        for step in np.unique(level[level > 0]):
+            group.add(np.flatnonzero(level == step).tolist(), step / STEPS, "REPLACE")
+    modifier = skin_object.modifiers.new("Armature", "ARMATURE")
+    modifier.object, modifier.use_deform_preserve_volume = armature_object, True

@@ -18,6 +18,7 @@ from .skin_parts import Part, body_parts
 from .skin_patches import refined
 from .skin_rays import Rays, cast, segments_of
 from .skin_roots import limb_normals, limb_root, part_root
+from .skin_weights import chain_weights
 
 __all__ = ["Skin", "SkinSettings", "body_skin", "limb_skin"]
 
@@ -53,16 +54,17 @@ def body_skin(shape: BodyShape, motion: np.ndarray, settings: SkinSettings | Non
     parts = body_parts(shape)
     if not parts:
         raise InputError(f"The skin of “{shape.model}” cannot be made: it has no metaballs; give its bones radii in the model.")
-    n_bones = len(shape.skeleton.bones)
     R, head = bone_frames(shape.skeleton, shape.lengths_m, np.asarray(motion, dtype=np.float64))
     vertices, normals, faces, weights, first = [], [], [], [], 0
     for index, part in enumerate(parts):
-        rays = cast(segments_of(shape, part.bones, R, head), settings, n_bones)
+        segments = segments_of(shape, part.bones, R, head)
+        rays = cast(segments, settings)
         found, across = _surface(shape, parts, index, R, head, rays)
         vertices.append(found)
         normals.append(across)
         faces.append(first + chain_faces(len(rays.bone), settings.rays))
-        weights.append(rays.weights)
+        local = np.einsum("vi,vij->vj", found - head[rays.bone], R[rays.bone])
+        weights.append(chain_weights(shape, segments, rays, local))
         first += len(rays.bone)
     skin = Skin(vertices_m=np.concatenate(vertices), faces=np.concatenate(faces), weights=np.concatenate(weights),
                 bone_names=tuple(bone.name for bone in shape.skeleton.bones), part_sizes=tuple(map(len, vertices)),

@@ -124,13 +124,15 @@ def _evaluated(net: np.ndarray, axis: int, detail: int) -> tuple[np.ndarray, np.
 
 
 def _between(weights: np.ndarray, rays: int, detail: int) -> np.ndarray:
-    """The bones' shares (V', B), linear between the contours."""
-    contours = np.concatenate([weights[:1], weights[1:-1:rays], weights[-1:]])
-    place = np.arange((len(contours) - 1) * detail + 1) / detail
-    low = np.minimum(place.astype(int), len(contours) - 2)
-    part = (place - low)[:, None]
-    fine = (1 - part) * contours[low] + part * contours[low + 1]
-    return np.concatenate([fine[:1], np.repeat(fine[1:-1], rays * detail, axis=0), fine[-1:]])
+    """The bones' shares (V', B), linear between the contours and around them."""
+    rings = weights[1:-1].reshape(-1, rays, weights.shape[1])
+    poles = (np.broadcast_to(weights[i], (1, *rings.shape[1:])) for i in (0, -1))
+    net = np.concatenate([next(poles), rings, next(poles)])
+    part = (np.arange(detail) / detail)[:, None, None]
+    along = np.concatenate([((1 - part) * net[:-1, None] + part * net[1:, None]).reshape(-1, *net.shape[1:]), net[-1:]])
+    ahead = np.roll(along, -1, axis=1)
+    fine = ((1 - part[:, 0]) * along[:, :, None] + part[:, 0] * ahead[:, :, None]).reshape(len(along), -1, net.shape[2])
+    return np.concatenate([weights[:1], fine[1:-1].reshape(-1, net.shape[2]), weights[-1:]])
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

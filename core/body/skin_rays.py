@@ -30,7 +30,6 @@ RADIUS_OF_L = 0.65  # seen radius of a limb of three balls / l
 TILT_NEEDED = 1.3  # reach of the tilted contours, in limb radii times tan(β/2); > 1, or contours would cross
 TILT_LEAST = 0.30  # … and at least this fraction of the bone
 SHARPEST_COS = -0.96  # bends beyond 164° are cut as if 164°
-BLEND = 0.2  # half width of the zone of shared bone weights, as a fraction of the bone
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -41,7 +40,7 @@ class Rays:
     direction: np.ndarray  # (V, 3) ρ is the distance across the bone
     reach: np.ndarray  # (V,) largest ρ
     bone: np.ndarray  # (V,)
-    weights: np.ndarray  # (V, B)
+    station: np.ndarray  # (V,) how far from its bone's head the contour of a vertex meets the bone [m]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -111,22 +110,20 @@ def _bend(y: np.ndarray, other: np.ndarray, sign: int) -> np.ndarray:
     return sign * (other - cosine * y) / (1 + max(cosine, SHARPEST_COS))
 
 
-def cast(segments: list[Segment], settings: SkinSettings, n_bones: int) -> Rays:
+def cast(segments: list[Segment], settings: SkinSettings) -> Rays:
     """All rays of a chain: the pole at its base, contour after contour, the pole at its end."""
     parts: list[Rays] = []
-    neighbours = [None, *segments, None]
-    for before, segment, after in zip(neighbours, segments, neighbours[2:]):
+    for segment in segments:
         inset = min(CAP_START * segment.radius / segment.length, DEEPEST_CAP)
         start, stop = inset if segment.first else 0.0, 1 - inset if segment.last else 1.0
         fraction = np.linspace(start, stop, settings.contours + 1)[0 if segment.first else 1:]
-        around = (before.bone if before else None, after.bone if after else None)
         if segment.first:
             rise = _cap_angles(segment, settings)
-            parts.append(_contours(segment, np.full(len(rise), start), -rise[::-1], around, settings, n_bones))
-        parts.append(_contours(segment, fraction, np.zeros(len(fraction)), around, settings, n_bones))
+            parts.append(_contours(segment, np.full(len(rise), start), -rise[::-1], settings))
+        parts.append(_contours(segment, fraction, np.zeros(len(fraction)), settings))
         if segment.last:
             rise = _cap_angles(segment, settings)
-            parts.append(_contours(segment, np.full(len(rise), stop), rise, around, settings, n_bones))
+            parts.append(_contours(segment, np.full(len(rise), stop), rise, settings))
     parts = [_pole(segments[0], parts[0], 0), *parts, _pole(segments[-1], parts[-1], -1)]
     return Rays(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in Rays.__slots__})
 
@@ -137,8 +134,7 @@ def _cap_angles(segment: Segment, settings: SkinSettings) -> np.ndarray:
     return np.arange(1, count + 1) * (np.pi / 2 / (count + 1))
 
 
-def _contours(segment: Segment, fraction: np.ndarray, rise: np.ndarray, around: tuple[int | None, int | None], settings: SkinSettings,
-              n_bones: int) -> Rays:
+def _contours(segment: Segment, fraction: np.ndarray, rise: np.ndarray, settings: SkinSettings) -> Rays:
     """Rays of contours at `fraction` (C,) of the bone; `rise` (C,) turns those of the caps towards the axis (rad, + to the tail)."""
     a, b = fraction * segment.length, (1 - fraction) * segment.length
     phi = np.arange(settings.rays) * (2 * np.pi / settings.rays) + segment.delta * (1 - smooth(fraction))[:, None]
@@ -151,14 +147,9 @@ def _contours(segment: Segment, fraction: np.ndarray, rise: np.ndarray, around: 
         reach = np.where(inner * reach > limit, limit / np.maximum(inner, 1e-9), reach)  # the pencil's line
     u = np.cos(rise)[:, None, None] * (e + tilt[..., None] * segment.y) + np.sin(rise)[:, None, None] * segment.y
     reach = np.where(rise[:, None] == 0, reach, np.maximum(reach, CAP_START * segment.radius + segment.length / 2))
-    weights = np.zeros((len(fraction), n_bones))
-    for distance, other in ((a, around[0]), (b, around[1])):
-        if other is not None:
-            weights[:, other] = 0.5 * (1 - smooth(distance / (BLEND * segment.length)))
-    weights[:, segment.bone] = 1 - weights.sum(axis=1)
     origin = segment.head + a[:, None, None] * segment.y + 0 * u
     return Rays(origin=origin.reshape(-1, 3), direction=u.reshape(-1, 3), reach=reach.ravel(), bone=np.full(u[..., 0].size, segment.bone),
-                 weights=np.repeat(weights, settings.rays, axis=0))
+                 station=np.repeat(a, settings.rays))
 
 
 def smooth(v: np.ndarray) -> np.ndarray:
@@ -169,4 +160,4 @@ def smooth(v: np.ndarray) -> np.ndarray:
 
 def _pole(segment: Segment, cap: Rays, at: int) -> Rays:
     direction = segment.y[None] * (-1 if at == 0 else 1)
-    return Rays(origin=cap.origin[[at]], direction=direction, reach=cap.reach[[at]], bone=cap.bone[[at]], weights=cap.weights[[at]])
+    return Rays(origin=cap.origin[[at]], direction=direction, reach=cap.reach[[at]], bone=cap.bone[[at]], station=cap.station[[at]])

@@ -11,9 +11,10 @@ from tricap.core import store
 from tricap.core.body.fields import potential_named
 from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
+from tricap.core.body.one_skin import one_skin
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin import body_skin
+from tricap.core.body.skin import SkinSettings, body_skin
 from tricap.core.errors import InputError
 
 from .conftest import FRAMES, SmallRun
@@ -78,31 +79,37 @@ def test_the_implicit_surface_is_that_of_the_field(empty: ModuleType, small_run:
         build_scene(small_run.out, options=SceneOptions(implicit=True, field="Shan"))
 
 
-def test_the_skin_in_one_piece(empty: ModuleType) -> None:
-    """Closed, in one piece, faces outwards, on the surface; the shares of the bones go over the borders of the parts without a jump."""
-    import bmesh
+def crossing_faces(bpy: ModuleType, thing: object) -> int:
+    """How many pairs of faces of the deformed mesh pass through each other."""
+    from mathutils.bvhtree import BVHTree
 
-    from tricap.addon.scene import armature, one_skin
-    from tricap.core.body import one_skin as core
+    corners = [list(face.vertices) for face in thing.data.polygons]
+    tree = BVHTree.FromPolygons(world_vertices(bpy, thing).tolist(), corners)
+    return sum(a < b and not set(corners[a]) & set(corners[b]) for a, b in tree.overlap(tree))
 
-    shape = default_shape(read_model("full"))
+
+@pytest.mark.parametrize(("model", "bone"), [("arm.R", "forearm.R"), ("leg.L", "shin.L"), ("full", "forearm.L"), ("full", "shin.R")])
+def test_elbows_and_knees_bend_without_the_skin_crossing_itself(empty: ModuleType, model: str, bone: str) -> None:
+    from tricap.addon.scene import armature, skin
+
+    shape = default_shape(read_model(model))
     body = armature.add_armature(empty.context.scene.collection, shape)
-    whole = one_skin.add_one_skin(empty.context.scene.collection, body, shape)
-    mesh = bmesh.new()
-    mesh.from_mesh(whole.data)
-    assert all(edge.is_manifold and edge.is_contiguous for edge in mesh.edges) and mesh.calc_volume(signed=True) > 0.03
-    assert len(mesh.verts) - len(mesh.edges) + len(mesh.faces) == 2  # one surface without handles
-    mesh.free()
-    points = np.array([v.co for v in whole.data.vertices])
-    rest = np.zeros(len(shape.skeleton.dof_names))
-    assert np.linalg.norm(core.onto_surface(shape, rest, points) - points, axis=1).max() < 3e-4
-    weights = np.zeros((len(points), len(whole.vertex_groups)))
-    for vertex in whole.data.vertices:
-        for member in vertex.groups:
-            weights[vertex.index, member.group] = member.weight
-    assert np.abs(weights.sum(axis=1) - 1).max() < 0.05
-    ends = np.array([edge.vertices for edge in whole.data.edges])
-    assert np.abs(weights[ends[:, 0]] - weights[ends[:, 1]]).max() < 0.3
+    bent = skin.add_skin(empty.context.scene.collection, body, shape)
+    for degrees in (0, 80, 140):
+        body.pose.bones[bone].rotation_euler[0] = np.radians(degrees)
+        empty.context.view_layer.update()
+        assert crossing_faces(empty, bent) == 0, degrees
+    bent.modifiers["Armature"].use_deform_preserve_volume = False
+    empty.context.view_layer.update()
+    assert crossing_faces(empty, bent) > 0  # without it the elbow collapses
+
+
+def test_one_skin_is_shown_and_metaballs_wait_hidden(empty: ModuleType, small_run: SmallRun) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(small_run.out)
+    shown = {o.name for o in empty.data.objects if o.type in ("MESH", "META") and o.name.startswith(("Skin", "Flesh")) and not o.hide_get()}
+    assert shown == {"Skin"} and not empty.data.objects["Skin"].hide_render and empty.data.objects["Flesh"].hide_render
 
 
 def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:
@@ -233,9 +240,8 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
     families = [part for part in flesh if len(world_vertices(empty, part))]
     assert len(families) == 5
     skin_object = skin.add_skin(empty.context.scene.collection, body, shape)
-    assert skin_object.data.uv_layers and skin_object.data.has_custom_normals
-    rest = body_skin(shape, np.zeros(len(shape.skeleton.dof_names))).vertices_m
-    np.testing.assert_allclose(world_vertices(empty, skin_object), rest, atol=2e-5)
+    assert skin_object.data.uv_layers and all(len(face.vertices) == 4 for face in skin_object.data.polygons)
+    np.testing.assert_allclose(world_vertices(empty, skin_object), one_skin(shape, SkinSettings()).vertices_m, atol=2e-5)
 
 
 @pytest.mark.slow

@@ -73,7 +73,7 @@ def test_where_parts_meet_they_have_one_surface_without_a_seam(angles: dict[str,
     for index in range(1, 5):
         for bone in parts[index].junction[:-1] or parts[index].junction:
             towards = Rays(origin=p - 0.02 * n, direction=n, reach=np.full(len(p), 0.04), bone=np.full(len(p), bone),
-                           weights=np.zeros((len(p), len(shape.lengths_m))))
+                           station=np.zeros(len(p)))
             rho, normals = part_root(shape, parts, index, R, head, towards)
             both = np.abs(rho - 0.02) < 3e-4
             angle = np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", n, normals)[both], -1, 1)))

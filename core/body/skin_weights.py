@@ -1,0 +1,74 @@
+"""Which bones move a vertex of the skin: shares that let a joint bend as far as joints bend, without the skin passing through itself.
+
+An armature that keeps volumes turns a vertex near a joint, bent by β, by w β about the joint. On the inner side of the bend a vertex at
+the distance d along its bone and h off the axis stands at the angle 90° + φ from the joint, φ = atan(d/h), and must not be carried past the
+plane that halves the bend: φ + w β ≥ β/2, rising with d. So, for all β < 2 atan(D/h),
+
+    w = ½ (1 − atan(d/q)/atan(D/q)) ,   q = max(h, q_0) ,   D = 5 q                                         (1)
+
+which allows 157° of a cylinder. Joints that bend to one side only, as elbows and knees, have a wide zone there and a narrow one on the
+outer side, so that the point of the elbow stays with its bones; how far a joint is such a hinge is read from its limits.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .shape import BodyShape
+from .skeleton import Bone
+from .skin_rays import Rays, Segment, swing
+
+ZONE = 5.0  # D/q of (1): atan 5 = 79°, with room for limbs that are no cylinders
+LEAST_Q = 0.5  # q_0, in limb radii
+ROUNDED = 0.4  # the maximum of (1) is rounded over this many limb radii
+LARGEST_ZONE = 0.7  # of the bone's length
+
+
+def chain_weights(shape: BodyShape, segments: Sequence[Segment], rays: Rays, local_m: np.ndarray) -> np.ndarray:
+    """The share (V, B) of every bone in the vertices of one chain, given in their bones' axes (V, 3); rows sum to 1.  (1)"""
+    weights = np.zeros((len(local_m), len(shape.skeleton.bones)))
+    for here, segment in enumerate(segments):
+        own = np.flatnonzero(rays.bone == segment.bone)
+        along = rays.station[own]
+        for other, joint, distance in ((here - 1, here, along), (here + 1, here + 1, segment.length - along)):
+            if not 0 <= other < len(segments):
+                continue
+            inner = _inner_side(shape, segments[joint - 1].bone, segments[joint].bone, segment.bone)
+            radius = min(segments[joint - 1].radius, segments[joint].radius)
+            weights[own, segments[other].bone] = _share(distance, local_m[own] @ inner, radius, segment.length)
+        weights[own, segment.bone] = 1 - weights[own].sum(axis=1)
+    return weights
+
+
+def _share(distance: np.ndarray, inwards: np.ndarray, radius: float, length: float) -> np.ndarray:
+    """w of (1) of the bone beyond the joint."""
+    least, over = LEAST_Q * radius, inwards - LEAST_Q * radius
+    q = least + 0.5 * (over + np.hypot(over, ROUNDED * radius))
+    zone = np.minimum(ZONE * q, LARGEST_ZONE * length)
+    return np.asarray(0.5 * np.maximum(0.0, 1 - np.arctan2(np.maximum(distance, 0.0), q) / np.arctan2(zone, q)))
+
+
+def _inner_side(shape: BodyShape, parent: int, child: int, bone: int) -> np.ndarray:
+    """Where the joint of parent and child bends its bones to, in the axes of `bone`, one of both; as long as it is a hinge, 0 to 1."""
+    bones = shape.skeleton.bones
+    inner = hinge(bones[child])
+    if bone == child:
+        return inner
+    y_parent, y_child = bones[parent].R_rest[:, 1], bones[child].R_rest[:, 1]
+    return np.asarray(bones[parent].R_rest.T @ swing(y_child, y_parent) @ bones[child].R_rest @ inner)
+
+
+def hinge(bone: Bone) -> np.ndarray:
+    """(3,) in the bone's axes: the side that its joint bends it to, 1 long if to that side only, 0 if to all sides alike."""
+    middle, reach = np.zeros(3), 0.0
+    for dof in bone.dofs:
+        if dof.axis == "y":
+            continue
+        low, high = dof.limits
+        if not np.isfinite([low, high]).all():
+            return np.zeros(3)
+        axis = np.eye(3)["xyz".index(dof.axis)]
+        middle += (low + high) / 2 * np.cross(axis, [0.0, 1.0, 0.0])
+        reach = max(reach, (high - low) / 2)
+    size = float(np.linalg.norm(middle))
+    return middle * max(0.0, 2 * size / reach - 1) / size if reach and size else np.zeros(3)
