@@ -34,7 +34,8 @@ from .template_patches import monomials
 
 WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
 SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SHARE = 0.1, 0.001, 1.0  # px/px and px/px² in the search view that moves fastest; of itself
-SAME_PLACE, UNSURE_PX, SAME_PLACE_M = 0.25, 0.1, 0.003  # of the patch's width, half of it at this sigma; and never less
+SLOPE_ERROR, CURVATURE_ERROR = 0.8, 3.0  # of a quadric over −1…1 by 49 neighbours of scatter 1, of which five are independent
+SAME_PLACE, UNSURE_PX, SAME_PLACE_M = 0.25, 0.08, 0.003  # of the patch's width, half of it at this sigma; and never less
 SMOOTH_EXTRA_PX = 4  # wider where texture is weak
 STIFF = 0.1  # of these sigmas in the second try
 FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
@@ -108,7 +109,7 @@ def _object_space(
     around = _surface_of(field, cameras[reference], reference, speed)
     xy, start = field.grid.xy(field.cell), around.coefficients[:, : 6 if settings.neighbours else 3]
     seen = _seen(field, reference)
-    prior = _prior(start, speed)
+    prior = _prior(start, speed, around.scatter, RADIUS_CELLS * field.grid.spacing_px)
     wide = replace(loosened(settings), patch_px=settings.patch_px + WINDOW_EXTRA_PX, max_sigma0=LOOSER * settings.max_sigma0)
 
     def match(
@@ -124,14 +125,15 @@ def _object_space(
             start[which],
             replace(wide, patch_px=wide.patch_px + extra_px),
             sigma_across_px=sigma_c,
-            prior=SurfacePrior(value=prior.value[which], sigma=prior.sigma[which]),
+            prior=prior.select(which),
             weight=np.broadcast_to(weight, (len(which), len(weight))),
             seen=seen[which],
             monitor=monitor,
         )
 
     every = np.arange(len(xy))
-    sample = match(every[:: max(1, len(xy) // SAMPLE)], prior, FREE_SIGMA_PX)
+    inner = np.flatnonzero(around.support >= np.median(around.support))  # at an outline a patch shifts for other reasons than the rig's
+    sample = match(inner[:: max(1, len(inner) // SAMPLE)], prior, FREE_SIGMA_PX)
     known = sample.ok[:, None] & sample.seen
     rig_sigma_px = _rig_sigma(sample.across_px[known], sample.across_sigma_px[known])
     if rig_sigma_px > MAX_RIG_SIGMA_PX:
@@ -142,7 +144,7 @@ def _object_space(
     if len(again):
         _replace(found, again, match(again, prior, sigma_c))
     if settings.neighbours:
-        stiff = SurfacePrior(value=prior.value, sigma=prior.sigma * np.array([1, STIFF, STIFF, STIFF, STIFF, STIFF]))
+        stiff = replace(prior, sigma=prior.sigma * np.array([1, STIFF, STIFF, STIFF, STIFF, STIFF]))
         again = np.flatnonzero(~found.ok)
         _replace(found, again, match(again, stiff, sigma_c))
         again = np.flatnonzero(~found.ok & field.smoothed)
@@ -181,13 +183,20 @@ def _without_unlike(seen: np.ndarray, ok: np.ndarray, correlation: np.ndarray, s
     return rows
 
 
-def _prior(start: np.ndarray, speed: float) -> SurfacePrior:
-    """What the neighbours say of slopes and curvatures, the less surely the rounder it is there; of planes (N, 3) they say nothing."""
+def _prior(start: np.ndarray, speed: float, scatter: np.ndarray, radius_px: int) -> SurfacePrior:
+    """What the neighbours say of slopes and curvatures, the less surely the rounder it is there; of planes (N, 3) they say nothing.
+
+    How wrong that is follows from their scatter (N,) about the quadric, of radius `radius_px`.
+    """
     sigma = np.full(start.shape, np.inf)
-    if start.shape[1] == 6:
-        sigma[:, 1:3] = SLOPE_SIGMA / speed
-        sigma[:, 3:] = CURVATURE_SIGMA / speed + CURVATURE_SHARE * np.linalg.norm(start[:, 3:], axis=1, keepdims=True)
-    return SurfacePrior(value=start, sigma=sigma)
+    if start.shape[1] < 6:
+        return SurfacePrior(value=start, sigma=sigma)
+    sigma[:, 1:3] = SLOPE_SIGMA / speed
+    sigma[:, 3:] = CURVATURE_SIGMA / speed + CURVATURE_SHARE * np.linalg.norm(start[:, 3:], axis=1, keepdims=True)
+    error = np.zeros(start.shape)
+    error[:, 1:3] = SLOPE_ERROR / radius_px * scatter[:, None]
+    error[:, 3:] = CURVATURE_ERROR / radius_px**2 * scatter[:, None]
+    return SurfacePrior(value=start, sigma=sigma, error=np.minimum(error, sigma))
 
 
 def _window(patch_px: int, row_step: int) -> np.ndarray:

@@ -12,6 +12,11 @@ J = [fx, fx u, fx v, fy, fy u, fy v] of the template's gradients, r0 and r1 are 
     σ0² = |f̃|² (1 − ρ²) / (n − 8) ,   ρ = g̃·f̂ / |g̃| ,   K_c = σ0² A H⁻¹[d] Aᵀ             (4)
     o = Σ u |∇f|² / Σ |∇f|² ,   x_o = c + A o ,   K_o = σ0² A E H⁻¹ Eᵀ Aᵀ , E = [1 o] ⊗ I   (5)
 
+Noise of the template's gradients is in H but does not pull, so a step leaves a part λ of the way to go, with σ the point's sigma, and
+no less than a tenth, for the texture's curvature. Where that foresees too little to matter, the next iteration is spared:
+
+    λ = 130/144 σn² n H⁻¹[d] ≈ 0.45 n σ² ,   σ² = 2 σn² H⁻¹[d] of two images of noise σn                           (6)
+
 What was matched is the texture, so the point that is transferred with least bias is the gradients' centre of gravity o of the patch
 (Förstner 1984), not its middle: at the outline of a body it lies on the body, where the middle may lie on the background.
 
@@ -32,12 +37,15 @@ from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from ..progress import Monitor
 from ..settings import knob
+from .affine_steps import compose
 from .parameter_sets import PARAMETERS, reduced_sets
 
 CHUNK, LARGEST = 512, 1024  # patches that threads do not share; the most that a piece has when they do
 THREADS = 2
-MAX_STEP_PX = 2.0
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
+REMAINS_SIGMAS, REMAINS_PX = 0.1, 0.005  # what may remain after the last step where (6) foresees it
+GRADIENT_NOISE, CURVATURE = 0.45, 0.1  # of (6)
+LINEAR_PX = 0.25  # (6) holds while no part of the patch moves by more
 MIN_CONDITION = 1e-6
 PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "textured")  # arrays
 UPPER, SYMMETRIC = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a 3×3 matrix: its upper part, and back
@@ -282,24 +290,35 @@ class PatchTemplates:
         for iteration in range(1, s.max_iterations + 1):
             if not len(active):
                 break
-            step, rho = self._step(image, c[active], A[active], slice(None) if len(active) == n else active)  # all: no copies
-            correlation[active], iterations[active] = rho, iteration
-            c[active], A[active], moved = _compose(c[active], A[active], step)
+            step, rho, gain = self._step(image, c[active], A[active], slice(None) if len(active) == n else active)  # all: no copies
+            c[active], A[active], moved = compose(c[active], A[active], step)
             gone = (largest(c[active] - start[active]) > 2 * s.max_shift_px) | ~np.isfinite(moved)
-            done = moved < np.maximum(s.converged_px, CONVERGED_SIGMAS * self._sigma(rho, active))
+            near, spared = self._converged(step, moved, self._sigma(rho, active))
+            correlation[active], iterations[active] = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho), iteration
+            done = near | spared
             status[active[done]] = MatchStatus.OK
             status[active[gone]] = MatchStatus.SHIFT_TOO_LARGE
             active = active[~(done | gone)]
         return self._judge(image, start, shape, c, A, status, correlation, iterations)
 
-    def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+    def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, ...]:
+        """Δp of (2) (m, 6), the correlation ρ (m,) before it, and what it adds to ρ² where it is small enough to be linear."""
         g = image.sample_patches(c, A, self._pixels)
         g -= (g @ self._mean)[:, None]
         power = np.maximum(np.einsum("ij,ij->i", g, g), 1e-6)
         along = np.einsum("ij,ij->i", g, self.f[rows])
         gain = self.contrast[rows] * along / power  # r1
-        rhs = (self._project(g, rows) - self.q[rows] * along[:, None]) * gain[:, None]
-        return np.einsum("nij,nj->ni", self.inverse[rows], rhs.astype(np.float64)), along / np.sqrt(power)  # (2)
+        rhs = ((self._project(g, rows) - self.q[rows] * along[:, None]) * gain[:, None]).astype(np.float64)
+        step = np.einsum("nij,nj->ni", self.inverse[rows], rhs)
+        explained = np.einsum("ni,ni->n", step, rhs) / np.maximum(self.contrast[rows], 1e-6) ** 2
+        return step, along / np.sqrt(power), explained
+
+    def _converged(self, step: np.ndarray, moved: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which patches' last step was small; and for which it foresees by (6) that the next would be."""
+        rate = np.maximum(CURVATURE, GRADIENT_NOISE * self.n_pixels * sigma**2)
+        linear = moved + self._half[0] * largest(step[:, [1, 2, 4, 5]]) <= LINEAR_PX
+        spared = linear & (moved < np.maximum(REMAINS_PX, REMAINS_SIGMAS * sigma) / rate)
+        return moved < np.maximum(self._settings.converged_px, CONVERGED_SIGMAS * sigma), spared
 
     def _sigma(self, rho: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
@@ -372,24 +391,6 @@ def _difference(values: np.ndarray, step: int) -> np.ndarray:
         far *= np.float32(1 / 12)
         near -= far
     return out
-
-
-def _compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The warp after the inverse of a step, and how far the centre moved [px].  (3)"""
-    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
-    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
-    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
-    det = a * e - b * d
-    inverse = 1 / np.where(np.abs(det) < 0.1, np.nan, det)
-    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
-    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
-    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
-    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
-    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
-    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
-    if bad.any():
-        A_new[bad], move[bad] = A[bad], 0.0
-    return c - move, A_new, moved
 
 
 def _empty() -> Matches:

@@ -20,6 +20,9 @@ Covariance: the template's noise is common to all search images (σ_f² = σ²/2
 (SCIENCE §4), so with N' free of the gradients' noise
 
     K = N'⁻¹ [ Σ_k ½ P_k J_kᵀ J_k + σ_f² (Σ_k P_k J_k)ᵀ (Σ_k P_k J_k) + P_prior ] N'⁻¹                       (5)
+
+in whose middle J_kᵀ J_k is weighted by W², not W, where the patch is seen through a window, and P_prior is P_prior² times the squares of
+the prior's errors where these are known.
 """
 
 from collections.abc import Sequence
@@ -44,10 +47,18 @@ MIN_REMAINING = 0.1  # of the gradients' energy is always texture
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SurfacePrior:
-    """Pseudo-observations θ = value ± sigma of N points, in the unknowns of (1); an infinite sigma says nothing."""
+    """Pseudo-observations θ = value ± sigma of N points, in the unknowns of (1); an infinite sigma says nothing.
+
+    `error` is how wrong the values are thought to be, where that is known better than the sigma with which they take part.
+    """
 
     value: np.ndarray  # (N, P)
     sigma: np.ndarray  # (N, P)
+    error: np.ndarray | None = None  # (N, P)
+
+    def select(self, rows: np.ndarray | slice) -> "SurfacePrior":
+        """Only these points."""
+        return SurfacePrior(value=self.value[rows], sigma=self.sigma[rows], error=None if self.error is None else self.error[rows])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -137,7 +148,7 @@ def match_surface(
     def work(span: slice) -> SurfacePatch:
         if monitor is not None and monitor.cancelled:
             monitor.step("surface", span.start, n)
-        part = None if prior is None else SurfacePrior(value=prior.value[span], sigma=prior.sigma[span])
+        part = None if prior is None else prior.select(span)
         patches = TemplatePatches(
             images[reference],
             xy[span],
@@ -209,7 +220,7 @@ class _Adjustment:
                 break
             linear, rhs = self._linearise(theta[active], across[active], active)
             pseudo, wish = self._pseudo(theta[active], across[active], active)
-            N = self._normal(linear, active) + pseudo[:, :, None] * np.eye(P + S)
+            N = self._normal(linear, self._patches, active) + pseudo[:, :, None] * np.eye(P + S)
             step = solve_normals(N, rhs + pseudo * wish)
             length = np.abs(step[:, 0]) * linear.speed
             shrink = np.minimum(1.0, MAX_STEP_PX / np.maximum(length, 1e-12))[:, None]
@@ -249,14 +260,14 @@ class _Adjustment:
             state.held &= visible | ~seen
         return state, rhs
 
-    def _normal(self, a: "_Linear", rows: np.ndarray | slice) -> np.ndarray:
+    def _normal(self, a: "_Linear", patches: TemplatePatches, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Σ P_k J_kᵀ M J_k (m, P + S, P + S)."""
         P, N = self._P, np.zeros((len(a.speed), self._P + self._S, self._P + self._S))
         for k in range(self._S):
             s, t, weight = a.along[:, k], a.side[:, k], a.weight[:, k]
-            N[:, :P, :P] += weight[:, None, None] * self._patches.normal(s, s, rows)
-            self._cross(N, k, weight[:, None] * self._patches.normal_to_shift(s, t, rows))
-            N[:, P + k, P + k] = weight * self._patches.normal_of_shift(t, t, rows)
+            N[:, :P, :P] += weight[:, None, None] * patches.normal(s, s, rows)
+            self._cross(N, k, weight[:, None] * patches.normal_to_shift(s, t, rows))
+            N[:, P + k, P + k] = weight * patches.normal_of_shift(t, t, rows)
         return N
 
     def _cross(self, N: np.ndarray, k: int, block: np.ndarray) -> None:
@@ -264,27 +275,23 @@ class _Adjustment:
 
     def _covariance(self, a: "_Linear", pseudo: np.ndarray) -> np.ndarray:
         """(5) for all points of the chunk (n, P + S, P + S)."""
-        P, patches, every = self._P, self._patches, slice(None)
-        N, noise, common = (
-            self._normal(a, every),
-            np.zeros((len(pseudo), P + self._S, P + self._S)),
-            np.zeros_like(pseudo[:, :, None] * pseudo[:, None]),
-        )
+        P, patches, squared = self._P, self._patches, self._patches.squared()
+        noise, common = np.zeros((2, len(pseudo), P + self._S, P + self._S))
         total = np.einsum("nk,nki->ni", a.weight, a.along)
-        common[:, :P, :P] = patches.normal(total, total)
+        common[:, :P, :P] = squared.normal(total, total)
         for k in range(self._S):
             s, t = a.along[:, k] * self._seen[:, [k]], a.side[:, k] * self._seen[:, [k]]
             noise[:, :P, :P] += np.einsum("ni,ni->n", s, s)[:, None, None] * patches.noise_moment
             self._cross(noise, k, np.einsum("ni,ni->n", s, t)[:, None] * patches.noise_moment[:, 0])
             noise[:, P + k, P + k] = np.einsum("ni,ni->n", t, t) * patches.noise_moment[:, 0, 0]
-            self._cross(common, k, patches.normal_to_shift(total, a.weight[:, k, None] * t))
+            self._cross(common, k, squared.normal_to_shift(total, a.weight[:, k, None] * t))
             for j in range(self._S):
-                common[:, P + k, P + j] = patches.normal_of_shift(a.weight[:, k, None] * t, a.weight[:, j, None] * a.side[:, j])
-        middle = 0.5 * N + 0.5 * common / np.maximum(a.weight.max(axis=1), 1e-12)[:, None, None]
+                common[:, P + k, P + j] = squared.normal_of_shift(a.weight[:, k, None] * t, a.weight[:, j, None] * a.side[:, j])
+        middle = 0.5 * self._normal(a, squared) + 0.5 * common / np.maximum(a.weight.max(axis=1), 1e-12)[:, None, None]
         diagonal = np.arange(P + self._S)
-        texture = without_noise(N, 0.5 * patches.gradient_noise[:, None, None] * noise)
-        for M in (middle, texture):
-            M[:, diagonal, diagonal] += pseudo
+        texture = without_noise(self._normal(a, patches), 0.5 * patches.gradient_noise[:, None, None] * noise)
+        texture[:, diagonal, diagonal] += pseudo
+        middle[:, diagonal, diagonal] += pseudo * self._overrated(pseudo)
         half = inverse_normals(texture)
         return half @ middle @ half
 
@@ -296,6 +303,14 @@ class _Adjustment:
             weight[:, : self._P] = 1 / self._prior.sigma[rows] ** 2
             wish[:, : self._P] = np.where(weight[:, : self._P] > 0, self._prior.value[rows] - theta, 0.0)
         return weight, wish
+
+    def _overrated(self, pseudo: np.ndarray) -> np.ndarray:
+        """(n, P + S) variance of the pseudo-observations' errors in units of what their weights say."""
+        ratio = np.ones_like(pseudo)
+        if self._prior is not None and self._prior.error is not None:
+            taking_part = pseudo[:, : self._P] > 0
+            ratio[:, : self._P] = np.where(taking_part, pseudo[:, : self._P] * np.where(taking_part, self._prior.error, 0.0) ** 2, 1.0)
+        return ratio
 
     def _judge(
         self,

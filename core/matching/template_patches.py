@@ -9,7 +9,12 @@ Matthews 2004):
 
 with W the pixels' weights, f̂ the patch free of its mean and of unit length, and M the elimination of offset and gain. Mxx, Mxy and Myy
 belong to the template, so that normal matrices of any number of search images, in any iteration, cost a few small products.
+
+Weights that fade out towards the rim (a window) are not those of the noise, which is alike in all pixels. The right side of the normal
+equations then has the covariance σ² (M J)ᵀ W² M J, which is less than σ² Jᵀ W M J: see `squared`.
 """
+
+from copy import copy
 
 import numpy as np
 
@@ -30,6 +35,7 @@ class TemplatePatches:
         self.monomials = monomials(self.u, self.v, degree)  # (n, P)
         self.inside = image.inside(xy, np.array(self.half) + 1.0)
         f, fx, fy = _sample(image, np.where(self.inside[:, None], xy, self.half + np.array(3.0)), self.half)
+        self._weighted = weight is not None
         self._weight = np.ones_like(f) if weight is None else weight.astype(np.float32)
         self.pixels = self._weight.sum(axis=1).astype(np.float64)  # (N,)
         self.mean_weight = self._weight / np.maximum(self.pixels, 1e-6)[:, None].astype(np.float32)
@@ -54,20 +60,46 @@ class TemplatePatches:
         self.spread = np.maximum(moment[:, 2:] - moment[:, :2] ** 2, 0.0)  # (N, 2)
 
     def _moments(self, fx: np.ndarray, fy: np.ndarray) -> None:
-        m = self.monomials
-        P = m.shape[1]
-        second = (m[:, :, None] * m[:, None, :]).reshape(len(m), P * P)
-        xx, xy, yy = ((a @ second).reshape(-1, P, P).astype(np.float64) for a in (self._wfx * fx, self._wfx * fy, self._wfy * fy))
-        mean = [(w @ m).astype(np.float64) for w in (self._wfx, self._wfy)]
         self.q = np.stack(self.project(self.f), axis=1)  # (N, 2, P)  Jᵀ W f̂ for s = (1, 0) and (0, 1)
-        n = np.maximum(self.pixels, 1e-6)[:, None, None]
+        n = np.sqrt(np.maximum(self.pixels, 1e-6))[:, None, None]
+        mean = np.stack([self._sums(self._wfx), self._sums(self._wfy)], axis=1) / n
+        C = np.stack([mean, self.q], axis=2)  # (N, 2, 2, P) of Jᵀ W with the two vectors of unit length that M takes out
+        pairs = ((self._wfx * fx, 0, 0), (self._wfx * fy, 0, 1), (self._wfy * fy, 1, 1))
+        self.noise_moment = self._products(self._weight)  # of gradients that are noise of variance 1
+        self._moment = np.stack([self._products(g) - C[:, i].transpose(0, 2, 1) @ C[:, j] for g, i, j in pairs], axis=1)  # (N, 3, P, P)
+        self._squared, self.parameter_pixels = self._moment, np.ones(len(self.pixels))
+        if self._weighted:
+            self._squared, self.parameter_pixels = self._squared_moments(C)
 
-        def reduced(M: np.ndarray, i: int, j: int) -> np.ndarray:
-            outer = mean[i][:, :, None] * mean[j][:, None, :] / n + self.q[:, i, :, None] * self.q[:, j, None, :]
-            return M - outer
+    def _squared_moments(self, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(M J)ᵀ W² M J (N, 3, P, P), and Σ w² / Σ w (N,): of the weights' sum, what an unknown takes from the residuals."""
+        x, y, w, wf = self._wfx, self._wfy, self._weight, self.weighted_f
+        n = np.sqrt(np.maximum(self.pixels, 1e-6))
+        share, cross = np.einsum("ij,ij->i", w, w) / n**2, np.einsum("ij,ij->i", w, wf) / n
+        E = np.stack([share, cross, cross, np.einsum("ij,ij->i", wf, wf)], axis=1).reshape(-1, 1, 2, 2)
+        D = np.stack([np.stack([self._sums(w * g) / n[:, None], self._sums(g * wf)], axis=1) for g in (x, y)], axis=1)
+        rest, left = D - E @ C, (C.transpose(0, 1, 3, 2), D.transpose(0, 1, 3, 2))
+        pairs = ((x * x, 0, 0), (x * y, 0, 1), (y * y, 1, 1))
+        parts = [self._products(g) - left[0][:, i] @ rest[:, j] - left[1][:, i] @ C[:, j] for g, i, j in pairs]
+        return np.stack(parts, axis=1), share
 
-        self._moment = np.stack([reduced(xx, 0, 0), reduced(xy, 0, 1), reduced(yy, 1, 1)], axis=1)  # (N, 3, P, P)
-        self.noise_moment = (self._weight @ second).reshape(-1, P, P).astype(np.float64)  # of gradients that are noise of variance 1
+    def _sums(self, values: np.ndarray) -> np.ndarray:
+        """Products (N, P) of values (N, n) with the monomials."""
+        return (values @ self.monomials).astype(np.float64)
+
+    def _products(self, values: np.ndarray) -> np.ndarray:
+        """Products (N, P, P) of values (N, n) with the products of two monomials."""
+        P = self.monomials.shape[1]
+        i, j = np.triu_indices(P)
+        place = np.zeros((P, P), dtype=np.int64)
+        place[i, j] = place[j, i] = np.arange(len(i))
+        return (values @ (self.monomials[:, i] * self.monomials[:, j])).astype(np.float64)[:, place]
+
+    def squared(self) -> "TemplatePatches":
+        """The same, but its normal matrices are (M J)ᵀ W² M J: what noise that is alike in all pixels does to the right side."""
+        same = copy(self)
+        same._moment = self._squared
+        return same
 
     def project(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Products (m, P) of g (m, n) with the design matrix (1) for s = (1, 0) and s = (0, 1)."""
@@ -109,7 +141,7 @@ class TemplatePatches:
     def residual_variance(self, rho: np.ndarray, parameters: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Variance [grey values²] of a pixel after the adjustment, at correlation rho (m,), as white noise that would do as much."""
         lost = self.noise_factor[rows] * self.contrast[rows] ** 2 * np.clip(1 - rho**2, 0, 1)
-        return lost / np.maximum(self.pixels[rows] - parameters, 1.0)
+        return lost / np.maximum(self.pixels[rows] - parameters * self.parameter_pixels[rows], 1.0)
 
 
 def monomials(u: np.ndarray, v: np.ndarray, degree: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
 from tricap.core.matching.growing import GrowingSettings, TripletField, grow, rounds_of_larger_patches
-from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
+from tricap.core.matching.least_squares import MatchingSettings, MatchStatus, patch_offsets
 from tricap.core.matching.middle import believed, depth_doubt, in_doubt
 from tricap.core.matching.multi_image import match_multi_image
 from tricap.core.matching.object_space import Epipolar, SurfacePrior, match_surface
@@ -120,14 +120,28 @@ def test_design_matrix_is_the_derivative_of_the_patch(degree: int) -> None:
     assert np.abs((patches.normal(s, s)[0] - J.T @ M @ J) / np.outer(scale, scale)).max() < 2e-3
     assert patches.normal_to_shift(s, s)[0] == pytest.approx(patches.normal(s, s)[0, :, 0])
     assert patches.normal_of_shift(s, s)[0] == pytest.approx(patches.normal(s, s)[0, 0, 0])
+    weight = np.exp(-(patches.u**2 + patches.v**2) / 40)[None]
+    windowed = TemplatePatches(SplineImage(look(x, y)), np.array([[30.0, 28.0]]), 13, 1, degree=degree, weight=weight)
+    W = np.diag(weight[0].astype(float))
+    f = look(30 + patches.u, 28 + patches.v)
+    f = f - np.diag(W) @ f / np.trace(W)
+    f /= np.sqrt(f @ W @ f)
+    MJ = J - (np.ones((len(f), len(f))) / np.trace(W) + np.outer(f, f)) @ W @ J
+    assert np.abs((windowed.normal(s, s)[0] - MJ.T @ W @ MJ) / np.outer(scale, scale)).max() < 2e-3
+    assert np.abs((windowed.squared().normal(s, s)[0] - MJ.T @ W**2 @ MJ) / np.outer(scale, scale)).max() < 2e-3
 
 
-def test_object_space_finds_the_plane_and_knows_its_error(surfaces: ModuleType) -> None:
+@pytest.mark.parametrize("window", [None, 5.0])
+def test_object_space_finds_the_plane_and_knows_its_error(surfaces: ModuleType, window: float | None) -> None:
+    """Also through a window, whose weights are not those of the noise."""
+    settings = SETTINGS if window is None else replace(SETTINGS, patch_px=17)
+    u, v, _ = patch_offsets(settings.patch_px, 1)
     z, bias = [], []
     for seed in range(3):
         scene = Scene(surfaces, surfaces.plane(), "strong", seed)
         start = scene.theta[:, :3] * (1 + 0.002 * np.random.default_rng(seed).standard_normal((len(scene.xy), 1)))  # about 0.3 px
-        found = match_surface(scene.images, scene.rig, 1, RowGrid(), scene.xy, start, SETTINGS, sigma_across_px=0.03)
+        weight = None if window is None else np.tile(np.exp(-0.5 * (u**2 + v**2) / window**2), (len(start), 1))
+        found = match_surface(scene.images, scene.rig, 1, RowGrid(), scene.xy, start, settings, sigma_across_px=0.03, weight=weight)
         assert found.ok.mean() > 0.98
         o, ok = found.offset, found.ok
         m = monomials(o[:, 0], o[:, 1], 1).astype(float)
@@ -136,8 +150,20 @@ def test_object_space_finds_the_plane_and_knows_its_error(surfaces: ModuleType) 
         z.append(error / np.sqrt(np.einsum("ni,nij,nj->n", m, found.covariance, m))[ok])
         bias.append(error * 210)  # px in a search view: f · base
         assert np.median(found.across_px[ok] ** 2) < 0.03**2
-    assert 0.8 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.25
+    assert 0.85 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.2
     assert abs(np.mean(np.concatenate(bias))) < 0.01
+
+
+def test_beliefs_that_are_better_than_their_weight(plane: Scene) -> None:
+    """Curvatures that are known to be right, though they take part with a wide sigma: the depth is as sure as it is."""
+    sigma = np.tile([np.inf, 5e-4, 5e-4, 5e-6, 5e-6, 5e-6], (len(plane.xy), 1))
+    z = []
+    for error in (None, 0.01 * sigma):
+        prior = SurfacePrior(value=plane.theta, sigma=sigma, error=error)
+        found = match_surface(plane.images, plane.rig, 1, RowGrid(), plane.xy, plane.theta, SETTINGS, sigma_across_px=0.03, prior=prior)
+        wrong = found.theta[:, 0] - plane.theta[:, 0]
+        z.append(np.sqrt(np.mean((wrong**2 / found.covariance[:, 0, 0])[found.ok])))
+    assert z[0] < 0.9 < z[1] < 1.2
 
 
 def test_collinearity_holds_the_rays_together(plane: Scene) -> None:

@@ -287,6 +287,26 @@ def test_without_its_texture_a_patch_is_its_middle() -> None:
     assert np.array_equal(middle.transfer_covariance, middle.covariance) and np.array_equal(middle.transfer_xy, middle.xy)
 
 
+@pytest.mark.parametrize(("noise", "most_iterations"), [(1.0, 1.2), (2.0, 1.4)])
+def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float, most_iterations: float) -> None:
+    """From starts a third of a pixel off or a few hundredths, against what many iterations end at; sigmas are those of the end."""
+    a, b = noisy_pair(1.5, noise, (0.3, -0.2), 0)
+    xy = points()
+    off = np.random.default_rng(4).standard_normal(xy.shape)
+    true = xy + (0.3, -0.2)
+    near, far = (find(a, b, xy, start=true + size * off) for size in (0.02, 0.35))
+    image, at, eye = SplineImage(b), true, np.tile(np.eye(2), (len(xy), 1, 1))
+    for _ in range(10):
+        end = match_patches(SplineImage(a), xy, [image], [at], [eye], OPEN)[0]
+        at, eye = end.xy, end.shape
+    sigma = np.sqrt(np.trace(end.covariance, axis1=1, axis2=2) / 2)
+    assert near.iterations.mean() < most_iterations and near.iterations.mean() < far.iterations.mean()
+    for found in (near, far):
+        left = np.linalg.norm(found.xy - end.xy, axis=1) / sigma
+        assert np.sqrt(np.mean(left**2)) < 0.2
+        assert found.sigma0 == pytest.approx(end.sigma0, rel=0.05) and np.mean(found.sigma0 / end.sigma0) == pytest.approx(1.0, abs=0.003)
+
+
 @pytest.mark.parametrize("n", [0, 1, 511, 512, 513, 1650, 5000])
 def test_pieces_for_the_threads_are_equal_and_cover_all(n: int) -> None:
     spans = _spans(n)

@@ -175,7 +175,7 @@ def test_a_guide_carries_lost_points_longer_than_neighbours_may(tmp_path: Path, 
         back = np.isin(steps[4].identity, hidden)
         was = steps[1].xyz_m[np.searchsorted(steps[1].identity, steps[4].identity[back])]
         away = np.linalg.norm((steps[4].xyz_m[back] - was)[:, :2] - [0.012, 0.006], axis=1)
-        assert len(hidden) > 10 and (away < 0.3 * scenes.pixel_m).all()
+        assert len(hidden) > 10 and (away < 0.35 * scenes.pixel_m).all()
         assert guide is None or guide.asked >= len(hidden)
     assert regained[True] > 0.8 and regained[None] == regained[False] == 0
 
