@@ -58,8 +58,8 @@ class GrowingSettings:
     seed_spacing_px: int = knob(24, "Distance between the points at which seeds are looked for.", unit="px", low=4, high=128)
     attempts: int = knob(3, "How often a point is tried from different neighbours.", low=1, high=8)
     bigger_patches: int = knob(
-        3,
-        "Rounds in which what failed is tried again with a patch 4 px larger, from the second on smoothed; one where pixels are large.",
+        5,
+        "Rounds in which what failed is tried again with a patch 4 px larger, from the second on smoothed; fewer where pixels are large.",
         low=0,
         high=5,
     )

@@ -40,7 +40,7 @@ from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
 from .template_patches import TemplatePatches, monomials
 
 MIN_NOISE = 0.4  # grey values, of a difference of two images: no image is better than its quantisation
-CONVERGED_SIGMAS = 0.05
+CONVERGED_SIGMAS = 0.2  # of the sigma that N says, which noise of the gradients makes too small where texture is weak
 MAX_STEP_PX = 1.5
 MIN_REMAINING = 0.1  # of the gradients' energy is always texture
 
