@@ -75,6 +75,8 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise InputError("The bar's length is missing; give --bar-length with the distance between its two targets in metres.")
     if args.focal_px is not None and not 10 < args.focal_px < 1e6:
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
+    if not args.format and args.out.is_dir():
+        raise InputError(f"--out {args.out} is a folder; give the file of the rig to write, such as {args.out / 'rig.toml'}.")
     world = _world(args)
     footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field)
     measured = measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter)

@@ -257,3 +257,10 @@ def test_missing_folder_and_missing_arguments(tmp_path: Path, capsys) -> None:
     assert main(["calibrate", "--out", str(tmp_path / "r.toml")]) == 2
     with pytest.raises(InputError):
         open_bar(tmp_path / "none")
+
+
+def test_a_folder_as_the_rig_to_write_is_told_before_anything_is_measured(tmp_path: Path, capsys) -> None:
+    """There is no bar either: that would be told later."""
+    assert main(["calibrate", str(tmp_path / "none"), "--bar-length", "1", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said == f"tricap: --out {tmp_path} is a folder; give the file of the rig to write, such as {tmp_path / 'rig.toml'}."
