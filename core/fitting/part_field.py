@@ -108,10 +108,10 @@ class Part:
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """For each of its bones whether each of its rotations turns it (k, d), and whether each of its lengths shifts it (k, l)."""
+        """For each of its bones whether each of its DOFs moves it (k, d), and whether each of its lengths shifts it (k, l)."""
         bones, n = np.array([b for b, _ in self.bones]), len(self.skeleton.base_dofs)
         moved = self.skeleton.moved_by[np.ix_(bones, self.dofs)].astype(float)
-        moved[:, :n] = 0.0
+        moved[:, :n] = 1.0
         return moved, self.skeleton.offset_by[np.ix_(bones, self.lengths)].astype(float)
 
 
@@ -163,15 +163,15 @@ class PartField:
         return (pulls @ table.reshape(3 * m, 3 * k)).reshape(-1, k, 3)
 
     def _to_motion(self) -> np.ndarray:
-        state, part, n = self.state, self.part, len(self.part.skeleton.base_dofs)
-        axes, g, X = state.axes[part.dofs], self._bone_gradients, self.xyz_m[:, :, None]
-        table = part.tables[0][:, None] * np.concatenate([state.levers[part.dofs], -axes], axis=1).T  # (k, 6, d)
-        table[:, :3, :n] = -axes[:n].T
-        wrench = np.empty((len(g), g.shape[1], 6))  # force and moment X × g of each bone
-        wrench[..., :3] = g
-        for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)), 3):
-            wrench[..., i] = X[:, a] * g[..., b] - X[:, b] * g[..., a]
-        return wrench.reshape(len(g), -1) @ table.reshape(-1, len(part.dofs))  # (1): −a·((X − o) × g) = −a·(X × g) + (a × o)·g
+        """(1), for all bones at once: the sum over the bones is a product with a table of the DOFs' screws."""
+        part, X, (n, k, _) = self.part, self.xyz_m, self._bone_gradients.shape
+        screws = self.state.screws[part.dofs].transpose(2, 1, 0)  # (3, 4, d)
+        table = (part.tables[0][:, None, None] * screws).reshape(3 * k, -1)
+        terms = (self._bone_gradients.reshape(n, 3 * k) @ table).reshape(n, 4, -1)
+        J = terms[:, 0]
+        for c in range(3):
+            J = J + terms[:, 1 + c] * X[:, c, None]
+        return np.asarray(J)
 
     def _to_shape(self) -> np.ndarray:
         state, part = self.state, self.part

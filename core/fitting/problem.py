@@ -169,14 +169,14 @@ def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scal
         for rows, columns, J in blocks_of(o, state, len(free) > 0):
             weighted, columns, J = _free_columns(problem, D, w, rows, columns, J)
             H, g = weighted @ J, weighted @ r[rows]
-            motion = columns < D
-            d, s = columns[motion], columns[~motion] - D
-            e.diagonal[t][np.ix_(d, d)] += H[np.ix_(motion, motion)]
-            e.g[t][d] -= g[motion]
+            n = int(np.searchsorted(columns, D))  # its DOFs
+            d, s = columns[:n], columns[n:] - D
+            e.diagonal[t][d[:, None], d] += H[:n, :n]
+            e.g[t][d] -= g[:n]
             if len(s):
-                e.border[t][np.ix_(d, s)] += H[np.ix_(motion, ~motion)]
-                e.corner[np.ix_(s, s)] += H[np.ix_(~motion, ~motion)]
-                e.h[s] -= g[~motion]
+                e.border[t][d[:, None], s] += H[:n, n:]
+                e.corner[s[:, None], s] += H[n:, n:]
+                e.h[s] -= g[n:]
     lin.observations.append(frame)
 
 
@@ -197,7 +197,7 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
         n = int(np.searchsorted(columns, D))  # its DOFs
         d, s = columns[:n], columns[2 * n :] - 2 * D
         A, B, S = slice(0, n), slice(n, 2 * n), slice(2 * n, None)
-        dd, ds = np.ix_(d, d), np.ix_(d, s)
+        dd, ds = (d[:, None], d), (d[:, None], s)
         e.diagonal[t][dd] += H[A, A]
         e.diagonal[t + 1][dd] += H[B, B]
         e.next1[t][dd] += H[B, A]
@@ -205,7 +205,7 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
         e.g[t + 1][d] -= g[B]
         e.border[t][ds] += H[A, S]
         e.border[t + 1][ds] += H[B, S]
-        e.corner[np.ix_(s, s)] += H[S, S]
+        e.corner[s[:, None], s] += H[S, S]
         e.h[s] -= g[S]
 
 

@@ -15,6 +15,7 @@ from ..body.bone_profile import BoneProfile, bone_profiles, chain_neighbours
 from ..body.metaballs import Metaballs
 from ..body.shape import BodyShape
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
+from ..geometry.rotation import cross_matrix
 from .part_field import CROSS, Part, cross
 
 __all__ = ["CROSS", "FIRM", "BodyState", "ShapeParameters", "free_bones", "shape_vector"]
@@ -61,9 +62,12 @@ class BodyState:
         return frames, np.einsum("mi,mij->mj", self.head_m[of], frames) + self.balls.centres_m(self.lengths_m) / radii
 
     @cached_property
-    def levers(self) -> np.ndarray:
-        """(D, 3) a × o of the DOFs' axes a and the places o that they pass through."""
-        return cross(self.axes, self.head_m[self.skeleton.dof_bone])
+    def screws(self) -> np.ndarray:
+        """(D, 4, 3) what a DOF makes of a force g at X: −g · (a × (X − o)) = (1, X) · (screw g); of base DOFs, which shift by a, −g · a."""
+        screws, n = np.empty((len(self.axes), 4, 3)), len(self.skeleton.base_dofs)
+        screws[:, 0], screws[:, 1:] = cross(self.axes, self.head_m[self.skeleton.dof_bone]), cross_matrix(self.axes)
+        screws[:n, 0], screws[:n, 1:] = -self.axes[:n], 0.0
+        return screws
 
     @cached_property
     def log_radii(self) -> np.ndarray:
