@@ -26,7 +26,7 @@ from . import status
 
 log = logging.getLogger(__name__)
 
-TICK_S = 0.1
+TICK_S, SHOW_S = 0.1, 0.25  # how often a job is looked at, and its progress drawn: where the machine is busy, drawing is what takes long
 PACE_S, PACE_PARTS = 20.0, 200  # the time left is told from the pace of the last seconds
 SWITCH_S = 0.0005  # how soon the worker hands the interpreter to the window: redrawn after 30…90 ms at worst; Python's 5 ms: 130 ms
 BUG = "Tricap made a mistake ({error}); the console shows where. Please report it with that text."
@@ -171,7 +171,7 @@ class JobOperator:
 
     job: Job
     timer: Any = None
-    shown: str = ""
+    shown: tuple[str, float] = ("", 0.0)  # the words that tell the progress, and since when
     step: ClassVar[str] = ""  # of the workflow, in which the job is at its beginning
     last_words: ClassVar[str] = ""
 
@@ -264,8 +264,9 @@ class JobOperator:
     def _show(self, context: bpy.types.Context) -> None:
         job = self.job
         words = job.stage_words + ("" if job.monitor.cancelled else f" {job.fraction:.0%}  {job.left_words}  (Esc stops)")
-        if words != self.shown:  # where drawing is slow, the window has time for its user
-            self.shown = words
+        before, since = self.shown
+        if words != before and (job.monitor.cancelled or time.monotonic() - since >= SHOW_S):
+            self.shown = words, time.monotonic()
             status.tell(context, f"Tricap: {words}")
             redraw(context)
 

@@ -30,6 +30,7 @@ STAGE = {"surface": "measure", "tracks": "track", "body": "fit"}  # the stage of
 WRITES = {"surface": "clouds", "tracks": "trajectories.npz", "body": "motion.csv"}
 SAVE_FIRST = "Save this file first: the project lies in a folder beside it. Then add the films of your cameras."
 NEEDED_JOINTS = 2  # the fit's own least number
+MOST_REMEMBERED = 500  # joints
 INSIDE = ("spine", "chest", "clavicle.L", "clavicle.R")  # in the trunk: hardly anyone can say where
 
 
@@ -72,6 +73,7 @@ class _Found:
 
 _opened: dict[tuple[Any, ...], Sequence] = {}
 _joints: dict[str, tuple[str, ...]] = {}
+_met: dict[tuple[Any, ...], str] = {}  # joint, its clicks and cameras -> what is wrong with them, or ""
 
 
 def compute(scene: bpy.types.Scene) -> Look:
@@ -158,8 +160,7 @@ def _seeds(scene: bpy.types.Scene, found: _Found) -> State:
     wanted = joints_of(take.body_model)
     clicked = take.seeds.joints
     if found.footage is not None:
-        for name, at in clicked.items():
-            clicked_depth(found.footage, name, at)
+        _check_clicks(found.footage)
     whole = [name for name in wanted if len(clicked.get(name, {})) >= 2]
     if len(whole) < min(NEEDED_JOINTS, len(wanted)):
         return State(word="ready", why=f"Click the joints in two views at least: {len(whole)} of {len(wanted)} so far.")
@@ -167,6 +168,28 @@ def _seeds(scene: bpy.types.Scene, found: _Found) -> State:
     if missing:
         return State(word="done", why=f"{len(whole)} of {len(wanted)} joints; {missing[0]} and others would make it safer.")
     return State(word="done", why=f"All {len(wanted)} joints are clicked.")
+
+
+def _check_clicks(footage: Footage) -> None:
+    """Each joint's clicks meet in space; what was found of the same clicks and cameras is remembered.
+
+    Raises:
+        InputError: those of a joint do not.
+    """
+    take, rig = footage.take, footage.take.rig_path.stat()
+    for name, at in take.seeds.joints.items():
+        clicks = tuple((view, *xy.tolist()) for view, xy in sorted(at.items()))
+        key = (take.rig_path, rig.st_mtime_ns, rig.st_size, take.reference, name, clicks)
+        if key not in _met:
+            if len(_met) > MOST_REMEMBERED:
+                _met.clear()
+            try:
+                clicked_depth(footage, name, at)
+                _met[key] = ""
+            except InputError as error:
+                _met[key] = str(error)
+        if _met[key]:
+            raise InputError(_met[key])
 
 
 def _stage(step: str, states: Mapping[str, State], found: _Found) -> State:

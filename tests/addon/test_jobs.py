@@ -99,6 +99,25 @@ def test_words_are_told_in_one_workspace(blender: ModuleType, monkeypatch: pytes
     assert told == {"Layout": None, "Clicks": None}
 
 
+def test_progress_is_drawn_a_few_times_a_second(jobs: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not at all where nothing new is to be told; that it is stopping is told at once."""
+    told, now = list[str](), [100.0]
+    monkeypatch.setattr(jobs.status, "tell", lambda context, words: told.append(words))
+    monkeypatch.setattr(jobs, "redraw", lambda context: None)
+    monkeypatch.setattr(jobs, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    watcher = jobs.JobOperator()
+    watcher.job = SimpleNamespace(monitor=SimpleNamespace(cancelled=False), stage_words="surface", fraction=0.0, left_words="")
+    for tick in range(40):  # four seconds
+        watcher.job.fraction, now[0] = tick // 20 * 0.3 + tick % 20 / 100, 100.0 + jobs.TICK_S * tick
+        watcher._show(None)
+    assert 12 <= len(told) <= 17 and len(set(told)) == len(told)
+    watcher.job.monitor.cancelled, watcher.job.stage_words = True, "Stopping"
+    watcher._show(None)
+    now[0] += 10
+    watcher._show(None)
+    assert told[-1] == "Tricap: Stopping" and told.count("Tricap: Stopping") == 1
+
+
 def test_cancelling_joins_within_a_second(jobs: ModuleType) -> None:
     job = running(jobs)
     began = time.monotonic()

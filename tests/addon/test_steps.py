@@ -314,6 +314,22 @@ def test_a_click_that_contradicts_itself_is_told_at_its_step(blender: ModuleType
 
 
 @pytest.mark.slow
+def test_clicks_are_intersected_once(blender: ModuleType, states: ModuleType, sample: Path, tmp_path: Path,
+                                     monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not whenever something in the scene changes; again for other clicks and another calibration, and a fault is not forgotten."""
+    scene, asked, real = opened(blender, sample, tmp_path), list[str](), states.clicked_depth
+    monkeypatch.setattr(states, "_met", {})
+    monkeypatch.setattr(states, "clicked_depth", lambda footage, name, at: asked.append(name) or real(footage, name, at))
+    for _ in range(2):
+        assert states.compute(scene).states["seeds"].word == "done" and sorted(asked) == ["elbow.R", "shoulder.R", "wrist.R"]
+    os.utime(tmp_path / "take" / "rig.toml", ns=(1, 1))
+    assert states.compute(scene).states["seeds"].word == "done" and len(asked) == 6
+    scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers[0].co = (0.1, 0.1)
+    for _ in range(2):
+        found = states.compute(scene).states["seeds"]
+        assert found.word == "failed" and "wrist.R" in found.why and asked.count("wrist.R") == 3
+
+
 def test_swapped_views_are_told(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
     scene = opened(blender, sample, tmp_path)
     views = scene.tricap.views

@@ -28,7 +28,7 @@ from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E4
 
 CLIP_FRAMES = 30_000
 COARSE = ("growing.spacing_px=6", "tracking.spacing_px=12")
-STAGES = ("measure", "track", "contour", "run")  # the run, with the contours
+STAGES = ("measure", "track", "run", "contour", "outlined")  # the last: the fit with the contours
 VIEWS = ("L", "C", "R")
 SHORT = AT_ONCE // 3
 FIT_LENGTHS, FIT_LIMIT_MB = (3 * SHORT, 9 * SHORT), 2048  # whole stretches
@@ -104,7 +104,8 @@ def long_take(pictures: Path, folder: Path, frames: int) -> Path:
 def peak_mb(stage: str, take: Path, out: Path) -> float:
     """Peak resident memory [MB] of one command in a process of its own."""
     views = ["--view", *VIEWS] if stage == "contour" else []
-    argv = [stage, str(take), "--out", str(out), "--quiet", *views, *(f"--set={s}" for s in COARSE)]
+    command = "fit" if stage == "outlined" else stage
+    argv = [command, str(take), "--out", str(out), "--quiet", *views, *(f"--set={s}" for s in COARSE)]
     done = subprocess.run([sys.executable, "-c", CHILD, *argv], capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"tricap {stage} ended with {done.returncode}: {done.stderr}")
