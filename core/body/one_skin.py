@@ -18,6 +18,7 @@ from .skin_mesh import SkinSettings
 from .skin_parts import body_parts
 from .skin_patches import corner_uv, refined
 from .skin_quads import cut, face_uv, net_faces
+from .skin_weights import strongest
 from .welding import welded
 from .whole_surface import WholeSurface
 
@@ -72,7 +73,7 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     part, pieces = whole.part, detail * settings.detail
     if pieces > 1:
         vertices, weights, part, faces, uv = cut(vertices, weights, part, faces, uv, pieces)
-        vertices = surface.reached(vertices, part)
+        vertices, weights = surface.reached(vertices, part), strongest(weights)
     return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
 
 
@@ -116,4 +117,4 @@ def _smoothed(weights: np.ndarray, vertices: np.ndarray, faces: np.ndarray, near
     edge = float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).mean())
     for _ in range(round(2 * (SMOOTHED_M / edge) ** 2)):
         found[free] = 0.5 * found[free] + 0.5 * (near[free] @ found)
-    return np.asarray(found / found.sum(axis=1, keepdims=True))
+    return strongest(found)

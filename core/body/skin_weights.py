@@ -21,6 +21,7 @@ from .skin_rays import Rays, Segment, swing
 ZONE = 5.0  # D/q of (1): atan 5 = 79°, with room for limbs that are no cylinders
 LEAST_Q = 0.5  # q_0, in limb radii
 ROUNDED = 0.4  # the maximum of (1) is rounded over this many limb radii
+MOST_BONES = 4  # at a vertex, as game engines and glTF take them
 LARGEST_ZONE = 0.7  # of the bone's length
 
 
@@ -38,6 +39,13 @@ def chain_weights(shape: BodyShape, segments: Sequence[Segment], rays: Rays, loc
             weights[own, segments[other].bone] = _share(distance, local_m[own] @ inner, radius, segment.length)
         weights[own, segment.bone] = 1 - weights[own].sum(axis=1)
     return weights
+
+
+def strongest(weights: np.ndarray) -> np.ndarray:
+    """Of the shares (V, B) in every vertex the `MOST_BONES` largest, which sum to 1."""
+    least = np.sort(weights, axis=1)[:, -MOST_BONES:][:, :1]
+    found = np.where(weights >= least, weights, 0.0)
+    return np.asarray(found / found.sum(axis=1, keepdims=True))
 
 
 def _share(distance: np.ndarray, inwards: np.ndarray, radius: float, length: float) -> np.ndarray:

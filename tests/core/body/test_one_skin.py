@@ -10,7 +10,7 @@ from tricap.core.body.one_skin import OneSkin, one_skin
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import body_skin
 from tricap.core.body.skin_mesh import SkinSettings
-from tricap.core.body.skin_weights import hinge
+from tricap.core.body.skin_weights import MOST_BONES, hinge
 from tricap.core.body.whole_surface import WholeSurface
 
 
@@ -70,6 +70,7 @@ def test_islands_lie_side_by_side_and_no_face_is_turned_over() -> None:
 def test_shares_of_the_bones_do_not_jump() -> None:
     skin = skin_of("full")
     assert np.allclose(skin.weights.sum(axis=1), 1) and skin.weights.min() >= 0
+    assert (skin.weights > 0).sum(axis=1).max() <= MOST_BONES and (skin_of("upper_body", 2).weights > 0).sum(axis=1).max() <= MOST_BONES
     ends = np.concatenate([skin.faces[:, [i, (i + 1) % 4]] for i in range(4)])
     assert np.abs(skin.weights[ends[:, 0]] - skin.weights[ends[:, 1]]).max() < 0.45
 
