@@ -108,8 +108,9 @@ def test_one_skin_is_shown_and_metaballs_wait_hidden(empty: ModuleType, small_ru
     from tricap.addon.scene.build import build_scene
 
     build_scene(small_run.out)
-    shown = {o.name for o in empty.data.objects if o.type in ("MESH", "META") and o.name.startswith(("Skin", "Flesh")) and not o.hide_get()}
+    shown = {o.name for o in empty.data.objects if o.type in ("MESH", "META") and o.name.startswith(("Skin", "Flesh")) and o.visible_get()}
     assert shown == {"Skin"} and not empty.data.objects["Skin"].hide_render and empty.data.objects["Flesh"].hide_render
+    assert empty.data.objects["Flesh"].hide_viewport  # the eye alone would leave it in every frame's work
 
 
 def test_lights_and_floor(empty: ModuleType, small_run: SmallRun) -> None:
