@@ -138,6 +138,18 @@ def three_views(frames: list[np.ndarray], start: np.ndarray) -> float:
     return time.process_time() - begin
 
 
+def in_turns(frames: list[np.ndarray], many: np.ndarray, few: np.ndarray) -> dict[str, float]:
+    """The step's speed and its ratios to the peers': medians of seven rounds in which each is timed beside the others."""
+    rounds = []
+    for _ in range(7):
+        before = three_views(frames, many)
+        lk, ecc = (timed(*peer)["points_frames_per_cpu_s"] for peer in ((pyramid, frames[:6], many), (loop, frames[:4], few)))
+        step = 2 * len(many) / (before + three_views(frames, many))
+        rounds.append((step, 3 * step / lk, 5 * step / ecc))
+    names = ("points_per_cpu_s", "of PyrLK's speed per view", "times an ECC loop over the same five matches a point")
+    return dict(zip(names, np.median(rounds, axis=0).tolist()))
+
+
 def timed(method: object, frames: list[np.ndarray], start: np.ndarray) -> dict[str, float]:
     begin = time.process_time()
     path = method(frames, start)  # type: ignore[operator]
@@ -160,13 +172,7 @@ def main() -> None:
         "ECC loop": timed(loop, frames[:6], few),
     }
     results["CPU s of a step in three views"] = {str(len(p)): three_views(frames, p) for p in (points(20), points(14), points(10))}
-    step = len(many) / min(three_views(frames, many) for _ in range(3))
-    lk, ecc = (results[name]["points_frames_per_cpu_s"] for name in ("PyrLK", "ECC loop"))  # type: ignore[index]
-    results["a step in three views"] = {
-        "points_per_cpu_s": step,
-        "of PyrLK's speed per view": 3 * step / lk,
-        "times an ECC loop over the same five matches a point": 5 * step / ecc,
-    }
+    results["a step in three views"] = in_turns(frames, many, few)
     blender = blender_tracks(frames, few)
     results["Blender's tracker"] = "not compared: this Python has no bpy module" if blender is None else judged(blender[0], few, blender[1])
     results["ours, the same points as Blender's"] = timed(ours, frames, few)
