@@ -26,7 +26,7 @@ MIDDLE_PX = 5
 DEPTH_SIGMA_PX, SLOPE_SIGMA = 0.5, 0.01  # px, px/px in the search view that moves fastest: what a mixture may be off; held
 ACROSS_SIGMA_PX = 0.03
 LEAST_EXPLAINED = 0.25  # of R²: what explains less is as far off
-LARGEST_M, MEDIANS = 0.010, 2.0  # of (1) that is believed; more where most points are worse
+LARGEST_M, MEDIANS = 0.011, 2.2  # of (1) that is believed; more where most points are worse
 
 
 def in_doubt(
