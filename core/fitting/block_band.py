@@ -43,13 +43,13 @@ class NormalEquations:
         self.border[:, motion] = 0.0
         self.g[:, motion] = 0.0
 
-    def solve(self, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """x (T, D) and s (S,), with the diagonal multiplied by 1 + damping (Marquardt).
+    def solve(self, damping: float = 0.0, held_back: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """x (T, D) and s (S,), with the diagonal multiplied by 1 + damping (Marquardt), and more by as much as frames are `held_back` (T,).
 
         Raises:
             numpy.linalg.LinAlgError: the equations are not positive definite.
         """
-        factor = Factor(self, damping)
+        factor = Factor(self, damping, held_back)
         rhs = factor.solve(np.concatenate([self.g[..., None], self.border], axis=2))
         free, V = rhs[..., 0], rhs[..., 1:]
         schur = self.corner + damping * np.diag(np.diag(self.corner)) - np.einsum("tds,tdr->sr", self.border, V)
@@ -99,11 +99,11 @@ def eliminated(equations: NormalEquations, frames: int) -> NormalEquations:
 class Factor:
     """Cholesky factor of the band: inverses of the diagonal blocks, and the two blocks below each."""
 
-    def __init__(self, equations: NormalEquations, damping: float) -> None:
+    def __init__(self, equations: NormalEquations, damping: float, held_back: np.ndarray | None = None) -> None:
         e, T = equations, len(equations.diagonal)
         self.inverse, self.below1, self.below2 = np.empty_like(e.diagonal), np.empty_like(e.next1), np.empty_like(e.next2)
         for t in range(T):
-            A = e.diagonal[t] + damping * np.diag(np.diag(e.diagonal[t]))
+            A = e.diagonal[t] + np.diag(damping * np.diag(e.diagonal[t]) + (0.0 if held_back is None else held_back[t]))
             if t > 0:
                 A = A - self.below1[t - 1] @ self.below1[t - 1].T
             if t > 1:

@@ -1,13 +1,21 @@
-"""Levenberg-Marquardt over one frame or a whole sequence (D'Apuzzo et al. 1999, Eqs. 9–13, with Marquardt's damping of the diagonal)."""
+"""Levenberg-Marquardt over one frame or a whole sequence (D'Apuzzo et al. 1999, Eqs. 9–13, with Marquardt's damping of the diagonal).
+
+Marquardt's damping is relative: a limb's twist, of which one-sided points tell little, may still turn by radians in one step, far beyond
+what the linearisation knows, and end in another posture. So frames are held back by Levenberg's absolute damping, each as much as it takes
+for no DOF to go further than `FURTHEST`.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..progress import Monitor
+from .block_band import NormalEquations
 from .problem import Linearised, Problem, Scales, cost, first_scales, linearise
 
 START_DAMPING, LARGEST_DAMPING = 1e-3, 1e8
+FURTHEST = 0.2  # rad, m: a step of any DOF
+HELD_BACK, MOST_HELD_BACK = 10.0, 1e12  # 1/rad², 1/m²: first, and where it ends
 POOR, GOOD = 0.25, 0.5  # gain of a step over what was foreseen
 STEP_DONE = 1e-4  # rad, m, relative
 COST_DONE = 1e-4
@@ -74,7 +82,7 @@ def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector
     """The first damped step that does not raise the cost: new motion, new vector, new cost; None if there is none."""
     while damping < LARGEST_DAMPING:
         try:
-            dx, ds = lin.equations.solve(damping)
+            dx, ds = bounded_step(lin.equations, damping)
         except np.linalg.LinAlgError:
             damping *= 10
             continue
@@ -86,6 +94,17 @@ def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector
             return (motion + dx, new_vector, value), _next_damping(damping, lin.cost - value, foreseen)
         damping *= 10
     return None, damping
+
+
+def bounded_step(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """The damped step (T, D), (S,) in which no DOF of a frame goes further than `FURTHEST`."""
+    held_back = np.zeros(len(equations.g))
+    while True:
+        dx, ds = equations.solve(damping, held_back)
+        far = np.abs(dx).max(axis=1, initial=0.0) > FURTHEST
+        if not far.any() or held_back.max() > MOST_HELD_BACK:
+            return dx, ds
+        held_back[far] = np.maximum(10 * held_back[far], HELD_BACK)
 
 
 def _next_damping(damping: float, gain: float, foreseen: float) -> float:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tricap.core.fitting.block_band import NormalEquations, eliminated, reversed_in_time
+from tricap.core.fitting.solver import FURTHEST, bounded_step
 
 
 def _random(T: int, D: int, S: int, seed: int) -> tuple[NormalEquations, np.ndarray, np.ndarray]:
@@ -36,6 +37,10 @@ def test_solution_and_inverse_blocks_equal_dense_algebra(T: int, S: int) -> None
         dense = np.linalg.solve(N + damping * np.diag(np.diag(N)), b)
         x, s = e.solve(damping)
         assert np.allclose(np.concatenate([x.ravel(), s]), dense, rtol=1e-8, atol=1e-10)
+    back = np.arange(1.0, T + 1)
+    x, s = e.solve(0.3, back)
+    dense = np.linalg.solve(N + 0.3 * np.diag(np.diag(N)) + np.diag(np.concatenate([np.repeat(back, D), np.zeros(S)])), b)
+    assert np.allclose(np.concatenate([x.ravel(), s]), dense, rtol=1e-8, atol=1e-10)
     inverse = np.linalg.inv(N)
     pose, mixed, shape = e.covariance()
     for t in range(T):
@@ -61,3 +66,16 @@ def test_equations_without_information_are_refused() -> None:
     e.diagonal[1] = 0.0
     with pytest.raises(np.linalg.LinAlgError):
         e.solve()
+
+
+def test_a_frame_that_would_go_too_far_is_held_back_and_no_other() -> None:
+    """Frame 1 of three uncoupled ones hardly knows its first unknown."""
+    e = NormalEquations.empty(3, 2, 0)
+    e.diagonal[:] = np.diag([1e4, 2e4])
+    e.diagonal[1] = [[10.0, 5.0], [5.0, 1e4]]
+    e.g[:] = [[100.0, -200.0], [20.0, 300.0], [1900.0, 10.0]]
+    free, _ = e.solve(1e-3)
+    step, _ = bounded_step(e, 1e-3)
+    assert np.abs(free[1]).max() > 1.5 and FURTHEST / 10 < np.abs(step[1]).max() <= FURTHEST
+    assert (step[[0, 2]] == free[[0, 2]]).all()
+    assert np.sum(step * e.g) > 0  # still downhill
