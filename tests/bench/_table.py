@@ -80,6 +80,8 @@ def fit(table: dict[str, Any]) -> Iterator[Row]:
     one, (short, long) = table["one_frame"], table["sequence"]
     yield Row("fit", "solver", one["scipy_2point_s"] / one["ours_s"], "speed", "scipy, differences")
     yield Row("fit", "solver", one["scipy_jacobian_s"] / one["ours_s"], "speed", "scipy, our Jacobian")
+    yield Row("fit", "solver, to equal cost", one["scipy_2point_equal_times"], "speed", "scipy, differences")
+    yield Row("fit", "solver, to equal cost", one["scipy_jacobian_equal_times"], "speed", "scipy, our Jacobian")
     yield Row("fit", "what is left", one["ours_cost"] / one["scipy_2point_cost"], "error", "scipy, differences")
     whole = [table["sequence_ms_a_frame"] + table["covariance_ms_a_frame"] for table in (short, long)]
     yield Row("fit", f"cost of a frame, {long['frames']}", whole[1] / whole[0], "cost", f"{short['frames']} frames")

@@ -11,6 +11,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,6 +39,7 @@ from tricap.core.geometry.rig import Rig
 
 POINTS, NOISE_M, FPS = 4000, 0.001, 25.0
 POSTURES = 5  # whose median is told beside scipy
+MOST, EQUAL = 60, 1.01  # steps; the cost that counts as reached, over the worse of what both end with
 
 
 def rig() -> Rig:
@@ -117,7 +119,10 @@ def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
 
 
 def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
-    """One frame's posture from 0.05 rad off: our solver, and scipy's with 2-point differences and with our Jacobian, on the same points."""
+    """One frame's posture from 0.05 rad off: our solver, and scipy's with 2-point differences and with our Jacobian, on the same points.
+
+    `…_s` is until each ends, wherever that is; `…_equal_s` until the cost that both reach, `…_equal_times` that over ours.
+    """
     shape, random, cameras = default_shape(read_model("full")), np.random.default_rng(seed), rig()
     motion = walk(shape, 1)
     seen = cloud(shape, motion[0], 0, random)
@@ -151,12 +156,24 @@ def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
         return min(spent), found
 
     problem = fit.problem(lambda t, state: held)
-    ours, x = seconds(lambda: solve(problem, start[None], vector, steps=30).motion[0])
-    two_point, x2 = seconds(lambda: least_squares(residual, start, xtol=1e-4, ftol=1e-4).x, 1)
-    with_jacobian, x3 = seconds(lambda: least_squares(residual, start, jacobian, xtol=1e-4, ftol=1e-4).x)
-    cost = [float(residual(y) @ residual(y)) for y in (x, x2, x3)]
-    return {"points": len(points.xyz_m), "ours_s": ours, "scipy_2point_s": two_point, "scipy_jacobian_s": with_jacobian,
-            "ours_cost": cost[0], "scipy_2point_cost": cost[1], "scipy_jacobian_cost": cost[2]}
+    ways: dict[str, Callable[[int], np.ndarray]] = {
+        "ours": lambda most: solve(problem, start[None], vector, steps=most).motion[0],
+        "scipy_jacobian": lambda most: least_squares(residual, start, jacobian, xtol=1e-4, ftol=1e-4, max_nfev=most).x,
+        "scipy_2point": lambda most: least_squares(residual, start, xtol=1e-4, ftol=1e-4, max_nfev=most).x}
+
+    def cost(x: np.ndarray) -> float:
+        return float(residual(x) @ residual(x))
+
+    out: dict[str, float] = {"points": len(points.xyz_m)}
+    for name, way in ways.items():
+        out[f"{name}_s"], x = seconds(lambda way=way: way(MOST), 1 if name == "scipy_2point" else 3)
+        out[f"{name}_cost"] = cost(x)
+    both = EQUAL * max(out["ours_cost"], out["scipy_jacobian_cost"])  # what each of the two reaches
+    steps = {name: next(n for n in range(1, MOST + 1) if cost(ways[name](n)) <= both) for name in ("ours", "scipy_jacobian")}
+    steps["scipy_2point"] = steps["scipy_jacobian"]  # the same steps to rounding
+    for name, way in ways.items():
+        out[f"{name}_equal_s"] = seconds(lambda way=way, n=steps[name]: way(n), 1 if name == "scipy_2point" else 3)[0]
+    return out | {f"{name}_equal_times": out[f"{name}_equal_s"] / out["ours_equal_s"] for name in ways if name != "ours"}
 
 
 def ablation(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
