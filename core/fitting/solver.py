@@ -2,7 +2,7 @@
 
 Marquardt's damping is relative: a limb's twist, of which one-sided points tell little, may still turn by radians in one step, far beyond
 what the linearisation knows, and end in another posture. So frames are held back by Levenberg's absolute damping, each as much as it takes
-for no DOF to go further than `FURTHEST`.
+for no DOF to go further than `FURTHEST`. Not where the shape is free as well: it would take up what the posture is held back from.
 """
 
 from dataclasses import dataclass
@@ -97,7 +97,9 @@ def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector
 
 
 def bounded_step(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """The damped step (T, D), (S,) in which no DOF of a frame goes further than `FURTHEST`."""
+    """The damped step (T, D), (S,); where the shape is held, no DOF of a frame goes further than `FURTHEST`."""
+    if len(equations.h):
+        return equations.solve(damping)
     held_back = np.zeros(len(equations.g))
     while True:
         dx, ds = equations.solve(damping, held_back)

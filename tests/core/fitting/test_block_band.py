@@ -1,5 +1,7 @@
 """The banded, bordered solver against dense algebra."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -79,3 +81,5 @@ def test_a_frame_that_would_go_too_far_is_held_back_and_no_other() -> None:
     assert np.abs(free[1]).max() > 1.5 and FURTHEST / 10 < np.abs(step[1]).max() <= FURTHEST
     assert (step[[0, 2]] == free[[0, 2]]).all()
     assert np.sum(step * e.g) > 0  # still downhill
+    with_shape = replace(e, border=np.zeros((3, 2, 1)), corner=np.eye(1), h=np.ones(1))
+    assert (bounded_step(with_shape, 1e-3)[0] == with_shape.solve(1e-3)[0]).all()
