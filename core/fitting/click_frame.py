@@ -14,7 +14,7 @@ from .lost_limbs import found_again
 from .observations import Observation
 from .problem import linearise
 from .segmentation import crop
-from .solver import Solution, solve
+from .solver import FURTHEST, Solution, solve
 from .state import BodyState
 
 REACH_M = 0.20  # points further than this from the clicked limb's surface are not looked at
@@ -100,7 +100,7 @@ def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
 def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
     """First the posture, then posture and shape, together or in turns as published: each holds the other."""
     near = crop(points, fit.parameters.state(motion, vector), REACH_M)
-    solution = solve(fit.problem(_observe(fit, near, WIDE)), motion[None], vector, steps=POSE_STEPS)
+    solution = solve(fit.problem(_observe(fit, near, WIDE)), motion[None], vector, steps=POSE_STEPS, furthest=FURTHEST)
     if fit.settings.method == "joint":
         for wide in (WIDE, 1.0):
             problem = fit.problem(_observe(fit, near, wide), "shape")

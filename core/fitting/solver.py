@@ -1,8 +1,8 @@
 """Levenberg-Marquardt over one frame or a whole sequence (D'Apuzzo et al. 1999, Eqs. 9–13, with Marquardt's damping of the diagonal).
 
 Marquardt's damping is relative: a limb's twist, of which one-sided points tell little, may still turn by radians in one step, far beyond
-what the linearisation knows, and end in another posture. So frames are held back by Levenberg's absolute damping, each as much as it takes
-for no DOF to go further than `FURTHEST`. Not where the shape is free as well: it would take up what the posture is held back from.
+what the linearisation knows, and end in another posture. So from a start that may be far off, frames are held back by Levenberg's absolute
+damping, each as much as it takes for no DOF to go further than `FURTHEST`.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from .block_band import NormalEquations
 from .problem import Linearised, Problem, Scales, cost, first_scales, linearise
 
 START_DAMPING, LARGEST_DAMPING = 1e-3, 1e8
-FURTHEST = 0.2  # rad, m: a step of any DOF
+FURTHEST = 0.2  # rad, m: a step of any DOF from a start that may be far off
 HELD_BACK, MOST_HELD_BACK = 10.0, 1e12  # 1/rad², 1/m²: first, and where it ends
 POOR, GOOD = 0.25, 0.5  # gain of a step over what was foreseen
 STEP_DONE = 1e-4  # rad, m, relative
@@ -38,8 +38,10 @@ class Solution:
 
 
 def solve(problem: Problem, motion: np.ndarray, vector: np.ndarray, *, steps: int, scales: Scales | None = None,
-          monitor: Monitor | None = None, stage: str = "fit") -> Solution:
+          monitor: Monitor | None = None, stage: str = "fit", furthest: float = np.inf) -> Solution:
     """Minimise the problem's cost from a motion (T, D) and a shape vector (S,). Time and memory are linear in frames.
+
+    `furthest` [rad, m]: no DOF goes further in one step; `FURTHEST` from a start that may be far off.
 
     Raises:
         Cancelled: the user asked to stop.
@@ -53,7 +55,7 @@ def solve(problem: Problem, motion: np.ndarray, vector: np.ndarray, *, steps: in
         iteration += 1
         lin = linearise(problem, motion, vector, scales)
         last = lin.cost
-        new, damping = _accepted_step(problem, lin, motion, vector, damping)
+        new, damping = _accepted_step(problem, lin, motion, vector, damping, furthest)
         if new is None:
             done = _at_minimum(lin)
             break
@@ -78,11 +80,11 @@ def _at_minimum(lin: Linearised) -> bool:
 
 
 def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarray,
-                   damping: float) -> tuple[tuple[np.ndarray, np.ndarray, float] | None, float]:
+                   damping: float, furthest: float) -> tuple[tuple[np.ndarray, np.ndarray, float] | None, float]:
     """The first damped step that does not raise the cost: new motion, new vector, new cost; None if there is none."""
     while damping < LARGEST_DAMPING:
         try:
-            dx, ds = bounded_step(lin.equations, damping)
+            dx, ds = bounded_step(lin.equations, damping, furthest)
         except np.linalg.LinAlgError:
             damping *= 10
             continue
@@ -96,14 +98,12 @@ def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector
     return None, damping
 
 
-def bounded_step(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """The damped step (T, D), (S,); where the shape is held, no DOF of a frame goes further than `FURTHEST`."""
-    if len(equations.h):
-        return equations.solve(damping)
+def bounded_step(equations: NormalEquations, damping: float, furthest: float) -> tuple[np.ndarray, np.ndarray]:
+    """The damped step (T, D), (S,) in which no DOF of a frame goes further than `furthest`."""
     held_back = np.zeros(len(equations.g))
     while True:
         dx, ds = equations.solve(damping, held_back)
-        far = np.abs(dx).max(axis=1, initial=0.0) > FURTHEST
+        far = np.abs(dx).max(axis=1, initial=0.0) > furthest
         if not far.any() or held_back.max() > MOST_HELD_BACK:
             return dx, ds
         held_back[far] = np.maximum(10 * held_back[far], HELD_BACK)

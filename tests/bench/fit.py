@@ -33,7 +33,7 @@ from tricap.core.fitting.cloud_points import thinned
 from tricap.core.fitting.conditions import Conditions
 from tricap.core.fitting.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.solver import solve
+from tricap.core.fitting.solver import FURTHEST, solve
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 
@@ -157,7 +157,7 @@ def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
 
     problem = fit.problem(lambda t, state: held)
     ways: dict[str, Callable[[int], np.ndarray]] = {
-        "ours": lambda most: solve(problem, start[None], vector, steps=most).motion[0],
+        "ours": lambda most: solve(problem, start[None], vector, steps=most, furthest=FURTHEST).motion[0],
         "scipy_jacobian": lambda most: least_squares(residual, start, jacobian, xtol=1e-4, ftol=1e-4, max_nfev=most).x,
         "scipy_2point": lambda most: least_squares(residual, start, xtol=1e-4, ftol=1e-4, max_nfev=most).x}
 

@@ -1,7 +1,5 @@
 """The banded, bordered solver against dense algebra."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -77,9 +75,8 @@ def test_a_frame_that_would_go_too_far_is_held_back_and_no_other() -> None:
     e.diagonal[1] = [[10.0, 5.0], [5.0, 1e4]]
     e.g[:] = [[100.0, -200.0], [20.0, 300.0], [1900.0, 10.0]]
     free, _ = e.solve(1e-3)
-    step, _ = bounded_step(e, 1e-3)
+    step, _ = bounded_step(e, 1e-3, FURTHEST)
     assert np.abs(free[1]).max() > 1.5 and FURTHEST / 10 < np.abs(step[1]).max() <= FURTHEST
     assert (step[[0, 2]] == free[[0, 2]]).all()
     assert np.sum(step * e.g) > 0  # still downhill
-    with_shape = replace(e, border=np.zeros((3, 2, 1)), corner=np.eye(1), h=np.ones(1))
-    assert (bounded_step(with_shape, 1e-3)[0] == with_shape.solve(1e-3)[0]).all()
+    assert (bounded_step(e, 1e-3, np.inf)[0] == free).all()
