@@ -101,6 +101,8 @@ def test_alembic_comes_back(empty: ModuleType, small_run: SmallRun, tmp_path: Pa
     file, source = tmp_path / "a.abc", from_run(small_run.out)
     export_file(small_run.out, "glb", tmp_path / "a.glb", "plain", Monitor())
     imported(empty, tmp_path / "a.glb", source.fps)
+    for modifier in (m for o in empty.data.objects for m in o.modifiers if m.type == "ARMATURE"):
+        modifier.use_deform_preserve_volume = True  # glTF cannot say so, Alembic has the places themselves
     wanted = [extent(empty, int(source.frames[0]) + k) for k in range(6)]
     export_file(small_run.out, "abc", file, preset, Monitor())
     imported(empty, file, source.fps)
