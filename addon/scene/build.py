@@ -294,7 +294,8 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
         warnings.append(f"No polygonal skin in the scene: {error}")
     else:
         for other in {*flesh, skin_object} - {shown}:  # they lie in the surface of the one that is shown
-            other.hide_viewport = other.hide_render = True  # not by the eye, or metaballs would be made anew in every frame all the same
+            other.hide_set(True)  # by the eye alone: metaballs stay live, for whoever opens it or reads them by a script
+            other.hide_render = True
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
