@@ -305,7 +305,7 @@ def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float,
     assert near.iterations.mean() < most_iterations and near.iterations.mean() < far.iterations.mean()
     for found in (near, far):
         left = np.linalg.norm(found.xy - end.xy, axis=1) / sigma
-        assert np.sqrt(np.mean(left**2)) < 0.2
+        assert np.sqrt(np.mean(left**2)) < 0.3  # 0.1 with OpenCV 5; OpenCV 4 samples in steps of 1/128 px
         assert found.sigma0 == pytest.approx(end.sigma0, rel=0.05) and np.mean(found.sigma0 / end.sigma0) == pytest.approx(1.0, abs=0.003)
 
 
