@@ -10,16 +10,15 @@ squares fit to limbs of three balls: a limb of 40 mm is off by 0.04 mm RMS (with
 most 0.33 mm). Blender adds the fields of all
 objects whose names agree but for the number; that is one family, polygonised in the object without a number.
 
-A part of the body is a family. In the fit the fields of a limb's first bone and of the bone it grows out of add, too, which one family more
-cannot say without melting arms and flanks: at shoulders and hips the metaballs are thinner than the skin, by 20 mm RMS within 0.2 m.
+Which balls make a family, so that hips and shoulders are as thick as fitted and arms do not melt into flanks: core.body.families.
 """
 
 import bpy
 import numpy as np
 
+from ...core.body.families import families
 from ...core.body.metaballs import THRESHOLD, Metaballs
 from ...core.body.shape import BodyShape
-from ...core.body.skin_parts import body_parts
 from . import paint
 
 NAME = "Flesh"
@@ -31,20 +30,17 @@ SKIN_COLOUR = (0.80, 0.52, 0.41)
 
 
 def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape) -> list[bpy.types.Object]:
-    """One metaball object per bone, child of that bone; a family for each part of the body, polygonised in the part's first object.
-
-    Parts (arms, legs, trunk) are families of their own, or the thigh would swell where it lies in the pelvis.
-    """
+    """For each family a metaball object per bone, child of that bone; a family is polygonised in its first object."""
     objects = []
-    parts = body_parts(shape)
-    for part in parts:
-        words = NAME if len(parts) == 1 else f"{NAME} {shape.skeleton.bones[part.bones[0]].name}"
+    found = families(shape)
+    for own in found:
+        bones = list(dict.fromkeys(shape.metaballs.bone_index[own].tolist()))
+        words = NAME if len(found) == 1 else f"{NAME} {shape.skeleton.bones[bones[0]].name}"
         family = free_family_name(words)
         material = paint.plain_material(family, SKIN_COLOUR)
-        for i, b in enumerate(part.bones):
+        for i, b in enumerate(bones):
             bone = shape.skeleton.bones[b].name
-            own = np.flatnonzero(shape.metaballs.bone_index == b)
-            data = _data(family, shape.metaballs, own, shape.lengths_m, material)
+            data = _data(family, shape.metaballs, own[shape.metaballs.bone_index[own] == b], shape.lengths_m, material)
             member = bpy.data.objects.new(f"{family}.{i:03d}" if i else family, data)
             member.parent, member.parent_type, member.parent_bone = armature_object, "BONE", bone
             member.location = (0.0, -armature_object.data.bones[bone].length, 0.0)  # children of a bone sit at its tail
