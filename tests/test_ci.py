@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt" or not RUN.is_file() or shutil.w
 PROGRAM = """#!/usr/bin/env bash
 case "$1 $2 $3" in
     -c*) exit 0 ;;
-    "dev.py test --all") {slow} ;;
+    "dev.py test -m") {slow} ;;
     "dev.py test ") {quick} ;;
     "dev.py gui-test --install") {window} ;;
 esac
@@ -21,7 +21,7 @@ esac
 
 
 def ci(folder: Path, *, slow: str = "exit 0", quick: str = "exit 0", window: str = "exit 0", seconds: tuple[int, int, int] = (60, 20, 30)):
-    """Exit code and lines of .ci/run with programs that do as said; seconds for everything, the window, the first Python."""
+    """Exit code and lines of .ci/run with programs that do as said; seconds for everything, the window, one Python's tests."""
     (folder / ".ci").mkdir()
     shutil.copy(RUN, folder / ".ci" / "run")
     (folder / "programs").mkdir()
@@ -29,7 +29,7 @@ def ci(folder: Path, *, slow: str = "exit 0", quick: str = "exit 0", window: str
         program = folder / "programs" / f"python{version}"
         program.write_text(PROGRAM.format(slow=slow, quick=quick, window=window))
         program.chmod(0o755)
-    limits = dict(zip(("TRICAP_CI_ALL_S", "TRICAP_CI_WINDOW_S", "TRICAP_CI_FIRST_S"), map(str, seconds)))
+    limits = dict(zip(("TRICAP_CI_ALL_S", "TRICAP_CI_WINDOW_S", "TRICAP_CI_TESTS_S"), map(str, seconds)))
     environment = {**os.environ, **limits, "PATH": f"{folder / 'programs'}{os.pathsep}{os.environ['PATH']}"}
     done = subprocess.run(["bash", folder / ".ci" / "run"], env=environment, capture_output=True, text=True, timeout=60)
     return done.returncode, done.stdout
@@ -37,7 +37,7 @@ def ci(folder: Path, *, slow: str = "exit 0", quick: str = "exit 0", window: str
 
 def test_all_passes(tmp_path: Path) -> None:
     code, said = ci(tmp_path)
-    assert code == 0 and said.count("dev.py test --all") == 2 and "Window: exit code 0" in said
+    assert code == 0 and said.count("dev.py test") == 4 and said.count("dev.py test -m slow") == 2 and "Window: exit code 0" in said
 
 
 @pytest.mark.parametrize("part", ["slow", "window"])
@@ -58,7 +58,7 @@ def test_a_window_that_cannot_be_set_up_in_time_is_a_sentence(tmp_path: Path) ->
 
 def test_slow_tests_without_room_run_under_one_python(tmp_path: Path) -> None:
     code, said = ci(tmp_path, slow="sleep 2", seconds=(8, 5, 3))
-    assert code == 0 and said.count("dev.py test --all") == 1 and "the slow tests are left to the Python before" in said
+    assert code == 0 and said.count("dev.py test -m slow") == 1 and "the slow tests are left to the other Python" in said
 
 
 def test_tests_that_hang_are_stopped(tmp_path: Path) -> None:
