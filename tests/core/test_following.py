@@ -23,11 +23,28 @@ def same(a: TrackedFrame, b: TrackedFrame) -> None:
             assert x.dtype == y.dtype and x.tobytes() == y.tobytes(), f"{f.name} of frame {a.frame}"
 
 
+@pytest.fixture(scope="module")
+def surfaces(plane_take: Path, tmp_path_factory: pytest.TempPathFactory, scenes: Any) -> Path:
+    """The results of measuring alone; do not change them, copy them."""
+    out: Path = tmp_path_factory.mktemp("surfaces") / "out"
+    scenes.measure(plane_take, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(plane_take: Path, surfaces: Path, tmp_path_factory: pytest.TempPathFactory, scenes: Any) -> Path:
+    """The results of measuring and tracking in one go; do not change them, copy them."""
+    out = Path(shutil.copytree(surfaces, tmp_path_factory.mktemp("whole") / "out"))
+    scenes.track(plane_take, out, scenes.measure(plane_take, out))
+    return out
+
+
 @pytest.mark.parametrize("stop_at", [1, 2, 3])
-def test_a_resumed_run_is_the_same_run(plane_take: Path, tmp_path: Path, scenes: Any, stop_at: int) -> None:
+def test_a_resumed_run_is_the_same_run(plane_take: Path, surfaces: Path, whole: Path, tmp_path: Path, scenes: Any, stop_at: int) -> None:
     """Cancelled before frame `stop_at` and run again, with surfaces that come from checkpoints too: byte-equal."""
-    whole = scenes.track(plane_take, tmp_path / "whole", scenes.measure(plane_take, tmp_path / "whole"))
+    shutil.copytree(surfaces, tmp_path / "parts")
     measured = scenes.measure(plane_take, tmp_path / "parts")
+    at_once = scenes.track(plane_take, whole, measured)
 
     def stop(stage: str, done: float, total: float) -> None:
         if stage == "tracks" and done >= stop_at - 0.5:
@@ -39,15 +56,16 @@ def test_a_resumed_run_is_the_same_run(plane_take: Path, tmp_path: Path, scenes:
     kept = sorted(p.stem for p in (tmp_path / "parts" / "cache" / "tracks").glob("*.npz"))
     assert 1 <= len(kept) < 4
     resumed = scenes.track(plane_take, tmp_path / "parts", scenes.measure(plane_take, tmp_path / "parts"))
-    for a, b in zip(whole, resumed):
+    for a, b in zip(at_once, resumed, strict=True):
         same(a, b)
     for path in list((tmp_path / "parts" / "cache" / "tracks").glob("0002*.npz")):
         path.write_bytes(path.read_bytes()[:2000])  # damaged: made anew, and so is what depends on it, alike
-    for a, b in zip(whole, scenes.track(plane_take, tmp_path / "parts", measured)):
+    for a, b in zip(at_once, scenes.track(plane_take, tmp_path / "parts", measured), strict=True):
         same(a, b)
 
 
-def test_what_changes_is_tracked_again(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
+def test_what_changes_is_tracked_again(plane_take: Path, whole: Path, tmp_path: Path, scenes: Any) -> None:
+    shutil.copytree(whole, tmp_path / "out")
     measured = scenes.measure(plane_take, tmp_path / "out")
     first = scenes.track(plane_take, tmp_path / "out", measured)
     coarse = scenes.track(plane_take, tmp_path / "out", measured, {"tracking": {"spacing_px": 16}})
@@ -59,13 +77,15 @@ def test_what_changes_is_tracked_again(plane_take: Path, tmp_path: Path, scenes:
         same(a, b)
 
 
-def test_filters_ask_for_no_new_tracking(plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_filters_ask_for_no_new_tracking(
+    plane_take: Path, whole: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Other knobs of the filters: every checkpoint is used again, and the result is that of a fresh run. A knob of the step tracks anew."""
     other = {"tracking": {"max_speed": 8.0, "max_acceleration": 90.0, "uniformity": "voxels", "max_sigma_ratio": 2.0, "min_length": 3,
                           "smooth_frames": 5}}  # fmt: skip
     assert set(other["tracking"]) == set(AFTERWARDS)
+    shutil.copytree(whole, tmp_path / "out")
     measured = scenes.measure(plane_take, tmp_path / "out")
-    scenes.track(plane_take, tmp_path / "out", measured)
     fresh = scenes.track(plane_take, tmp_path / "fresh", measured, other)
 
     def no_tracking(*_: Any) -> None:
