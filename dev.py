@@ -177,7 +177,7 @@ def demo(out: str) -> int:
 
 
 def test(everything: bool, pytest_arguments: list[str]) -> int:
-    """Lint, types and tests; without `--all` the slow tests are left out. One process per core, each file in one of them (`-n0`: in none)."""
+    """Lint, types and tests; without `--all` the slow tests are left out. A process per core, each file in one of them (`-n0`: in none)."""
     selection = [] if everything or "-m" in pytest_arguments else ["-m", "not slow"]
     processes = ["-n", str(min(os.cpu_count() or 1, 4)), "--dist", "loadfile"]
     linted = lint()
