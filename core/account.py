@@ -35,10 +35,11 @@ def new_account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]
 def track_figures(kept: Trajectories) -> dict[str, Any]:
     """How many trajectories were kept, and how long and sure they are."""
     seen = kept.seen
+    count = seen.shape[1] if kept.track is None else len(np.unique(kept.track[seen]))
     return {
-        "trajectories": int(seen.shape[1]),
+        "trajectories": int(count),
         "points_per_frame": float(seen.sum(axis=1).mean()),
-        "mean_length_frames": float(seen.sum(axis=0).mean()) if seen.shape[1] else 0.0,
+        "mean_length_frames": float(seen.sum() / count) if count else 0.0,
         "sigma_mm": 1e3 * median(kept.sigma_m[seen]),
     }
 

@@ -3,7 +3,7 @@
 They come after measuring and tracking, whose checkpoints stay valid: a correction costs no new matching, and taking it back neither.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from .geometry.rig import Rig
 from .progress import Monitor
 from .surface.cloud import PointCloud
 from .take import Correction
-from .tracking.corrections import in_region, inside_polygon, without_clicked
+from .tracking.corrections import clicked, in_region, inside_polygon, without
 from .tracking.settings import TrackingSettings
 from .tracking.trajectories import Filtered, Trajectories, filter_trajectories
 
@@ -26,19 +26,28 @@ def corrected_cloud(cloud: PointCloud, corrections: Sequence[Correction], rig: R
 
 
 def corrected_tracks(
-    raw: Trajectories, corrections: Sequence[Correction], rig: Rig, settings: TrackingSettings, monitor: Monitor
-) -> tuple[Filtered, list[str]]:
-    """The filtered trajectories without what the user took out; and a sentence for each click that hit none."""
-    left_out, missed = np.zeros(raw.seen.shape, dtype=bool), []
+    raw: Trajectories, corrections: Sequence[Correction], rig: Rig, settings: TrackingSettings, monitor: Monitor, rows: range | None = None
+) -> tuple[Filtered, dict[int, int]]:
+    """The filtered trajectories without what the user took out; and, by the number of a correction, the column of `raw` that its click hit.
+
+    Clicks in other frames than those of the `rows` (None: all) hit nothing.
+    """
+    left_out = np.zeros(raw.seen.shape, dtype=bool)
     for c in corrections:
         if c.kind == "region":
             left_out |= in_region(raw, rig[c.view], c.xy_px, c.frames)
-    filtered = filter_trajectories(raw, settings, monitor, left_out)
-    for c in corrections:
-        if c.kind == "trajectory":
-            after = without_clicked(filtered, rig[c.view], c.xy_px[0], c.frames.start)
-            if after is None:
-                x, y = c.xy_px[0]
-                missed.append(f"The correction at ({x:g}, {y:g}) of view {c.view} in frame {c.frames.start} has no trajectory near it.")
-            filtered = after or filtered
-    return filtered, missed
+    filtered, hit = filter_trajectories(raw, settings, monitor, left_out), dict[int, int]()
+    here = raw.frames[slice(rows.start, rows.stop) if rows else slice(None)]
+    for number, c in enumerate(corrections):
+        if c.kind == "trajectory" and c.frames.start in here:
+            source = clicked(filtered, rig[c.view], c.xy_px[0], c.frames.start)
+            if source is not None:
+                filtered, hit[number] = without(filtered, source), source
+    return filtered, hit
+
+
+def missed_clicks(corrections: Sequence[Correction], hit: Collection[int]) -> list[str]:
+    """A sentence for each click of the corrections whose number is not among those that hit a trajectory."""
+    missed = [c for number, c in enumerate(corrections) if c.kind == "trajectory" and number not in hit]
+    where = [f"({c.xy_px[0][0]:g}, {c.xy_px[0][1]:g}) of view {c.view} in frame {c.frames.start}" for c in missed]
+    return [f"The correction at {place} has no trajectory near it." for place in where]

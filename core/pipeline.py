@@ -21,7 +21,7 @@ from .body_guide import BodyGuide
 from .checking.take_check import causes_of_failure, doubts, with_cause
 from .checking.timing import in_step
 from .clicked_points import clicked_depth
-from .correcting import corrected_cloud, corrected_tracks
+from .correcting import corrected_cloud, corrected_tracks, missed_clicks
 from .errors import InputError
 from .fit_sources import clicks_left_out, fit_input, missing_for_fit
 from .fitting.body_motion import BodyFit
@@ -47,8 +47,9 @@ from .surface.cloud import PointCloud, SurfaceSettings
 from .surface.voxels import as_written
 from .take import Footage, open_take, read_take
 from .tracking.contour import ContourSettings
+from .tracking.long_tracks import trajectories_of
 from .tracking.settings import TrackingSettings, TrackStatus
-from .tracking.trajectories import Trajectories, assemble
+from .tracking.trajectories import Filtered, Trajectories
 from .tracking.waiting import Guide
 from .without_surface import can_do_without, empty_clouds, empty_views, known_silhouettes
 
@@ -253,29 +254,35 @@ def _follow(run: Run, monitor: Monitor, guide: Guide | None = None) -> dict[str,
     Raises:
         Cancelled: what is done is kept.
     """
-    s = run.settings
+    s, take, hit = run.settings, run.footage.take, set[int]()
+
+    def decide(raw: Trajectories, rows: range) -> tuple[Filtered, np.ndarray]:
+        filtered, clicked = corrected_tracks(raw, take.corrections, run.footage.rig, s["tracking"], monitor, rows)
+        hit.update(clicked)
+        return filtered, np.array([*clicked.values()], dtype=np.int64)
+
     try:
         limit_px = run.measured.limit_px
         steps = track_frames(run.footage, run.measured, limit_px, s["matching"], s["tracking"], run.results, monitor, s["enhance"], guide)
-        raw = assemble(steps, run.footage.take.fps)
+        filtered, reasons = trajectories_of(steps, take.fps, s["tracking"], decide)
     except Cancelled as stop:
         raise Cancelled(
             "Stopped: the surface of all frames is kept, and the tracks as far as they are; the same command goes on from there."
         ) from stop
-    if raw.omitted:
-        run.warn(
-            f"Only the {raw.seen.shape[1]} longest of {raw.seen.shape[1] + raw.omitted} trajectories are kept: "
-            "more have no room in one table of so many frames; run the take in pieces (--frames) to have all."
-        )
-    filtered, missed = corrected_tracks(raw, run.footage.take.corrections, run.footage.rig, s["tracking"], monitor)
     run.trajectories = filtered.kept
-    run.results.write_trajectories(filtered, run.footage.take.fps)
-    seen, why = filtered.kept.seen, Counter(TrackStatus(int(r)).words for r in filtered.reason)
-    for sentence in missed:
+    run.results.write_trajectories(filtered, take.fps)
+    for sentence in missed_clicks(take.corrections, hit):
         run.warn(sentence)
-    if not seen.shape[1] and raw.seen.any():
-        run.warn(f"No trajectory was kept of {raw.seen.shape[1]}: most were removed as “{why.most_common(1)[0][0]}”.")
-    return {"started": int(raw.seen.shape[1] + raw.omitted), **track_figures(filtered.kept), "reasons": dict(why.most_common())}
+    why = Counter({TrackStatus(r).words: n for r, n in reasons.items()})
+    figures = track_figures(filtered.kept)
+    if filtered.kept.omitted:
+        run.warn(
+            f"The {filtered.kept.omitted} shortest of {figures['trajectories'] + filtered.kept.omitted} trajectories are left out: "
+            "they have no room in one table of so many frames; run the take in pieces (--frames) to have all."
+        )
+    if not figures["trajectories"] and reasons:
+        run.warn(f"No trajectory was kept of {reasons.total()}: most were removed as “{why.most_common(1)[0][0]}”.")
+    return {"started": reasons.total(), **figures, "reasons": dict(why.most_common())}
 
 
 def fit(run: Run, monitor: Monitor) -> None:

@@ -123,7 +123,8 @@ class Results:
 
     def write_trajectories(self, filtered: Filtered, fps: float) -> None:
         """trajectories.npz, and trajectories_raw.npz with those that the filters or the user removed."""
-        for name, arrays in (("", filtered.kept.arrays() | {"source": filtered.source}), ("_raw", filtered.arrays())):
+        kept = filtered.kept.arrays() | ({"source": filtered.source} if filtered.kept.track is None else {})
+        for name, arrays in (("", kept), ("_raw", filtered.arrays())):
             single = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in arrays.items()}
             store.save(self.path(f"trajectories{name}.npz"), single, {"format": f"tricap-trajectories{name}", "version": 1, "fps": fps})
 

@@ -4,7 +4,6 @@ A file appears under its name only when it is complete: everything is written be
 """
 
 import hashlib
-import io
 import json
 import math
 import os
@@ -106,10 +105,9 @@ def read_json(path: Path) -> Any:
 def save(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any], *, compress: bool = True) -> None:
     """Arrays and a JSON header into one .npz (no pickle). Checkpoints are not compressed: that takes longer than computing some."""
     text = json.dumps({"store_version": STORE_VERSION, "arrays": sorted(arrays), **header}, sort_keys=True, allow_nan=False)
-    buffer = io.BytesIO()
     write = np.savez_compressed if compress else np.savez
-    write(buffer, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
-    write_bytes(path, buffer.getvalue())
+    with written(path) as file:
+        write(file, **{HEADER: np.array(text)}, **arrays)  # type: ignore[arg-type]
 
 
 def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

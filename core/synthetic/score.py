@@ -175,9 +175,11 @@ def _score_trajectories(truth: Truth, path: Path, monitor: Monitor) -> Trajector
         return None
     try:
         with np.load(path, allow_pickle=False) as file:
-            frames, xyz = file["frames"].astype(np.intp), file["xyz_m"].astype(np.float64)
+            frames, xyz, shared = file["frames"].astype(np.intp), file["xyz_m"].astype(np.float64), "track" in file.files
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path} holds no trajectories or is damaged; run the tracking again.") from error
+    if shared:
+        raise InputError(f"{path} has several trajectories in a column, which cannot be scored; run fewer frames of the take (--frames).")
     if len(frames) and frames.max() >= len(truth.vertices_m):
         raise InputError(f"{path} has frame {frames.max()}, the recording only {len(truth.vertices_m)}; score the run with its own take.")
     seen = np.isfinite(xyz).all(axis=2)

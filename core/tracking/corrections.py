@@ -32,22 +32,24 @@ def in_region(raw: Trajectories, camera: Camera, polygon: np.ndarray, frames: ra
     return inside
 
 
-def without_clicked(filtered: Filtered, camera: Camera, xy: np.ndarray, frame: int) -> Filtered | None:
-    """The trajectories without the one that the camera sees nearest to a pixel (2,) in a frame, all of its pieces; None where none is near.
+def clicked(filtered: Filtered, camera: Camera, xy: np.ndarray, frame: int) -> int | None:
+    """The column of the raw trajectory that the camera sees nearest to a pixel (2,) in a frame; None where none is near.
 
     One that the filters kept is meant before one that they removed.
     """
-    for candidates in (filtered.kept.xyz_m, filtered.raw.xyz_m):
-        t = np.flatnonzero(filtered.raw.frames == frame)
-        if not len(t):
-            return None
+    t = np.flatnonzero(filtered.raw.frames == frame)
+    for candidates in (filtered.kept.xyz_m, filtered.raw.xyz_m) if len(t) else ():
         rows = np.flatnonzero(np.isfinite(candidates[t[0], :, 0]))
         away = np.linalg.norm(camera.project(candidates[t[0], rows]) - xy, axis=1)
         if len(rows) and away.min() <= CLICK_REACH_PX:
             at = rows[int(away.argmin())]
-            source = int(filtered.source[at]) if candidates is filtered.kept.xyz_m else int(at)
-            verdict = filtered.raw.status.copy()
-            verdict[filtered.raw.seen[:, source], source] = TrackStatus.REMOVED_BY_USER
-            left = filtered.source != source
-            return Filtered(kept=picked(filtered.kept, left), source=filtered.source[left], raw=replace(filtered.raw, status=verdict))
+            return int(filtered.source[at]) if candidates is filtered.kept.xyz_m else int(at)
     return None
+
+
+def without(filtered: Filtered, source: int) -> Filtered:
+    """The trajectories without that of a raw column, all of its pieces."""
+    verdict = filtered.raw.status.copy()
+    verdict[filtered.raw.seen[:, source], source] = TrackStatus.REMOVED_BY_USER
+    left = filtered.source != source
+    return Filtered(kept=picked(filtered.kept, left), source=filtered.source[left], raw=replace(filtered.raw, status=verdict))

@@ -1,6 +1,6 @@
 """Trajectories: position, velocity and acceleration of every tracked point, raw and smoothed (kinematics.py), and why it ended."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,11 +11,9 @@ from ..values import frozen
 from .filters import against_neighbours, against_voxels, cut, over_thresholds
 from .kinematics import Kinematics, differences, smoothed
 from .settings import TrackingSettings, TrackStatus
-from .tracked import TrackedFrame
+from .tracked import TrackedFrame, rows_of
 
 SMOOTH_FRAMES = 7
-LOOKED_THROUGH_EVERY = 500  # frames, for points that the table will not hold
-MOST_CELLS = 4_000_000  # frames times trajectories of one table: filtering it takes about 2 GB
 
 Seen = tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # frame, identity, xyz_m, sigma_m, ended, reason
 
@@ -33,6 +31,7 @@ class Trajectories:
     status: np.ndarray  # (T, N)
     raw: Kinematics | None = None  # the same velocities and accelerations with their sigmas
     smooth: Kinematics | None = None  # smoothed ones with theirs
+    track: np.ndarray | None = None  # (T, N) which trajectory it is, −1 for none, where several share a column (long_tracks.py)
     omitted: int = 0  # shorter ones that found no room in the table
 
     def __post_init__(self) -> None:
@@ -48,7 +47,7 @@ class Trajectories:
         for prefix, kinematics in (("", self.raw), ("smooth_", self.smooth)):
             if kinematics is not None:
                 arrays |= {f"{prefix}{f.name}": getattr(kinematics, f.name) for f in fields(Kinematics)}
-        return arrays
+        return arrays if self.track is None else arrays | {"track": self.track}
 
     @property
     def seen(self) -> np.ndarray:
@@ -56,43 +55,28 @@ class Trajectories:
         return np.isfinite(self.xyz_m[..., 0])
 
 
-def assemble(steps: Iterable[TrackedFrame], fps: float, smooth_frames: int = SMOOTH_FRAMES, most_cells: int = MOST_CELLS) -> Trajectories:
-    """The trajectories of consecutive tracked frames, in the order of their identities; derivatives smoothed over so many frames (or 0).
+def assemble(steps: Iterable[TrackedFrame], fps: float, smooth_frames: int = SMOOTH_FRAMES) -> Trajectories:
+    """The trajectories of consecutive tracked frames, in the order of their identities; derivatives smoothed over so many frames (or 0)."""
+    return assembled([seen_of(step) for step in steps], fps, smooth_frames)[0]
 
-    Of a long recording only the longest trajectories are taken, as many as a table of `most_cells` frames times trajectories can hold.
-    """
-    seen, born = list[Seen](), 0
-    for s in steps:
-        seen.append((s.frame, s.identity, s.xyz_m, np.sqrt(np.trace(s.covariance_m2, axis1=1, axis2=2)), s.ended, s.reason))
-        born = max(born, int(s.identity.max(initial=-1)) + 1)
-        if len(seen) % LOOKED_THROUGH_EVERY == 0:
-            seen = _promising(seen, most_cells)
-    length = np.bincount(np.concatenate([identity for _, identity, *_ in seen] or [np.zeros(0, dtype=np.int64)]), minlength=born)
-    T, N = len(seen), min(len(length), max(1, most_cells // max(1, len(seen))))
-    column = np.full(len(length), -1)
-    column[np.sort(np.argsort(-length, kind="stable")[:N])] = np.arange(N)
+
+def seen_of(step: TrackedFrame) -> Seen:
+    """What a tracked frame says of trajectories."""
+    return step.frame, step.identity, step.xyz_m, np.sqrt(np.trace(step.covariance_m2, axis1=1, axis2=2)), step.ended, step.reason
+
+
+def assembled(seen: Sequence[Seen], fps: float, smooth_frames: int) -> tuple[Trajectories, np.ndarray]:
+    """The trajectories of these frames, and their identities (N,), ascending."""
+    identities = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(identity for _, identity, *_ in seen)]))
+    T, N = len(seen), len(identities)
     xyz, sigma = np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
     status = np.zeros((T, N), dtype=np.int8)
     for t, (_, identity, place, uncertainty, ended, reason) in enumerate(seen):
-        here, gone = column[identity], column[ended]
-        xyz[t, here[here >= 0]], sigma[t, here[here >= 0]] = place[here >= 0], uncertainty[here >= 0]
-        status[t, here[here >= 0]] = TrackStatus.MEASURED
+        here, gone = rows_of(identities, identity), rows_of(identities, ended)
+        xyz[t, here], sigma[t, here], status[t, here] = place, uncertainty, TrackStatus.MEASURED
         status[t, gone[gone >= 0]] = reason[gone >= 0]
     frames = np.array([frame for frame, *_ in seen], dtype=np.int32)
-    return replace(with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames), omitted=len(length) - N)
-
-
-def _promising(seen: list[Seen], most_cells: int) -> list[Seen]:
-    """The same frames without the points that ended long ago and are not among the longest, which are all that the table can hold."""
-    if sum(len(identity) for _, identity, *_ in seen) <= most_cells:
-        return seen
-    length = np.bincount(np.concatenate([identity for _, identity, *_ in seen]))
-    keep = np.zeros(len(length), dtype=bool)
-    keep[np.argsort(-length, kind="stable")[: max(1, most_cells // len(seen))]] = True
-    for _, identity, *_ in seen[-LOOKED_THROUGH_EVERY:]:
-        keep[identity] = True
-    return [(frame, identity[keep[identity]], xyz[keep[identity]], sigma[keep[identity]], ended, reason)
-            for frame, identity, xyz, sigma, ended, reason in seen]
+    return with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames), identities
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -100,14 +84,14 @@ class Filtered:
     """Trajectories after the filters, and all of them as they were before, with the verdict on each frame."""
 
     kept: Trajectories  # pieces, M
-    source: np.ndarray  # (M,) the column of `raw` that a piece is of
+    source: np.ndarray  # (M,) the column of `raw` that a piece is of; −1 where columns are shared
     raw: Trajectories  # N; status: MEASURED where kept, or why the frame went, or why the trajectory ended there
 
     @property
     def reason(self) -> np.ndarray:
         """(N,) one TrackStatus for each raw trajectory: the end of one that was kept, what removed most frames of one that was not.
 
-        MEASURED: it was kept to the end of the recording.
+        MEASURED: it was kept to the end of the recording. Of a column that several share, the last one's.
         """
         status, seen = self.raw.status, self.raw.seen
         against = np.stack([(status == s).sum(axis=0) for s in TrackStatus])
@@ -120,7 +104,8 @@ class Filtered:
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays of trajectories_raw.npz."""
         raw = self.raw
-        return {"frames": raw.frames, "xyz_m": raw.xyz_m, "status": raw.status, "reason": self.reason}
+        arrays = {"frames": raw.frames, "xyz_m": raw.xyz_m, "status": raw.status, "reason": self.reason}
+        return arrays if raw.track is None else arrays | {"track": raw.track}
 
 
 def filter_trajectories(

@@ -5,7 +5,8 @@
 The clip is 40 pictures a camera shown to and fro, each a hard link, so that a long one takes no more room than a short one. Each length is
 run in a process of its own; what grows is told per frame and for 30,000 frames. The fit of a whole body with 4,000 points a frame, 25
 clouds to and fro that are made as they are read, may need 2 GB for them: what a frame adds is found with stretches of a third of the
-usual length, in a third of the time, and added to what two usual stretches need.
+usual length, in a third of the time, and added to what two usual stretches need. The table of trajectories is filled from steps of 1,000
+points that are made as they are read.
 """
 
 import argparse
@@ -14,7 +15,8 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,8 +25,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
 
+from tricap.core.account import track_figures  # noqa: E402
 from tricap.core.fitting.stretches import AT_ONCE  # noqa: E402
+from tricap.core.results import Results  # noqa: E402
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E402
+from tricap.core.tracking.long_tracks import trajectories_of  # noqa: E402
+from tricap.core.tracking.settings import TrackingSettings, TrackStatus  # noqa: E402
+from tricap.core.tracking.tracked import TrackedFrame, born  # noqa: E402
+from tricap.core.tracking.trajectories import Filtered, Trajectories, filter_trajectories  # noqa: E402
 
 CLIP_FRAMES = 30_000
 COARSE = ("growing.spacing_px=6", "tracking.spacing_px=12")
@@ -52,7 +60,14 @@ import memory
 memory.long_fit(*map(int, sys.argv[1:]))
 {PEAK}
 """
+TABLE_CHILD = f"""
+import pathlib, resource, sys
+import memory
+memory.long_table(int(sys.argv[1]))
+{PEAK}
+"""
 KINDS = 25
+TABLE_LENGTHS, TABLE_POINTS, TABLE_LIFE = (1500, 6000), 1000, 25
 
 
 class ToAndFro(Sequence[Any]):
@@ -88,6 +103,29 @@ def long_fit(frames: int, at_once: int) -> None:
     sequence.fit_sequence(given, fit.FitSettings(sequence_steps=2))
 
 
+def long_table(frames: int) -> None:
+    """Filter and write the trajectories of so many frames: points that rock to and fro, some born and lost in each frame."""
+    random = np.random.default_rng(0)
+    place = random.uniform(-0.3, 0.3, (frames + TABLE_LIFE, TABLE_POINTS // TABLE_LIFE, 3))
+
+    def steps() -> Iterator[TrackedFrame]:
+        for t in range(frames):
+            xyz = place[t : t + TABLE_LIFE].reshape(-1, 3) + 0.1 * np.sin(0.2 * t) + 2e-4 * random.standard_normal((TABLE_POINTS, 3))
+            first = t * place.shape[1]
+            n, gone = len(xyz), np.arange(max(0, first - place.shape[1]), first)
+            step = born(t, first + np.arange(n), np.zeros((n, 2, 2)), np.zeros((n, 2, 2, 2)), xyz, np.tile(np.eye(3) * 1e-8, (n, 1, 1)))
+            yield replace(step, ended=gone, reason=np.full(len(gone), TrackStatus.NOT_FOUND, dtype=np.int8))
+
+    def decide(raw: Trajectories, rows: range) -> tuple[Filtered, np.ndarray]:
+        return filter_trajectories(raw, settings), np.zeros(0, dtype=np.int64)
+
+    settings = TrackingSettings()
+    filtered, _ = trajectories_of(steps(), 25.0, settings, decide)
+    with tempfile.TemporaryDirectory() as name:
+        Results(Path(name)).write_trajectories(filtered, 25.0)
+    print(f"{frames} frames: {track_figures(filtered.kept)}, {filtered.kept.omitted} left out", file=sys.stderr)
+
+
 def long_take(pictures: Path, folder: Path, frames: int) -> Path:
     """A take of so many frames that shows the pictures of another to and fro."""
     for view in sorted(p for p in pictures.iterdir() if p.is_dir()):
@@ -114,12 +152,23 @@ def peak_mb(stage: str, take: Path, out: Path) -> float:
 
 def fit_peak_mb(frames: int, at_once: int) -> float:
     """Peak resident memory [MB] of a fit of a whole body over so many frames, in stretches of `at_once`."""
+    return _child_peak_mb(FIT_CHILD, frames, at_once)
+
+
+def _child_peak_mb(code: str, *numbers: int) -> float:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])}
-    argv = [sys.executable, "-c", FIT_CHILD, str(frames), str(at_once)]
-    done = subprocess.run(argv, capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run([sys.executable, "-c", code, *map(str, numbers)], capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
-        raise SystemExit(f"The fit of {frames} frames ended with {done.returncode}: {done.stderr}")
+        raise SystemExit(f"{numbers[0]} frames ended with {done.returncode}: {done.stderr}")
     return float(done.stdout.split()[-1])
+
+
+def table_row(lengths: tuple[int, int] = TABLE_LENGTHS) -> dict[str, object]:
+    """The row of the table of trajectories."""
+    few, many = (_child_peak_mb(TABLE_CHILD, frames) for frames in lengths)
+    added = 1024 * (many - few) / (lengths[1] - lengths[0])
+    return {"stage": "table", "peak_mb": {str(lengths[0]): round(few, 1), str(lengths[1]): round(many, 1)}, "kb_per_frame": round(added, 1),
+            "mb_20_minutes": round(many + max(0.0, added) * (CLIP_FRAMES - lengths[1]) / 1024)}
 
 
 def fit_growth(lengths: tuple[int, int] = FIT_LENGTHS, at_once: int = SHORT) -> float:
@@ -159,7 +208,7 @@ def main() -> None:
     parser.add_argument("--stages", nargs="+", default=list(STAGES), choices=STAGES)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    rows = [*growth(tuple(args.stages), sorted(args.frames)), fit_row()]
+    rows = [*growth(tuple(args.stages), sorted(args.frames)), table_row(), fit_row()]
     for row in rows:
         print(f"{row['stage']:<8} peak {row['peak_mb']} MB, {row['kb_per_frame']} KB a frame, 20 minutes: {row['mb_20_minutes']} MB")
     if args.json:

@@ -61,9 +61,9 @@ def test_clouds(take: Path, truth: Truth, tmp_path: Path) -> None:
     assert score is not None and 0.5 < score.coverage < 0.75 and score.median_mm < 1e-3
 
 
-def put_trajectories(out: Path, truth: Truth, xyz: np.ndarray) -> None:
+def put_trajectories(out: Path, truth: Truth, xyz: np.ndarray, **more: np.ndarray) -> None:
     buffer = io.BytesIO()
-    np.savez(buffer, frames=np.arange(FRAMES), xyz_m=xyz)
+    np.savez(buffer, frames=np.arange(FRAMES), xyz_m=xyz, **more)
     (out / "trajectories.npz").write_bytes(buffer.getvalue())
 
 
@@ -79,6 +79,9 @@ def test_trajectories(take: Path, truth: Truth, tmp_path: Path) -> None:
     positions = 200 * 3 + 100 * 2 + 100 * 2
     assert score.false_fraction == pytest.approx(300 / positions, abs=1e-3)
     assert score.median_mm == pytest.approx(3.0, abs=0.5)  # those born 3 mm off are tied to the surface, not to their own place
+    put_trajectories(tmp_path, truth, xyz, track=np.zeros(xyz.shape[:2], dtype=np.int32))
+    with pytest.raises(InputError, match="several trajectories in a column"):
+        score_run(take, tmp_path)
 
 
 def put_fit(out: Path, values: np.ndarray, shape: BodyShape) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.correcting import corrected_cloud, corrected_tracks
+from tricap.core.correcting import corrected_cloud, corrected_tracks, missed_clicks
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 from tricap.core.progress import Monitor
@@ -45,20 +45,23 @@ def region(frames: range, x0: float, x1: float) -> Correction:
 
 
 def test_a_clicked_trajectory_goes_whole() -> None:
-    filtered, missed = corrected_tracks(row(), [click(147, 152, 3), click(10, 10, 3)], RIG, SETTINGS, Monitor())  # column 2 is at 146
+    clicks = [click(147, 152, 3), click(10, 10, 3)]  # column 2 is at 146
+    filtered, hit = corrected_tracks(row(), clicks, RIG, SETTINGS, Monitor())
     assert filtered.source.tolist() == [0, 1, 3, 4, 5, 6, 7, 8] and filtered.kept.seen.all()
     assert (filtered.raw.status[:, 2] == TrackStatus.REMOVED_BY_USER).all() and filtered.raw.seen.all()
     assert filtered.reason[2] == TrackStatus.REMOVED_BY_USER and filtered.reason[3] == TrackStatus.MEASURED
-    assert len(missed) == 1 and "(10, 10)" in missed[0]
+    missed = missed_clicks(clicks, hit)
+    assert hit == {0: 2} and len(missed) == 1 and "(10, 10)" in missed[0]
+    assert not corrected_tracks(row(), clicks, RIG, SETTINGS, Monitor(), range(4, FRAMES))[1]  # rows that do not hold the clicks' frame
 
 
 def test_a_region_leaves_gaps_and_takes_the_points_of_the_clouds() -> None:
     take_out = [region(range(4, 7), 135, 165)]
     raw = row()
-    filtered, missed = corrected_tracks(raw, take_out, RIG, SETTINGS, Monitor())
+    filtered, hit = corrected_tracks(raw, take_out, RIG, SETTINGS, Monitor())
     u = CAMERA.project(raw.xyz_m.reshape(-1, 3))[:, 0].reshape(raw.seen.shape)
     gone = (u > 135) & (u < 165) & ((np.arange(FRAMES) >= 4) & (np.arange(FRAMES) < 7))[:, None]
-    assert gone.any() and not missed
+    assert gone.any() and not hit
     assert np.array_equal(filtered.raw.status == TrackStatus.REMOVED_BY_USER, gone)
     assert np.array_equal(filtered.kept.seen, ~gone) and np.array_equal(filtered.kept.status == TrackStatus.REMOVED_BY_USER, gone)
     n = raw.seen.shape[1]
