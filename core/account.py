@@ -9,6 +9,7 @@ from . import store
 from .settings import to_table
 from .stages import command_of
 from .take import Footage
+from .tracking.settings import TrackStatus
 from .tracking.trajectories import Trajectories
 
 
@@ -32,16 +33,28 @@ def new_account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]
     }
 
 
-def track_figures(kept: Trajectories) -> dict[str, Any]:
-    """How many trajectories were kept, and how long and sure they are."""
-    seen = kept.seen
-    count = seen.shape[1] if kept.track is None else len(np.unique(kept.track[seen]))
-    return {
-        "trajectories": int(count),
+def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[str, Any], list[str]]:
+    """How many trajectories were kept, how long and sure they are, and how often which TrackStatus was the reason; and what to warn of."""
+    seen, started = kept.seen, sum(reasons.values())
+    count = int(seen.shape[1] if kept.track is None else len(np.unique(kept.track[seen])))
+    why = {TrackStatus(r).words: n for r, n in sorted(reasons.items(), key=lambda found: -found[1])}
+    warnings = []
+    if kept.omitted:
+        warnings.append(
+            f"The {kept.omitted} shortest of {count + kept.omitted} trajectories are left out: they have no room in one table of so many "
+            "frames; run the take in pieces (--frames) to have all."
+        )
+    if not count and started:
+        warnings.append(f"No trajectory was kept of {started}: most were removed as “{next(iter(why))}”.")
+    figures = {
+        "started": started,
+        "trajectories": count,
         "points_per_frame": float(seen.sum(axis=1).mean()),
         "mean_length_frames": float(seen.sum() / count) if count else 0.0,
         "sigma_mm": 1e3 * median(kept.sigma_m[seen]),
+        "reasons": why,
     }
+    return figures, warnings
 
 
 def median(values: Sequence[float] | np.ndarray) -> float:

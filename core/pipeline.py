@@ -4,7 +4,6 @@ Every stage asks the stages before it for their results; what is checkpointed is
 """
 
 import time
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -48,7 +47,7 @@ from .surface.voxels import as_written
 from .take import Footage, open_take, read_take
 from .tracking.contour import ContourSettings
 from .tracking.long_tracks import trajectories_of
-from .tracking.settings import TrackingSettings, TrackStatus
+from .tracking.settings import TrackingSettings
 from .tracking.trajectories import Filtered, Trajectories
 from .tracking.waiting import Guide
 from .without_surface import can_do_without, empty_clouds, empty_views, known_silhouettes
@@ -271,18 +270,10 @@ def _follow(run: Run, monitor: Monitor, guide: Guide | None = None) -> dict[str,
         ) from stop
     run.trajectories = filtered.kept
     run.results.write_trajectories(filtered, take.fps)
-    for sentence in missed_clicks(take.corrections, hit):
+    figures, warnings = track_figures(filtered.kept, reasons)
+    for sentence in (*missed_clicks(take.corrections, hit), *warnings):
         run.warn(sentence)
-    why = Counter({TrackStatus(r).words: n for r, n in reasons.items()})
-    figures = track_figures(filtered.kept)
-    if filtered.kept.omitted:
-        run.warn(
-            f"The {filtered.kept.omitted} shortest of {figures['trajectories'] + filtered.kept.omitted} trajectories are left out: "
-            "they have no room in one table of so many frames; run the take in pieces (--frames) to have all."
-        )
-    if not figures["trajectories"] and reasons:
-        run.warn(f"No trajectory was kept of {reasons.total()}: most were removed as “{why.most_common(1)[0][0]}”.")
-    return {"started": reasons.total(), **figures, "reasons": dict(why.most_common())}
+    return figures
 
 
 def fit(run: Run, monitor: Monitor) -> None:

@@ -120,10 +120,10 @@ def long_table(frames: int) -> None:
         return filter_trajectories(raw, settings), np.zeros(0, dtype=np.int64)
 
     settings = TrackingSettings()
-    filtered, _ = trajectories_of(steps(), 25.0, settings, decide)
+    filtered, reasons = trajectories_of(steps(), 25.0, settings, decide)
     with tempfile.TemporaryDirectory() as name:
         Results(Path(name)).write_trajectories(filtered, 25.0)
-    print(f"{frames} frames: {track_figures(filtered.kept)}, {filtered.kept.omitted} left out", file=sys.stderr)
+    print(f"{frames} frames: {track_figures(filtered.kept, reasons)[0]}, {filtered.kept.omitted} left out", file=sys.stderr)
 
 
 def long_take(pictures: Path, folder: Path, frames: int) -> Path:
