@@ -73,7 +73,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     Raises:
         InputError: the arguments or the take need mending.
     """
-    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
+    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), contours_aside=True) as job:
         start = Start(
             polygon=read_polygon(args.polygon) if args.polygon else None,
             background=read_image(args.background) if args.background else None,
@@ -88,7 +88,8 @@ def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start:
     Measures and tracks first where that is needed: a background shows the outline in every frame, and what cannot be measured, or is not
     to be (fitting.use_surface), is followed in the images from a polygon.
 
-    Says what was found. A body that the contours begin with is that of the same frames and settings; with the contours it is stale.
+    Says what was found. A body that the contours begin with is that of the same frames and settings; with the contours it is stale, and the
+    next fit replaces it.
 
     Raises:
         InputError: there is no such view, or nothing to start from.
@@ -126,7 +127,6 @@ def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, st
             file.write(contour_rows(frame, contour).encode())
             seen.append(contour.seen.mean())
     job.results.remove(f"cache/{_checkpoints(view)}")
-    job.account["stages"].pop("fit", None)  # the body is to be fitted again
     job.results.write_run(job.account)
     return f"{path}: the outline in {len(seen)} frames, {100 * float(np.mean(seen)):.0f} % of its vertices on an edge."
 

@@ -143,11 +143,11 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
 
 @contextmanager
 def open_run(
-    take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None, *, restart: bool = False
-) -> Iterator[Run]:
+    take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None, *,
+    restart: bool = False, contours_aside: bool = False) -> Iterator[Run]:  # fmt: skip
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
-    What an earlier run with other footage, settings or frames left in OUT is removed once it is replaced; `restart` removes it now.
+    What an earlier run of other input left in OUT is removed (with `contours_aside` not for new contours alone); `restart` removes it all.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
@@ -167,7 +167,7 @@ def open_run(
             results.remove("clouds", *DERIVED, "cache")  # the cache last: it marks the folder as ours
         before = {} if restart else results.read_run()
         account = new_account(footage, settings)
-        account["stages"] = kept = still_good(before, keys)
+        account["stages"] = kept = still_good(before, keys, contours_aside=contours_aside)
         if before:  # what was made otherwise must not stand beside the new
             results.remove(*(name for stage, c in CONCERNS.items() if stage not in kept for name in c.files))
         yield Run(footage=footage, settings=settings, results=results, keys=keys, account=account)

@@ -72,7 +72,8 @@ DERIVED = tuple(name for concern in CONCERNS.values() for name in concern.files)
 
 
 def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict[str, str]:
-    """The key of every stage, for opened footage, the settings of a run, and the contours that were put into its folder OUT.
+    """The key of every stage, for opened footage, the settings of a run, and the contours that were put into its folder OUT, which are the
+    second word of the fit's key.
 
     Raises:
         InputError: footage, rig or model have gone.
@@ -81,8 +82,9 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict
     try:
         for stage, concern in CONCERNS.items():
             said = [settings[name] for name in concern.settings], concern.take(footage)
-            before = store.digest(before, repr(said), *(sorted((out / "contours").glob("*.csv")) if stage == "fit" else ()))
-            keys[stage] = before
+            before = keys[stage] = store.digest(before, repr(said))
+        contours = sorted((out / "contours").glob("*.csv"))
+        keys["fit"] += f" {store.digest(*contours)}" if contours else ""
     except OSError as error:
         raise InputError(f"Cannot read {error.filename}: {error.strerror or error}.") from error
     return keys
@@ -105,11 +107,19 @@ def stage_of(group: str) -> str:
     return next(stage for stage, concern in CONCERNS.items() if group in concern.settings)
 
 
-def still_good(run: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any]:
-    """The stages in a run.json that were done with these keys; the report is as good as the fit, and so are tracks that the body guided."""
-    keys = {**keys, "report": keys["fit"]}
+def still_good(run: Mapping[str, Any], keys: Mapping[str, str], *, contours_aside: bool = False) -> dict[str, Any]:
+    """The stages in a run.json that were done with these keys; the report is as good as the fit, and so are tracks that the body guided.
+
+    `contours_aside`: a body that was fitted with other contours, or none, is good enough.
+    """
     stages: dict[str, Any] = run.get("stages", {})
-    good = {name: entry for name, entry in stages.items() if entry.get("key") == keys.get(name, "")}
+    keys = {**keys, "report": keys["fit"]}
+
+    def done_so(name: str, entry: Mapping[str, Any]) -> bool:
+        key, now = entry.get("key"), keys.get(name, "")
+        return bool(key) and (key == now or (contours_aside and key.partition(" ")[0] == now.partition(" ")[0]))
+
+    good = {name: entry for name, entry in stages.items() if done_so(name, entry)}
     if "fit" not in good and "tracked_again" in stages.get("fit", {}):
         good.pop("track", None)
     return good

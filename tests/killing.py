@@ -10,6 +10,7 @@ import os
 import random
 import re
 import select
+import shutil
 import signal
 import sys
 import time
@@ -84,25 +85,53 @@ def command(take: Path, out: Path, tell: "Tell", in_stretches: bool = False) -> 
     tell(Monitor)
     if in_stretches:
         short_stretches("tricap")
-    sets = [f"--set={group}.{name}={value}" for group, table in SETTINGS.items() for name, value in table.items()]
-    code = main(["run", str(take), "--out", str(out), *sets])
+    code = main(["run", str(take), "--out", str(out), *_sets()])
     if code:
         raise SystemExit(code)
 
 
 def operator(take: Path, out: Path, tell: "Tell", in_stretches: bool = False) -> None:
     """Driver: bpy.ops.tricap.run in a Blender without window."""
+    bpy = _blender(tell)
+    if in_stretches:
+        short_stretches(EXTENSION)
+    if bpy.ops.tricap.run(take=str(take), out=str(out)) != {"FINISHED"}:
+        raise SystemExit(3)
+
+
+def contours(take: Path, out: Path, tell: "Tell") -> None:
+    """Driver: `tricap contour` of two views from the fitted body, where the run was done."""
+    from tricap.__main__ import main
+
+    tell(Monitor)
+    code = main(["contour", str(take), "--out", str(out), "--view", "L", "C", "--from-body", *_sets()])
+    if code:
+        raise SystemExit(code)
+
+
+def contour_operator(take: Path, out: Path, tell: "Tell") -> None:
+    """Driver: bpy.ops.tricap.follow_contours of all views, where the run was done."""
+    bpy = _blender(tell)
+    scene = bpy.context.scene
+    scene.tricap.take, scene.tricap.out = str(take), str(out)
+    if bpy.ops.tricap.follow_contours() != {"FINISHED"}:
+        raise SystemExit(3)
+
+
+def _blender(tell: "Tell") -> Any:
+    """bpy with the extension, and its panel's knobs set."""
     bpy, addon_utils = importlib.import_module("bpy"), importlib.import_module("addon_utils")
     addon_utils.extensions_refresh()
     assert addon_utils.enable(EXTENSION, default_set=True) is not None
     tell(importlib.import_module(f"{EXTENSION}.core.progress").Monitor)
-    if in_stretches:
-        short_stretches(EXTENSION)
     for group, table in SETTINGS.items():
         for name, value in table.items():
             setattr(getattr(bpy.context.scene.tricap, group), name, value)
-    if bpy.ops.tricap.run(take=str(take), out=str(out)) != {"FINISHED"}:
-        raise SystemExit(3)
+    return bpy
+
+
+def _sets() -> list[str]:
+    return [f"--set={group}.{name}={value}" for group, table in SETTINGS.items() for name, value in table.items()]
 
 
 def short_stretches(package: str) -> None:
@@ -119,7 +148,10 @@ DRIVERS: dict[str, Driver] = {
     "operator": operator,
     "tricap run, in stretches": partial(command, in_stretches=True),
     "operator, in stretches": partial(operator, in_stretches=True),
+    "tricap contour": contours,
+    "contour operator": contour_operator,
 }
+BEFORE: dict[str, Driver] = {"tricap contour": command, "contour operator": operator}  # what is done, and not killed, first
 
 
 def start(driver: Driver, take: Path, out: Path, moment: Moment | None = None) -> Ended:
@@ -255,15 +287,25 @@ def moments(whole: Ended, seed: int) -> Iterator[Moment]:
             yield Moment(operation=chance.randrange(whole.operations), how=chance.choice(("before", "after", "half")))
 
 
+def _begun(folder: Path, name: str) -> Path:
+    """A folder for results, with those of what is done first if there are any."""
+    if (folder / "before").exists():
+        shutil.copytree(folder / "before", folder / name)
+    return folder / name
+
+
 def kill_runs(driver_name: str, take: Path, folder: Path, count: int, seed: int = 0) -> Tally:
     """Kill runs at `count` moments; what did not end as a run without a kill stands in `faults`."""
     driver, tally = DRIVERS[driver_name], Tally()
-    whole = start(driver, take, folder / "whole")
+    if driver_name in BEFORE:
+        before = start(BEFORE[driver_name], take, folder / "before")
+        assert before.code == 0, before.said
+    whole = start(driver, take, _begun(folder, "whole"))
     assert whole.code == 0, whole.said
     expected = contents(folder / "whole")
     chosen, number = moments(whole, seed), 0
     while sum(tally.moments.values()) < count:
-        out, number, history = folder / f"out{number}", number + 1, []
+        out, number, history = _begun(folder, f"out{number}"), number + 1, []
         tally.runs += 1
         for _ in range(KILLS):
             moment = next(chosen)

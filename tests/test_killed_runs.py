@@ -39,12 +39,14 @@ def profile(killing: ModuleType, tmp_path: Path) -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("driver", "count"), [("tricap run", 9), ("operator", 6), ("tricap run, in stretches", 6), ("operator, in stretches", 4)]
-)
+    ("driver", "count"),
+    [("tricap run", 9), ("operator", 6), ("tricap run, in stretches", 6), ("operator, in stretches", 4),
+     ("tricap contour", 4), ("contour operator", 2)],
+)  # fmt: skip
 def test_a_killed_run_goes_on_to_the_same_bytes(
     killing: ModuleType, take: Path, tmp_path: Path, profile: None, driver: str, count: int
 ) -> None:
-    if driver.startswith("operator") and importlib.util.find_spec("bpy") is None:
+    if "operator" in driver and importlib.util.find_spec("bpy") is None:
         pytest.skip("bpy is not installed for this Python")
     tally = killing.kill_runs(driver, take, tmp_path, count, seed=7)
     assert sum(tally.moments.values()) == count and not tally.faults, "\n".join(tally.faults)

@@ -46,7 +46,7 @@ def follow(
     take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], view: str, monitor: Monitor, start: Start
 ) -> list[str]:
     """The computation, free of bpy: what was found in every view."""
-    with pipeline.open_run(take, out, overrides) as run:
+    with pipeline.open_run(take, out, overrides, contours_aside=True) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]
         return write_contours(run, names, monitor, start)
 

@@ -101,7 +101,12 @@ def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
     shutil.copytree(take, tmp_path / "take")
     before = keys(tmp_path / "take")
     store.write_text(tmp_path / "take" / "out" / "contours" / "L.csv", "frame,x,y\n")
-    assert [stage for stage in STAGES if keys(tmp_path / "take")[stage] != before[stage]] == ["fit"]
+    now = keys(tmp_path / "take")
+    assert [stage for stage in STAGES if now[stage] != before[stage]] == ["fit"]
+    stages = {"fit": {"key": before["fit"]}, "report": {"key": before["fit"]}}
+    assert still_good({"stages": stages}, now) == {} and still_good({"stages": stages}, now, contours_aside=True) == stages
+    other = keys(tmp_path / "take", {"fitting": {"frame_steps": 3}})
+    assert still_good({"stages": stages}, other, contours_aside=True) == {}, "a body of other settings is none to begin with"
 
 
 def test_every_part_of_a_take_concerns_a_stage() -> None:
