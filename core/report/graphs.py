@@ -9,6 +9,9 @@ WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 520, 170, 56, 26, 26
 COLOURS = ("#c0392b", "#2471a3", "#1e8449", "#b9770e", "#7d3c98", "#515a5a")
 
 
+MOST_PER_CURVE = 1200  # frames, two for each pixel of the width: of more only what is lowest and highest in a stretch can be seen
+
+
 def curve_graph(title: str, unit: str, frames: np.ndarray, curves: Mapping[str, np.ndarray], sigma: np.ndarray | None = None) -> str:
     """One graph; NaN interrupts a curve. `sigma` is the band of the first curve."""
     values = np.concatenate([c for c in curves.values()])
@@ -40,11 +43,12 @@ def curve_graph(title: str, unit: str, frames: np.ndarray, curves: Mapping[str, 
         f'<text x="{WIDTH - 10}" y="{HEIGHT - 8}" text-anchor="end">{frames[-1]}</text>',
     ]
     if sigma is not None:
-        for px, c, s in _runs(x, first, sigma):
+        for px, c, s in _runs(*thinned(x, first, sigma)):
             band = _points(np.concatenate([px, px[::-1]]), np.concatenate([y(c + s), y(c - s)[::-1]]))
             parts.append(f'<polygon points="{band}" fill="{COLOURS[0]}" opacity="0.18"/>')
     for (_, curve), stroke in zip(curves.items(), COLOURS):
-        parts += [f'<polyline points="{_points(px, y(c))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>' for px, c in _runs(x, curve)]
+        runs = _runs(*thinned(x, curve))
+        parts += [f'<polyline points="{_points(px, y(c))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>' for px, c in runs]
     return "".join(parts) + "</svg>"
 
 
@@ -76,6 +80,20 @@ def field_graph(title: str, radius: np.ndarray, curves: Mapping[str, np.ndarray]
                   line.format(x(ends), x(ends), y(0) - 7, y(0) + 5, stroke),
                   f'<text x="{WIDTH - 14}" y="{TOP + 14 * (i + 1)}" text-anchor="end" fill="{stroke}">{html.escape(row)}</text>']
     return "".join(parts) + "</svg>"
+
+
+def thinned(x: np.ndarray, curve: np.ndarray, *more: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The lowest and the highest value of each stretch of a long curve, and a gap where there is one; a short curve as it is."""
+    if len(x) <= MOST_PER_CURVE:
+        return x, curve, *more
+    chosen = set[int]()
+    for part in np.array_split(np.arange(len(x)), MOST_PER_CURVE // 3):
+        known = np.isfinite(curve[part])
+        finite = part[known]
+        chosen.update(part[~known][:1].tolist())
+        chosen.update(finite[[curve[finite].argmin(), curve[finite].argmax()]].tolist() if len(finite) else ())
+    kept = np.array(sorted(chosen))
+    return tuple(a[kept] for a in (x, curve, *more))
 
 
 def _runs(x: np.ndarray, *curves: np.ndarray) -> list[tuple[np.ndarray, ...]]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core.report import pictures
-from tricap.core.report.graphs import curve_graph
+from tricap.core.report.graphs import MOST_PER_CURVE, curve_graph, thinned
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.tracking.trajectories import Trajectories
 
@@ -31,6 +31,15 @@ def test_a_graph_is_a_picture_of_its_curve() -> None:
 def test_gaps_interrupt_a_curve() -> None:
     svg = curve_graph("g", "", np.arange(6), {"c": np.array([1.0, 2, np.nan, 3, np.inf, 5])})
     assert [len(p.split()) for p in lines(svg)] == [2, 1, 1] and "nan" not in svg and "inf" not in svg
+
+
+def test_a_long_curve_keeps_its_peaks_and_its_gaps() -> None:
+    curve = np.sin(np.arange(30_000) / 500)
+    curve[12_345], curve[20_000:20_100] = 9.0, np.nan
+    x, y, band = thinned(np.arange(30_000), curve, np.ones(30_000))
+    assert len(x) == len(y) == len(band) < MOST_PER_CURVE and (np.diff(x) > 0).all()
+    assert y[x == 12_345] == 9.0 and np.isnan(y).any() and np.nanmin(y) == np.nanmin(curve)
+    assert len(curve_graph("g", "", np.arange(30_000), {"c": curve})) < 20_000
 
 
 @pytest.mark.parametrize("values", [[3.0], [0.0, 0.0], [1e-12, 1e-12], [-5.0, np.nan]])
