@@ -26,7 +26,7 @@ REQUIREMENTS = {
 BLENDER = {(3, 11): "4.5 LTS", (3, 13): "5.2 LTS"}
 WINDOWS = os.name == "nt"
 STAMP = "tricap-setup.txt"
-LONG_BENCHES = ("resume", "surface")  # run when they are named only
+LONG_BENCHES = ("resume", "surface", "clip")  # run when they are named only
 # What an extension consists of; everything else in the repository is for developers.
 SHIPPED_FILES = ("blender_manifest.toml", "__init__.py", "__main__.py", "LICENSE")
 SHIPPED_FOLDERS = {"core": (".py", ".toml"), "addon": (".py", ".toml", ".json")}

@@ -145,8 +145,14 @@ def memory(rows: list[dict[str, Any]]) -> Iterator[Row]:
             yield Row("memory", f"{frames} frames, {row['stage']} [MB]", peak, "memory", "")
 
 
+def clip(table: dict[str, Any]) -> Iterator[Row]:
+    """The peak of each stage of a whole run of a clip."""
+    for row in table["stages"]:
+        yield Row("clip", f"{row['frames']} frames, {row['stage']} [MB]", row["peak_mb"], "memory", "")
+
+
 STAGES: dict[str, Callable[[Any], Iterator[Row]]] = {
-    f.__name__: f for f in (matching, constraints, tracking, fit, calibration, run, memory)
+    f.__name__: f for f in (matching, constraints, tracking, fit, calibration, run, memory, clip)
 }
 
 
