@@ -116,7 +116,7 @@ def still_good(run: Mapping[str, Any], keys: Mapping[str, str], *, contours_asid
     keys = {**keys, "report": keys["fit"]}
 
     def done_so(name: str, entry: Mapping[str, Any]) -> bool:
-        key, now = entry.get("key"), keys.get(name, "")
+        key, now = str(entry.get("key", "")), keys.get(name, "")
         return bool(key) and (key == now or (contours_aside and key.partition(" ")[0] == now.partition(" ")[0]))
 
     good = {name: entry for name, entry in stages.items() if done_so(name, entry)}
