@@ -16,6 +16,7 @@ from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.steering import controls_of
 from ...core.motion.retarget.turns import angle_of, transposed
 from ...core.progress import Monitor
+from .memory import remember
 from .programs import presets
 from .read import read_motion, read_rig, with_soles
 from .write import Written, write_action
@@ -94,6 +95,9 @@ def apply(armature_object: bpy.types.Object, source: Motion, source_map: RigMap,
     """Write the action and play some frames of it. Main thread."""
     steering = target.rig_map.steering
     written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg, properties=steering.properties if steering else {})
+    for action in filter(None, [written.action, written.raw]):
+        if result.motion.unshown is not None:
+            remember(action, result.motion.unshown)
     figures = measure(source, source_map, result.motion, target.rig_map, result.contacts, target.floor_m)
     notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source_map.missing]
     if written.muted:

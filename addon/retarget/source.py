@@ -12,6 +12,7 @@ from ...core.motion.sources import read_motion_source
 from ...core.progress import Monitor
 from . import files
 from .export import IN_BLENDER
+from .memory import recalled
 from .read import action_frames, read_motion, read_rig
 
 
@@ -27,7 +28,7 @@ def open_source(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -
     moving = [o for o in bpy.data.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action]
     if len(moving) != 1:
         raise InputError(f"{path.name} has {len(moving)} armatures with an action; a motion needs one.")
-    return read_motion(moving[0], read_rig(moving[0]), action_frames(moving[0]), monitor)
+    return recalled(moving[0], read_motion(moving[0], read_rig(moving[0]), action_frames(moving[0]), monitor))
 
 
 def account(outcome: Any, source_map: RigMap, target_map: RigMap) -> dict[str, Any]:

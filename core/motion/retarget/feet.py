@@ -35,6 +35,7 @@ TILT = 0.2  # a turn of the hips counts as much less than one of a leg
 RAISED = 0.006  # a swinging foot that would be in the floor by less than this part of the leg's length is raised, not turned
 BENT = np.radians(8.0)  # a knee is taken to be bent at least as much in (2)
 REACH = 0.9995  # a leg is not stretched beyond this part of its length
+MEDIAN_STEPS = 60
 STRAIGHT = 0.005  # a knee that is out of the line by less of the thigh's length bends forwards
 
 
@@ -48,6 +49,7 @@ class Leg:
     foot: tuple[int, ...]
     toe: tuple[int, ...]
     ball_m: np.ndarray  # (3,) the toe's joint in the rest pose
+    ankle_m: float  # height of the ankle over the sole in the rest pose
     sole_m: np.ndarray  # (K, 3) points under the foot, rest pose
     tip_m: np.ndarray  # (J, 3) points under the toes, rest pose
 
@@ -77,18 +79,28 @@ def _leg(rig: Rig, side: str, bones: Mapping[str, tuple[int, ...]], floor_m: flo
     under = np.array([1.0, 1.0, 0.0])
     sole = np.concatenate(skin) if skin else np.array([ankle * under, ball * under]) + (0, 0, low)
     tips = np.concatenate(toes) if toes else np.array([tip * under + (0, 0, low)])
-    return Leg(side=side, **{k: tuple(v) for k, v in bones.items()}, ball_m=ball, sole_m=sole, tip_m=tips)
+    return Leg(side=side, **{k: tuple(v) for k, v in bones.items()}, ball_m=ball, ankle_m=float(ankle[2] - sole[:, 2].min()), sole_m=sole,
+               tip_m=tips)
 
 
 def level_feet(since_rest: np.ndarray, flat: np.ndarray, A: np.ndarray) -> np.ndarray:
     """A foot's alignment such that its sole is level when the source's foot stands flat, whatever the source's rest pose.
 
-    `since_rest` (T, 3, 3) of the source's foot, `flat` (T,) when it stands on heel and ball. n = mean of D(t)ᵀ z; A' = shortest(z → n) A.
+    `since_rest` (T, 3, 3) of the source's foot, `flat` (T,) when it stands on heel and ball. n = median of D(t)ᵀ z; A' = shortest(z → n) A.
     """
     if not flat.any():
         return A
-    n = unit(np.median(since_rest[flat, 2, :], axis=0))
+    n = unit(_middle(since_rest[flat, 2, :]))
     return shortest(np.array([0.0, 0.0, 1.0]), n) @ A if n[2] > 0.2 else A
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The point with the least sum of distances to the points (n, 3), which turns as they turn (Weiszfeld, 1937)."""
+    middle = np.asarray(points.mean(axis=0))
+    for _ in range(MEDIAN_STEPS):
+        weight = 1.0 / np.maximum(np.linalg.norm(points - middle, axis=1), 1e-9)
+        middle = weight @ points / weight.sum()
+    return middle
 
 
 def lock_flat(R: np.ndarray, legs: Mapping[str, Leg], contacts: Contacts, rig: Rig, settings: FeetSettings, fps: float) -> np.ndarray:

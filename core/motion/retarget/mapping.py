@@ -23,7 +23,8 @@ NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RigMap:
-    """`bones`: by role, a chain of bone names from the body outwards. `twist`: by role, bones that share its twist."""
+    """`bones`: by role, a chain of bone names from the body outwards. `twist`: by role, bones that share its twist. `hung`: roles that the
+    rig has not, and of which it is only remembered how they turned."""
 
     bones: Map[str, tuple[str, ...]]
     twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
@@ -31,6 +32,7 @@ class RigMap:
     notes: tuple[str, ...] = ()
     origin: str = "names"
     steering: Steering | None = None  # of a rig whose mapped bones are controls
+    hung: frozenset[str] = frozenset()
 
     def first(self, role: str) -> str | None:
         """The bone at whose head the part begins."""

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Container, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -15,11 +15,14 @@ from . import feet
 from .contacts import Contacts, FeetSettings, find_contacts
 from .hands import hold_hands
 from .mapping import RigMap
+from .places import heads_of, hip_centre, loose_parts
 from .rest import with_person_like_rest
+from .restore import held_turns, lacking, restored, turned_by
 from .rig import Motion, Rig, channels, head_of
-from .roles import SEGMENTS, SIDES, parent_role, sided
+from .roles import SEGMENTS, SIDES, sided
 from .transfer import alignments, body_axes, follow, share_twist, turn
 from .turns import matrix_from_vector, unit
+from .unshown import STATES, Unshown
 
 SHORTEST_LIMB_M = 1e-4
 LYING = 0.3  # height of the head over the hips, per distance
@@ -40,7 +43,7 @@ class RetargetSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Retargeted:
-    """The target's motion, its pose channels, and how it came about."""
+    """The target's motion, with what it does not show of the source's; its pose channels, and how it came about."""
 
     motion: Motion
     basis: np.ndarray  # (T, B, 3, 3) pose channels
@@ -64,6 +67,7 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     """
     settings, feet_settings, monitor = settings or RetargetSettings(), feet_settings or FeetSettings(), monitor or Monitor()
     monitor.step("retargeting", 0, 4)
+    source, source_map, known = restored(source, source_map, feet_settings)
     source, rest_note = with_person_like_rest(source, source_map)
     for rig, rig_map, which in ((source.rig, source_map, "source"), (target, target_map, "target")):
         _check_lengths(rig, rig_map, which)
@@ -71,32 +75,49 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     if not aligned:
         raise InputError("Source and target have no part of the body in common; check the two mappings.")
     scale = settings.scale or leg_ratio(source.rig, source_map, target, target_map)
-    contacts = find_contacts(source, source_map, feet_settings, _leg_m(source.rig, source_map) or source.rig.height_m / 2)
+    contacts = known or find_contacts(source, source_map, feet_settings, _leg_m(source.rig, source_map) or source.rig.height_m / 2)
     legs = feet.find_legs(target, target_map, floor_m) if "hips" in aligned else {}
     if contacts is not None:
         aligned = aligned | _level(source, source_map, aligned, contacts)
-    turned = turn(source, source_map, target, target_map, aligned)
+    untwisted = turned = turn(source, source_map, target, target_map, aligned)
     monitor.step("retargeting", 1, 4)
     if settings.twist != "off":
         turned = share_twist(target, target_map, turned, lone_forearms=settings.twist == "forearms")
-    R, driven = turned.R, turned.driven
-    carrier = _carrier(target, target_map) if "hips" in aligned and settings.root != "still" else -1
+    free, driven = turned.R, turned.driven
+    travels, carrier = settings.root != "in place", _carrier(target, target_map) if "hips" in aligned and settings.root != "still" else -1
     monitor.step("retargeting", 2, 4)
-    R, shift = _grounded(source, source_map, target, target_map, R, driven, carrier, scale, legs, contacts, feet_settings, floor_m)
+    R, shift, moved_m = _grounded(source, source_map, target, target_map, free, driven, carrier, scale, legs, contacts, feet_settings,
+                                  floor_m)
+    unshown = Unshown(
+        frames=source.frames, held=held_turns(target, target_map, free, R), moved_m=moved_m if travels else moved_m * (0.0, 0.0, 1.0),
+        twisted=_twisted(target, target_map, untwisted.R, free) if settings.twist == "forearms" else {}, feet=asdict(feet_settings),
+        stands={state: getattr(contacts, state) if contacts is not None and legs else {} for state in STATES},
+        level_m=floor_m + _ankle_level(legs), chains=lacking(source, source_map, target, target_map, aligned, free))
     monitor.step("retargeting", 3, 4)
-    if settings.root == "in place" and carrier >= 0:
+    if not travels and carrier >= 0:
         shift = shift - (shift - shift[0]) * (1.0, 1.0, 0.0)
-    head = _heads(target, R, carrier, shift, target_map)
+    head = heads_of(target, R, carrier, shift, target_map)
     if settings.hands == "keep":
         held = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
         R = follow(target, hold_hands(source, source_map, held, target_map, scale), driven)
-        head = _heads(target, R, carrier, shift, target_map)
-    moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
-    notes = (*filter(None, [rest_note, lies(source, source_map)]), *_notes(source_map, target_map, aligned))
+        head = heads_of(target, R, carrier, shift, target_map)
+    moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head, unshown=unshown)
+    notes = (*source.notes, *filter(None, [rest_note, lies(source, source_map)]), *_notes(source_map, target_map, aligned))
     monitor.step("retargeting", 4, 4)
     loose = {b: head[:, b] - head_of(target, R, head, b) for b in loose_parts(target, target_map) if driven[b] and b != carrier}
     return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, loose_m=loose, driven=driven, scale=scale,
                       roles=tuple(aligned), contacts=contacts, notes=notes)
+
+
+def _twisted(target: Rig, target_map: RigMap, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
+    """By role how lone forearms were twisted, which cannot be read from them."""
+    return {role: turned_by(role, target, target_map, before, after) for role in (sided("forearm", side) for side in SIDES)
+            if len(target_map.bones.get(role, ())) == 1 and role not in target_map.twist}
+
+
+def _ankle_level(legs: Mapping[str, feet.Leg]) -> float:
+    """Height of the ankles over the soles in the rest pose."""
+    return float(np.mean([leg.ankle_m for leg in legs.values()])) if legs else 0.0
 
 
 def _notes(source_map: RigMap, target_map: RigMap, common: Container[str]) -> tuple[str, ...]:
@@ -163,43 +184,6 @@ def _carrier(target: Rig, target_map: RigMap) -> int:
     return bone
 
 
-def loose_parts(target: Rig, target_map: RigMap) -> dict[int, int]:
-    """Bones that do not hang on what they belong to in a body (as in control rigs), by index, and what that is: they must be carried."""
-    loose = {}
-    for role, chain in target_map.bones.items():
-        above = parent_role(role)
-        while above and above not in target_map.bones:
-            above = parent_role(above)
-        line = [*(target_map.bones[above][-1:] if above else ()), *chain]
-        for a, b in zip((target.index[name] for name in line), (target.index[name] for name in line[1:])):
-            if a not in target.ancestors(b) and not target.connected[b]:
-                loose[b] = a
-    return loose
-
-
-def _heads(target: Rig, R: np.ndarray, carrier: int, shift: np.ndarray, target_map: RigMap) -> np.ndarray:
-    """Heads (T, B, 3) of all bones, loose parts where the body has them."""
-    head, loose = np.empty(R.shape[:3]), loose_parts(target, target_map)
-    done: set[int] = set()
-
-    def place(b: int) -> None:
-        if b in done:
-            return
-        done.add(b)
-        a = loose.get(b, int(target.parents[b]))
-        if a >= 0:
-            place(a)
-            head[:, b] = head[:, a] + R[:, a] @ (target.R_rest[a].T @ (target.head_m[b] - target.head_m[a]))
-        else:
-            head[:, b] = target.head_m[b]
-        if b == carrier:
-            head[:, b] += shift
-
-    for b in range(len(target.names)):
-        place(b)
-    return head
-
-
 def _check_lengths(rig: Rig, rig_map: RigMap, which: str) -> None:
     for side in SIDES:
         for part, after in SEGMENTS:
@@ -209,37 +193,30 @@ def _check_lengths(rig: Rig, rig_map: RigMap, which: str) -> None:
                 raise InputError(f"The bone “{name}” of the {which} has no length; mend the rig's rest pose or map another bone.")
 
 
-def hip_centre(motion: Motion, rig_map: RigMap) -> np.ndarray:
-    """Between the heads of the thighs (T, 3), or the head of the hips."""
-    names = [rig_map.first(sided("thigh", side)) for side in SIDES]
-    known = [motion.head_m[:, motion.rig.index[name]] for name in names if name]
-    return np.mean(known, axis=0) if len(known) == 2 else motion.head_m[:, motion.rig.index[rig_map.bones["hips"][0]]]
-
-
 def _grounded(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, carrier: int,
               scale: float, legs: Mapping[str, feet.Leg], contacts: Contacts | None, settings: FeetSettings, floor_m: float
-              ) -> tuple[np.ndarray, np.ndarray]:
-    """R with feet on the floor and the carrier's shift (T, 3)."""
-    shift = np.zeros((len(R), 3))
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """R with feet on the floor, the carrier's shift (T, 3), and what of it is for the feet's standing (T, 3)."""
+    shift = unmoved = np.zeros((len(R), 3))
     if carrier < 0:
-        return R, shift
+        return R, shift, unmoved
     pinning = contacts is not None and settings.mode != "off" and bool(legs)
     if pinning and contacts is not None:
         R = follow(target, feet.lock_flat(R, legs, contacts, target, settings, source.fps), driven)
-    heads = _heads(target, R, carrier, shift, target_map)
+    heads = heads_of(target, R, carrier, shift, target_map)
     middle = hip_centre(Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=heads), target_map)
     path = _travel(source, source_map, target, target_map, contacts, scale, legs, floor_m)
     shift = path - middle
     if not pinning or contacts is None:
-        return R, shift
-    heads = _heads(target, R, carrier, shift, target_map)
+        return R, shift, unmoved
+    heads = heads_of(target, R, carrier, shift, target_map)
     stands = feet.find_stands(legs, contacts, target, R, floor_m)
     moved, tilt, places = feet.carry_root(
         stands, {side: heads[:, leg.foot[0]] for side, leg in legs.items()}, {s: heads[:, leg.thigh[0]] - path for s, leg in legs.items()},
         {side: feet.stiffness(leg, target, R) for side, leg in legs.items()}, source.fps, _leg_m(target, target_map))
     R, shift = _tilted(target, target_map, R, driven, carrier, shift, tilt, path + moved)
-    return _pinned(target, target_map, R, driven, _heads(target, R, carrier, shift, target_map), legs, stands, places, floor_m,
-                   settings.blend_s * source.fps), shift
+    return _pinned(target, target_map, R, driven, heads_of(target, R, carrier, shift, target_map), legs, stands, places, floor_m,
+                   settings.blend_s * source.fps), shift, moved
 
 
 def _tilted(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, carrier: int, shift: np.ndarray, tilt: np.ndarray,
@@ -249,7 +226,7 @@ def _tilted(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, 
     for name in target_map.bones["hips"]:
         R[:, target.index[name]] = matrix_from_vector(tilt) @ R[:, target.index[name]]
     R = follow(target, R, driven)
-    now = Motion(rig=target, fps=1.0, frames=np.arange(len(R)), R=R, head_m=_heads(target, R, carrier, shift, target_map))
+    now = Motion(rig=target, fps=1.0, frames=np.arange(len(R)), R=R, head_m=heads_of(target, R, carrier, shift, target_map))
     return R, shift + middle - hip_centre(now, target_map)
 
 
@@ -261,8 +238,7 @@ def _travel(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap,
         rest_s = source.rig.head_m[source.rig.index[source_map.bones["hips"][0]]]
         rest_t = target.head_m[target.index[target_map.bones["hips"][0]]]
         return rest_t + scale * (path - rest_s)
-    level = np.mean([target.head_m[leg.foot[0], 2] - leg.sole_m[:, 2].min() for leg in legs.values()])
-    return scale * (path - (0.0, 0.0, contacts.ankle_level_m)) + (0.0, 0.0, floor_m + level)
+    return scale * (path - (0.0, 0.0, contacts.ankle_level_m)) + (0.0, 0.0, floor_m + _ankle_level(legs))
 
 
 def _pinned(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, heads: np.ndarray, legs: Mapping[str, feet.Leg],
@@ -279,4 +255,4 @@ def _pinned(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, 
 
 def restarted(motion: Motion, first_frame: float) -> Motion:
     """The same motion, beginning at another frame."""
-    return replace(motion, frames=motion.frames - motion.frames[0] + first_frame)
+    return replace(motion, frames=motion.frames - motion.frames[0] + first_frame, unshown=None)

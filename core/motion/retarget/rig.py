@@ -17,6 +17,7 @@ import numpy as np
 from ...errors import InputError
 from ...values import frozen
 from .turns import transposed
+from .unshown import Unshown
 
 SHORTEST_BONE_M = 1e-6
 
@@ -93,13 +94,16 @@ class Rig:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Motion:
-    """A rig that moves: R (T, B, 3, 3) and heads (T, B, 3) [m] in the world, at frames (T,) of `fps` frames per second."""
+    """A rig that moves: R (T, B, 3, 3) and heads (T, B, 3) [m] in the world, at frames (T,) of `fps` frames per second. `unshown`: what is
+    known of the motion beyond what the rig can show, at the same frames; `notes`: sentences on where it comes from."""
 
     rig: Rig
     fps: float
     frames: np.ndarray  # (T,) frame numbers of the scene
     R: np.ndarray  # (T, B, 3, 3)
     head_m: np.ndarray  # (T, B, 3)
+    unshown: Unshown | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         t, n = len(self.frames), len(self.rig.names)

@@ -39,7 +39,7 @@ class Turned:
 def body_axes(rig: Rig, rig_map: RigMap) -> np.ndarray:
     """The body's left, back and up (columns, in the world) in the rest pose; the world's axes for a person who faces −Y."""
     def place(role: str) -> np.ndarray | None:
-        name = rig_map.first(role)
+        name = rig_map.first(role) if role not in rig_map.hung else None
         return rig.head_m[rig.index[name]] if name else None
 
     pairs = [(place(sided(part, "L")), place(sided(part, "R"))) for part in ("thigh", "upper_arm", "clavicle", "shin", "forearm")]
@@ -115,7 +115,7 @@ def turn(motion: Motion, source_map: RigMap, target: Rig, target_map: RigMap, al
     for role, A in aligned.items():
         nodes = _nodes(motion.rig, source_map, role, since_rest)
         chain = [target.index[name] for name in target_map.bones[role]]
-        fractions = _spread_over(nodes[0][1:], _fractions(target, chain)) if part_of(role) in SPREAD else np.ones(len(chain))
+        fractions = _spread_over(nodes[0][1:], fractions_of(target, chain)) if part_of(role) in SPREAD else np.ones(len(chain))
         for bone, fraction in zip(chain, fractions):
             wanted[bone] = _at(nodes, fraction) @ A @ target.R_rest[bone]
     _point(motion, source_map, target, target_map, wanted)
@@ -123,7 +123,11 @@ def turn(motion: Motion, source_map: RigMap, target: Rig, target_map: RigMap, al
     for bone, rotation in wanted.items():
         R[:, bone] = rotation
     driven = np.isin(np.arange(len(target.names)), list(wanted))
-    return Turned(R=follow(target, R, driven), driven=driven)
+    R = follow(target, R, driven)
+    for side in SIDES:  # toes that only the target has go with their foot, until they stand
+        if sided("foot", side) in aligned:
+            driven[[target.index[name] for name in target_map.bones.get(sided("toe", side), ())]] = True
+    return Turned(R=R, driven=driven)
 
 
 def kept(chain: Sequence[Any], role: str) -> Any:
@@ -140,10 +144,10 @@ def _nodes(rig: Rig, rig_map: RigMap, role: str, since_rest: np.ndarray) -> Node
     if part_of(role) not in SPREAD:
         return np.array([0.0, 1.0]), np.stack([since_rest[:, kept(chain, role)]] * 2)
     start = since_rest[:, rig.index[rig_map.bones[above][-1]]] if above else since_rest[:, chain[0]]
-    return np.concatenate([[0.0], _fractions(rig, chain)]), np.stack([start, *(since_rest[:, b] for b in chain)])
+    return np.concatenate([[0.0], fractions_of(rig, chain)]), np.stack([start, *(since_rest[:, b] for b in chain)])
 
 
-def _fractions(rig: Rig, chain: list[int]) -> np.ndarray:
+def fractions_of(rig: Rig, chain: list[int]) -> np.ndarray:
     """Where each bone of a chain ends, as a part (0…1] of its length."""
     ends = [rig.head_m[b] for b in chain[1:]] + [rig.tail_m[chain[-1]]]
     length = np.array([np.linalg.norm(end - rig.head_m[b]) for b, end in zip(chain, ends)])
@@ -155,12 +159,12 @@ def _fractions(rig: Rig, chain: list[int]) -> np.ndarray:
 def _spread_over(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Where on the source's chain each of the target's bones has its rotation from; both by where their bones end (0…1]."""
     if len(target) < len(source):
-        return source[_partners(target, source)]
-    partners = _partners(source, target)
+        return source[partners_of(target, source)]
+    partners = partners_of(source, target)
     return np.asarray(np.interp(target, np.concatenate([[0.0], target[partners]]), np.concatenate([[0.0], source])))
 
 
-def _partners(few: np.ndarray, many: np.ndarray) -> list[int]:
+def partners_of(few: np.ndarray, many: np.ndarray) -> list[int]:
     """Which of `many` rising numbers goes with each of `few`: the nearest, each once, in order; the last with the last."""
     partners: list[int] = []
     for i, place in enumerate(few):
