@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.body.fields import EXPONENTIAL, POTENTIALS
+from ..core.body.one_skin import DETAIL
 from ..core.errors import InputError
 from ..core.progress import Monitor
 
@@ -28,7 +29,8 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--preview", metavar="FILE.png", type=Path, help="also a picture: the body shaded, and over the footage")
     parser.add_argument("--turntable", metavar="FILE.mp4", type=Path, help="also a movie of a turn around the body")
     parser.add_argument("--frame", metavar="N", type=int, help="the frame of preview, turntable, implicit surface (default: middle)")
-    parser.add_argument("--detail", metavar="N", type=int, default=1, choices=range(1, 9), help="level of detail of the skin, 1 to 8")
+    parser.add_argument("--detail", metavar="N", type=int, default=DETAIL, choices=range(1, 9),
+                        help=f"level of detail of the skin, 1 to 8 (default {DETAIL})")
     parser.add_argument("--exact-skin", action="store_true", help="also the run's skin of every frame, as FILE.pc2 beside the .blend")
     parser.add_argument("--implicit", action="store_true", help="also the implicit surface itself in the middle frame, for checking")
     parser.add_argument("--field", choices=tuple(POTENTIALS), default=EXPONENTIAL.name,

@@ -15,7 +15,7 @@ import numpy as np
 from .account import median, new_account, track_figures
 from .body.model_file import read_model
 from .body.shape import write_body
-from .body.skin import SkinSettings, body_skin
+from .body.skin import SkinSettings, body_skin, shape_for_skin
 from .body_guide import BodyGuide
 from .checking.take_check import causes_of_failure, doubts, with_cause
 from .checking.timing import in_step
@@ -387,7 +387,7 @@ def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
     for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
         monitor.step("skin", i, len(body.motion.frames))
         try:
-            skin = body_skin(body.shape, values, run.settings["skin"])
+            skin = body_skin(shape_for_skin(body.shape, run.settings["skin"]), values, run.settings["skin"])
         except InputError as no_skin:
             run.warn(f"No skin was made: {no_skin}")
             run.results.remove("skin")

@@ -37,7 +37,7 @@ class BuildScene(JobOperator, bpy.types.Operator):
 
     rest_pose: bpy.props.EnumProperty(name="Rest Pose", items=[(pose, f"{pose}-pose", "") for pose in POSES],  # type: ignore[valid-type]
                                       description="In A-pose every channel is a number of motion.csv")
-    detail: bpy.props.IntProperty(name="Skin Detail", default=1, min=1, max=8,  # type: ignore[valid-type]
+    detail: bpy.props.IntProperty(name="Skin Detail", default=DEFAULTS.detail, min=1, max=8,  # type: ignore[valid-type]
                                   description="Pieces of each edge of the skin")
     exact_skin: bpy.props.BoolProperty(name="Exact Skin", default=False,  # type: ignore[valid-type]
                                        description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file")

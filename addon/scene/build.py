@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from ...core.body.fields import EXPONENTIAL, potential_named
+from ...core.body.one_skin import DETAIL
 from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
@@ -34,7 +35,7 @@ KEYS_KEY = "tricap_keys"  # and the keys of the stages that had been done (core/
 class SceneOptions:
     """What a user may want otherwise."""
 
-    detail: int = 1  # the skin's level of detail: pieces of each edge
+    detail: int = DETAIL  # the skin's level of detail: pieces of each edge
     exact_skin: bool = False  # also the skin of every frame, as the run found it: a mesh cache beside the .blend
     implicit: bool = False  # also the implicit surface itself, in the middle frame
     field: str = EXPONENTIAL.name  # of its balls, one of core.body.fields.POTENTIALS
@@ -285,7 +286,7 @@ def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: li
     flesh = metaballs.add_metaballs(collection, armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
-        found = contents.ready.skin if shape is measured_shape and options.detail == 1 else None
+        found = contents.ready.skin if shape is measured_shape and options.detail == DETAIL else None
         shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, found)
         if contents.skins is not None and blend is not None:
             shown = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))

@@ -14,7 +14,7 @@ import numpy as np
 from ...core import store
 from ...core.bar_file import read_bar
 from ...core.body.shape import BodyShape, read_body
-from ...core.body.skin_mesh import SkinSettings
+from ...core.body.skin import SkinSettings, shape_for_skin
 from ...core.errors import InputError
 from ...core.motion.ply import Ply, read_ply
 from ...core.motion.tables import MotionTable, read_motion
@@ -38,7 +38,7 @@ class FrameSkins:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Contents:
-    """The parts of OUT. `clouds` by frame; `trajectories` as in trajectories.npz; `motion` in radians and metres."""
+    """The parts of OUT. `shape` as its skin shows it, `clouds` by frame, `trajectories` as in their file; `motion`: radians, metres."""
 
     out: Path
     run: Mapping[str, Any]
@@ -88,8 +88,9 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     motion = _motion(out / "motion.csv", shape, warnings)
     monitor.step("reading results", 3, 3)
     settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
-    ready = find_ready(clouds, trajectories, shape, motion, settings, monitor)
-    return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=shape, motion=motion,
+    person = None if shape is None else shape_for_skin(shape, settings)
+    ready = find_ready(clouds, trajectories, person, motion, settings, monitor)
+    return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=person, motion=motion,
                    skin_settings=settings, ready=ready, skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
                    bar=_bar(footage, warnings), warnings=tuple(warnings))
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...core.body.one_skin import OneSkin, one_skin
+from ...core.body.one_skin import DETAIL, OneSkin, one_skin
 from ...core.body.shape import BodyShape
 from ...core.body.skin_mesh import SkinSettings
 from ...core.errors import InputError
@@ -78,7 +78,7 @@ def _of_tracks(segments: "_Segments", arrays: Mapping[str, np.ndarray]) -> np.nd
 
 def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> OneSkin | None:
     try:
-        return None if shape is None else one_skin(shape, settings)
+        return None if shape is None else one_skin(shape, settings, DETAIL)
     except InputError:
         return None
 

@@ -22,6 +22,7 @@ from .skin_weights import strongest
 from .welding import welded
 from .whole_surface import WholeSurface
 
+DETAIL = 2  # of a scene: at 32 rays the quads are 0.2 to 0.3 mm RMS from the surface, with 1 they are 0.7, being flat
 SEAM_RINGS = 4  # so many quads on either side of a seam are evened out
 EVENING_STEPS = 40
 UNTANGLING_STEPS = 30  # the first of them, which move vertices also across the surface

@@ -20,6 +20,8 @@ class SkinSettings:
     detail: int = knob(1, "Pieces of each mesh between contours and points, by B-spline patches; 1: the points alone.", low=1, high=16)
     patches: str = knob(INTERPOLATING, "B-spline patches go through the points, or approximate them and shrink a little.",
                         choices=(INTERPOLATING, APPROXIMATING))
+    anatomy: bool = knob(True, "Heads, hands and feet as people have them, with jaw, fingers, heel and toes, not the three balls that "
+                               "were fitted.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

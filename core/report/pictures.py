@@ -7,7 +7,7 @@ import numpy as np
 
 from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
-from ..body.skin import SkinSettings, body_skin
+from ..body.skin import SkinSettings, body_skin, shape_for_skin
 from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..surface.cloud import PointCloud
@@ -28,7 +28,7 @@ def body_over_footage(grey: np.ndarray, camera: Camera, shape: BodyShape, values
 
     `person_px` (V, 2): the outline of the person in the footage, drawn as well.
     """
-    skin = body_skin(shape, values, settings)
+    skin = body_skin(shape_for_skin(shape, settings), values, settings)
     picture = colour(grey).astype(np.float32)
     light, covered = shade(camera, skin.vertices_m, skin.triangles)
     alpha = (OPACITY * covered)[..., None]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from ..body.shape import BodyShape
-from ..body.skin import SkinSettings, body_skin
+from ..body.skin import SkinSettings, body_skin, shape_for_skin
 from ..errors import InputError
 from ..fitting.body_motion import BodyFit
 from ..geometry.camera import Camera
@@ -89,7 +89,7 @@ def by_view(fits: Sequence[SilhouetteFit]) -> dict[str, dict[str, float]]:
 def body_masks(cameras: Sequence[Camera], shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> list[np.ndarray]:
     """What each camera shows of a body (h, w), holes filled; nothing of a body without a skin."""
     try:
-        skin = body_skin(shape, values, settings)
+        skin = body_skin(shape_for_skin(shape, settings), values, settings)
     except InputError:
         return [np.zeros(camera.size_px[::-1], bool) for camera in cameras]
     masks = []

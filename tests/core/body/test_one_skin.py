@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
-from tricap.core.body.one_skin import OneSkin, one_skin
+from tricap.core.body.one_skin import DETAIL, OneSkin, one_skin
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import body_skin
 from tricap.core.body.skin_mesh import SkinSettings
@@ -50,6 +50,15 @@ def test_cut_finer_it_is_the_same_surface() -> None:
     assert len(skin.faces) == 4 * len(skin_of("upper_body").faces)
     off = WholeSurface(shape, np.zeros(len(shape.skeleton.dof_names))).distance_m(skin.vertices_m, skin.part)
     assert np.sqrt((off**2).mean()) < 0.3e-3
+
+
+def test_a_scenes_quads_are_near_the_surface() -> None:
+    """At 32 points a ring and a scene's own detail; 0.17 mm RMS, with half as many 0.7."""
+    shape, skin = default_shape(read_model("upper_body")), skin_of("upper_body", DETAIL)
+    corner = skin.vertices_m[skin.faces]
+    area = np.linalg.norm(face_normals(skin), axis=1)
+    off = WholeSurface(shape, np.zeros(len(shape.skeleton.dof_names))).distance_m(corner.mean(axis=1), skin.part[skin.faces[:, 0]])
+    assert np.sqrt((area * off**2).sum() / area.sum()) < 0.3e-3
 
 
 def test_both_sides_are_mirror_images() -> None:
