@@ -98,7 +98,7 @@ def apply(armature_object: bpy.types.Object, source: Motion, source_map: RigMap,
     for action in filter(None, [written.action, written.raw]):
         if result.motion.unshown is not None:
             remember(action, result.motion.unshown)
-    figures = measure(source, source_map, result.motion, target.rig_map, result.contacts, target.floor_m)
+    figures = measure(source, source_map, result.travelling, target.rig_map, result.contacts, target.floor_m)
     notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source_map.missing]
     if written.muted:
         notes.append(f"{len(written.muted)} constraints on driven bones were muted: {', '.join(written.muted[:3])} …")

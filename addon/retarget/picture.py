@@ -17,25 +17,35 @@ from ...core.motion.retarget.transfer import body_axes
 COLUMNS = 8
 CELL_PX = (190, 270)
 MOST_POINTS = 15000
+ROOM = 1.3  # for heads and titles above the highest joint
+APART = 0.2  # of a line's length: gaps between its bones
 PAPER, INK, LEFT, RIGHT, SKIN, FLOOR = (255, 255, 255), (60, 60, 60), (40, 90, 220), (210, 120, 30), (185, 185, 185), (160, 160, 160)
 
 
 def draw(path: Path, source: Motion, source_map: RigMap, target: bpy.types.Object, motion: Motion, target_map: RigMap) -> None:
-    """Write a PNG: a row of frames of the source, below it the target, obliquely from the front; left limbs are red, right ones blue.
+    """Write a PNG: a row of frames of the source, below it the target, obliquely from the front, with frame numbers; left limbs are red,
+    right ones blue.
 
     Raises:
         InputError: the file cannot be written.
     """
     some = np.unique(np.linspace(0, len(motion.frames) - 1, COLUMNS).round().astype(int))
     rows = []
-    for moved, rig_map, skinned in ((source, source_map, None), (motion, target_map, target)):
-        size = max(float(np.percentile(np.ptp(moved.head_m[..., 2], axis=1), 90)) * 1.35, 1e-3)
+    for moved, rig_map, skinned, title in ((source, source_map, None, "source"), (motion, target_map, target, "target")):
+        size = max(float(moved.head_m[some, :, 2].max() - min(moved.head_m[..., 2].min(), 0.0)) * ROOM, 1e-3)
         view = _view(moved, rig_map)
-        rows.append(np.concatenate([_cell(moved, rig_map, int(i), size, view, skinned) for i in some], axis=1))
+        cells = [_cell(moved, rig_map, int(i), size, view, skinned) for i in some]
+        for k, (i, cell) in enumerate(zip(some, cells)):
+            _write(cell, (8, 18), f"{title}, frame {moved.frames[i]:g}" if k == 0 else f"{moved.frames[i]:g}")
+        rows.append(np.concatenate(cells, axis=1))
     done, data = cv2.imencode(".png", np.concatenate(rows, axis=0))
     if not done:
         raise InputError(f"The picture {path} could not be made; leave --report out.")
     store.write_bytes(path, data.tobytes())
+
+
+def _write(image: np.ndarray, place: tuple[int, int], words: str) -> None:
+    cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, INK, 1, cv2.LINE_AA)
 
 
 def _view(motion: Motion, rig_map: RigMap) -> np.ndarray:
@@ -68,9 +78,21 @@ def _cell(motion: Motion, rig_map: RigMap, i: int, size: float, view: np.ndarray
             if 0 <= x < CELL_PX[0] and 0 <= y < CELL_PX[1]:
                 image[y, x] = SKIN
     for line, colour in _lines(rig_map):
-        places = pixel(np.array([head[motion.rig.index[name]] for name in line])).round().astype(np.int32)
+        ends = [head[motion.rig.index[name]] for name in line]
+        places = pixel(np.array([*ends, *_tip(motion, i, line)])).round().astype(np.int32)
         cv2.polylines(image, [places.reshape(-1, 1, 2)], False, colour, 2, cv2.LINE_AA)
     return image
+
+
+def _tip(motion: Motion, i: int, line: list[str]) -> list[np.ndarray]:
+    """Where the last bone of a line ends, of a rig whose bones end where the next ones begin; other ends tell nothing."""
+    rig, bones = motion.rig, [motion.rig.index[name] for name in line]
+    gaps = np.linalg.norm(rig.tail_m[bones[1:-1]] - rig.head_m[bones[2:]], axis=1)
+    steps = np.linalg.norm(rig.head_m[bones[2:]] - rig.head_m[bones[1:-1]], axis=1)
+    last = bones[-1]
+    if gaps.sum() > APART * steps.sum():
+        return []
+    return [motion.head_m[i, last] + motion.R[i, last] @ (rig.R_rest[last].T @ (rig.tail_m[last] - rig.head_m[last]))]
 
 
 def _lines(rig_map: RigMap) -> list[tuple[list[str], tuple[int, int, int]]]:

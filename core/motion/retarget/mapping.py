@@ -18,6 +18,7 @@ from .rig import Rig
 from .roles import ARM, FINGERS, LEG, ROLES, SIDES, sided
 from .steering import Steering
 
+FITS = 0.9  # a family's names are taken if a rig has more than this part of them
 NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm", "forearm", "thigh", "shin")))
 
 
@@ -135,10 +136,18 @@ def apply_preset(rig: Rig, preset: Preset) -> RigMap:
                   origin=f"mapping “{preset.name}”", steering=preset.steering)
 
 
-def fit_of(rig: Rig, preset: Preset) -> float:
-    """How much of a preset (0…1) a rig has under exactly these names."""
+def fit_of(rig: Rig, preset: Preset) -> tuple[float, int]:
+    """How much of a preset (0…1) a rig has under exactly these names, and how many bones that are."""
     names = [name for chain in preset.bones.values() for name in chain]
-    return max(sum(prefix + name in rig.index for name in names) for prefix in preset.prefixes) / max(len(names), 1)
+    count = max(sum(prefix + name in rig.index for name in names) for prefix in preset.prefixes)
+    return count / max(len(names), 1), count
+
+
+def _family(rig: Rig, presets: Sequence[Preset]) -> Preset | None:
+    """The preset that fits: of several the one that steers the rig, then the one that says most of it (a mannequin of five spine bones also
+    has the three of its forerunner)."""
+    fitting = [preset for preset in presets if fit_of(rig, preset)[0] > FITS]
+    return max(fitting, key=lambda preset: (preset.steering is not None, fit_of(rig, preset)[1]), default=None)
 
 
 def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
@@ -149,8 +158,8 @@ def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
     """
     from .shape import by_shape
 
-    best = max(presets, key=lambda preset: fit_of(rig, preset), default=None)
-    if best is not None and fit_of(rig, best) > 0.9:
+    best = _family(rig, presets)
+    if best is not None:
         found = apply_preset(rig, best)
         return found if found.steering is not None else _completed(rig, found)
     named = by_names(rig)
@@ -296,7 +305,7 @@ def _central_end(rig: Rig, top: int, arms: Sequence[int], necks: Sequence[int]) 
 
 
 def _completed(rig: Rig, found: RigMap) -> RigMap:
-    """Add limbs' in-between bones and twist bones, and list what is missing."""
+    """Add the in-between bones of limbs and trunk, and twist bones, and list what is missing."""
     bones, twist = dict(found.bones), dict(found.twist)
     used = {name for chain in bones.values() for name in chain} | {name for names in twist.values() for name in names}
     for side in SIDES:
@@ -312,9 +321,21 @@ def _completed(rig: Rig, found: RigMap) -> RigMap:
             beside = [n for b, n in enumerate(rig.names) if n not in used and n not in bones[role] and rig.parents[b] in line_bones
                       and read_name(n).twist and not rig.children[b]]
             if beside:
-                twist.setdefault(role, tuple(beside))
+                twist[role] = (*twist.get(role, ()), *beside)
+    bones |= _up_to_the_head(rig, bones)
     known = {name for chain in bones.values() for name in chain}
     missing = found.missing + tuple(f"{role}: no bone was recognised" for role in NEEDED if role not in bones and not any(
         text.startswith(role) for text in found.missing))
     return RigMap(bones={role: bones[role] for role in ROLES if role in bones}, twist=twist, missing=missing, notes=found.notes + (
         (f"{len(rig.names) - len(known)} other bones follow their parents",) if len(rig.names) > len(known) else ()), origin=found.origin)
+
+
+def _up_to_the_head(rig: Rig, bones: Map[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Spine and neck with the bones that follow up to the arms and the head, where a family's names stop earlier."""
+    longer = {}
+    arms = [bones[role][0] for part in ("clavicle", "upper_arm") for role in (sided(part, "L"), sided(part, "R")) if role in bones]
+    for role, ends in (("spine", [*arms[:2], *bones.get("neck", bones.get("head", ()))[:1]]), ("neck", bones.get("head", ()))):
+        if role in bones and ends:
+            lines = [rig.path(rig.index[bones[role][-1]], rig.index[end])[1:-1] for end in ends]
+            longer[role] = (*bones[role], *(rig.names[b] for b in lines[0] if all(b in line for line in lines)))
+    return longer

@@ -17,6 +17,7 @@ NOISE = set("""j bip bip01 b bn sk c cc base def org jnt joint bone bones mixamo
 STEERING = set("""ik pole control ctrl target end nub tip slot socket heel goal helper mch vis tweak gizmo prop weapon attach site lock
     parent master widget roll pivot offset handle look aim fk2 leaf eff effector secondary
     hair skirt cloth breast bust eye jaw tongue""".split())
+ENDS = {"end", "nub", "tip", "leaf", "site", "eff", "effector"}  # bones that only tell where the one before ends
 TWIST = {"twist", "twst", "roll"}
 
 SURE = {
@@ -77,6 +78,11 @@ def read_name(name: str) -> Reading:
     if not side and part not in ("", "hips", "spine", "neck", "head"):
         part = ""
     return Reading(side=side, part=part, perhaps=perhaps if side else (), twist=twist)
+
+
+def marks_an_end(name: str) -> bool:
+    """Whether a bone's name says that it only tells where another one ends ("head_end", "HeadTop_End", "Bip01 HeadNub")."""
+    return bool(ENDS & {word.lower() for word in WORD.findall(name)})
 
 
 def _without_prefix(name: str) -> str:

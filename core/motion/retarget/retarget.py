@@ -55,6 +55,12 @@ class Retargeted:
     roles: tuple[str, ...]
     contacts: Contacts | None
     notes: tuple[str, ...]
+    kept_back_m: np.ndarray  # (T, 3) of the body's path, when it moves on the spot
+
+    @property
+    def travelling(self) -> Motion:
+        """The target's motion as it would go through the room."""
+        return replace(self.motion, head_m=self.motion.head_m + self.kept_back_m[:, None])
 
 
 def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, settings: RetargetSettings | None = None,
@@ -94,8 +100,8 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
         stands={state: getattr(contacts, state) if contacts is not None and legs else {} for state in STATES},
         level_m=floor_m + _ankle_level(legs), chains=lacking(source, source_map, target, target_map, aligned, free))
     monitor.step("retargeting", 3, 4)
-    if not travels and carrier >= 0:
-        shift = shift - (shift - shift[0]) * (1.0, 1.0, 0.0)
+    kept_back_m = (shift - shift[0]) * (0.0 if travels else 1.0, 0.0 if travels else 1.0, 0.0)
+    shift = shift - kept_back_m
     head = heads_of(target, R, carrier, shift, target_map)
     if settings.hands == "keep":
         held = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
@@ -106,7 +112,7 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     monitor.step("retargeting", 4, 4)
     loose = {b: head[:, b] - head_of(target, R, head, b) for b in loose_parts(target, target_map) if driven[b] and b != carrier}
     return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, loose_m=loose, driven=driven, scale=scale,
-                      roles=tuple(aligned), contacts=contacts, notes=notes)
+                      roles=tuple(aligned), contacts=contacts, notes=notes, kept_back_m=kept_back_m)
 
 
 def _twisted(target: Rig, target_map: RigMap, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:

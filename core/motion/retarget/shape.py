@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .mapping import RigMap, _completed
+from .names import marks_an_end
 from .rig import Rig
 from .roles import sided
 
@@ -70,12 +71,17 @@ def _pairs(rig: Rig) -> list[tuple[_Branch, _Branch]]:
 def _branch(rig: Rig, start: int) -> _Branch:
     """The longest line from `start` outwards; among fingers the one in the middle does as well as another."""
     best = _Branch(line=(start,), length_m=float(np.linalg.norm(rig.tail_m[start] - rig.head_m[start])))
-    for child in rig.children[start]:
+    for child in _parts_of_it(rig, start):
         tail = _branch(rig, child)
         length = tail.length_m + float(np.linalg.norm(rig.head_m[child] - rig.head_m[start]))
         if length > best.length_m or len(best.line) == 1:
             best = _Branch(line=(start, *tail.line), length_m=length)
     return best
+
+
+def _parts_of_it(rig: Rig, bone: int) -> list[int]:
+    """The children of a bone, but not those that only tell where it ends."""
+    return [child for child in rig.children[bone] if rig.children[child] or not marks_an_end(rig.names[child])]
 
 
 def _end(rig: Rig, branch: _Branch) -> np.ndarray:
@@ -135,7 +141,7 @@ def _upwards(rig: Rig, chest: int, taken: set[int]) -> list[int]:
     line: list[int] = []
     bone = chest
     while True:
-        ahead = [c for c in rig.children[bone] if c not in taken and rig.head_m[c][2] >= rig.head_m[bone][2] - 1e-6
+        ahead = [c for c in _parts_of_it(rig, bone) if c not in taken and rig.head_m[c][2] >= rig.head_m[bone][2] - 1e-6
                  and np.linalg.norm((rig.head_m[c] - rig.head_m[chest])[:2]) < 0.06 * rig.height_m]
         if not ahead or len(line) > 6:
             return line

@@ -222,6 +222,7 @@ def share_twist(target: Rig, target_map: RigMap, turned: Turned, *, lone_forearm
             chain = [target.index[name] for name in target_map.bones.get(role, ())]
             beside = [target.index[name] for name in target_map.twist.get(role, ()) if target.parents[target.index[name]] in chain]
             d = direction(target, target_map, role)
+            beside.sort(key=lambda b: float((target.head_m[b] - target.head_m[chain[0]]) @ (d if d is not None else np.zeros(3))))
             if d is None or not driven[chain[0]] or (after and (end is None or not driven[target.index[end]])):
                 continue
             twist = _twist(target, turned.R, chain[0], d, target.index[end] if end else None)

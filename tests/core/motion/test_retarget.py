@@ -183,6 +183,19 @@ def test_twist_is_shared_and_moves_no_joint() -> None:
     assert np.degrees(angle_of(transposed(shared.R[:, b]) @ plain.R[:, b])).max() > 5.0
 
 
+def test_twist_bones_take_their_share_by_place_not_by_name() -> None:
+    """On Unreal's mannequin the first one is next to the wrist."""
+    rig, b = person(), person().index["forearm.L"]
+    places = rig.head_m[b] + np.array([[0.8], [0.4]]) * (rig.tail_m[b] - rig.head_m[b])
+    more = Rig(names=(*rig.names, "forearm_twist_01.L", "forearm_twist_02.L"), parents=np.array([*rig.parents, b, b]),
+               R_rest=np.concatenate([rig.R_rest, rig.R_rest[[b, b]]]), head_m=np.concatenate([rig.head_m, places]),
+               tail_m=np.concatenate([rig.tail_m, places + 0.02]), connected=np.zeros(len(rig.names) + 2, dtype=bool),
+               inherits_rotation=np.ones(len(rig.names) + 2, dtype=bool))
+    R = retarget(flail(person(), frames=12), find_map(person()), more, find_map(more), feet_settings=OFF).motion.R
+    outer, inner = (angle_of(transposed(R[:, b]) @ R[:, k]).max() for k in (-2, -1))
+    assert outer > 1.5 * inner > 0.01
+
+
 def test_feet_that_stand_stay_on_legs_of_other_proportions() -> None:
     source, target = squat(person()), person(thigh_part=0.58, size=0.8, roll_seed=6)
     maps = find_map(source.rig), find_map(target)
@@ -225,6 +238,7 @@ def test_root_modes() -> None:
     went = travel.motion.head_m[:, 0] - travel.motion.head_m[0, 0]
     np.testing.assert_allclose(went[-1], 2.0 * (source.head_m[-1, 0] - source.head_m[0, 0]), atol=1e-6)
     np.testing.assert_allclose(np.ptp(spot.motion.head_m[:, 0, :2], axis=0), 0.0, atol=1e-9)
+    np.testing.assert_allclose(spot.travelling.head_m, travel.motion.head_m, atol=1e-9)  # where feet are measured
     np.testing.assert_allclose(still.motion.head_m[:, 0], np.broadcast_to(target.head_m[0], went.shape))
 
 

@@ -1,16 +1,20 @@
 """Recognition of rigs by names, by shape, and by presets."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tricap.core.errors import InputError
-from tricap.core.motion.retarget.mapping import NEEDED, apply_preset, by_names, find_map, fit_of, read_preset, write_map
+from tricap.core.motion.retarget.mapping import NEEDED, _family, apply_preset, by_names, find_map, fit_of, read_preset, write_map
 from tricap.core.motion.retarget.names import read_name
+from tricap.core.motion.retarget.rig import Rig
 from tricap.core.motion.retarget.roles import ROLES, parent_role, part_of, side_of, sided
 from tricap.core.motion.retarget.shape import by_shape
 
 from .persons import person
+from .test_retarget import in_three
 
 PRESETS = sorted((Path(__file__).resolve().parents[3] / "addon" / "presets").glob("*.json"))
 BODY = tuple(role for role in ROLES if "." not in part_of(role))
@@ -79,7 +83,32 @@ def test_presets_read_write_and_fit_their_own(tmp_path: Path) -> None:
     found = by_names(rig)
     write_map(tmp_path / "mine.json", found, "mine")
     again = apply_preset(rig, read_preset(tmp_path / "mine.json"))
-    assert again.bones == found.bones and fit_of(rig, read_preset(tmp_path / "mine.json")) == 1.0
+    assert again.bones == found.bones and fit_of(rig, read_preset(tmp_path / "mine.json"))[0] == 1.0
+
+
+def test_of_several_families_the_one_that_says_most(tmp_path: Path) -> None:
+    """A mannequin of five spine bones has all names of the one of three, too; a trunk goes on to the arms if a family's stops earlier."""
+    presets = [read_preset(path) for path in sorted(PRESETS)]
+    older, newer = (next(p for p in presets if mark in p.name) for mark in ("UE4", "UE5"))
+    bones = {name: i for i, name in enumerate(name for chain in newer.bones.values() for name in chain)}
+    assert _family(SimpleNamespace(index=bones), presets) is newer  # type: ignore[arg-type]
+    del bones["spine_05"], bones["spine_04"], bones["neck_02"]
+    assert _family(SimpleNamespace(index=bones), presets) is older  # type: ignore[arg-type]
+    write_map(tmp_path / "one.json", by_names(person()), "of one spine bone")
+    assert find_map(in_three(person(), 0.3, 0.6), [read_preset(tmp_path / "one.json")]).bones["spine"] == ("spine", "spine_2", "spine_3")
+
+
+def test_bones_that_mark_an_end_are_no_parts() -> None:
+    """Files from Blender's own FBX exporter end every limb with one."""
+    names = {role: f"joint{i * 7 % 31}" for i, role in enumerate(person().names)}
+    rig = person(names=names, without=("neck", "toe"))
+    ends = [b for b in range(len(rig.names)) if not rig.children[b]]
+    n = len(rig.names) + len(ends)
+    longer = Rig(names=(*rig.names, *(f"{rig.names[b]}_end" for b in ends)), parents=np.array([*rig.parents, *ends]),
+                 R_rest=np.concatenate([rig.R_rest, rig.R_rest[ends]]), head_m=np.concatenate([rig.head_m, rig.tail_m[ends]]),
+                 tail_m=np.concatenate([rig.tail_m, 2 * rig.tail_m[ends] - rig.head_m[ends]]),
+                 connected=np.zeros(n, dtype=bool), inherits_rotation=np.ones(n, dtype=bool))
+    assert find_map(longer).bones == find_map(rig).bones and find_map(rig).origin == "shape"
 
 
 @pytest.mark.parametrize(("text", "word"), [
