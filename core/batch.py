@@ -98,7 +98,7 @@ def run_take(take: str, out: str, overrides: pipeline.Overrides, restart: bool) 
         with pipeline.open_run(Path(take), Path(out), overrides, restart=restart) as job:
             pipeline.all_stages(job, Monitor(_reporter(take)))
             _scene(job)
-        status, said = DONE, str(job)
+        status, said = DONE, _told(job)
     except InputError as error:
         status, said = MEND, str(error)
     except Exception as error:  # the edge of the worker: whatever happens is told in the summary
@@ -106,6 +106,13 @@ def run_take(take: str, out: str, overrides: pipeline.Overrides, restart: bool) 
         store.write_text(path, traceback.format_exc())
         status, said = BUG, f"Tricap made a mistake ({type(error).__name__}); please report it with {path}."
     return asdict(Outcome(take=take, out=out, status=status, said=said, seconds=round(time.perf_counter() - began, 1)))
+
+
+def _told(job: pipeline.Run) -> str:
+    """The run in a line, with what is doubtful about it: the first doubt, and how many more the report has."""
+    doubts = job.account["warnings"]
+    more = f" ({len(doubts) - 1} more in the report)" if len(doubts) > 1 else ""
+    return f"{job}. Doubtful: {doubts[0]}{more}" if doubts else str(job)
 
 
 def _scene(job: pipeline.Run) -> None:

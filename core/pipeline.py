@@ -17,6 +17,7 @@ from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin, shape_for_skin
 from .body_guide import BodyGuide
+from .checking.body_check import odd_limbs
 from .checking.take_check import causes_of_failure, doubts, with_cause
 from .checking.timing import in_step
 from .clicked_points import clicked_depth
@@ -94,10 +95,9 @@ class Run:
         """A cloud without what the user took out."""
         return corrected_cloud(cloud, self.footage.take.corrections, self.footage.rig)
 
-    def warn(self, sentence: str) -> None:
-        """Note something that the user should know."""
-        if sentence not in self.account["warnings"]:
-            self.account["warnings"].append(sentence)
+    def warn(self, *sentences: str) -> None:
+        """Note what the user should know."""
+        self.account["warnings"].extend(s for s in dict.fromkeys(sentences) if s not in self.account["warnings"])
 
     def finish_stage(self, stage: str, began: float, **figures: Any) -> None:
         """Note what a stage took and found, and write run.json."""
@@ -218,8 +218,7 @@ def measure(run: Run, monitor: Monitor) -> None:
     notes = tuple(sorted(done, key=lambda n: n.frame))
     run.measured = MeasuredFrames(footage=run.footage, results=run.results, notes=notes)
     residual = median([n.residual_px for n in notes])
-    for sentence in doubts(run.footage, [n.frame for n in notes], [n.points for n in notes], [n.residual_px for n in notes], monitor):
-        run.warn(sentence)
+    run.warn(*doubts(run.footage, [n.frame for n in notes], [n.points for n in notes], [n.residual_px for n in notes], monitor))
     run.finish_stage(
         "measure",
         began,
@@ -271,8 +270,7 @@ def _follow(run: Run, monitor: Monitor, guide: Guide | None = None) -> dict[str,
     run.trajectories = filtered.kept
     run.results.write_trajectories(filtered, take.fps)
     figures, warnings = track_figures(filtered.kept, reasons)
-    for sentence in (*missed_clicks(take.corrections, hit), *warnings):
-        run.warn(sentence)
+    run.warn(*(*missed_clicks(take.corrections, hit), *warnings))
     return figures
 
 
@@ -292,8 +290,7 @@ def fit(run: Run, monitor: Monitor) -> None:
     began = time.perf_counter()
     run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
     missing = missing_for_fit(run.footage)
-    for sentence in clicks_left_out(run.footage):
-        run.warn(sentence)
+    run.warn(*clicks_left_out(run.footage))
     if missing:
         run.warn(f"No body was fitted: take.toml has {missing}.")
         run.finish_stage("fit", began, not_done=missing)
@@ -334,6 +331,7 @@ def _told_states(run: Run, body: BodyFit) -> dict[str, int]:
     doubtful = ", ".join(f"{n} {word}" for word, n in states.items() if word != "fitted")
     if doubtful:
         run.warn(f"Frames in which the body rests partly on prediction: {doubtful}.")
+    run.warn(*odd_limbs(body.shape))
     if not body.converged:
         run.warn(f"The body has not settled after {body.iterations} steps: look at the pictures, and raise fitting.sequence_steps.")
     return states

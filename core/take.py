@@ -170,12 +170,12 @@ def read_take(folder: Path) -> Take:
     folder = Path(folder)
     path = folder / "take.toml" if folder.name != "take.toml" else folder
     try:
-        return take_of_text(path.read_text(encoding="utf-8"), path)
+        return take_of_text(path.read_text(encoding="utf-8-sig"), path)
     except OSError as error:
         said = f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
         raise InputError(said) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a TOML file: {error}.") from error
+        raise InputError(f"{path} is not a text in UTF-8 ({error}); save it as UTF-8 (in Notepad under “Encoding”).") from error
 
 
 def take_of_text(text: str, path: Path) -> Take:
@@ -187,7 +187,7 @@ def take_of_text(text: str, path: Path) -> Take:
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a TOML file: {error}.") from error
+        raise InputError(f"{path} is not a TOML file: {error}; mend that place.") from error
     return _take(table, path.parent.resolve(), str(path))
 
 

@@ -14,17 +14,18 @@ from .clicks import seed_findings
 from .findings import Checked, Finding, doubtful, wrong
 from .rig_check import geometry_findings
 from .rig_fit import ENOUGH, rig_findings, same_views, share, stale_finding
-from .survey import picture_findings, rate_findings, survey
+from .survey import frozen, picture_findings, rate_findings, survey
 from .texture import texture_findings
 from .timing import Film, Offset, estimate_offsets
 from .view_matches import match_views
 
 DOUBTFUL_RESIDUAL_PX = 1.0
+FROZEN_FRAMES = 3
 FEWEST_BESIDE = 4  # frames on either side of a step
 STEP, STEP_PX = 2.0, 0.05  # sound takes: medians of two parts differ by a twelfth at most
 SMALL = 0.05  # frames: not worth an interpolation
 SPARE = 0.25  # frames: an offset beyond it spoils a measurement
-UNUSABLE = ("blank view", "identical views", "swapped views", "foreign rig", "no texture")  # after them, timing says nothing
+UNUSABLE = ("blank view", "frozen view", "identical views", "swapped views", "foreign rig", "no texture")  # after them, timing says nothing
 
 
 def check_take(folder: Path, monitor: Monitor) -> Checked:
@@ -125,14 +126,26 @@ def sudden_step(frames: list[int], miss_px: np.ndarray) -> list[str]:
 
 
 def first_look(footage: Footage, frame: int) -> list[Finding]:
-    """Views that are identical or swapped, or a rig of another recording, from one frame: a second's work in every run.
+    """Views that are identical, swapped or frozen, or a rig of another recording, from the first frames: a second's work in every run.
 
     Raises:
         InputError: an image cannot be read.
     """
     names, rows = tuple(v.name for v in footage.take.views), footage.take.rows_at(frame)
-    pairs = match_views([[rows.rows(image) for image in footage.read(frame)]], rows)
-    return same_views(pairs, names) or rig_findings(pairs, footage.rig.cameras, names)
+    pictures = footage.read(frame)
+    still = still_views(footage, frame, pictures)
+    pairs = match_views([[rows.rows(image) for image in pictures]], rows)
+    return same_views(pairs, names) or [*(frozen(name) for name in still), *rig_findings(pairs, footage.rig.cameras, names)]
+
+
+def still_views(footage: Footage, frame: int, pictures: list[np.ndarray]) -> list[str]:
+    """Views of which a few frames after `frame` have its very picture, noise and all, while those of another view differ."""
+    names, step = [v.name for v in footage.take.views], footage.take.instants.per_image
+    after = [f for f in (frame + n * step for n in range(1, FROZEN_FRAMES)) if f in footage.frames]
+    same = np.ones(len(names), dtype=bool)
+    for f in after:
+        same &= [np.array_equal(a, b) for a, b in zip(pictures, footage.read(f))]
+    return [name for name, stood in zip(names, same) if stood] if len(after) == FROZEN_FRAMES - 1 and not same.all() else []
 
 
 def with_cause(error: InputError, footage: Footage, frame: int) -> InputError:

@@ -63,7 +63,8 @@ def enough(xyz_m: np.ndarray, joint_names: Sequence[str], observations: Sequence
     located = [name for name, place in zip(joint_names, xyz_m) if np.isfinite(place).all()]
     if len(located) < 2:
         raise InputError(f"The body needs at least two of the joints {', '.join(joint_names)} clicked in two views each, "
-                         f"but has {', '.join(located) or 'none'}; click more of them under [seeds.joints].")
+                         f"but has {', '.join(located) or 'none'}; click more of them under [seeds.joints], or choose the model under "
+                         "[body] that has those that you clicked.")
     return Clicks(observations=tuple(observations), xyz_m=xyz_m)
 
 

@@ -48,7 +48,7 @@ def read_rig(path: Path) -> Rig:
         InputError: the file is missing, is no TOML, or a camera in it is incomplete or impossible.
     """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"Cannot read the rig {path}: {error.strerror or error}. Calibrate first, or mend `rig` in take.toml.") from error
     except (ValueError, RecursionError) as error:

@@ -192,7 +192,7 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
             raise InputError(f"The movie {path} of view {view} is missing; mend `movie` in take.toml.")
         return Movie(path)
     try:
-        paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS), key=natural))
+        paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS and p.name[0] != "."), key=natural))
     except (ValueError, IndexError, NotImplementedError):  # what pathlib raises for a pattern that is none
         paths = ()
     if not paths:
@@ -274,6 +274,11 @@ def _first_bytes(path: Path, what: str) -> bytes:
     try:
         with open(path, "rb") as file:
             return file.read(8)
+    except FileNotFoundError as error:
+        if path.is_symlink():
+            where = f"leads to {path.readlink()}, which is not there; is its drive connected?"
+            raise InputError(f"The {what} {path} is a link that {where}") from error
+        raise InputError(f"The {what} {path} is gone; put it back.") from error
     except OSError as error:
         raise InputError(f"Cannot read the {what} {path}: {error.strerror or error}.") from error
 
@@ -282,6 +287,8 @@ def _check_signature(path: Path) -> None:
     """What is no image by its first bytes is told before anything is computed, not when its turn comes."""
     first = _first_bytes(path, "image")
     _refuse_open_exr(first, path)
+    if first.startswith(b"version "):
+        raise InputError(f"{path} is a placeholder that Git LFS left for the image; fetch the images themselves with `git lfs pull`.")
     if not first.startswith(SIGNATURES):
         raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
 

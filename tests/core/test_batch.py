@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -104,6 +104,13 @@ def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: py
     assert told["status"] == DONE and "4 frames" in told["said"] and (tmp_path / "out" / "report" / "report.html").exists()
     (tmp_path / "file").write_text("")
     assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == MEND
+
+
+def test_what_is_doubtful_stands_in_the_summary() -> None:
+    job = SimpleNamespace(account={"warnings": []}, __str__=lambda: "")
+    assert batch._told(job) == str(job)
+    job.account["warnings"] = ["View R stood still.", "Another.", "A third."]
+    assert batch._told(job).endswith(". Doubtful: View R stood still. (2 more in the report)")
 
 
 def test_without_dask(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture) -> None:

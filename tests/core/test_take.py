@@ -182,8 +182,16 @@ def test_folders_that_are_no_take(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="is not a take: cannot read take.toml in it .* Make one with `tricap new`"):
             read_take(folder)
     (tmp_path / "take.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match="is not a TOML file"):
+    with pytest.raises(InputError, match="is not a text in UTF-8 .* save it as UTF-8"):
         read_take(tmp_path)
+
+
+def test_files_that_an_editor_saved_with_a_byte_order_mark(footage: Path) -> None:
+    sound = open_take(read_take(footage))
+    for name in ("take.toml", "rig.toml"):
+        (footage / name).write_bytes(b"\xef\xbb\xbf" + (footage / name).read_bytes().replace(b"\n", b"\r\n"))
+    marked = open_take(read_take(footage))
+    assert marked.take.views == sound.take.views and [c.name for c in marked.rig.cameras] == [c.name for c in sound.rig.cameras]
 
 
 def test_an_opened_take_has_its_cameras_in_the_order_of_its_views(footage: Path) -> None:

@@ -118,6 +118,12 @@ def repeated(take: Path) -> None:
         shutil.copy(files[i - 1], files[i])
 
 
+def frozen(take: Path) -> None:
+    first, *rest = pictures(take, "R")
+    for path in rest:
+        shutil.copy(first, path)
+
+
 def a_frame_late(take: Path) -> None:
     text = (take / "take.toml").read_text().replace('images = "R/*.png"', 'images = "R/*.png"\noffset_frames = -1')
     (take / "take.toml").write_text(text.replace("fps", "frames = [1, 7]\nfps").replace("frame = 0", "frame = 1"))
@@ -149,7 +155,8 @@ FAULTS = {
     black: "blank view", black_for_a_while: "blank view", identical: "identical views", identical_but_encoded_again: "identical views",
     swapped: "swapped views", foreign_rig: "foreign rig", knocked_camera: "stale calibration", no_texture: "no texture",
     plain_clothes: "no texture",
-    smooth_sleeve: "weak texture", dark: "dark", overexposed: "overexposed", repeated: "repeated frames", a_frame_late: "out of step",
+    smooth_sleeve: "weak texture", dark: "dark", overexposed: "overexposed", repeated: "repeated frames", frozen: "frozen view",
+    a_frame_late: "out of step",
     seed_on_the_wall: "seed on the background", contradicting_click: "clicks", image_gone: "input", other_size: "input",
 }  # fmt: skip
 
@@ -219,7 +226,8 @@ def test_exit_codes_and_json(arm_recording: Record, tmp_path: Path, capsys: pyte
 
 
 MEASURED = {black: "View L is black", identical: "show the same picture", swapped: "L and R are swapped",
-            foreign_rig: "rig.toml", no_texture: "is blank", seed_on_the_wall: "Surface seed 1"}  # fmt: skip
+            foreign_rig: "rig.toml", no_texture: "is blank", frozen: "View R shows the same picture",
+            seed_on_the_wall: "Surface seed 1"}  # fmt: skip
 
 
 @pytest.mark.parametrize("make", MEASURED, ids=lambda make: make.__name__)

@@ -279,3 +279,20 @@ def test_a_variable_frame_rate_is_noticed(tmp_path: Path) -> None:
             assert abs(movie.read(i).mean() - 20 * i) < 4
         found[name] = movie.unevenness
     assert found["even"] < 0.1 and found["uneven"] > 0.6, found
+
+
+def test_hidden_files_beside_the_images_are_none(tmp_path: Path) -> None:
+    numbered(tmp_path / "L", 1, 2, 3)
+    (tmp_path / "L" / "._1.png").write_bytes(b"\0\5\26\7")  # what macOS leaves on other file systems
+    assert open_sequence(tmp_path, images="L/*.png", movie=None, view="L").count == 3
+
+
+def test_links_and_placeholders_of_images_that_are_elsewhere(tmp_path: Path) -> None:
+    numbered(tmp_path / "L", 1, 2)
+    (tmp_path / "L" / "3.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n")
+    with pytest.raises(InputError, match="git lfs pull"):
+        open_sequence(tmp_path, images="L/*.png", movie=None, view="L")
+    (tmp_path / "L" / "3.png").unlink()
+    (tmp_path / "L" / "3.png").symlink_to(tmp_path / "drive" / "3.png")
+    with pytest.raises(InputError, match="a link that leads to .* is its drive connected"):
+        open_sequence(tmp_path, images="L/*.png", movie=None, view="L")
