@@ -43,7 +43,7 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
     first = int(roots[0])
     shift_m = motion.head_m[:, first] - rig.head_m[first]
     write_action(armature_object, Retargeted(motion=motion, basis=basis, shift_m=shift_m, carrier=first, loose_m={}, driven=driven,
-                                             scale=1.0, roles=(), contacts=None, notes=()), name)
+                                             scale=1.0, roles=(), contacts=None, notes=(), kept_back_m=0.0 * shift_m), name)
     return armature_object
 
 
