@@ -121,9 +121,9 @@ def link_source() -> None:
     link_folder(source / "tricap", ROOT)
     write_if_changed(site_packages() / "tricap.pth", f"{source}\n")
     if WINDOWS:
-        write_if_changed(venv_folder() / "Scripts" / "tricap.cmd", '@"%~dp0python.exe" -m tricap %*\n')
+        write_if_changed(venv_folder() / "Scripts" / "tricap.cmd", '@"%~dp0python.exe" -P -m tricap %*\n')
     else:
-        script = f"#!/bin/sh\nexec {shlex.quote(str(venv_program('python')))} -m tricap \"$@\"\n"
+        script = f"#!/bin/sh\nexec {shlex.quote(str(venv_program('python')))} -P -m tricap \"$@\"\n"
         write_if_changed(venv_program("tricap"), script)
         venv_program("tricap").chmod(0o755)
 

@@ -35,6 +35,14 @@ def test_it_runs_as_a_module_and_faults_of_the_input_end_with_2(tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
+def test_modules_in_a_stranger_s_folder_are_not_loaded(tmp_path: Path) -> None:
+    for name in ("numpy", "click", "cv2", "json"):
+        (tmp_path / f"{name}.py").write_text("print('stranger')\nraise SystemExit(7)\n")
+    line = [sys.executable, "-m", "tricap", "check", "take", "--quiet"]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and "stranger" not in done.stdout + done.stderr, done.stderr
+
+
 @pytest.mark.slow
 def test_the_demo_ends_and_leaves_every_promised_file(tmp_path: Path) -> None:
     pytest.importorskip("bpy")
