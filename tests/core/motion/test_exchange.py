@@ -1,5 +1,6 @@
 """BVH, TRC, C3D and CSV: round trips, readers that are not ours, and damaged files."""
 
+import re
 import struct
 import sys
 from dataclasses import replace
@@ -255,9 +256,11 @@ def test_whatever_is_changed_in_a_c3d_file_it_is_read_or_said(tmp_path: Path) ->
             continue
 
 
-def test_all_motions_at_hand_are_read_and_mapped() -> None:
+def test_all_motions_at_hand_are_read_and_mapped(tmp_path: Path) -> None:
     if not MOCAP.is_dir() or sys.platform == "win32":
         pytest.skip("the motions are not on this machine (no folder shared/mocap beside the repository)")
     for path in sorted(MOCAP.glob("*/*.bvh")):
-        motion = read_bvh(path)
-        assert not find_map(motion.rig).missing, path
+        skeleton, _, motion = path.read_text(errors="replace").partition("Frame Time:")
+        some = re.sub(r"Frames:\s*\d+", "Frames: 5", skeleton) + "Frame Time:" + "\n".join(motion.splitlines()[:6]) + "\n"
+        (tmp_path / path.name).write_text(some)
+        assert not find_map(read_bvh(tmp_path / path.name).rig).missing, path
