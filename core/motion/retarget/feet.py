@@ -3,7 +3,7 @@
 A walk on legs of other proportions keeps its directions only if the body's path changes. So first the path is solved for: a correction
 c(t) of the root and a place X_k for every contact k, from
 
-    Σ |r(t) + c(t) + ω(t) × h_f(t) + o_f(t) − X_k − s_f(t)|²  +  τ⁴ Σ |c̈(t)|²  +  μ Σ |c(t)|²  +  the like of ω   →  min      (1)
+    Σ |r(t) + c(t) + ω(t) × h_f(t) + o_f(t) − X_k − s_f(t)|²  +  Σ (τ⁴ |c̈(t)|² + λ τ² |ċ(t)|² + μ |c(t)|²)  +  the like of ω   →  min   (1)
 
 with r the root, ω a small turn of the hips, h_f a hip joint, o_f the ankle seen from the root, and s_f how the ankle moves about the
 standing ball of the foot while the heel lifts: feet and toes keep the directions that they have in the source, as long as they are not in
@@ -30,6 +30,7 @@ from .roles import sided
 from .turns import matrix_from_vector, rotate, shortest, unit, vector_from_matrix
 
 SMOOTH_S = 0.05  # τ: the body's path does not follow the feet's noise
+LEVEL = 0.1  # λ: in the air the path keeps the correction that it had on the ground, and does not go on as it began to
 HOLD = 1e-5  # μ: where nothing stands the path stays as it was
 TILT = 0.2  # a turn of the hips counts as much less than one of a leg
 RAISED = 0.006  # a swinging foot that would be in the floor by less than this part of the leg's length is raised, not turned
@@ -215,7 +216,7 @@ def carry_root(stands: list[Stand], ankles: Mapping[str, np.ndarray], hips: Mapp
     lever = W @ -cross_matrix(np.concatenate([hips[s.side][s.begin:s.end] for s in stands]))  # ω × h = −[h]× ω
     A = sparse.hstack([_placed(np.concatenate([W, lever], axis=2), 6 * frame[:, None] + np.arange(6), 6 * t),  # c and ω by frame
                        _placed(-W[:, :, :2], 2 * which[:, None] + np.arange(2), 2 * k)])
-    smooth = _roughness(t) * (SMOOTH_S * fps) ** 4
+    smooth = _roughness(t, 2) * (SMOOTH_S * fps) ** 4 + _roughness(t, 1) * LEVEL * (SMOOTH_S * fps) ** 2
     shifts, turns = np.diag([1.0] * 3 + [0.0] * 3), np.diag([0.0] * 3 + [1.0] * 3) * (TILT * leg_m) ** 2
     hold = sparse.kron(smooth + HOLD * sparse.identity(t), shifts) + sparse.kron(smooth + sparse.identity(t), turns)
     normal = (A.T @ A + sparse.block_diag([hold, 1e-9 * sparse.identity(2 * k)])).tocsc()
@@ -232,11 +233,11 @@ def _placed(blocks: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_m
     return sparse.csr_matrix((blocks.ravel(), (rows.ravel(), np.broadcast_to(columns[:, None, :], blocks.shape).ravel())), (3 * n, width))
 
 
-def _roughness(t: int) -> sparse.csr_matrix:
-    """(t, t): xᵀ M x is the sum of the squared second differences of x; nothing bends in fewer than three frames."""
-    if t < 3:
+def _roughness(t: int, order: int) -> sparse.csr_matrix:
+    """(t, t): xᵀ M x is the sum of the squared first or second differences of x; nothing bends in fewer than three frames."""
+    if t < order + 1:
         return sparse.csr_matrix((t, t))
-    bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(t - 2, t))
+    bend = sparse.diags([[-1.0, 1.0], [1.0, -2.0, 1.0]][order - 1], list(range(order + 1)), shape=(t - order, t))
     return (bend.T @ bend).tocsr()
 
 

@@ -13,6 +13,7 @@ from tricap.core.body.shape import default_shape
 from tricap.core.errors import InputError
 from tricap.core.motion.bvh import write_bvh
 from tricap.core.motion.retarget.contacts import FeetSettings, hysteresis, planted, steady, without_short
+from tricap.core.motion.retarget.feet import Stand, carry_root
 from tricap.core.motion.retarget.keys import needed_keys
 from tricap.core.motion.retarget.mapping import RigMap, find_map
 from tricap.core.motion.retarget.measure import measure
@@ -215,6 +216,15 @@ def test_feet_that_stand_stay_on_legs_of_other_proportions() -> None:
     assert measure(source, maps[0], loose.motion, maps[1], firm.contacts).slide_mm > 20.0
     assert figures.slide_mm < 0.1 and figures.penetration_mm < 0.1 and figures.float_mm < 0.1, figures
     assert figures.direction_rms_deg < 1.0, figures
+
+
+def test_a_body_in_the_air_does_not_go_on_as_its_feet_had_it_move() -> None:
+    """Over ten frames on the ground the path must be corrected by a centimetre more in each; after the jump no such thing goes on."""
+    still, stiff = np.zeros((40, 3)), np.broadcast_to(np.eye(3), (40, 3, 3))
+    stand = Stand(side="L", begin=0, end=11, path_m=np.linspace(0.0, 0.1, 11)[:, None] * (0.0, 0.0, 1.0))
+    shift, _, _ = carry_root([stand], {"L": still}, {"L": still}, {"L": stiff}, 30.0, 0.9)
+    np.testing.assert_allclose(shift[1:10, 2], stand.path_m[1:10, 2], atol=2e-3)
+    assert 0.0 < shift[39, 2] - shift[10, 2] < 0.06, shift[:, 2]  # straight on: 0.29
 
 
 @pytest.mark.parametrize("frames", [1, 2])
