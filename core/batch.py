@@ -9,6 +9,7 @@ does not stop the others; neither does a bug of ours, whose traceback is kept in
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import time
@@ -171,11 +172,17 @@ def _client(engine: Engine) -> Iterator[Any]:
         dask.config.set(quiet),
         LocalCluster(
             n_workers=engine.workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None, memory_limit=0,
-            silence_logs=50,
+            silence_logs=50, env=shares(engine.workers, os.cpu_count() or 1),
         ) as cluster,
         Client(cluster) as client,
     ):
         yield client
+
+
+def shares(workers: int, cores: int) -> dict[str, str]:
+    """The environment of each worker: as many threads, ours and OpenCV's, as there are cores for it."""
+    share = str(max(1, min(2, cores // workers)))
+    return {"TRICAP_THREADS": share, "OPENCV_FOR_THREADS_NUM": share}
 
 
 def _as_they_end(

@@ -12,6 +12,7 @@ from .findings import Checked, Finding, doubtful, wrong
 
 FOCAL = (0.4, 12.0)  # of the image's longer side: 103° and 5° of view
 OFF_CENTRE = 0.2  # of the image's longer side
+FAR_APART_M = 100.0
 SAME_PLACE = 0.005  # of the longest base
 SIGMA0_PX = 1.0
 
@@ -44,6 +45,7 @@ def geometry_findings(rig: Rig) -> list[Finding]:
                         base_m=base,
                     )
                 )
+        found += unit_findings(rig)
         if longest > 0 and not _look_together(rig.cameras, longest):
             found.append(
                 wrong(
@@ -53,6 +55,15 @@ def geometry_findings(rig: Rig) -> list[Finding]:
                 )
             )
     return found
+
+
+def unit_findings(rig: Rig) -> list[Finding]:
+    """Cameras that stand further apart than any hall is long: their places are in another unit than it says."""
+    longest = max(_bases(rig.cameras).values(), default=0.0)
+    if longest < FAR_APART_M:
+        return []
+    said = f"The cameras stand up to {longest:.0f} m apart: rig.toml seems to be in millimetres or centimetres, not in metres."
+    return [wrong("unit", said, 'Write its unit, such as unit = "mm", under [metadata] of rig.toml.', base_m=longest)]
 
 
 def _interior(camera: Camera) -> list[Finding]:

@@ -12,7 +12,7 @@ from ..settings import from_table
 from ..take import Footage, open_take, read_take
 from .clicks import seed_findings
 from .findings import Checked, Finding, doubtful, wrong
-from .rig_check import geometry_findings
+from .rig_check import geometry_findings, unit_findings
 from .rig_fit import ENOUGH, rig_findings, same_views, share, stale_finding
 from .survey import frozen, picture_findings, rate_findings, survey
 from .texture import texture_findings
@@ -135,7 +135,8 @@ def first_look(footage: Footage, frame: int) -> list[Finding]:
     pictures = footage.read(frame)
     still = still_views(footage, frame, pictures)
     pairs = match_views([[rows.rows(image) for image in pictures]], rows)
-    return same_views(pairs, names) or [*(frozen(name) for name in still), *rig_findings(pairs, footage.rig.cameras, names)]
+    beside = [*unit_findings(footage.rig), *(frozen(name) for name in still)]
+    return same_views(pairs, names) or [*beside, *rig_findings(pairs, footage.rig.cameras, names)]
 
 
 def still_views(footage: Footage, frame: int, pictures: list[np.ndarray]) -> list[str]:

@@ -24,6 +24,7 @@ H belongs to the template alone, so it is built once; all patches of a chunk are
 Coordinates are pixels of the images given (a field's rows count as rows).
 """
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
@@ -41,12 +42,12 @@ from .affine_steps import compose
 from .parameter_sets import PARAMETERS, reduced_sets
 
 CHUNK, LARGEST = 512, 1024  # patches that threads do not share; the most that a piece has when they do
-THREADS = 2
+_SHARE = os.environ.get("TRICAP_THREADS", "")  # `tricap batch` gives each worker its own
+THREADS = int(_SHARE) if _SHARE.isdecimal() and int(_SHARE) > 0 else 2
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
 REMAINS_SIGMAS, REMAINS_PX = 0.1, 0.005  # what may remain after the last step where (6) foresees it
 GRADIENT_NOISE, CURVATURE = 0.45, 0.1  # of (6)
-LINEAR_PX = 0.25  # (6) holds while no part of the patch moves by more
-MIN_CONDITION = 1e-6
+LINEAR_PX, MIN_CONDITION = 0.25, 1e-6  # (6) holds while no part of the patch moves by more
 PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "textured")  # arrays
 UPPER, SYMMETRIC = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a 3×3 matrix: its upper part, and back
 NOISE_ENERGY = 4.0  # of a gradient [grey values² / px²]: less is noise, not texture

@@ -5,6 +5,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -28,8 +30,6 @@ def killing() -> ModuleType:
     spec = importlib.util.spec_from_file_location("killing_for_batch", Path(__file__).parents[1] / "killing.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
-    import sys
-
     sys.modules["killing_for_batch"] = module
     spec.loader.exec_module(module)
     return module
@@ -104,6 +104,14 @@ def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: py
     assert told["status"] == DONE and "4 frames" in told["said"] and (tmp_path / "out" / "report" / "report.html").exists()
     (tmp_path / "file").write_text("")
     assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == MEND
+
+
+@pytest.mark.parametrize(("workers", "cores", "threads"), [(1, 2, "2"), (2, 2, "1"), (2, 8, "2"), (16, 8, "1")])
+def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, threads: str) -> None:
+    environment = os.environ | batch.shares(workers, cores)
+    code = "import cv2; from tricap.core.matching import least_squares, object_space; print(object_space.THREADS, least_squares.THREADS)"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [threads, threads]
 
 
 def test_what_is_doubtful_stands_in_the_summary() -> None:

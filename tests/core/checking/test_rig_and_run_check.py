@@ -45,6 +45,7 @@ def with_first(**changes: Any) -> Rig:
 RIGS: dict[str, tuple[Rig, str]] = {
     "same place": (same_place(), "same place"),
     "looking away": (looking_away(), "no common view"),
+    "in millimetres": (Rig(cameras=tuple(replace(c, t_cam_world_m=1000 * c.t_cam_world_m) for c in CAMERAS)), "unit"),
     "one camera": (Rig(cameras=CAMERAS[:1]), "one camera"),
     "focal length of another size": (with_first(matrix=scaled(CAMERAS[0].matrix, focal=0.1)), "odd camera"),
     "principal point of a crop": (with_first(matrix=scaled(CAMERAS[0].matrix, shift_px=300)), "odd camera"),
