@@ -1,12 +1,14 @@
 """The first body: posture and shape at the frame in which the joints were clicked (D'Apuzzo et al. 1999, §3.3)."""
 
 from collections.abc import Callable
+from itertools import chain
 
 import numpy as np
 from scipy.stats import qmc
 
 from ..errors import InputError
 from ..progress import Monitor
+from .bone_lengths import clicked_chains
 from .cloud_points import CloudPoints
 from .conditions import Conditions
 from .inverse_kinematics import inverse_kinematics, other_postures
@@ -33,7 +35,7 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     Raises:
         InputError: neither measured points nor outlines lie near the clicked joints, and there are no keypoints.
     """
-    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.settings.length_sigma)
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     best, best_support = None, -1.0
     starts = _starts(fit, points, clicked.motion[0], clicked.vector)
     for i, motion in enumerate(starts):
@@ -70,7 +72,7 @@ def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarr
     if _plausible(best):
         return best
     best_support = fit.support(fit.click, points, best.motion[0], best.vector)
-    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.settings.length_sigma)
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     for start in _around(fit, clicked.motion[0]):
         solution = _to_surface(fit, points, start, clicked.vector)
         support = fit.support(fit.click, points, solution.motion[0], solution.vector)
@@ -114,12 +116,13 @@ def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector
 
 
 def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
-    """ln of the bone lengths (B,) and their sigmas, as the click frame knows them."""
+    """ln of the bone lengths (B,) and their sigmas, as the click frame knows them; infinite for bones that are not between clicks."""
     near = crop(points, fit.parameters.state(solution.motion[0], solution.vector), REACH_M)
     problem = fit.problem(_observe(fit, near, 1.0), "shape")
     covariance = linearise(problem, solution.motion, solution.vector, solution.scales).equations.covariance()[2]
     lengths = fit.parameters.layout.set("lengths")
-    return solution.vector[lengths], np.sqrt(np.diag(covariance)[lengths])
+    between = np.isin(lengths, list(chain.from_iterable(clicked_chains(fit.model.skeleton, fit.located))))
+    return solution.vector[lengths], np.where(between, np.sqrt(np.diag(covariance)[lengths]), np.inf)
 
 
 def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> list[np.ndarray]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import cast
 
 import numpy as np
@@ -10,12 +10,13 @@ import numpy as np
 from ..body.model_file import BodyModel
 from ..geometry.camera import Camera
 from .acceleration import Acceleration
+from .bone_lengths import proportions
 from .clicks import Clicks
 from .cloud_points import CloudPoints
 from .empty_views import EmptyViews
 from .joint_tracks import JointTracks
 from .limbs_apart import LimbsApart
-from .observations import ClickedJoints, EqualRadii, Observation, ShapePrior, SilhouetteRays, SurfacePoints, Symmetry
+from .observations import ClickedJoints, EqualRadii, Observation, Proportions, ShapePrior, SilhouetteRays, SurfacePoints, Symmetry
 from .problem import Problem
 from .robust import robust_weights
 from .segmentation import HeldSegments, segment
@@ -40,6 +41,8 @@ class Conditions:
     settings: FitSettings
     clicks: Clicks
     click: int  # index of the frame where the fit begins
+    located: np.ndarray  # (J,) whether a joint has a place in space of its own, in any frame
+    frames: int  # for how many a belief of a single bone's length counts
     priors: list[Observation]  # of every frame's motion
     clicked: Mapping[int, ClickedJoints]  # by frame index
     tracks: JointTracks
@@ -96,15 +99,23 @@ class Conditions:
             counts += POINTS_OF_RAY * np.bincount(rays.bone, minlength=b)
         return np.asarray(counts + np.where(np.isin(ends, self.tracks.joints(t)), self.settings.min_points, 0))
 
+    @cached_property
+    def proportions(self) -> Proportions:
+        """What is believed of the bone lengths; of a single bone, against the error that the model has in all frames alike."""
+        s = self.settings
+        return proportions(self.model.skeleton, self.parameters.template.lengths_m, self.located, s.length_sigma,
+                           s.proportion_sigma / np.sqrt(self.frames))
+
     def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
-        """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the model is known."""
+        """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the proportions is
+        known (else infinite)."""
         mean, s = self.parameters.vector(), self.settings
         sigma = np.full(len(mean), s.radius_sigma)
-        of_lengths = self.parameters.layout.set("lengths")
         sigma[self.parameters.layout.set("weights")] = WEIGHT_SIGMA
-        mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], s.length_sigma)
+        of_lengths = self.parameters.layout.set("lengths")
+        mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], np.inf)
         radii = self.parameters.template.metaballs.radii_m
-        found: list[Observation] = [ShapePrior(mean=mean, sigma=sigma),
+        found: list[Observation] = [ShapePrior(mean=mean, sigma=sigma), self.proportions,
                                     EqualRadii(sigma=s.roundness_sigma, log_ratio=np.log(radii[:, 0] / radii[:, 2]))]
         left, right = self.parameters.pairs()
         return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma)] if len(left) else found

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.skeleton import Skeleton, joint_positions
+from .bone_lengths import STATURE_SIGMA
 from .clicks import Clicks
-from .observations import JointLimits, MotionPrior, Observation, ShapePrior
+from .observations import JointLimits, MotionPrior, Observation, Proportions
 from .solver import Problem, Solution, solve
 from .state import FIRM, ShapeParameters
 
@@ -20,20 +21,19 @@ STEPS = 40
 LITTLE = np.radians(65.0)  # what bends less belongs to the trunk
 LASTS_S = 0.5
 ENOUGH_BONES = 4
-OWN_SIGMA, STATURE_SIGMA = 0.10, 0.07  # of a bone about its person's proportions, of a person about the model
+OWN_SIGMA = 0.10  # of a clicked bone about its person's proportions
 CLICK_SIGMA_M = 0.03
 
 
-def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], length_sigma: float) -> Solution:
+def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], lengths: Proportions) -> Solution:
     """Motion (1, D) and shape vector at the click frame. `priors`: limits and beliefs about the DOFs.
 
-    Bone lengths are free (relative sigma `length_sigma` about the model's), radii are not.
+    Bone lengths are free within what is believed of them, radii are not.
     """
     vector = parameters.vector()
     start = coarse_posture(parameters, clicks)
-    sigma = np.full(len(vector), length_sigma)
     problem = Problem(parameters=parameters, observe=lambda t, state: [*clicks.observations, *priors],
-                      of_shape=[ShapePrior(mean=vector, sigma=sigma)], free_shape=parameters.layout.set("lengths"),
+                      of_shape=[lengths], free_shape=parameters.layout.set("lengths"),
                       held=parameters.skeleton.held)
     return solve(problem, start[None], vector, steps=STEPS)
 

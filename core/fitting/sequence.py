@@ -11,10 +11,10 @@ A recording of more than `AT_ONCE` frames is adjusted stretch by stretch, so tha
 
 Points, outlines and keypoints are each enough alone.
 
-A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is known of the shape
-beforehand (radii from the model, bone lengths from the click frame) weigh as much against the points of so many frames as against those of
-one. By default it counts once: a click frame's lengths err by more than a body differs from its balls, and other postures tell of them.
-One ellipsoid a bone differs far from a body, and in every frame alike: there it counts for all frames.
+A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is believed of the shape
+beforehand weigh as much against the points of so many frames as against those of one. By default it counts once: other postures tell of
+radii, and of the lengths between clicked joints. That bones are as long as other people's counts for all frames, for what nobody clicked is
+not seen in other postures either (`bone_lengths`). One ellipsoid a bone differs far from a body: there all of it counts for all frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -216,6 +216,8 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     parameters = ShapeParameters(shape, settings.weights)
     return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,
                       click=begin, priors=priors, clicked=clicked, tracks=tracks,
+                      frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
+                      located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
                       silhouettes=Silhouettes(given, model.surface, settings), empty=EmptyViews(given, parameters, settings),
                       limbs=LimbsApart(model.skeleton, shape.metaballs.bone_index))
 

@@ -35,7 +35,10 @@ class FitSettings:
     outline_gate_m: float = knob(0.10, "A ray of an outline further than this from every limb touches none.", unit="m", low=0.005, high=1.0)
     floor: bool = knob(False, "A foot that stands keeps the height that feet have when they stand (world: Z up, a level floor).")
     click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)
-    length_sigma: float = knob(0.15, "Relative sigma of the model's bone lengths.", low=0.001, high=1.0)
+    length_sigma: float = knob(0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.",
+                               low=0.001, high=1.0)
+    proportion_sigma: float = knob(0.04, "Relative sigma of one bone about other people's of that size; all frames count as one.",
+                                   low=0.001, high=1.0)
     radius_sigma: float = knob(0.2, "Relative sigma of the model's radii.", low=0.001, high=1.0)
     roundness_sigma: float = knob(0.10, "Relative sigma of the difference of a ball's two cross radii.", low=0.001, high=1.0)
     symmetry_sigma: float = knob(0.03, "Relative sigma of the difference between left and right.", low=0.001, high=1.0)

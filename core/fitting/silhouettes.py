@@ -19,7 +19,7 @@ from .settings import FitSettings
 from .state import BodyState
 
 SPACING_M = 0.012  # of the rays, at the body
-BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders, the crown and the tips of the feet, where the parts' fields meet
+BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders and the crown, where the parts' fields meet
 OUTLINE_PATCHES = 3  # an outline that follows a wrong edge does so for about this many patches of the model's error, in all views alike
 MOST_FRAMES = 500  # whose rays are kept: more than are adjusted at once
 ALIKE = float(np.cos(np.radians(40.0)))  # views that look in directions closer than this show the same outline
@@ -102,6 +102,9 @@ def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: 
 def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Rows (K,) of the rays that touch a limb, and its bone (K,). `surface` (B, 2) and `gate_m` as in `segmentation.segment`."""
     gate = np.broadcast_to(gate_m, (len(state.lengths_m),))
+    first, last = surface[:, 0] - BEYOND, surface[:, 1] + BEYOND
+    goes_on = np.isin(np.arange(len(gate)), state.skeleton.parents, invert=True) & (surface[:, 1] < 1)  # in fingers, which are no bones
+    last = np.where(goes_on, surface[:, 1], last)
     n = len(rays.direction)
     nearest, owner, own = np.full(n, np.inf), np.zeros(n, dtype=np.intp), np.zeros(n, dtype=bool)
     for b in np.unique(state.balls.bone_index).tolist():
@@ -109,7 +112,7 @@ def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarra
         gap, along, facing = from_bone(X, rays.outward, state, b)
         closer = gap < nearest
         nearest[closer], owner[closer] = gap[closer], b
-        own[closer] = ((along >= surface[b, 0] - BEYOND) & (along <= surface[b, 1] + BEYOND) & facing)[closer]
+        own[closer] = ((along >= first[b]) & (along <= last[b]) & facing)[closer]
     rows = np.flatnonzero(own & (np.abs(nearest) < gate[owner]))
     return rows, owner[rows]
 

@@ -181,7 +181,8 @@ def ablation(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
     base = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
     rows: list[tuple[str, tuple[str, ...], FitSettings]] = [
         ("points", (), base),
-        ("points, wide beliefs of the shape", (), replace(base, length_sigma=1.0, radius_sigma=1.0, roundness_sigma=1.0)),
+        ("points, wide beliefs of the shape", (),
+         replace(base, length_sigma=1.0, proportion_sigma=1.0, radius_sigma=1.0, roundness_sigma=1.0)),
         ("+ trajectories", ("trajectories",), base), ("+ trajectories + outlines", ("trajectories", "contours"), base),
         ("  in turns as published", ("trajectories", "contours"), replace(base, method="alternating")),
         ("  the published residual", ("trajectories", "contours"), replace(base, residual="paper")),

@@ -18,12 +18,14 @@ from .gaussian_prior import MotionPrior, ShapePrior
 from .joint_limit import JointLimits
 from .keypoint import Keypoints
 from .material_step import MaterialSteps, StepsFromFixed
+from .proportions import Proportions
 from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
 from .symmetry import Symmetry
 
 __all__ = ["Apart", "Block", "ClickedJoints", "EmptySpace", "EqualRadii", "FootOnFloor", "FromBlocks", "JointLimits", "Keypoints",
-           "MaterialSteps", "MotionPrior", "Observation", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints", "Symmetry"]
+           "MaterialSteps", "MotionPrior", "Observation", "Proportions", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints",
+           "Symmetry"]
 
 
 class Observation(Protocol):

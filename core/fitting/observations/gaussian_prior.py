@@ -1,5 +1,5 @@
-"""Parameters believed to lie near a value: (θ − mean) / σ. Used for the prediction 2θ_i − θ_{i−1}, for weak beliefs about twist, for
-bone lengths and radii (in logarithms, so that σ is relative)."""
+"""Parameters believed to lie near a value: (θ − mean) / σ. Used for the prediction 2θ_i − θ_{i−1}, for weak beliefs about twist, and
+for radii (in logarithms, so that σ is relative)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class MotionPrior(FromBlocks):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapePrior:
-    """Mean and sigma of the shape vector (S,): logarithms of lengths and cross radii."""
+    """Mean and sigma of the shape vector (S,), logarithms of lengths and cross radii; an infinite sigma believes nothing."""
 
     mean: np.ndarray
     sigma: np.ndarray

@@ -17,6 +17,7 @@ from tricap.core.fitting.observations import (
     Keypoints,
     MaterialSteps,
     MotionPrior,
+    Proportions,
     ShapePrior,
     SilhouetteRays,
     StepsFromFixed,
@@ -49,12 +50,14 @@ def _cases(parameters: ShapeParameters, state, rng):
     camera = Camera(name="C", size_px=(800, 600), matrix=np.array([[900, 0, 400], [0, 900, 300], [0, 0, 1.0]]),
                     distortions=np.array([-0.1, 0.05, 1e-3, -1e-3, 0.0]), t_cam_world_m=np.array([0, 0, 3.0]))
     shape = parameters.vector()
+    root = rng.normal(0, 0.1, (len(state.lengths_m),) * 2)
     return [SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma).scaled(state),
             SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma, form="paper").scaled(state),
             ClickedJoints(cameras=(camera,) * joints, joint=np.arange(joints), xy_px=rng.normal(400, 50, (joints, 2)), sigma_px=5.0),
             JointLimits(low=np.full(dofs, -0.2), high=np.full(dofs, 0.2), sigma=0.03),
             MotionPrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
             ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)), EqualRadii(sigma=0.1, log_ratio=0.3),
+            Proportions(mean=shape[: len(root)], covariance=root @ root.T + 0.01 * np.eye(len(root))),
             FootOnFloor(joint=np.arange(joints), height_m=rng.normal(0, 0.1, joints), floor_m=0.1, sigma_m=0.02),
             Keypoints(joint=np.arange(joints), xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=rng.uniform(0.005, 0.02, joints)),
             _apart(state, rng), _empty(camera, joints, rng), _rays(state, near, bone, sigma, rng),

@@ -3,6 +3,7 @@
 Bounds are those of the project's plan (a simulation with 3 mm one-sided noise gave 2.2 mm and 0.6°); what was measured stands beside each.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from tricap.core.fitting.sequence import FitInput, FitSettings, _begun_anew, con
 from tricap.core.fitting.solver import Solution, solve
 from tricap.core.progress import Cancelled, Monitor
 
-KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
+KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
 UNKNOWN = FitSettings(model_sigma_m=0.0, voxel_m=0.002)
 
 
@@ -93,7 +94,7 @@ def test_starts_thirty_degrees_off_all_converge(make_scene) -> None:
     scene = make_scene(seed=1)
     fit = conditions(_given(scene), KNOWN)
     points = thinned(scene.clouds[0], KNOWN.voxel_m)
-    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, KNOWN.length_sigma)
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     rng, good = np.random.default_rng(0), 0
     for _ in range(200):
         start = clicked.motion[0].copy()
@@ -210,8 +211,7 @@ def test_cancelling_stops_the_fit(make_scene) -> None:
 
 def test_paper_mode_fits_too(make_scene) -> None:
     scene = make_scene(seed=10)
-    settings = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.002, method="alternating", residual="paper",
-                           robust="huber", robust_width=1.345)
+    settings = replace(KNOWN, method="alternating", residual="paper", robust="huber", robust_width=1.345)
     assert _joint_errors(scene, _fit(scene, settings)).mean() < 5e-3
 
 
@@ -233,7 +233,7 @@ def test_a_start_behind_the_limb_begins_anew_around_the_clicks(make_scene) -> No
     scene = make_scene(seed=1, points=400)
     fit = conditions(_given(scene), KNOWN)
     points = thinned(scene.clouds[0], KNOWN.voxel_m)
-    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, KNOWN.length_sigma)
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     around = click_frame._around(fit, clicked.motion[0])
     assert np.array_equal(around, click_frame._around(fit, clicked.motion[0])) and np.array_equal(around[0], clicked.motion[0])
     assert len(np.unique(np.round(around, 6), axis=0)) == len(around) == click_frame.OTHERS_AROUND + 1

@@ -13,7 +13,7 @@ from tricap.core.fitting.soft_segmentation import OUTLIERS, responsibilities, so
 from tricap.core.fitting.state import ShapeParameters
 
 EVERYWHERE = np.tile([0.0, 1.0], (2, 1))
-KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
+KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
 
 
 def test_shares_follow_distances_normals_and_the_spread() -> None:

@@ -6,7 +6,7 @@ import pytest
 from tricap.core.fitting import sequence, stretches
 from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
 
-KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.005)
+KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.005)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
 from tricap.core.progress import Cancelled, Monitor
 from tricap.core.results import KeptFit, Results
 
-SETTINGS = FitSettings(model_sigma_m=0.0, length_sigma=0.001, radius_sigma=0.001, voxel_m=0.006, sequence_steps=4)
+SETTINGS = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.006, sequence_steps=4)
 CLICK, FRAMES = 3, 9
 
 

@@ -11,7 +11,7 @@ from tricap.core.fitting.sequence import FitInput, fit_sequence
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.state import ShapeParameters
 
-SETTINGS = FitSettings(model_sigma_m=0.0, voxel_m=0.002, length_sigma=0.01, radius_sigma=0.02)
+SETTINGS = FitSettings(model_sigma_m=0.0, voxel_m=0.002, length_sigma=0.01, proportion_sigma=0.01, radius_sigma=0.02)
 
 
 def test_weights_are_parameters_only_where_that_is_asked_for() -> None:

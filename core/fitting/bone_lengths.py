@@ -1,0 +1,54 @@
+"""What is believed of the bone lengths before anything but clicks is looked at.
+
+    ln L_b = ln L_b,model + g + c_k + d_b ,   g ~ N(0, σ_g²) ,   c_k ~ N(0, σ_k²) ,   d_b ~ N(0, σ_d²)                      (1)
+    σ_k² = σ_c⁴ / (σ_c² + (e / L_k)²)                                                                                  (2)
+
+g is the person's size: all bones share it. d_b is what one bone is longer or shorter than in other people of that size, a few per cent.
+c_k belongs to a chain k of bones whose two ends were clicked: there the length is what was clicked (a joint is where the operator, or a
+detector, sees it, not where the anatomist does), so it is free by σ_c, as far as two clicks that are off by e tell a length L_k (2); a
+neck is too short for them. Inside a chain (collarbones; pelvis, spine and chest), and where nobody clicked at all (head, hands), bones
+keep the model's proportions: clouds and outlines show no joints there, and what a body differs from its balls (a cap, fingers, loose
+clothes) it differs in all frames alike. However many they are, frames do not outvote σ_d: it counts as often as they do.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..body.skeleton import Skeleton
+from .observations import Proportions
+
+STATURE_SIGMA = 0.07  # relative, of a person about the model
+CLICKS_OFF_M = 0.02  # of both ends of a length together
+
+
+def proportions(skeleton: Skeleton, lengths_m: np.ndarray, located: np.ndarray, clicked_sigma: float, own_sigma: float) -> Proportions:
+    """(1) about the lengths (B,) of a model, when some joints (J,) have places: σ_c and σ_d. Lengths that are known fix the size too."""
+    stature = min(STATURE_SIGMA, clicked_sigma)
+    covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(np.full(len(lengths_m), own_sigma**2))
+    for chain in clicked_chains(skeleton, located):
+        of_clicks = (CLICKS_OFF_M / lengths_m[chain].sum()) ** 2
+        covariance[np.ix_(chain, chain)] += clicked_sigma**4 / (clicked_sigma**2 + of_clicks)  # (2)
+    return Proportions(mean=np.log(lengths_m), covariance=covariance)
+
+
+def clicked_chains(skeleton: Skeleton, located: np.ndarray) -> list[list[int]]:
+    """The bones that have joints with places (J,) on both sides, those together that follow each other without such a joint or a fork."""
+    joint = {name: i for i, name in enumerate(skeleton.joint_names)}
+    ends = [(joint[bone.head_joint], joint[bone.tail_joint]) for bone in skeleton.bones]
+    chains = [[b] for b in range(len(ends)) if _clicked_on_both_sides(ends, b, located)]
+    meeting = np.bincount(np.array(ends).ravel(), minlength=len(joint))
+    for between in np.flatnonzero((meeting == 2) & ~located).tolist():
+        here = [chain for chain in chains if any(between in ends[b] for b in chain)]
+        if len(here) == 2:
+            chains = [*(chain for chain in chains if chain not in here), here[0] + here[1]]
+    return chains
+
+
+def _clicked_on_both_sides(ends: Sequence[tuple[int, int]], bone: int, located: np.ndarray) -> bool:
+    beyond = {ends[bone][1]}
+    for b, (head, tail) in enumerate(ends):  # parents come first
+        if b != bone and head in beyond:
+            beyond.add(tail)
+    far = np.isin(np.arange(len(located)), list(beyond))
+    return bool((located & far).any() and (located & ~far).any())

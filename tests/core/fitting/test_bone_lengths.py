@@ -1,0 +1,84 @@
+"""What is believed of bone lengths: clicked ones are free, the others follow the person's size and the model's proportions."""
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.fitting.bone_lengths import clicked_chains, proportions
+from tricap.core.fitting.observations import Proportions
+from tricap.core.fitting.silhouettes import Rays, touched
+from tricap.core.fitting.state import ShapeParameters
+
+CLICKED = ["neck", "head", *(f"{joint}.{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR")]
+
+
+@pytest.fixture(scope="module")
+def full():
+    return read_model("full")
+
+
+def _located(model) -> np.ndarray:
+    return np.isin(model.skeleton.joint_names, CLICKED)
+
+
+def _believed(model) -> tuple[dict[str, int], Proportions]:
+    names = [bone.name for bone in model.skeleton.bones]
+    believed = proportions(model.skeleton, default_shape(model).lengths_m, _located(model), 0.15, 0.04)
+    return {name: i for i, name in enumerate(names)}, believed
+
+
+def _told(believed: Proportions, rows: list[int], by: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean change and sigma (B,) of all lengths' logarithms when those of some bones are seen to be `by` larger."""
+    K = believed.covariance
+    gain = K[:, rows] @ np.linalg.inv(K[np.ix_(rows, rows)])
+    return gain @ np.full(len(rows), by), np.sqrt(np.maximum(np.diag(K - gain @ K[rows]), 0.0))
+
+
+def test_bones_between_clicks_are_chains_and_those_beyond_are_none(full) -> None:
+    names = [bone.name for bone in full.skeleton.bones]
+    chains = {frozenset(names[b] for b in chain) for chain in clicked_chains(full.skeleton, _located(full))}
+    assert frozenset({"pelvis", "spine", "chest"}) in chains and frozenset({"collar.R", "shoulder.R"}) in chains
+    assert {frozenset({bone}) for bone in ("neck", "hip.L", "upper_arm.L", "forearm.R", "thigh.R", "shin.L")} <= chains
+    assert not {"head", "hand.R", "foot.L"} & set().union(*chains)
+    assert clicked_chains(full.skeleton, np.zeros(len(full.skeleton.joint_names), dtype=bool)) == []
+
+
+def test_what_nobody_clicked_follows_the_size_that_the_clicked_limbs_have(full) -> None:
+    at, believed = _believed(full)
+    limbs = [at[f"{bone}.{side}"] for bone in ("thigh", "shin", "upper_arm", "forearm") for side in "LR"]
+    change, sigma = _told(believed, limbs, 0.08)
+    assert 0.04 < change[at["head"]] < 0.08 and abs(change[at["head"]] - change[at["hand.R"]]) < 1e-12
+    assert 0.04 < sigma[at["head"]] < 0.06  # its own 4 %, and what is left open of the size
+
+
+def test_one_clicked_bone_does_not_pull_the_others(full) -> None:
+    at, believed = _believed(full)
+    change, _ = _told(believed, [at["forearm.R"]], -0.12)
+    assert abs(change[at["head"]]) < 0.03
+    assert np.sqrt(believed.covariance[at["forearm.R"], at["forearm.R"]]) > 0.13  # what was clicked is free
+
+
+def test_a_chain_shares_what_its_ends_say_and_a_short_one_is_held(full) -> None:
+    at, believed = _believed(full)
+    change, _ = _told(believed, [at["chest"]], 0.10)
+    assert change[at["spine"]] > 0.08 and change[at["pelvis"]] > 0.08  # the three are seen as one length
+    free = {bone: believed.covariance[at[bone], at[bone]] for bone in ("neck", "hip.R", "thigh.R")}
+    assert free["neck"] < free["hip.R"] < free["thigh.R"]
+
+
+def test_an_outline_beyond_the_hand_is_the_fingers_and_one_over_the_crown_is_the_heads(full) -> None:
+    parameters = ShapeParameters(default_shape(full))
+    state = parameters.state(np.zeros(len(full.skeleton.dofs)), parameters.vector())
+    at = {bone.name: i for i, bone in enumerate(full.skeleton.bones)}
+
+    def owners(bone: str, along: float) -> np.ndarray:
+        b = at[bone]
+        X = state.head_m[b] + along * state.lengths_m[b] * state.R[b][:, 1] + 0.04 * state.R[b][:, 0]
+        view = state.R[b][:, 2]
+        rays = Rays(origin_m=(X - 3 * view)[None], direction=view[None], outward=state.R[b][:, 0][None], angle=np.full(1, 1e-3),
+                    alike=np.ones(1))
+        return touched(rays, state, full.surface, 0.1)[1]
+
+    assert owners("hand.R", 0.6).tolist() == [at["hand.R"]] and not len(owners("hand.R", 1.2))
+    assert owners("head", 1.1).tolist() == [at["head"]]
