@@ -45,13 +45,18 @@ def find_ready(clouds: Mapping[int, Ply], trajectories: Mapping[str, np.ndarray]
         Cancelled: the monitor was cancelled.
     """
     segments, velocity, owner = _Segments(shape, motion), {}, {}
+    tracks = _Tracks(trajectories)
     for i, (frame, ply) in enumerate(clouds.items()):
         monitor.step(STAGE, i, len(clouds) + 1)
         xyz = ply.xyz_m
-        velocity[frame], owner[frame] = velocity_nearby(frame, xyz, trajectories), segments.of(frame, xyz)
+        both = segments.of(frame, np.concatenate([xyz, tracks.of(frame)]))  # one look at the posture for both
+        velocity[frame], owner[frame] = velocity_nearby(frame, xyz, trajectories), both[: len(xyz)]
+        tracks.keep(frame, both[len(xyz) :])
+    for frame in sorted(tracks.rows.keys() - clouds.keys()):
+        tracks.keep(frame, segments.of(frame, tracks.of(frame)))
     monitor.step(STAGE, len(clouds), len(clouds) + 1)
     return Ready(bones=segments.names, velocity_m_s=velocity, segment=owner, skin=_rest_skin(shape, settings),
-                 track_segment=None if trajectories is None else _of_tracks(segments, trajectories))
+                 track_segment=None if trajectories is None else tracks.segment)
 
 
 def velocity_nearby(frame: int, xyz_m: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
@@ -67,13 +72,24 @@ def velocity_nearby(frame: int, xyz_m: np.ndarray, trajectories: Mapping[str, np
     return np.where(np.isfinite(distance)[:, None], velocity[known][np.minimum(nearest, known.sum() - 1)], 0.0)
 
 
-def _of_tracks(segments: "_Segments", arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The bones (T, N) of trajectories, `NOBODY` where they were not seen."""
-    seen = np.isfinite(arrays["xyz_m"]).all(axis=-1)
-    found = np.full(seen.shape, NOBODY)
-    for row, frame, xyz, mine in zip(found, arrays["frames"].tolist(), arrays["xyz_m"], seen):
-        row[mine] = segments.of(frame, xyz[mine])
-    return found
+class _Tracks:
+    """The bones (T, N) of trajectories, `NOBODY` where they were not seen, found frame by frame."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray] | None) -> None:
+        self._xyz_m = arrays["xyz_m"] if arrays is not None else np.zeros((0, 0, 3))
+        self._seen = np.isfinite(self._xyz_m).all(axis=-1)
+        self.rows = {int(frame): row for row, frame in enumerate(arrays["frames"])} if arrays is not None else {}
+        self.segment = np.full(self._seen.shape, NOBODY)
+
+    def of(self, frame: int) -> np.ndarray:
+        """Places (N', 3) of those that were seen in a frame."""
+        row = self.rows.get(frame)
+        return np.zeros((0, 3)) if row is None else np.asarray(self._xyz_m[row][self._seen[row]])
+
+    def keep(self, frame: int, bones: np.ndarray) -> None:
+        """Their bones."""
+        if frame in self.rows:
+            self.segment[self.rows[frame], self._seen[self.rows[frame]]] = bones
 
 
 def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> OneSkin | None:

@@ -26,6 +26,7 @@ DETAIL = 2  # of a scene: at 32 rays the quads are 0.2 to 0.3 mm RMS from the su
 SEAM_RINGS = 4  # so many quads on either side of a seam are evened out
 EVENING_STEPS = 40
 UNTANGLING_STEPS = 30  # the first of them, which move vertices also across the surface
+CUT_STEPS = 2  # Newton's, from the middle of an edge or quad: a millimetre
 SMOOTHED_M = 0.03  # shares are smoothed over about this distance
 
 
@@ -74,7 +75,7 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     part, pieces = whole.part, detail * settings.detail
     if pieces > 1:
         vertices, weights, part, faces, uv = cut(vertices, weights, part, faces, uv, pieces)
-        vertices, weights = surface.reached(vertices, part), strongest(weights)
+        vertices, weights = surface.reached(vertices, part, CUT_STEPS), strongest(weights)
     return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
 
 
