@@ -13,6 +13,7 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.errors import InputError
 from tricap.core.fitting.state import ShapeParameters
+from tricap.core.motion import sources
 from tricap.core.motion.markers import Markers
 
 from .mutations import mutate
@@ -75,13 +76,15 @@ def test_the_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert made("A rig preset")["preset"].name == "Puppet"
 
 
-def test_the_file_format(tmp_path: Path) -> None:
+def test_the_file_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = made("A file format")
     xyz = np.random.default_rng(0).uniform(-1, 1, (5, 2, 3)).round(6)
     points = Markers(names=("elbow.R", "wrist.R"), fps=25.0, frames=np.arange(5) + 3, xyz_m=xyz, sigma_m=np.full((5, 2), np.nan))
     names["write_xyz"](tmp_path / "a.xyz", points)
     found = names["read_xyz"](tmp_path / "a.xyz")
     assert found.names == points.names and np.array_equal(found.frames, points.frames) and np.allclose(found.xyz_m, xyz)
+    monkeypatch.setitem(sources.POINTS, ".xyz", (names["read_xyz"], sources.Z_UP))
+    assert len(sources.read_motion_source(tmp_path / "a.xyz", unit="cm").frames) == 5
     whole = (tmp_path / "a.xyz").read_bytes()
     refused = 0
     for number in range(60):

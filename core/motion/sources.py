@@ -1,5 +1,6 @@
 """Motions from anywhere: a run's folder, BVH, TRC, C3D and CSV."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from ..body.skeleton import bone_frames
 from ..errors import InputError
 from .bvh import read_bvh
 from .c3d import read_c3d
-from .markers import metres_per
+from .markers import Markers, metres_per
 from .points_csv import rate, read_points_csv
 from .retarget.points import motion_from_points
 from .retarget.rig import Motion, Rig
@@ -17,11 +18,13 @@ from .retarget.roles import model_roles
 from .tables import read_motion
 from .trc import read_trc
 
-FILES = (".bvh", ".trc", ".c3d", ".csv")
-
-
-UP = {".trc": {"": "OpenSim", "Y": "OpenSim", "Z": "Z up"}, ".c3d": {"": "Z up", "Y": "Y up", "Z": "Z up"},
-      ".csv": {"": "Z up", "Y": "Y up", "Z": "Z up"}}  # axes of points by the axis that is up
+Z_UP = {"": "Z up", "Y": "Y up", "Z": "Z up"}
+POINTS: dict[str, tuple[Callable[..., Markers], dict[str, str]]] = {  # the reader of each kind, and its axes by the axis that is up
+    ".trc": (read_trc, {"": "OpenSim", "Y": "OpenSim", "Z": "Z up"}),
+    ".c3d": (read_c3d, Z_UP),
+    ".csv": (read_points_csv, Z_UP),
+}
+FILES = (".bvh", *POINTS)
 
 
 def read_motion_source(path: Path, *, up: str = "", unit: str = "") -> Motion:
@@ -41,9 +44,9 @@ def read_motion_source(path: Path, *, up: str = "", unit: str = "") -> Motion:
     if kind == ".bvh":
         motion = read_bvh(path, unit_m=metres_per(unit, path) if unit else None, up=up or None)
         return Motion(rig=motion.rig, fps=motion.fps, frames=motion.frames + 1, R=motion.R, head_m=motion.head_m)
-    if kind in (".trc", ".c3d", ".csv"):
-        read = {".trc": read_trc, ".c3d": read_c3d, ".csv": read_points_csv}[kind]
-        return motion_from_points(read(path, axes=UP[kind][up], unit=unit))
+    if kind in POINTS:
+        read, axes = POINTS[kind]
+        return motion_from_points(read(path, axes=axes[up], unit=unit))
     raise InputError(f"{path.name} is no motion that can be read; give a run's folder or one of {', '.join(FILES)}.")
 
 
