@@ -122,14 +122,14 @@ def run_clip(folder: Path, frames: int, until: str) -> list[dict[str, Any]]:
 
 
 def growth(path: Path) -> dict[str, float]:
-    """What a frame adds to the resident memory [KB] of each kind of step, over the last nine tenths of it."""
+    """What a frame adds to the resident memory [KB] of each kind of step, over its second half: the first fills buffers."""
     samples: dict[str, list[tuple[float, float]]] = {}
     with path.open(encoding="utf-8") as file:
         for _, stage, done, _, mb in csv.reader(file):
             samples.setdefault(stage, []).append((float(done), float(mb)))
     found = {}
     for stage, pairs in samples.items():
-        done, mb = np.array(pairs)[len(pairs) // 10 :].T
+        done, mb = np.array(pairs)[len(pairs) // 2 :].T
         if np.ptp(done) >= 100:
             found[stage] = round(float(np.polyfit(done, 1024 * mb, 1)[0]), 2)
     return found
