@@ -224,7 +224,7 @@ def test_a_body_in_the_air_does_not_go_on_as_its_feet_had_it_move() -> None:
     stand = Stand(side="L", begin=0, end=11, path_m=np.linspace(0.0, 0.1, 11)[:, None] * (0.0, 0.0, 1.0))
     shift, _, _ = carry_root([stand], {"L": still}, {"L": still}, {"L": stiff}, 30.0, 0.9)
     np.testing.assert_allclose(shift[1:10, 2], stand.path_m[1:10, 2], atol=2e-3)
-    assert 0.0 < shift[39, 2] - shift[10, 2] < 0.06, shift[:, 2]  # straight on: 0.29
+    assert 0.0 < shift[39, 2] - shift[10, 2] < 0.06, shift[:, 2]  # 0.23 without
 
 
 @pytest.mark.parametrize("frames", [1, 2])
