@@ -269,17 +269,10 @@ def _from_surface(
 def _model_covariance(
     ray: np.ndarray, w: np.ndarray, speed: np.ndarray | float, around: NeighbourFit, rig_sigma_px: float, base: Camera
 ) -> np.ndarray:
-    """What matching cannot know of itself (N, 3, 3): the rig's own quality, what a quadric does not follow, and the body's outline.
-
-    A patch that hangs over an outline is shifted across the ray: that moves it off a surface that turns away there, and not off one that
-    faces the camera up to its edge.
-    """
+    """What matching cannot know of itself (N, 3, 3): the rig's own quality, what a quadric does not follow, and the body's outline."""
     along = (rig_sigma_px / np.maximum(speed, 1e-9)) ** 2 + (SCATTER_SHARE * around.scatter) ** 2
-    px_m2 = 1 / (base.focal_px * w) ** 2
-    all_ways, across = RAY_SIGMA_PX**2 + rig_sigma_px**2, (OUTLINE_SIGMA_PX * (1 - around.support)) ** 2
-    of_ray = along / w**4 - across * px_m2 / np.einsum("ni,ni->n", ray, ray)
-    of_all = (all_ways + across) * px_m2
-    return ray[:, :, None] * ray[:, None] * of_ray[:, None, None] + of_all[:, None, None] * np.eye(3)
+    side_px2 = RAY_SIGMA_PX**2 + rig_sigma_px**2 + (OUTLINE_SIGMA_PX * (1 - around.support)) ** 2
+    return ray[:, :, None] * ray[:, None] * (along / w**4)[:, None, None] + (side_px2 / (base.focal_px * w) ** 2)[:, None, None] * np.eye(3)
 
 
 def _epipolar(

@@ -9,14 +9,13 @@ import pytest
 
 from tricap.core.images.fields import RowGrid
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.constraints import OUTLINE_SIGMA_PX, _model_covariance, constrain
+from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
 from tricap.core.matching.growing import GrowingSettings, TripletField, grow, rounds_of_larger_patches
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus, patch_offsets
 from tricap.core.matching.middle import believed, depth_doubt, in_doubt
 from tricap.core.matching.multi_image import match_multi_image
-from tricap.core.matching.neighbourhood import NeighbourFit
 from tricap.core.matching.object_space import Epipolar, SurfacePrior, match_surface
 from tricap.core.matching.seeds import sweep_seeds
 from tricap.core.matching.template_patches import TemplatePatches, monomials
@@ -296,22 +295,6 @@ def test_larger_patches_only_where_pixels_are_small(plane: Scene) -> None:
     assert rounds_of_larger_patches(SETTINGS, growing, depth, plane.rig[1]) == 1  # 2 mm per pixel
     assert rounds_of_larger_patches(SETTINGS, growing, depth / 8, plane.rig[1]) == growing.bigger_patches
     assert rounds_of_larger_patches(SETTINGS, replace(growing, bigger_patches=0), depth, plane.rig[1]) == 0
-
-
-def test_an_outline_moves_points_across_the_ray(surfaces: ModuleType) -> None:
-    """Half of the neighbours missing: what that costs is not said of a surface that faces the camera, and in full of one seen edge-on."""
-    base, w = surfaces.cameras()[1], np.array([0.5])
-    ray = base.rays(np.array([[40.0, 200.0]]))
-    normal = ray[0] / np.linalg.norm(ray[0])
-    edge_on = np.cross(normal, [0.0, 1.0, 0.0]) / np.linalg.norm(np.cross(normal, [0.0, 1.0, 0.0]))
-    sigma = {}
-    for support in (0.5, 1.0):
-        around = NeighbourFit(coefficients=np.zeros((1, 6)), scatter=np.zeros(1), support=np.array([support]))
-        K = _model_covariance(ray, w, 100.0, around, 0.0, base)[0]
-        sigma[support] = [np.sqrt(n @ K @ n) * w[0] * base.focal_px for n in (normal, edge_on)]
-        assert (np.linalg.eigvalsh(K) > 0).all()
-    assert sigma[0.5][0] == pytest.approx(sigma[1.0][0], rel=1e-6)
-    assert sigma[0.5][1] == pytest.approx(0.5 * OUTLINE_SIGMA_PX, rel=1e-3)
 
 
 def test_failures_are_statuses(plane: Scene) -> None:
