@@ -71,8 +71,8 @@ def vector_from_matrix(R: np.ndarray) -> np.ndarray:
 
 
 def matrix_from_vector(v: np.ndarray) -> np.ndarray:
-    """Matrices (…, 3, 3) of Rodrigues vectors (…, 3) [rad]."""
-    return Rotation.from_rotvec(np.reshape(v, (-1, 3))).as_matrix().reshape(*np.shape(v)[:-1], 3, 3)
+    """Matrices (…, 3, 3) of Rodrigues vectors (…, 3) [rad], which may be read-only (older scipy wants its own)."""
+    return Rotation.from_rotvec(np.array(v, dtype=np.float64).reshape(-1, 3)).as_matrix().reshape(*np.shape(v)[:-1], 3, 3)
 
 
 def angle_of(R: np.ndarray) -> np.ndarray:
