@@ -3,7 +3,8 @@
     skin of the parts ── sewn together (welding) ──▶ vertices about the seams evened out, on the surface of the whole
 
 Between Newton's steps that take it onto the surface (whole_surface) a vertex near a seam goes half way to the middle of its neighbours.
-The bones' shares are those of the parts, smoothed about the seams, or the skin would tear where one part ends.
+The bones' shares are those of the parts, smoothed about the seams, or the skin would tear where one part ends. Where the surface of
+the whole folds near a seam (thighs that touch, an arm close to the flank), the mesh leaves it and goes smoothly over the fold.
 """
 
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ SEAM_RINGS = 4  # so many quads on either side of a seam are evened out
 EVENING_STEPS = 40
 UNTANGLING_STEPS = 30  # the first of them, which move vertices also across the surface
 CUT_STEPS = 2  # Newton's, from the middle of an edge or quad: a millimetre
+FOLD = 0.4  # cosine: a face that stands so steeply on what is about its corners is in a fold
+UNFOLDING_STEPS = 40
+LOOSE_RINGS = 4  # over so many quads the mesh comes back to the surface
 SMOOTHED_M = 0.03  # shares are smoothed over about this distance
 
 
@@ -54,8 +58,7 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     """The skin of the rest posture in one piece; with `detail` above 1 every edge in so many pieces, on the surface.
 
     A body of one chain is its closed chain, by B-spline patches where `settings` or `detail` want them; a whole body's vertices are on the
-    surface itself in any fineness. A whole body has 10,000 quads and takes 1.5 s. Where thighs touch in the rest posture, so may their
-    quads at the crotch.
+    surface itself in any fineness, but for folds near its seams. A whole body has 10,000 quads and takes 1.5 s.
 
     Raises:
         InputError: there are no metaballs, or the number of rays is odd.
@@ -70,12 +73,13 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     uv = face_uv(whole)
     near = _mean_of_neighbours(faces, len(whole.vertices_m))
     free = _within(near, whole.sewn, SEAM_RINGS)
-    vertices = _evened(whole.vertices_m, near, free, whole.part, surface)
+    vertices, loose = _unfolded(_evened(whole.vertices_m, near, free, whole.part, surface), faces, near, free)
     weights = _smoothed(whole.weights, vertices, faces, near, free)
     part, pieces = whole.part, detail * settings.detail
     if pieces > 1:
-        vertices, weights, part, faces, uv = cut(vertices, weights, part, faces, uv, pieces)
-        vertices, weights = surface.reached(vertices, part, CUT_STEPS), strongest(weights)
+        vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, loose]), part, faces, uv, pieces)
+        weights, kept = strongest(both[:, :-1]), 1 - both[:, -1:]
+        vertices = vertices + kept * (surface.reached(vertices, part, CUT_STEPS) - vertices)
     return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
 
 
@@ -112,6 +116,35 @@ def _evened(vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, par
         found[free] = surface.reached(found[free] + step, part, steps=1)
     found[free] = surface.reached(found[free], part)
     return found
+
+
+def _unfolded(
+    vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) of which the free ones leave the surface where it folds, and how far (V,), 0 to 1, each belongs to such a place."""
+    found, may = vertices.copy(), np.isin(np.arange(len(vertices)), free)
+    loose = np.zeros(len(vertices))
+    for _ in range(UNFOLDING_STEPS):
+        folded = np.zeros(len(vertices), dtype=bool)
+        folded[faces[_in_a_fold(found, faces) & may[faces].all(axis=1)]] = True
+        if not folded.any():
+            break
+        moved = np.intersect1d(_within(near, folded, 2), free)
+        found[moved] = 0.5 * (found[moved] + near[moved] @ found)
+        loose[moved] = 1.0
+    for _ in range(LOOSE_RINGS):
+        loose = np.maximum(loose, near @ loose)
+    return found, loose
+
+
+def _in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Which faces (F,) stand steeply on the mean of the faces about one of their corners."""
+    corner = vertices[faces]
+    normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    mean = np.stack([np.bincount(faces.ravel(), np.repeat(normal[:, k], 4), len(vertices)) for k in range(3)], axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    return np.asarray((np.einsum("fk,fck->fc", normal, mean[faces]) < FOLD).any(axis=1))
 
 
 def _smoothed(weights: np.ndarray, vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The skin in one piece: closed, of quads, on the fitted surface, with texture coordinates and shares of the bones."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -34,6 +35,20 @@ def test_it_is_closed_and_faces_outwards(model: str, detail: int) -> None:
     surface = WholeSurface(default_shape(read_model(model)), np.zeros(len(default_shape(read_model(model)).skeleton.dof_names)))
     outwards = surface.normals(skin.vertices_m[skin.faces].mean(axis=1), skin.part[skin.faces[:, 0]])
     assert (np.einsum("nk,nk->n", face_normals(skin), outwards) > 0).all()
+
+
+def test_thighs_that_touch_leave_no_fold_between_them() -> None:
+    """Thighs a sixth thicker, which are one at the crotch: no two faces along a common edge turn against each other."""
+    shape = default_shape(read_model("full"))
+    balls, bones = shape.metaballs, shape.skeleton.bones
+    thigh = np.array([bones[b].name.startswith("thigh") for b in balls.bone_index])
+    thick = replace(shape, metaballs=replace(balls, radii_m=np.where(thigh[:, None], 1.15, 1.0) * balls.radii_m))
+    skin = one_skin(thick, SkinSettings())
+    normals = face_normals(skin) / np.linalg.norm(face_normals(skin), axis=1, keepdims=True)
+    edges = np.sort(np.concatenate([skin.faces[:, [i, (i + 1) % 4]] for i in range(4)]), axis=1)
+    order = np.lexsort(edges.T)
+    pairs = np.tile(np.arange(len(skin.faces)), 4)[order].reshape(-1, 2)  # the two faces of each edge
+    assert np.einsum("nk,nk->n", normals[pairs[:, 0]], normals[pairs[:, 1]]).min() > -0.5
 
 
 def test_seams_are_on_the_surface_and_the_parts_skin_is_kept_elsewhere() -> None:
