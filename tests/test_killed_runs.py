@@ -29,8 +29,10 @@ def take(killing: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def profile(killing: ModuleType, tmp_path: Path) -> Iterator[None]:
-    """The children's Blender profile, not that of this process."""
+def profile(killing: ModuleType, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[None]:
+    """The children's Blender profile, not that of this process; where it has imported bpy already, it is that of this process."""
+    if "bpy" in sys.modules:
+        request.getfixturevalue("blender")
     before = os.environ.get("BLENDER_USER_RESOURCES")
     killing.prepare_profile(tmp_path / "profile")
     yield
