@@ -75,7 +75,8 @@ def test_the_button_leaves_the_bytes_of_the_command(killing: ModuleType, take: P
     found = []
     for driver in ("tricap run", "operator"):
         line = [sys.executable, "-c", DRIVER, driver, take, tmp_path / driver, tmp_path / "profile" / driver]
-        done = subprocess.run(line, env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}, capture_output=True, text=True)
+        some = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+        done = subprocess.run(line, env=os.environ | some, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         found.append(killing.contents(tmp_path / driver))
     assert len(found[1]) > 20 and killing.differences(*found) == ["body.blend"]
