@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from .account import median, new_account, track_figures
+from .body.ends import shape_for_skin
 from .body.model_file import read_model
 from .body.shape import write_body
-from .body.skin import SkinSettings, body_skin, shape_for_skin
+from .body.skin import SkinSettings, body_skin
 from .body_guide import BodyGuide
 from .checking.body_check import odd_limbs
 from .checking.take_check import causes_of_failure, doubts, with_cause
@@ -382,10 +383,11 @@ def is_complete(run: Run) -> bool:
 
 
 def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
+    person = shape_for_skin(body.shape, run.settings["skin"])
     for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
         monitor.step("skin", i, len(body.motion.frames))
         try:
-            skin = body_skin(shape_for_skin(body.shape, run.settings["skin"]), values, run.settings["skin"])
+            skin = body_skin(person, values, run.settings["skin"])
         except InputError as no_skin:
             run.warn(f"No skin was made: {no_skin}")
             run.results.remove("skin")

@@ -13,8 +13,9 @@ import numpy as np
 
 from ...core import store
 from ...core.bar_file import read_bar
+from ...core.body.ends import shape_for_skin
 from ...core.body.shape import BodyShape, read_body
-from ...core.body.skin import SkinSettings, shape_for_skin
+from ...core.body.skin_mesh import SkinSettings
 from ...core.errors import InputError
 from ...core.motion.ply import Ply, read_ply
 from ...core.motion.tables import MotionTable, read_motion

@@ -11,7 +11,6 @@ out of the trunk) overlap with them on one common surface.
 import numpy as np
 
 from ..errors import InputError
-from .ends import shape_for_skin
 from .shape import BodyShape
 from .skeleton import bone_frames
 from .skin_mesh import INTERPOLATING, Skin, SkinSettings, chain_faces
@@ -21,7 +20,7 @@ from .skin_rays import Rays, cast, segments_of
 from .skin_roots import limb_normals, limb_root, part_root
 from .skin_weights import chain_weights
 
-__all__ = ["Skin", "SkinSettings", "body_skin", "limb_skin", "shape_for_skin"]
+__all__ = ["Skin", "SkinSettings", "body_skin", "limb_skin"]
 
 
 def limb_skin(shape: BodyShape, motion: np.ndarray, settings: SkinSettings | None = None) -> Skin:

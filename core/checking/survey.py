@@ -123,10 +123,10 @@ def _blank(seen: Survey, name: str, blank: np.ndarray) -> Finding:
 def _frozen(seen: Survey, names: tuple[str, ...]) -> list[Finding]:
     """Views that show one picture, without even noise, while another view does not."""
     energy = np.nanmax(seen.energy, axis=1) if len(seen.frames) > 1 else np.zeros(len(names))
-    return [frozen(name) for name, most in zip(names, energy) if not most > 0] if (energy > 0).any() else []
+    return [frozen_view(name) for name, most in zip(names, energy) if not most > 0] if (energy > 0).any() else []
 
 
-def frozen(name: str) -> Finding:
+def frozen_view(name: str) -> Finding:
     """A view that shows one picture again and again."""
     said = f"View {name} shows the same picture in every frame that was looked at: its camera or its export stood still."
     return wrong("frozen view", said, "Give the view its right footage, or leave the view out of take.toml.")

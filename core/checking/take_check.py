@@ -14,7 +14,7 @@ from .clicks import seed_findings
 from .findings import Checked, Finding, doubtful, wrong
 from .rig_check import geometry_findings, unit_findings
 from .rig_fit import ENOUGH, rig_findings, same_views, share, stale_finding
-from .survey import frozen, picture_findings, rate_findings, survey
+from .survey import frozen_view, picture_findings, rate_findings, survey
 from .texture import texture_findings
 from .timing import Film, Offset, estimate_offsets
 from .view_matches import match_views
@@ -135,7 +135,7 @@ def first_look(footage: Footage, frame: int) -> list[Finding]:
     pictures = footage.read(frame)
     still = still_views(footage, frame, pictures)
     pairs = match_views([[rows.rows(image) for image in pictures]], rows)
-    beside = [*unit_findings(footage.rig), *(frozen(name) for name in still)]
+    beside = [*unit_findings(footage.rig), *(frozen_view(name) for name in still)]
     return same_views(pairs, names) or [*beside, *rig_findings(pairs, footage.rig.cameras, names)]
 
 

@@ -7,8 +7,6 @@ import numpy as np
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 520, 170, 56, 26, 26
 COLOURS = ("#c0392b", "#2471a3", "#1e8449", "#b9770e", "#7d3c98", "#515a5a")
-
-
 MOST_PER_CURVE = 1200  # frames, two for each pixel of the width: of more only what is lowest and highest in a stretch can be seen
 
 

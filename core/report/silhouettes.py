@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from ..body.ends import shape_for_skin
 from ..body.shape import BodyShape
-from ..body.skin import SkinSettings, body_skin, shape_for_skin
+from ..body.skin import SkinSettings, body_skin
 from ..errors import InputError
 from ..fitting.body_motion import BodyFit
 from ..geometry.camera import Camera

@@ -15,9 +15,9 @@ import numpy as np
 
 from .contacts import Contacts, FeetSettings
 from .mapping import RigMap
-from .places import hip_centre, loose_parts
+from .places import hip_centre, outwards
 from .rig import Motion, Rig
-from .roles import FINGERS, SPREAD, parent_role, part_of
+from .roles import FINGERS, SPREAD, above, part_of
 from .transfer import body_axes, fractions_of, kept, partners_of
 from .turns import matrix_from_vector, transposed, vector_from_matrix
 from .unshown import UnshownChain
@@ -49,23 +49,15 @@ def lacking(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap,
         bones, part = [rig.index[name] for name in names], part_of(role)
         if role in aligned and part in SPREAD:
             chains.append(_part_of_chain(role, [D[:, b] @ aligned[role] for b in bones], fractions_of(rig, bones), target, target_map, R))
-        elif role not in target_map.bones and part in HUNG and (above := _above(role, aligned)):
-            A = body if part in ("neck", "head", "clavicle") else aligned[above]
+        elif role not in target_map.bones and part in HUNG and (beside := above(role, aligned)):
+            A = body if part in ("neck", "head", "clavicle") else aligned[beside]
             bones = bones if part in SPREAD else [kept(bones, role)]
             along = target.height_m / max(rig.height_m, 1e-9) * A.T @ (rig.tail_m[bones[-1]] - rig.head_m[bones[0]])
-            ref = target.index[target_map.bones[above][-1]]
+            ref = target.index[target_map.bones[beside][-1]]
             chains.append(UnshownChain(
-                role=role, order=(-1,) * len(bones), ends=fractions_of(rig, bones), along_m=along, beside=above,
-                size=len(target_map.bones[above]), turn=np.stack([_against(D[:, b] @ A, target, R, ref) for b in bones])))
+                role=role, order=(-1,) * len(bones), ends=fractions_of(rig, bones), along_m=along, beside=beside,
+                size=len(target_map.bones[beside]), turn=np.stack([_against(D[:, b] @ A, target, R, ref) for b in bones])))
     return tuple(chains)
-
-
-def _above(role: str, known: Mapping[str, object]) -> str:
-    """The nearest part that a part hangs on and that is known."""
-    above = parent_role(role)
-    while above and above not in known:
-        above = parent_role(above)
-    return above
 
 
 def _against(D: np.ndarray, rig: Rig, R: np.ndarray, ref: int) -> np.ndarray:
@@ -117,16 +109,8 @@ def _turned_back(motion: Motion, rig_map: RigMap, turns: Mapping[str, np.ndarray
     for role in rig_map.bones:
         for k, name in enumerate(rig_map.bones[role]):
             back[rig.index[name]] = turns[role][min(k, len(turns[role]) - 1)] if role in turns else np.zeros((len(motion.frames), 3))
-    loose, R, head = loose_parts(rig, rig_map), motion.R.copy(), motion.head_m.copy()
-    done: set[int] = set()
-
-    def place(b: int) -> None:
-        if b in done:
-            return
-        done.add(b)
-        a = loose.get(b, int(rig.parents[b]))
-        if a >= 0:
-            place(a)
+    R, head = motion.R.copy(), motion.head_m.copy()
+    for b, a in outwards(rig, rig_map):
         if b in back:
             R[:, b] = matrix_from_vector(-back[b]) @ motion.R[:, b]
         elif a >= 0:
@@ -134,9 +118,6 @@ def _turned_back(motion: Motion, rig_map: RigMap, turns: Mapping[str, np.ndarray
         if a >= 0:
             arm = transposed(motion.R[:, a]) @ (motion.head_m[:, b] - motion.head_m[:, a])[..., None]
             head[:, b] = head[:, a] + (R[:, a] @ arm)[..., 0]
-
-    for b in range(len(rig.names)):
-        place(b)
     if "hips" not in rig_map.bones:
         return replace(motion, R=R, head_m=head)
     middle = hip_centre(motion, rig_map) - moved_m - hip_centre(replace(motion, R=R, head_m=head), rig_map)

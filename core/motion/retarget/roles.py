@@ -4,7 +4,7 @@ A limb's bones are rigid parts: their directions are what a motion looks like. T
 bend, of as many bones as a rig happens to have.
 """
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 SIDES = ("L", "R")
 ARM = ("clavicle", "upper_arm", "forearm", "hand")
@@ -50,6 +50,14 @@ def model_roles(names: Iterable[str]) -> dict[str, str]:
         role = sided(part, side) if side else part
         if role in ROLES:
             found[role] = name
+    return found
+
+
+def above(role: str, among: Container[str]) -> str:
+    """The nearest role that a role hangs on, of those `among` which one is looked for; "" where there is none."""
+    found = parent_role(role)
+    while found and found not in among:
+        found = parent_role(found)
     return found
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from .mapping import RigMap
 from .rig import Motion, Rig
-from .roles import ROLES, SEGMENTS, SIDES, SPREAD, parent_role, part_of, side_of, sided
+from .roles import ROLES, SEGMENTS, SIDES, SPREAD, above, part_of, side_of, sided
 from .turns import about, between, rotate, shortest, transposed, twist_about, unit
 
 UPRIGHT = np.cos(np.radians(35.0))  # a rest pose that leans less is taken as upright
@@ -79,10 +79,8 @@ def alignments(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap)
     for role in ROLES:
         if role not in source_map.bones or role not in target_map.bones:
             continue
-        part, above = part_of(role), role
-        while above and (above := parent_role(above)) and above not in aligned:
-            pass
-        A = aligned.get(above, body)
+        part = part_of(role)
+        A = aligned.get(above(role, aligned), body)
         if part in ("upper_arm", "forearm", "thigh", "shin") or "." in part:
             d_s, d_t = direction(source, source_map, role), direction(target, target_map, role)
             if d_s is not None and d_t is not None:
@@ -138,12 +136,10 @@ def kept(chain: Sequence[Any], role: str) -> Any:
 def _nodes(rig: Rig, rig_map: RigMap, role: str, since_rest: np.ndarray) -> Nodes:
     """The source's rotations along a chain: at 0 that of what the chain hangs on, then after each of its bones."""
     chain = [rig.index[name] for name in rig_map.bones[role]]
-    above = parent_role(role)
-    while above and above not in rig_map.bones:
-        above = parent_role(above)
+    before = above(role, rig_map.bones)
     if part_of(role) not in SPREAD:
         return np.array([0.0, 1.0]), np.stack([since_rest[:, kept(chain, role)]] * 2)
-    start = since_rest[:, rig.index[rig_map.bones[above][-1]]] if above else since_rest[:, chain[0]]
+    start = since_rest[:, rig.index[rig_map.bones[before][-1]]] if before else since_rest[:, chain[0]]
     return np.concatenate([[0.0], fractions_of(rig, chain)]), np.stack([start, *(since_rest[:, b] for b in chain)])
 
 
