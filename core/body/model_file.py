@@ -36,6 +36,7 @@ class BodyModel:
     surface: np.ndarray  # (B, 2) fractions of the bone between which a measured surface is the bone's own
     stations: np.ndarray  # (B, 3) fractions of the bone where its balls are
     aside: np.ndarray  # (B, 3, 2) how far they lie off the bone in its x and z, as fractions of its length
+    length_sigma: np.ndarray  # (B,) relative: how far the joints' places, as people click them, leave a bone's length open
 
     def __post_init__(self) -> None:
         b = len(self.skeleton.bones)
@@ -43,6 +44,7 @@ class BodyModel:
         object.__setattr__(self, "surface", frozen(self.surface, (b, 2), name="surface"))
         object.__setattr__(self, "stations", frozen(self.stations, (b, 3), name="stations"))
         object.__setattr__(self, "aside", frozen(self.aside, (b, 3, 2), name="aside"))
+        object.__setattr__(self, "length_sigma", frozen(self.length_sigma, (b,), name="length_sigma"))
 
 
 def model_names() -> tuple[str, ...]:
@@ -130,7 +132,7 @@ def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
     rows = [i for i, left in enumerate(names) if left not in gone]
     skeleton = Skeleton(name=name, bones=tuple(model.skeleton.bones[i] for i in rows), base_dofs=model.skeleton.base_dofs)
     return BodyModel(name=name, skeleton=skeleton, visible_radii_m=model.visible_radii_m[rows], surface=model.surface[rows],
-                     stations=model.stations[rows], aside=model.aside[rows])
+                     stations=model.stations[rows], aside=model.aside[rows], length_sigma=model.length_sigma[rows])
 
 
 def with_limits(model: BodyModel, limits: Mapping[str, tuple[float, float]], locked: Sequence[str]) -> BodyModel:
@@ -162,7 +164,7 @@ def mirrored(model: BodyModel, name: str) -> BodyModel:
     base = tuple(Dof(name=other_side(d.name), axis=d.axis, limits=d.limits, prior_sigma=d.prior_sigma) for d in old.base_dofs)
     return BodyModel(name=name, skeleton=Skeleton(name=name, bones=bones, base_dofs=base),
                      visible_radii_m=model.visible_radii_m, surface=model.surface, stations=model.stations,
-                     aside=model.aside * MIRROR[[0, 2]])
+                     aside=model.aside * MIRROR[[0, 2]], length_sigma=model.length_sigma)
 
 
 def other_side(name: str) -> str:
@@ -216,14 +218,16 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
         radii = [np.broadcast_to(np.array(t.get("radii_m", [np.nan] * 3), dtype=float).reshape(3, -1), (3, 2)) for t in rows]
         surface, stations = [t.get("surface", (0.0, 1.0)) for t in rows], [t.get("stations", STATIONS) for t in rows]
         aside = [np.array(t.get("aside", np.zeros((3, 2))), dtype=float) for t in rows]
+        open_lengths = [float(t.get("length_sigma", 0.0)) for t in rows]
         if table.get("symmetric", False):
             right = [i for i, bone in enumerate(bones) if bone.name.endswith(".R")]
             bones += [_mirrored_bone(bones[i]) for i in right]
             aside += [aside[i] * MIRROR[[0, 2]] for i in right]
-            radii, surface, stations = ([*column, *(column[i] for i in right)] for column in (radii, surface, stations))
+            columns: tuple[list[Any], ...] = (radii, surface, stations, open_lengths)
+            radii, surface, stations, open_lengths = ([*column, *(column[i] for i in right)] for column in columns)
         skeleton = Skeleton(name=str(table["name"]), bones=tuple(bones), base_dofs=base_dofs(str(table["base"])))
         return BodyModel(name=skeleton.name, skeleton=skeleton, visible_radii_m=np.array(radii), surface=np.array(surface),
-                         stations=np.array(stations), aside=np.array(aside))
+                         stations=np.array(stations), aside=np.array(aside), length_sigma=np.array(open_lengths))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The body model {path} lacks something or holds a wrong value: {error}.") from error
 

@@ -1,6 +1,6 @@
 """What is believed of the bone lengths before anything but clicks is looked at.
 
-    ln L_b = ln L_b,model + g + c_k + d_b ,   g ~ N(0, σ_g²) ,   c_k ~ N(0, σ_k²) ,   d_b ~ N(0, σ_d²)                      (1)
+    ln L_b = ln L_b,model + g + c_k + d_b + j_b ,   g ~ N(0, σ_g²) ,   c_k ~ N(0, σ_k²) ,   d_b ~ N(0, σ_d²)                (1)
     σ_k² = σ_c⁴ / (σ_c² + (e / L_k)²)                                                                                  (2)
 
 g is the person's size: all bones share it. d_b is what one bone is longer or shorter than in other people of that size, a few per cent.
@@ -9,12 +9,17 @@ detector, sees it, not where the anatomist does), so it is free by σ_c, as far 
 neck is too short for them. Inside a chain (collarbones; pelvis, spine and chest), and where nobody clicked at all (head, hands), bones
 keep the model's proportions: clouds and outlines show no joints there, and what a body differs from its balls (a cap, fingers, loose
 clothes) it differs in all frames alike. However many they are, frames do not outvote σ_d: it counts as often as they do.
+
+j_b ~ N(0, model.length_sigma²) is for a joint that has no place of its own that people agree on, clicked or not. A neck's base is taken
+anywhere between the breastbone and the vertebrae in the middle of the neck, 25 mm up or down. A neck that keeps its proportions above such
+a click lifts the skull off the head that was measured; one with j_b is as long as the head's surface says.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from ..body.model_file import BodyModel
 from ..body.skeleton import Skeleton
 from .observations import Proportions
 
@@ -22,11 +27,12 @@ STATURE_SIGMA = 0.07  # relative, of a person about the model
 CLICKS_OFF_M = 0.02  # of both ends of a length together
 
 
-def proportions(skeleton: Skeleton, lengths_m: np.ndarray, located: np.ndarray, clicked_sigma: float, own_sigma: float) -> Proportions:
+def proportions(model: BodyModel, lengths_m: np.ndarray, located: np.ndarray, clicked_sigma: float, own_sigma: float) -> Proportions:
     """(1) about the lengths (B,) of a model, when some joints (J,) have places: σ_c and σ_d. Lengths that are known fix the size too."""
     stature = min(STATURE_SIGMA, clicked_sigma)
-    covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(np.full(len(lengths_m), own_sigma**2))
-    for chain in clicked_chains(skeleton, located):
+    of_joints = np.minimum(model.length_sigma, 2 * clicked_sigma)
+    covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(own_sigma**2 + of_joints**2)
+    for chain in clicked_chains(model.skeleton, located):
         of_clicks = (CLICKS_OFF_M / lengths_m[chain].sum()) ** 2
         covariance[np.ix_(chain, chain)] += clicked_sigma**4 / (clicked_sigma**2 + of_clicks)  # (2)
     return Proportions(mean=np.log(lengths_m), covariance=covariance)

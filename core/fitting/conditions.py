@@ -103,7 +103,7 @@ class Conditions:
     def proportions(self) -> Proportions:
         """What is believed of the bone lengths; of a single bone, against the error that the model has in all frames alike."""
         s = self.settings
-        return proportions(self.model.skeleton, self.parameters.template.lengths_m, self.located, s.length_sigma,
+        return proportions(self.model, self.parameters.template.lengths_m, self.located, s.length_sigma,
                            s.proportion_sigma / np.sqrt(self.frames))
 
     def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:

@@ -24,7 +24,7 @@ def _located(model) -> np.ndarray:
 
 def _believed(model) -> tuple[dict[str, int], Proportions]:
     names = [bone.name for bone in model.skeleton.bones]
-    believed = proportions(model.skeleton, default_shape(model).lengths_m, _located(model), 0.15, 0.04)
+    believed = proportions(model, default_shape(model).lengths_m, _located(model), 0.15, 0.04)
     return {name: i for i, name in enumerate(names)}, believed
 
 
@@ -63,8 +63,22 @@ def test_a_chain_shares_what_its_ends_say_and_a_short_one_is_held(full) -> None:
     at, believed = _believed(full)
     change, _ = _told(believed, [at["chest"]], 0.10)
     assert change[at["spine"]] > 0.08 and change[at["pelvis"]] > 0.08  # the three are seen as one length
-    free = {bone: believed.covariance[at[bone], at[bone]] for bone in ("neck", "hip.R", "thigh.R")}
-    assert free["neck"] < free["hip.R"] < free["thigh.R"]
+    free = {bone: believed.covariance[at[bone], at[bone]] for bone in ("shoulder.R", "hip.R", "thigh.R")}
+    assert free["hip.R"] < free["shoulder.R"] < free["thigh.R"]  # the shoulder's chain is collarbone and shoulder
+
+
+def test_a_neck_is_as_long_as_the_heads_surface_says_and_the_head_keeps_its_size(full) -> None:
+    at, believed = _believed(full)
+    K, rows = believed.covariance, np.array([at["neck"], at["head"]])
+    lower = default_shape(full).lengths_m[rows]  # the crown is seen 40 mm lower than proportions have it
+    gain = K[:, rows] @ lower / (lower @ K[np.ix_(rows, rows)] @ lower)
+    change = -0.04 * gain
+    assert change[at["neck"]] < -0.3 and -0.02 < change[at["head"]] - change[at["hand.R"]] < 0
+
+
+def test_lengths_that_are_known_leave_the_neck_no_freedom(full) -> None:
+    known = proportions(full, default_shape(full).lengths_m, _located(full), 0.001, 0.001)
+    assert np.sqrt(np.diag(known.covariance)).max() < 0.003
 
 
 def test_an_outline_beyond_the_hand_is_the_fingers_and_one_over_the_crown_is_the_heads(full) -> None:
