@@ -6,7 +6,7 @@ Here the three balls of such a bone give way to ellipsoids at their places in an
 length, turned and stretched to the surface that was fitted, where that is a head's, a hand's or a foot's (not at the jaw, nor the sole):
 
     √(−½ ln F(X)) = √(½ ln 2) at points X of the fitted surface ± 4 mm ,   ln s_x, ln s_z = 0 ± 0.12 ,   ln s_y = 0 ± 0.03 ,
-    pitch = 0 ± 12°                                                                                       (1)
+    pitch = 0 ± 6°                                                                                        (1)
 
 Sizes of a person of 1.75 m in units of the bone (head 158 mm, hand 96 mm, foot 149 mm; Winter 2009, Table 4.1; Gordon et al., ANSUR 1989):
 head 228 mm high, 195 long, 154 wide; hand 189 long, 85 wide; foot 266 long, 98 wide, the ankle 82 mm above the sole.
@@ -23,7 +23,7 @@ from .metaballs import VISIBLE, Metaballs
 from .shape import BodyShape
 from .skin_mesh import SkinSettings
 
-SIZE, LENGTH, PITCH = 0.12, 0.03, np.radians(12.0)  # sigmas of ln s across and along the bone, and of the pitch, in (1)
+SIZE, LENGTH, PITCH = 0.12, 0.03, np.radians(6.0)  # sigmas of ln s across and along the bone, and of the pitch, in (1)
 UNKNOWN = 1e-3  # of both where the fitted surface tells no thickness
 NEAR_M = 0.004  # and of the distance from the fitted surface
 FARTHEST = 30.0  # of an equation

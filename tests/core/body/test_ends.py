@@ -90,6 +90,24 @@ def test_a_foot_that_was_fitted_out_to_its_toes_is_not_made_longer() -> None:
     assert reach_m(replace(shape, lengths_m=lengths)) < 1.1 * reach_m(shape)
 
 
+def test_toes_do_not_turn_up_where_the_balls_at_the_ankle_are_thick() -> None:
+    """As of a man who walked on a beam: what is measured about the heel and the ankle tells nothing of the sole's angle."""
+    shape = simple()
+    balls, b = shape.metaballs, [bone.name for bone in shape.skeleton.bones].index("foot.R")
+    radii = balls.radii_m.copy()
+    radii[balls.bone_index == b] *= [[1.3, 1, 1.7], [0.8, 1, 0.8], [1.1, 1, 0.95]]
+
+    def sole(person: BodyShape) -> float:
+        """Angle of the line from heel to great toe, about the bone's x axis."""
+        mine = person.metaballs.bone_index == b
+        names = [ball.name for ball in TABLES["foot"].balls]
+        toe, heel = (person.metaballs.centre[mine][names.index(name), 1:] for name in ("great toe", "heel"))
+        return float(np.degrees(np.arctan2(toe[1] - heel[1], toe[0] - heel[0])))
+
+    swollen = person_shape(replace(shape, metaballs=replace(balls, radii_m=radii)))
+    assert abs(sole(swollen) - sole(person_shape(shape))) < 5.0
+
+
 def test_refined_bodies_and_other_models_keep_what_they_have_and_the_knob_is_read() -> None:
     arm = default_shape(read_model("arm.R"))
     assert person_shape(arm) is arm
