@@ -22,7 +22,7 @@ ZONE = 5.0  # D/q of (1): atan 5 = 79°, with room for limbs that are no cylinde
 LEAST_Q = 0.5  # q_0, in limb radii
 ROUNDED = 0.4  # the maximum of (1) is rounded over this many limb radii
 MOST_BONES = 4  # at a vertex, as game engines and glTF take them
-LARGEST_ZONE = 0.7  # of the bone's length
+LARGEST_ZONE = 0.95  # of the bone's length: with less, a knee as stout as most lets only 130° of (1)
 
 
 def chain_weights(shape: BodyShape, segments: Sequence[Segment], rays: Rays, local_m: np.ndarray) -> np.ndarray:
