@@ -4,10 +4,15 @@ A limb of one chain has the field of its bones, F_b = own + parent's + children'
 of a body meet, the sum would bulge and the larger of the two would leave a crease; their fields are joined by the blend of
 constructive solid geometry (Ricci 1973, Comput. J. 16),
 
-    G = (F_b^n + max_q (w_q F_q)^n)^(1/n) ,   n = 4 ,   q: the bones of the other part next to b           (1)
+    G = (M^n + max M_other^n)^(1/n) ,   n = 4 ,   M = Σ_b u_b F_b   over a part's bones                    (1)
 
-with w_q = 1, but of the bones of the part that it grows out of a limb sees each only beside its own length: w_q falls to 0 where the next
-bone's field holds, as it does for that part itself. G is 2^(1/n) of the larger field where both are equal, and the larger field
+with the bones of the other part next to b in M_other. F_b and the next bone's field differ by the balls beyond both, which at a short neck
+are a tenth of the field: so along a chain u passes from bone to bone about their joint X_j,
+
+    u_1 = 1 − S_1 ,   u_2 = S_1 (1 − S_2) , … ,   S_j = smooth((1 + s/h)/2) ,   s = (X − X_j)·(y_j + y_j+1)/(1 + cos β)          (1b)
+
+with h half of the shorter bone, s = 0 on the plane that halves the bend β and the distance from the joint on both axes,
+or there would be a step around the neck. G is 2^(1/n) of the larger field where both are equal, and the larger field
 elsewhere: a fillet of 4 mm on a radius of 60 mm. Both parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A
 part ends inside its neighbour:
 
@@ -16,7 +21,7 @@ part ends inside its neighbour:
 with F_own the field of its own balls, so its mesh leaves the common surface only where the neighbour's is the body's surface.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,11 +29,11 @@ import numpy as np
 from .metaballs import THRESHOLD, active_balls, field, field_and_derivatives
 from .shape import BodyShape
 from .skin_parts import Part
-from .skin_rays import Rays, smooth
+from .skin_rays import SHARPEST_COS, Rays, smooth
 
 BLEND_POWER = 4.0  # n of (1)
 OWN_SHARE = 0.4  # τ of (2): below ½, or two that reach T together would both stay below it
-BORDER = 0.3  # w_q ends this part of the bone's length beyond its ends
+PASSING = 0.5  # h of (1b) over the shorter bone
 STEP = 0.05  # march, in units of the reach
 FINE_STEP = 0.02  # … outwards, where a gap between two parts must not be stepped over
 SECANT_STEPS = 7
@@ -126,100 +131,111 @@ class _JoinedField:
     weight: np.ndarray  # (m,) of the balls in use
     frame: np.ndarray  # (m, 3, 3) columns: a ball's axes in the world over its l
     shift: np.ndarray  # (m, 3) its centre in them
-    chosen: np.ndarray  # (K, m) 0 or 1: row 0 the field of the bone, row 1 of its own part alone, then those of other parts
-    head: np.ndarray  # (K − 2, 3) of these
-    along: np.ndarray  # (K − 2, 3) 1/m: their axes over their lengths
-    open_ends: np.ndarray  # (K − 2, 2) whether they go on before their heads, and beyond their tails
-
-    @property
-    def others(self) -> int:
-        """How many fields of other parts there are."""
-        return len(self.chosen) - 2
+    of_part: np.ndarray  # (m,) 0 or 1: the balls of the part
+    own: "Chain"  # the bone and those next to it
+    chosen: np.ndarray  # (K, m) 0 or 1: the fields of these
+    others: tuple[tuple["Chain", np.ndarray], ...]  # of other parts, with their fields
 
     def log_ratio(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
         """ln of (2) at ρ (N',) on the rays `which` (N',)."""
         points = self.origin[which] + rho[:, None] * self.direction[which]
-        ln = self._logs(self._terms(points)[1])
-        joined = self._joined(ln, self._shares(points, self.fade[which]))
-        return np.minimum(joined, ln[:, 1] - np.log(OWN_SHARE)) if self.others else joined  # (2)
+        terms = self._terms(points)[1]
+        own = np.einsum("nm,nm->n", terms, self.own.shares(points) @ self.chosen)
+        if not self.others:
+            return _log(own)
+        G = (own**BLEND_POWER + self._others(points, terms, which)[0] ** BLEND_POWER) ** (1 / BLEND_POWER)  # (1)
+        return _log(np.minimum(G, terms @ self.of_part / OWN_SHARE))  # (2)
 
     def log_own(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """ln of F_b/T at ρ (N',) on the rays `which` (N',)."""
-        terms = self._terms(self.origin[which] + rho[:, None] * self.direction[which])[1]
-        return np.asarray(np.log(np.maximum(terms @ self.chosen[0], NOTHING) / THRESHOLD))
+        """ln of M/T at ρ (N',) on the rays `which` (N',)."""
+        points = self.origin[which] + rho[:, None] * self.direction[which]
+        return _log(np.einsum("nm,nm->n", self._terms(points)[1], self.own.shares(points) @ self.chosen))
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """−∇G/|∇G| (N, 3) at a point of each ray."""
         q, terms = self._terms(points)
-        ln = self._logs(terms)
-        share = np.exp(BLEND_POWER * (ln + np.log(np.column_stack([np.ones((len(ln), 2)), self._shares(points, self.fade)]))))
-        share[:, 1] = 0.0
+        factors = self.own.shares(points) @ self.chosen
+        factors = np.einsum("nm,nm->n", terms, factors)[:, None] ** (BLEND_POWER - 1) * factors
         if self.others:
-            share[:, 2:] *= share[:, 2:] == share[:, 2:].max(axis=1, keepdims=True)
-        of_ball = terms * ((share / np.exp(ln)) @ self.chosen)
-        return _unit(np.einsum("nm,mij,nmj->ni", of_ball, self.frame, q, optimize=True))
+            other, balls = self._others(points, terms, np.arange(len(points)))
+            factors = factors + other[:, None] ** (BLEND_POWER - 1) * balls
+        return _unit(np.einsum("nm,mij,nmj->ni", terms * factors, self.frame, q, optimize=True))
 
     def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         flat = points @ self.frame.transpose(1, 0, 2).reshape(3, -1) - self.shift.ravel()
         q = flat.reshape(len(points), len(self.weight), 3)
         return q, self.weight * np.exp(-2 * np.einsum("nmi,nmi->nm", q, q))
 
-    def _logs(self, terms: np.ndarray) -> np.ndarray:
-        return np.asarray(np.log(np.maximum(terms @ self.chosen.T, NOTHING) / THRESHOLD))
+    def _others(self, points: np.ndarray, terms: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The largest M (N',) of other parts, as far as they count there, and the balls that make it (N', m), as factors."""
+        M, balls = np.zeros(len(points)), np.zeros(terms.shape)
+        for chain, chosen in self.others:
+            factors = self.fade[which, None] * (chain.shares(points) @ chosen)
+            found = np.einsum("nm,nm->n", terms, factors)
+            balls = np.where((found > M)[:, None], factors, balls)
+            M = np.maximum(M, found)
+        return M, balls
 
-    def _shares(self, points: np.ndarray, fade: np.ndarray) -> np.ndarray:
-        """How much each field of other parts counts at the points (N, 3): w_q of (1) times `fade` (N,), (N, K − 2)."""
-        t = np.einsum("nki,ki->nk", points[:, None] - self.head, self.along)
-        past = np.maximum(np.where(self.open_ends[:, 0], 0.0, -t), np.where(self.open_ends[:, 1], 0.0, t - 1.0))
-        return np.maximum(fade[:, None] * (1 - smooth(np.maximum(past, 0.0) / BORDER)), NOTHING)
 
-    def _joined(self, ln: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        """ln of (1) over T."""
-        if not self.others:
-            return np.asarray(ln[:, 0])
-        return np.asarray(np.logaddexp(BLEND_POWER * ln[:, 0], BLEND_POWER * (ln[:, 2:] + np.log(shares)).max(axis=1)) / BLEND_POWER)
+@dataclass(frozen=True, eq=False, slots=True)
+class Chain:
+    """K bones, each beginning where the one before ends, and where one's field passes to the next's: (1b)."""
+
+    across: np.ndarray  # (K − 1, 3) 1/m
+    joints: np.ndarray  # (K − 1,) s/h = X·across − joints
+
+    @staticmethod
+    def of(bones: Sequence[int], lengths_m: np.ndarray, R: np.ndarray, head: np.ndarray) -> "Chain":
+        """The chain of some bones of a part in a posture."""
+        chain = list(bones)
+        y, h = R[chain, :, 1], PASSING * np.minimum(lengths_m[chain][:-1], lengths_m[chain][1:])
+        bend = 1 + np.maximum(np.einsum("ki,ki->k", y[:-1], y[1:]), SHARPEST_COS)
+        across = (y[:-1] + y[1:]) / (bend * h)[:, None]
+        return Chain(across, np.einsum("ki,ki->k", head[chain[1:]], across))
+
+    def shares(self, points: np.ndarray) -> np.ndarray:
+        """u (N, K) of (1b) at points (N, 3); rows sum to 1."""
+        shares = np.ones((len(points), len(self.joints) + 1))
+        passed = smooth((1 + points @ self.across.T - self.joints) / 2)
+        for j, S in enumerate(passed.T):
+            shares[:, j + 1] = shares[:, j] * S
+            shares[:, j] *= 1 - S
+        return shares
+
+
+def _log(F: np.ndarray) -> np.ndarray:
+    return np.asarray(np.log(np.maximum(F, NOTHING) / THRESHOLD))
 
 
 def _joined_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays,
                   own: np.ndarray) -> _JoinedField:
     neighbours, balls, part = shape.skeleton.neighbours, shape.metaballs, parts[index]
-    active = active_balls(balls, neighbours, bone)
-    masks = [active, active & np.isin(balls.bone_index, part.bones)]
-    others = _adjacent(parts, index, bone)
-    masks += [active_balls(balls, neighbours, b) for b in others]
-    used = np.flatnonzero(np.any(masks, axis=0))
+    k = part.bones.index(bone)
+    chains = [part.bones[max(k - 1, 0):k + 2], *_adjacent(parts, index, bone)]
+    masks = [np.stack([active_balls(balls, neighbours, b) for b in chain]) for chain in chains]
+    used = np.flatnonzero(np.concatenate(masks).any(axis=0))
+    own_chain, *others = [(Chain.of(chain, shape.lengths_m, R, head), mask[:, used].astype(np.float64))
+                          for chain, mask in zip(chains, masks)]
     of, radii = balls.bone_index[used], balls.radii_m[used]
     frame = R[of] / radii[:, None, :]
-    fade = np.maximum(_fade(part, bone, rays, own, shape.lengths_m, head), NOTHING)
     return _JoinedField(
-        origin=rays.origin[own], direction=rays.direction[own], fade=fade,
-        weight=balls.weight[used], frame=frame, chosen=np.stack(masks)[:, used].astype(np.float64),
+        origin=rays.origin[own], direction=rays.direction[own], fade=_fade(part, bone, rays, own, shape.lengths_m, head),
+        weight=balls.weight[used], frame=frame, of_part=np.isin(of, part.bones).astype(np.float64),
         shift=np.einsum("mi,mij->mj", head[of], frame) + balls.centres_m(shape.lengths_m)[used] / radii,
-        head=head[others], along=R[others, :, 1] / shape.lengths_m[others, None], open_ends=_open_ends(parts, part, others))
+        own=own_chain[0], chosen=own_chain[1], others=tuple(others))
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), NOTHING))
 
 
-def _adjacent(parts: tuple[Part, ...], index: int, bone: int) -> list[int]:
-    """The bones of other parts whose field may join that of `bone`."""
+def _adjacent(parts: tuple[Part, ...], index: int, bone: int) -> list[tuple[int, ...]]:
+    """The bones of each other part whose field may join that of `bone`."""
     part = parts[index]
-    found = [b for other in parts if other.parent == index and _near(part, other.attachment, bone) for b in other.junction]
+    found = [other.junction for other in parts if other.parent == index and _near(part, other.attachment, bone)]
     if part.parent is not None and bone in part.junction:
-        found += [b for b in parts[part.parent].bones if _near(parts[part.parent], part.attachment, b)]
+        found.append(tuple(b for b in parts[part.parent].bones if _near(parts[part.parent], part.attachment, b)))
     return found
-
-
-def _open_ends(parts: tuple[Part, ...], part: Part, others: list[int]) -> np.ndarray:
-    """(K, 2): whether the field of a bone goes on before its head, and beyond its tail; not where its neighbour is one of `others`, too."""
-    above = parts[part.parent].bones if part.parent is not None else ()
-    ends = []
-    for bone in others:
-        k = above.index(bone) if bone in above else 0
-        beside = (above[max(k - 1, 0):k], above[k + 1:k + 2]) if bone in above else ((), ())
-        ends.append([not set(near) & set(others) for near in beside])
-    return np.array(ends, dtype=bool).reshape(-1, 2)
 
 
 def _near(part: Part, attachment: int | None, bone: int) -> bool:

@@ -1,9 +1,10 @@
 """The fitted surface of a whole body as a field of places, near the seams of its parts: what skin_roots finds along rays.
 
-    G = (M_trunk^n + M_limb^n)^(1/n) = T ,   M_part = max_b w_b F_b   over the part's bones b ,   n = 4       (1)
+    G = (M_trunk^n + M_limb^n)^(1/n) = T ,   M_part = Σ_b u_b F_b   over the part's bones b ,   n = 4          (1)
 
-F_b is the sum of the balls of bone b and of the bones that it meets, as in the fit; w_b is 1 beside the bone and falls to 0 beyond its ends
-where the part goes on (skin_roots). A place on a limb sees the trunk the less the farther out it lies; a place on the trunk sees its limbs,
+F_b is the sum of the balls of bone b and of the bones that it meets, as in the fit; u_b is 1 at the bone's middle and passes to the next
+bone's about the joint (1b in skin_roots). A place on a limb sees the trunk the less the farther out it lies; a place on the trunk sees its
+limbs,
 
     M_limbs = (Σ M_limb^m)^(1/m) ,   m = 12                                                               (2)
 
@@ -20,7 +21,7 @@ from .shape import BodyShape
 from .skeleton import bone_frames
 from .skin_parts import body_parts
 from .skin_rays import smooth
-from .skin_roots import BLEND_POWER, BORDER, OWN_SHARE
+from .skin_roots import BLEND_POWER, OWN_SHARE, Chain
 
 TAKING_OVER = 12.0  # m of (2)
 NEWTON_STEPS = 4
@@ -49,7 +50,7 @@ class WholeSurface:
         found = np.zeros((len(points), len(self._parts)))
         for p, part in enumerate(self._parts):
             if part.parent is not None:
-                without = self._largest(self._parts[part.parent].bones, points, terms * (1 - self._own[:, p]))[0]
+                without = self._of_bones(self._parts[part.parent].bones, points, terms * (1 - self._own[:, p]))[0]
                 found[:, p] = without / np.maximum(terms @ self._own[:, p], NOTHING)
         return found
 
@@ -85,7 +86,7 @@ class WholeSurface:
         G, of_ball = np.empty(len(points)), np.empty(terms.shape)
         for p in np.unique(part):
             rows = np.flatnonzero(part == p)
-            own, own_balls = self._largest(self._parts[p].bones, points[rows], terms[rows])
+            own, own_balls = self._of_bones(self._parts[p].bones, points[rows], terms[rows])
             other, other_balls = self._others(int(p), points[rows], terms[rows])
             fade = self._fade(int(p), points[rows])
             G[rows] = (own**BLEND_POWER + (fade * other) ** BLEND_POWER) ** (1 / BLEND_POWER)
@@ -100,33 +101,23 @@ class WholeSurface:
         seen = [other.junction for other in self._parts if other.parent == p] + ([self._parts[parent].bones] if parent is not None else [])
         if not seen:
             return np.full(len(points), NOTHING), np.zeros(terms.shape)
-        found = [self._largest(bones, points, terms) for bones in seen]
+        found = [self._of_bones(bones, points, terms) for bones in seen]
         each = np.stack([value for value, _ in found])
         M = (each**TAKING_OVER).sum(axis=0) ** (1 / TAKING_OVER)
         share = (each / M) ** (TAKING_OVER - 1)
         return M, sum((k[:, None] * balls for k, (_, balls) in zip(share, found)), np.zeros(terms.shape))
 
-    def _largest(self, bones: Sequence[int], points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _of_bones(self, bones: Sequence[int], points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """M (N,) of bones of one part, and the balls that make it (N, M), as factors.  (1)"""
         balls = np.stack([self._of_bone[b] for b in bones])
-        weight = np.stack([1 - smooth(self._beyond(b, points) / BORDER) for b in bones], axis=1)
-        fields = weight * (terms @ balls.T)
-        best = fields.argmax(axis=1)
-        row = np.arange(len(points))
-        M, factors = fields[row, best], weight[row, best, None] * balls[best]
+        factors = Chain.of(bones, self._shape.lengths_m, self._R, self._head).shares(points) @ balls
+        M = np.einsum("nm,nm->n", terms, factors)
         p = self._part_of[bones[0]]
         if self._parts[p].parent is not None:
             return np.maximum(M, NOTHING), factors
         own_balls = self._own[:, p] / OWN_SHARE
         own = terms @ own_balls
         return np.maximum(np.minimum(M, own), NOTHING), np.where((own < M)[:, None], own_balls, factors)
-
-    def _beyond(self, b: int, points: np.ndarray) -> np.ndarray:
-        """How far (N,) points lie beyond the ends of a bone, in its lengths; before a part's first bone and beyond its last, 0."""
-        part = self._parts[self._part_of[b]]
-        t = self._station(b, points)
-        before = 0.0 * t if b == part.bones[0] else -t
-        return np.maximum(np.maximum(before, 0.0 * t if b == part.bones[-1] else t - 1.0), 0.0)
 
     def _station(self, b: int, points: np.ndarray) -> np.ndarray:
         return np.asarray((points - self._head[b]) @ self._R[b, :, 1] / self._shape.lengths_m[b])
