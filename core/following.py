@@ -24,7 +24,7 @@ from .tracking.templates import Templates, Tiles, cut_tiles, no_templates
 from .tracking.tracked import TrackedFrame, joined, nothing
 from .tracking.waiting import Guide, Waiting, nobody
 
-ALGORITHM = "tracking 12"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "tracking 13"  # part of every key: raise it when the same input gives other numbers
 DROPOUT = 0.1  # of the points: where fewer are found in a frame, it is the frame that is missing
 
 

@@ -15,7 +15,7 @@ from .errors import InputError
 from .geometry.camera import Camera
 from .geometry.raster import rasterize
 from .images.fields import RowGrid
-from .matching.least_squares import patch_offsets
+from .matching.patch_pixels import patch_offsets
 from .matching.seeds import approximations_at_depth
 from .motion.ply import read_ply
 from .tracking.settings import TrackStatus

@@ -29,8 +29,9 @@ from .results import Results
 from .silhouettes import silhouette_file, silhouettes, told_by
 from .surface.cloud import IN_DOUBT, PointCloud, SurfaceSettings, point_cloud, why_removed
 from .take import Footage, footage_frames
+from .threads import in_threads
 
-ALGORITHM = "surface 15"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 16"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
@@ -97,7 +98,7 @@ def load_images(footage: Footage, frame: int, enhance: EnhanceSettings | None = 
     """
     grey = measured_rows(footage, frame)
     matched = enhanced(grey, enhance, row_step=footage.take.rows_at(frame).step) if enhance is not None else grey
-    return FrameImages(grey=grey, spline=[SplineImage(g) for g in matched])
+    return FrameImages(grey=grey, spline=in_threads(SplineImage, matched))
 
 
 def measure_frames(

@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 # Lowest first: a module of core imports only from its left. Sub-packages count as one.
 LAYERS = (
-    "errors progress settings values lazy toml_values store lock geometry images matching calibration surface tracking body fitting "
-    "motion keypoint_sources person_sources take take_file field_pictures run_json results contour_table fit_sources empty_sources "
+    "errors progress settings values lazy toml_values store lock threads geometry images matching calibration surface tracking body "
+    "fitting motion keypoint_sources person_sources take take_file field_pictures run_json results contour_table fit_sources empty_sources "
     "body_guide clicked_points silhouettes measuring measured following frame_table inspection without_surface correcting bar_file "
     "calibrating footage_files checking report stages account pipeline arguments calibrate_command track2d_command "
     "contour_command points_command check_command fields_command batch batch_command commands"

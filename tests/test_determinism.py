@@ -27,7 +27,6 @@ SHAPE, SKIN_M = 0.1, 1e-3  # sigmas of a length or radius (measured: 0.02), and 
 ONE_ALONE = 0.03  # of the points of a frame, that only one run has: those at a limit
 DRIVER = "import pathlib, sys, killing as k; *a, d = map(pathlib.Path, sys.argv[2:]); k.prepare_profile(d); k.DRIVERS[sys.argv[1]](*a, id)"
 COMMAND = "import sys; from tricap.core import commands; sys.exit(commands.main(sys.argv[1:]))"
-MATCHING = "import tricap.core.matching.{0} as m; m.THREADS = {1}; "
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +51,7 @@ def run(take: Path, out: Path, python: str = sys.executable, threads: int = 1) -
     The linear algebra of numpy 1 adds up in another order with more threads; the command gives it one (__main__.py).
     """
     blas = threads if int(np.__version__.partition(".")[0]) > 1 else 1
-    code = "".join(MATCHING.format(name, threads) for name in ("least_squares", "multi_image", "object_space"))
-    code += f"import cv2; cv2.setNumThreads({threads}); {COMMAND}"
+    code = f"import cv2; from tricap.core import threads; threads.THREADS = {threads}; cv2.setNumThreads({threads}); {COMMAND}"
     some = {name: str(blas) for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
     done = subprocess.run([python, "-c", code, "run", str(take), "--out", str(out), "--quiet"], env=os.environ | some,
                           capture_output=True, text=True, check=False)  # fmt: skip

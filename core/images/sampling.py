@@ -8,6 +8,7 @@ a patch of samples at unlike places averages that away. OpenCV 5 is exact.
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import BSpline
 from scipy.ndimage import spline_filter1d
 
@@ -28,6 +29,7 @@ class SplineImage:
         self.shape: tuple[int, int] = (grey.shape[0], grey.shape[1])
         self.noise = noise_sigma(grey)
         self._fine = _refine(_refine(grey, axis=1), axis=0)
+        self._pixels: np.ndarray | None = None  # (3, h, w) grey values and gradients, when they are asked for
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Grey values (n, m) float32 at columns x and rows y (n, m) float32; beyond the border the image is mirrored.
@@ -53,6 +55,22 @@ class SplineImage:
         x, y = (warp.reshape(-1, 3) @ basis).reshape(2, len(centre), -1)
         return cv2.remap(self._fine, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
 
+    def around(self, xy: np.ndarray, half: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Upright patches (N, n) float32 about whole pixels (N, 2), and their gradients by fourth-order central differences.
+
+        `half` (w, h) is half their size. A patch that does not lie in the image is moved into it; the image holds at least one.
+        """
+        if self._pixels is None:
+            grey = np.ascontiguousarray(self._fine[::FINENESS, ::FINENESS])
+            wide = cv2.copyMakeBorder(grey, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
+            step = wide.shape[1]
+            self._pixels = np.stack([grey, *(difference(wide, s).reshape(wide.shape)[2:-2, 2:-2] for s in (1, step))])
+        (w, h), (rows, columns) = half, self.shape
+        corner = np.clip(xy - half, 0, (columns - 1 - 2 * w, rows - 1 - 2 * h))
+        windows = [sliding_window_view(values, (2 * h + 1, 2 * w + 1)) for values in self._pixels]
+        f, fx, fy = (window[corner[:, 1], corner[:, 0]].reshape(len(xy), (2 * h + 1) * (2 * w + 1)) for window in windows)
+        return f, fx, fy
+
     def smoothed(self, sigma_px: float, row_step: int) -> "SplineImage":
         """The image after a Gaussian of `sigma_px` full-frame pixels (a field's rows are `row_step` of them); kept for the next call."""
         sigma = (sigma_px, sigma_px / row_step)
@@ -69,6 +87,19 @@ class SplineImage:
         x, y = xy[..., 0], xy[..., 1]
         with np.errstate(invalid="ignore"):
             return np.asarray((x >= mx) & (y >= my) & (x <= w - 1 - mx) & (y <= h - 1 - my))
+
+
+def difference(values: np.ndarray, step: int) -> np.ndarray:
+    """Central differences of fourth order from the values `step` and 2 `step` away in the flattened array; zero at its ends."""
+    p = values.reshape(-1)
+    out = np.zeros(p.size, np.float32)
+    if p.size > 4 * step:
+        near, far = out[2 * step : -2 * step], p[4 * step :] - p[: -4 * step]
+        np.subtract(p[3 * step : -step], p[step : -3 * step], out=near)
+        near *= np.float32(2 / 3)
+        far *= np.float32(1 / 12)
+        near -= far
+    return out
 
 
 def correlated_noise(fx: np.ndarray, fy: np.ndarray, smoothing: tuple[float, float]) -> np.ndarray:

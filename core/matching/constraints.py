@@ -23,12 +23,14 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..images.sampling import SplineImage
 from ..progress import Monitor
+from .epipolar import Epipolar
 from .foreground import Foreground
 from .growing import RETRY_SMOOTHING_PX, TripletField, loosened
-from .least_squares import MatchingSettings, MatchStatus, patch_offsets
+from .least_squares import MatchingSettings, MatchStatus
 from .multi_image import MultiImageMatches, match_multi_image
 from .neighbourhood import RADIUS_CELLS, NeighbourFit, fit_neighbours, neighbours_of
-from .object_space import Epipolar, SurfacePatch, SurfacePrior, match_surface, normal_to
+from .object_space import SurfacePatch, SurfacePrior, match_surface, normal_to
+from .patch_pixels import patch_offsets
 from .seeds import fewest_views
 from .template_patches import monomials
 

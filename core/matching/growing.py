@@ -19,6 +19,7 @@ from ..geometry.intersection import Intersection, forward_intersection
 from ..images.sampling import SplineImage
 from ..progress import Monitor
 from ..settings import knob
+from ..threads import in_threads
 from .foreground import Foreground
 from .grid import TemplateGrid
 from .least_squares import Matches, MatchingSettings, match_patches
@@ -161,7 +162,7 @@ def grow(
             settings = replace(settings, max_sigma_px=NARROW_SURE * settings.max_sigma_px)
         if level >= SMOOTH_FROM:
             settings = loosened(settings)
-            views = [image.smoothed(RETRY_SMOOTHING_PX, grid.rows.step) for image in images]
+            views = in_threads(lambda image: image.smoothed(RETRY_SMOOTHING_PX, grid.rows.step), images)
         while len(cells):
             monitor.step("surface", int(state.accepted.sum()), n_cells)
             state.attempts[cells] += 1

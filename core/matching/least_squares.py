@@ -20,17 +20,15 @@ no less than a tenth, for the texture's curvature. Where that foresees too littl
 What was matched is the texture, so the point that is transferred with least bias is the gradients' centre of gravity o of the patch
 (Förstner 1984), not its middle: at the outline of a body it lies on the body, where the middle may lie on the background.
 
-H belongs to the template alone, so it is built once; all patches of a chunk are arrays (N, n), and what has converged leaves the arrays.
+H belongs to the template alone, so it is built once; all patches of a piece, in all search images, are arrays, and what has converged
+leaves them.
 Coordinates are pixels of the images given (a field's rows count as rows).
 """
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
 
 import numpy as np
 
@@ -38,19 +36,19 @@ from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from ..progress import Monitor
 from ..settings import knob
+from ..threads import equal_pieces, in_threads
 from .affine_steps import compose
 from .parameter_sets import PARAMETERS, reduced_sets
+from .patch_pixels import compare, patch_offsets, template_pixels
 
-CHUNK, LARGEST = 512, 1024  # patches that threads do not share; the most that a piece has when they do
-_SHARE = os.environ.get("TRICAP_THREADS", "")  # `tricap batch` gives each worker its own
-THREADS = int(_SHARE) if _SHARE.isdecimal() and int(_SHARE) > 0 else 2
+LARGEST, SHARED_FROM = 3072, 513  # patches of a piece; from so many on threads share them
+STILL_WORTH = 0.75  # of the patches at work: with fewer that move, those that have ended are taken out
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
 REMAINS_SIGMAS, REMAINS_PX = 0.1, 0.005  # what may remain after the last step where (6) foresees it
 GRADIENT_NOISE, CURVATURE = 0.45, 0.1  # of (6)
 LINEAR_PX, MIN_CONDITION = 0.25, 1e-6  # (6) holds while no part of the patch moves by more
-PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "textured")  # arrays
-UPPER, SYMMETRIC = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a 3×3 matrix: its upper part, and back
-NOISE_ENERGY = 4.0  # of a gradient [grey values² / px²]: less is noise, not texture
+SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # a 3×3 matrix from its upper part
+PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "noise_factor", "textured")  # arrays
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -122,14 +120,6 @@ class Matches:
         return self.status == MatchStatus.OK
 
 
-@lru_cache(maxsize=64)
-def patch_offsets(patch_px: int, row_step: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Patch coordinates u, v (n,) float32 about the centre, and the half size; `row_step` 2 halves the rows (a field)."""
-    half_w, half_h = patch_px // 2, max(2, round((patch_px / row_step - 1) / 2))
-    _, u, v = _basis(half_w, half_h)
-    return u, v, (half_w, half_h)
-
-
 def match_patches(
     template: SplineImage,
     xy: np.ndarray,
@@ -147,51 +137,39 @@ def match_patches(
 
     `starts` are the approximate positions (N, 2) and `shapes` the approximate affine shapes (N, 2, 2), one of each per search image.
     `template_shape` (N, 2, 2) warps the patch in the template itself (a patch that was itself matched). NaN starts are OUT_OF_IMAGE.
-    Without `of_texture` the patch's middle stands for the texture's centre of gravity (5). Cost: 8 µs per patch of 13×13 and image.
+    Without `of_texture` the patch's middle stands for the texture's centre of gravity (5). Cost: 5 µs per patch of 13×13 and image.
     """
     n = len(xy)
-    spans = _spans(n)
 
     def work(span: slice) -> list[Matches]:
         if monitor is not None and monitor.cancelled:
             monitor.step("matching", span.start, n)
         drawn = None if template_shape is None else template_shape[span]
         patches = PatchTemplates(template, xy[span], settings, row_step, drawn, of_texture=of_texture)
-        return [patches.find(g, s[span], A[span]) for g, s, A in zip(searches, starts, shapes)]
+        return patches.find(searches, [s[span] for s in starts], [A[span] for A in shapes])
 
-    if len(spans) > 1:
-        with ThreadPoolExecutor(THREADS) as pool:
-            parts = list(pool.map(work, spans))
-    else:
-        parts = [work(span) for span in spans] or [[_empty() for _ in searches]]
+    parts = in_threads(work, _pieces(n))
     return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
 
 
 def prepare_templates(image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int) -> "PatchTemplates":
     """The template side of the patches about `xy` (N, 2), to be matched many times by their middles."""
-    spans = _spans(len(xy)) or [slice(0, 0)]
-    return PatchTemplates.joined([PatchTemplates(image, xy[span], settings, row_step, None, of_texture=False) for span in spans])
+    parts = in_threads(lambda span: PatchTemplates(image, xy[span], settings, row_step, None, of_texture=False), _pieces(len(xy)))
+    return PatchTemplates.joined(parts)
 
 
 def match_prepared(templates: "PatchTemplates", rows: np.ndarray, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
     """Find the prepared templates `rows` (N,) in an image, from positions `start` (N, 2) and shapes (N, 2, 2)."""
-    spans = _spans(len(rows)) or [slice(0, 0)]
     all_in_order = np.array_equal(rows, np.arange(len(templates.inside)))  # most often: slices then, no copies
 
     def work(span: slice) -> Matches:
-        return templates.select(span if all_in_order else rows[span]).find(image, start[span], shape[span])
+        return templates.select(span if all_in_order else rows[span]).find([image], [start[span]], [shape[span]])[0]
 
-    if len(spans) == 1:
-        return work(spans[0])
-    with ThreadPoolExecutor(THREADS) as pool:
-        return join_matches(list(pool.map(work, spans)))
+    return join_matches(in_threads(work, _pieces(len(rows))))
 
 
-def _spans(n: int) -> list[slice]:
-    """Equal pieces of n patches: small enough for the cache, large enough for arrays to pay, and two where two threads can share them."""
-    count = max(-(-n // LARGEST), THREADS if n > CHUNK else 1)
-    cuts = [n * i // count for i in range(count + 1)]
-    return [slice(a, b) for a, b in zip(cuts, cuts[1:])] if n else []
+def _pieces(n: int) -> list[slice]:
+    return equal_pieces(n, LARGEST, SHARED_FROM) or [slice(0, 0)]
 
 
 def join_matches(parts: Sequence[Matches]) -> Matches:
@@ -201,26 +179,18 @@ def join_matches(parts: Sequence[Matches]) -> Matches:
 
 
 class PatchTemplates:
-    """The template side of a chunk: patches, gradients, and the inverse of the reduced normal matrix."""
+    """The template side of a piece: patches, gradients, and the inverse of the reduced normal matrix."""
 
     def __init__(
         self, image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int, shape: np.ndarray | None, *, of_texture: bool
     ) -> None:
         self._settings, self._of_texture = settings, of_texture
-        self._u, self._v, self._half = patch_offsets(settings.patch_px, row_step)
-        self.n_pixels = len(self._u)
-        self._pixels = _basis(*self._half)  # (3, n)
-        self._monomials = np.ascontiguousarray(self._pixels.T)  # (n, 3)
-        self._mean = np.full(self.n_pixels, 1 / self.n_pixels, dtype=np.float32)
-        self.inside = image.inside(xy, np.array(self._half) + 1.0)
-        f, fx, fy = self._sample(image, np.where(self.inside[:, None], xy, 0.0), shape)
-        f -= (f @ self._mean)[:, None]
-        self.contrast = np.sqrt(np.einsum("ij,ij->i", f, f))
-        f *= (1 / np.maximum(self.contrast, np.float32(1e-6)))[:, None]
-        self.f = f
-        self.fx, self.fy = fx, fy
-        self.q = self._project(self.f)  # Jᵀ f̂
-        H = self._normal_matrix()
+        u, _, self.half = patch_offsets(settings.patch_px, row_step)
+        self.n_pixels = len(u)
+        self.inside = image.inside(xy, np.array(self.half) + 1.0)
+        p = template_pixels(image, np.where(self.inside[:, None], xy, 0.0), shape, self.half)
+        self.f, self.fx, self.fy, self.contrast, self.q = p.f, p.fx, p.fy, p.contrast, p.q
+        H = self._normal_matrix(p.second, p.mean)
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
         eye = np.eye(6) * MIN_CONDITION
         self.inverse = invert_spd(H * scale[:, :, None] * scale[:, None, :] + eye) * scale[:, :, None] * scale[:, None, :]
@@ -228,9 +198,10 @@ class PatchTemplates:
         self.offset: np.ndarray = np.zeros((len(xy), 2))
         self.spread = self.offset
         if of_texture:
-            self.offset, self.spread = self._centre_of_gravity()
-        patch = (-1, 2 * self._half[1] + 1, 2 * self._half[0] + 1)
-        self.noise_factor = correlated_noise(fx.reshape(patch), fy.reshape(patch), image.smoothing)
+            energy = p.energy.astype(np.float64)
+            self.offset, self.spread = energy[:, :2], energy[:, 2:] - energy[:, :2] ** 2  # (5)
+        patch = (-1, 2 * self.half[1] + 1, 2 * self.half[0] + 1)
+        self.noise_factor = correlated_noise(p.fx.reshape(patch), p.fy.reshape(patch), image.smoothing)
         self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
 
     def select(self, rows: np.ndarray | slice) -> "PatchTemplates":
@@ -248,83 +219,68 @@ class PatchTemplates:
             setattr(whole, name, np.concatenate([getattr(part, name) for part in parts]))
         return whole
 
-    def _sample(self, image: SplineImage, xy: np.ndarray, shape: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Patch and its gradients by fourth-order central differences, all in one look-up with a border of two."""
-        w, h = self._half
-        A = np.broadcast_to(np.eye(2), (len(xy), 2, 2)) if shape is None else shape
-        P = image.sample_patches(xy, A, _basis(w + 2, h + 2)).reshape(len(xy), 2 * h + 5, 2 * w + 5)
-        flat = (len(xy), self.n_pixels)
-        f, fx, fy = (a.reshape(P.shape)[:, 2:-2, 2:-2].reshape(flat) for a in (P, _difference(P, 1), _difference(P, 2 * w + 5)))
-        return f, fx, fy
-
-    def _centre_of_gravity(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and variance (m, 2) of the patch coordinates, weighted by the energy of the gradients above their noise.  (5)"""
-        energy = self.fx**2 + self.fy**2
-        energy = np.maximum(energy - NOISE_ENERGY, 1e-3)
-        total = energy.sum(axis=1, keepdims=True)
-        uv = np.stack([self._u, self._v, self._u**2, self._v**2], axis=1)
-        moment = (energy @ uv / total).astype(np.float64)
-        return moment[:, :2], moment[:, 2:] - moment[:, :2] ** 2
-
-    def _project(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Jᵀ g (m, 6)."""
-        return np.concatenate([(self.fx[rows] * g) @ self._monomials, (self.fy[rows] * g) @ self._monomials], axis=1)
-
-    def _normal_matrix(self) -> np.ndarray:
+    def _normal_matrix(self, second: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """H = Jᵀ M J (m, 6, 6), from products of the gradients with the monomials up to second order.  (2)"""
-        m = self._monomials
-        second = np.ascontiguousarray(m[:, UPPER[0]] * m[:, UPPER[1]])  # (n, 6)
-        xx, xy, yy = ((a * b @ second)[:, SYMMETRIC] for a, b in ((self.fx, self.fx), (self.fx, self.fy), (self.fy, self.fy)))
+        xx, xy, yy = second[:, :, SYMMETRIC]
         H = np.concatenate([np.concatenate([xx, xy], 2), np.concatenate([xy, yy], 2)], 1).astype(np.float64)
-        mean, q = np.concatenate([self.fx @ m, self.fy @ m], axis=1).astype(np.float64), self.q.astype(np.float64)
+        mean, q = mean.astype(np.float64), self.q.astype(np.float64)
         return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
-    def find(self, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
-        """Iterate (2) and (3) for all patches, then judge them."""
-        s, n = self._settings, len(start)
-        c, A = np.array(start, dtype=np.float64), np.array(shape, dtype=np.float64)
-        status = np.full(n, MatchStatus.NOT_CONVERGED, dtype=np.int8)
-        status[~self.textured] = MatchStatus.NO_TEXTURE
-        status[~(self.inside & image.inside(c, 0.0))] = MatchStatus.OUT_OF_IMAGE
-        correlation, iterations = np.zeros(n), np.zeros(n, dtype=np.int16)
-        active = np.flatnonzero(status == MatchStatus.NOT_CONVERGED)
+    def find(self, images: Sequence[SplineImage], starts: Sequence[np.ndarray], shapes: Sequence[np.ndarray]) -> list[Matches]:
+        """Iterate (2) and (3) for all patches in every image, then judge them. Rows go image after image."""
+        s, N = self._settings, len(self.inside)
+        start, A = (np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images]) for of_images in (starts, shapes))
+        c, status = start.copy(), self._usable(images, starts)
+        correlation, iterations = np.zeros(len(c)), np.zeros(len(c), dtype=np.int16)
+        alive = status == MatchStatus.NOT_CONVERGED
+        place, at, warp = np.arange(len(c)), np.where(alive[:, None], c, 0.0), np.where(alive[:, None, None], A, np.eye(2))
+        work = _AtWork(self, images, place)
         for iteration in range(1, s.max_iterations + 1):
-            if not len(active):
+            if not alive.any():
                 break
-            step, rho, gain = self._step(image, c[active], A[active], slice(None) if len(active) == n else active)  # all: no copies
-            c[active], A[active], moved = compose(c[active], A[active], step)
-            gone = (largest(c[active] - start[active]) > 2 * s.max_shift_px) | ~np.isfinite(moved)
-            near, spared = self._converged(step, moved, self._sigma(rho, active))
-            correlation[active], iterations[active] = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho), iteration
-            done = near | spared
-            status[active[done]] = MatchStatus.OK
-            status[active[gone]] = MatchStatus.SHIFT_TOO_LARGE
-            active = active[~(done | gone)]
-        return self._judge(image, start, shape, c, A, status, correlation, iterations)
+            if np.count_nonzero(alive) < STILL_WORTH * len(alive):
+                place, at, warp, alive = place[alive], at[alive], warp[alive], alive[alive]
+                work = _AtWork(self, images, place)
+            step, rho, gain = work.step(at, warp)
+            to, warped, moved = compose(at, warp, step)
+            gone = (largest(to - start[place]) > 2 * s.max_shift_px) | ~np.isfinite(moved)
+            near, spared = self._converged(step, moved, work.sigma(rho))
+            rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
+            ended = np.flatnonzero(alive & (near | spared | gone)) if iteration < s.max_iterations else np.flatnonzero(alive)
+            here = place[ended]
+            c[here], A[here], correlation[here], iterations[here] = to[ended], warped[ended], rho[ended], iteration
+            status[here] = np.where((near | spared)[ended], MatchStatus.OK, MatchStatus.NOT_CONVERGED)
+            status[place[alive & gone]] = MatchStatus.SHIFT_TOO_LARGE
+            alive[ended] = False
+            at, warp = to, warped
+            at[gone], warp[gone] = 0.0, np.eye(2)  # what has ended may go on, but nowhere
+        transferred = self._transferred()
+        spans = [slice(k * N, (k + 1) * N) for k in range(len(images))]
+        return [
+            self._judge(image, start[r], shape, c[r], A[r], status[r], correlation[r], iterations[r], transferred)
+            for image, shape, r in zip(images, shapes, spans)
+        ]
 
-    def _step(self, image: SplineImage, c: np.ndarray, A: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, ...]:
-        """Δp of (2) (m, 6), the correlation ρ (m,) before it, and what it adds to ρ² where it is small enough to be linear."""
-        g = image.sample_patches(c, A, self._pixels)
-        g -= (g @ self._mean)[:, None]
-        power = np.maximum(np.einsum("ij,ij->i", g, g), 1e-6)
-        along = np.einsum("ij,ij->i", g, self.f[rows])
-        gain = self.contrast[rows] * along / power  # r1
-        rhs = ((self._project(g, rows) - self.q[rows] * along[:, None]) * gain[:, None]).astype(np.float64)
-        step = np.einsum("nij,nj->ni", self.inverse[rows], rhs)
-        explained = np.einsum("ni,ni->n", step, rhs) / np.maximum(self.contrast[rows], 1e-6) ** 2
-        return step, along / np.sqrt(power), explained
+    def _usable(self, images: Sequence[SplineImage], starts: Sequence[np.ndarray]) -> np.ndarray:
+        """The statuses that patches have before they move; NOT_CONVERGED are those that can be matched."""
+        lost = ~np.concatenate([image.inside(start, 0.0) & self.inside for image, start in zip(images, starts)])
+        status = np.where(np.tile(self.textured, len(images)), MatchStatus.NOT_CONVERGED, MatchStatus.NO_TEXTURE).astype(np.int8)
+        status[lost] = MatchStatus.OUT_OF_IMAGE
+        return status
 
     def _converged(self, step: np.ndarray, moved: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which patches' last step was small; and for which it foresees by (6) that the next would be."""
         rate = np.maximum(CURVATURE, GRADIENT_NOISE * self.n_pixels * sigma**2)
-        linear = moved + self._half[0] * largest(step[:, [1, 2, 4, 5]]) <= LINEAR_PX
+        linear = moved + self.half[0] * largest(step[:, [1, 2, 4, 5]]) <= LINEAR_PX
         spared = linear & (moved < np.maximum(REMAINS_PX, REMAINS_SIGMAS * sigma) / rate)
         return moved < np.maximum(self._settings.converged_px, CONVERGED_SIGMAS * sigma), spared
 
-    def _sigma(self, rho: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
-        variance = self.contrast[rows].astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / max(1, self.n_pixels - PARAMETERS)
-        return np.sqrt(variance * np.maximum(self.inverse[rows, 0, 0], self.inverse[rows, 3, 3]))
+    def _transferred(self) -> np.ndarray | None:
+        """E H⁻¹ Eᵀ of (5) (N, 2, 2)."""
+        if not self._of_texture:
+            return None
+        E = np.concatenate([np.ones((len(self.offset), 1)), self.offset], axis=1)
+        return np.einsum("nabj,nj->nab", np.einsum("naibj,ni->nabj", self.inverse.reshape(-1, 2, 3, 2, 3), E), E)
 
     def _judge(
         self,
@@ -336,21 +292,20 @@ class PatchTemplates:
         status: np.ndarray,
         correlation: np.ndarray,
         iterations: np.ndarray,
+        transferred: np.ndarray | None,
     ) -> Matches:
         s = self._settings
         dof = max(1, self.n_pixels - PARAMETERS)
         lost = np.clip(1 - correlation**2, 0, 1)
         variance = self.noise_factor * self.contrast.astype(np.float64) ** 2 * lost / dof  # (4)
         K = K_o = variance[:, None, None] * sandwich(A, self.inverse[:, ::3, ::3])
-        if self._of_texture:
-            E = np.concatenate([np.ones((len(c), 1)), self.offset], axis=1)
-            transferred = np.einsum("nabj,nj->nab", np.einsum("naibj,ni->nabj", self.inverse.reshape(-1, 2, 3, 2, 3), E), E)  # (5)
+        if transferred is not None:
             K_o = variance[:, None, None] * sandwich(A, transferred)
         sigma0 = 50 * np.sqrt(lost * self.n_pixels / dof)
         sigma = np.sqrt(np.maximum(np.maximum(K[:, 0, 0], K[:, 1, 1]), 0))
         for bad, why in (
             (largest(c - start) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
-            (~image.inside(c, np.array(self._half) * 0.5), MatchStatus.OUT_OF_IMAGE),
+            (~image.inside(c, np.array(self.half) * 0.5), MatchStatus.OUT_OF_IMAGE),
             (largest((A - start_shape).reshape(-1, 4)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
             (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
             (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE),
@@ -372,29 +327,33 @@ class PatchTemplates:
         )
 
 
-@lru_cache(maxsize=64)
-def _basis(half_w: int, half_h: int) -> np.ndarray:
-    """Rows 1, u, v (3, n) float32 of a patch's pixels."""
-    v, u = np.mgrid[-half_h : half_h + 1, -half_w : half_w + 1].astype(np.float32)
-    basis = np.stack([np.ones(u.size, np.float32), u.ravel(), v.ravel()])
-    basis.setflags(write=False)
-    return basis
+class _AtWork:
+    """Those patches of a piece that move: the rows `place` (m,) of all patches in all images, image after image."""
 
+    def __init__(self, templates: PatchTemplates, images: Sequence[SplineImage], place: np.ndarray) -> None:
+        t, N = templates, len(templates.inside)
+        cuts = np.searchsorted(place, np.arange(len(images) + 1) * N)
+        own = [place[a:b] - k * N for k, (a, b) in enumerate(zip(cuts, cuts[1:]))]  # rows of the templates
+        parts = [slice(None) if len(rows) == N else rows for rows in own]  # no copies
+        self._views = [
+            (image, slice(a, b), (t.f[part], t.fx[part], t.fy[part])) for image, a, b, part in zip(images, cuts, cuts[1:], parts) if b > a
+        ]
+        self._half, self._dof = t.half, max(1, t.n_pixels - PARAMETERS)
+        self._contrast, self._q, self._inverse = (
+            np.concatenate([a[part] for part in parts]) if len(parts) > 1 else a[parts[0]] for a in (t.contrast, t.q, t.inverse)
+        )
 
-def _difference(values: np.ndarray, step: int) -> np.ndarray:
-    """Central differences of fourth order from the values `step` and 2 `step` away in the flattened array; zero at its ends."""
-    p = values.reshape(-1)
-    out = np.zeros(p.size, np.float32)
-    if p.size > 4 * step:
-        near, far = out[2 * step : -2 * step], p[4 * step :] - p[: -4 * step]
-        np.subtract(p[3 * step : -step], p[step : -3 * step], out=near)
-        near *= np.float32(2 / 3)
-        far *= np.float32(1 / 12)
-        near -= far
-    return out
+    def step(self, c: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Δp of (2) (m, 6), the correlation ρ (m,) before it, and what it adds to ρ² where it is small enough to be linear."""
+        found = [compare(image, c[rows], A[rows], self._half, patches) for image, rows, patches in self._views]
+        power, along, pulled = found[0] if len(found) == 1 else (np.concatenate(parts) for parts in zip(*found))
+        gain = self._contrast * along / power  # r1
+        rhs = ((pulled - self._q * along[:, None]) * gain[:, None]).astype(np.float64)
+        step = np.einsum("nij,nj->ni", self._inverse, rhs)
+        explained = np.einsum("ni,ni->n", step, rhs) / np.maximum(self._contrast, 1e-6) ** 2
+        return step, along / np.sqrt(power), explained
 
-
-def _empty() -> Matches:
-    pairs, matrices, z = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
-    return Matches(xy=pairs, shape=matrices, covariance=matrices, offset=pairs, spread=pairs, transfer_covariance=matrices, sigma0=z,
-                   correlation=z, iterations=z.astype(np.int16), parameters=z.astype(np.int8), status=z.astype(np.int8))  # fmt: skip
+    def sigma(self, rho: np.ndarray) -> np.ndarray:
+        """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
+        variance = self._contrast.astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / self._dof
+        return np.asarray(np.sqrt(variance * np.maximum(self._inverse[:, 0, 0], self._inverse[:, 3, 3])))

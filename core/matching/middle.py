@@ -17,9 +17,10 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
+from .epipolar import Epipolar
 from .growing import TripletField
 from .least_squares import MatchingSettings
-from .object_space import Epipolar, SurfacePrior, match_surface
+from .object_space import SurfacePrior, match_surface
 from .template_patches import TemplatePatches
 
 MIDDLE_PX = 5

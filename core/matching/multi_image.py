@@ -15,7 +15,6 @@ Covariance as in `object_space` (5): half of a residual's variance is the templa
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +23,9 @@ from ..geometry.camera import Camera
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..progress import Monitor
-from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
-from .object_space import MIN_NOISE, inverse_normals, solve_normals, without_noise
+from ..threads import equal_pieces, in_threads
+from .least_squares import MatchingSettings, MatchStatus
+from .object_space import LARGEST, MIN_NOISE, SHARED_FROM, inverse_normals, solve_normals, without_noise
 from .template_patches import TemplatePatches
 
 NEIGHBOUR_SHIFT_PX, NEIGHBOUR_SHAPE = 1.0, 0.1
@@ -92,11 +92,7 @@ def match_multi_image(
         adjustment = _Adjustment(patches, views, rig, rows, settings, sigma_c_px, neighbours, taking_part[span])
         return adjustment.solve(xy[span], middle[span], shape[span], xyz_m[span])
 
-    spans = [slice(i, min(i + CHUNK, n)) for i in range(0, max(n, 1), CHUNK)]
-    if len(spans) == 1:
-        return work(spans[0])
-    with ThreadPoolExecutor(THREADS) as pool:
-        parts = list(pool.map(work, spans))
+    parts = in_threads(work, equal_pieces(n, LARGEST, SHARED_FROM) or [slice(0, 0)])
     names = MultiImageMatches.__dataclass_fields__
     return MultiImageMatches(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 

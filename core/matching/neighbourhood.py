@@ -6,14 +6,16 @@ Used as the neighbourhood constraint of matching (SCIENCE §5b: what the neighbo
 neighbourhood filter (D'Apuzzo et al. 2000, §2.2: a point whose affine parameters differ from the local mean is removed).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ..threads import equal_pieces, in_threads
 from .grid import TemplateGrid
 from .template_patches import monomials
 
 RADIUS_CELLS = 3
+LARGEST = 512  # points whose neighbours stay in the cache
 ROBUST_STEPS = 3
 TUKEY = 4.685
 RIDGE = (1e-9, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2)  # with coordinates in units of the radius: a thin neighbourhood falls back to a plane
@@ -50,6 +52,17 @@ def fit_neighbours(
     Residuals below `min_scale` (M,) count fully; `radius_px` is the reach of the neighbourhood. Where there is no neighbour,
     coefficients are zero.
     """
+
+    def fit(rows: slice) -> NeighbourFit:
+        return _fitted(neighbour[rows], xy, values, query_xy[rows], degree, min_scale[rows], radius_px)
+
+    parts = in_threads(fit, equal_pieces(len(neighbour), LARGEST, LARGEST) or [slice(0, 0)])
+    return NeighbourFit(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(NeighbourFit)})
+
+
+def _fitted(
+    neighbour: np.ndarray, xy: np.ndarray, values: np.ndarray, query_xy: np.ndarray, degree: int, min_scale: np.ndarray, radius_px: float
+) -> NeighbourFit:
     valid = neighbour >= 0
     a, b = np.moveaxis(np.where(valid[..., None], xy[neighbour] - query_xy[:, None], 0.0) / radius_px, -1, 0)
     z = np.where(valid, values[neighbour], 0.0)

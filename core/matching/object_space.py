@@ -26,7 +26,6 @@ the prior's errors where these are known.
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,9 +35,13 @@ from ..geometry.small_matrices import invert_spd
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..progress import Monitor
-from .least_squares import CHUNK, THREADS, MatchingSettings, MatchStatus
+from ..threads import equal_pieces, in_threads
+from .epipolar import Epipolar
+from .least_squares import MatchingSettings, MatchStatus
+from .patch_pixels import pieces
 from .template_patches import TemplatePatches, monomials
 
+LARGEST, SHARED_FROM = 2048, 513  # points of a piece; from so many on threads share them
 MIN_NOISE = 0.4  # grey values, of a difference of two images: no image is better than its quantisation
 CONVERGED_SIGMAS = 0.2  # of the sigma that N says, which noise of the gradients makes too small where texture is weak
 MAX_STEP_PX = 1.5
@@ -83,43 +86,6 @@ class SurfacePatch:
         return self.status == MatchStatus.OK
 
 
-class Epipolar:
-    """N rays of the reference view and their images in one search view: (2), with lens distortion linear over a patch."""
-
-    def __init__(self, base: Camera, camera: Camera, rows: RowGrid, xy: np.ndarray) -> None:
-        self._camera, self._rows = camera, rows
-        frame = rows.to_frame(xy)
-        q = base.directions(frame)
-        tip = base.directions(frame[:, None] + [[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-        Q = np.stack([tip[:, 0] - tip[:, 1], (tip[:, 2] - tip[:, 3]) * rows.step], axis=2)  # ∂q/∂(u, v) (N, 3, 2)
-        rotation = camera.R_cam_world @ base.R_cam_world.T
-        self._h0, self._H = q @ rotation.T, rotation @ Q
-        self.shift = camera.R_cam_world @ base.centre_m + camera.t_cam_world_m  # t_k (3,)
-
-    def centre(self, theta: np.ndarray, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Image (m, 2) of the patch's middle, ∂x/∂w (m, 2), A (m, 2, 2) and the distortion's slope L (m, 2, 2). Rows' pixels."""
-        h = self._h0[rows] + theta[:, :1] * self.shift
-        X = (h - self._camera.t_cam_world_m) @ self._camera.R_cam_world
-        frame, J = self._camera.project_with_jacobian(X)
-        J = (J @ self._camera.R_cam_world.T) / np.array([1.0, self._rows.step])[:, None]  # ∂x/∂h
-        A = J @ (self._H[rows] + self.shift[:, None] * theta[:, None, 1:3])
-        return self._rows.from_frame(frame), J @ self.shift, A, J[:, :, :2] * h[:, 2, None, None]
-
-    def warp(
-        self, theta: np.ndarray, monomials: np.ndarray, rows: np.ndarray, at: np.ndarray, slope: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows (m, n) float32 of x(u, v), with middle `at` (m, 2) and distortion's slope `slope` (m, 2, 2).  (2)"""
-        u, v = monomials[:, 1], monomials[:, 2]
-        w = theta.astype(np.float32) @ monomials.T
-        h0, H, t = self._h0[rows].astype(np.float32), self._H[rows].astype(np.float32), self.shift.astype(np.float32)
-        x, y, z = (h0[:, i, None] + H[:, i, :1] * u + H[:, i, 1:] * v + w * t[i] for i in range(3))
-        middle = self._h0[rows] + theta[:, :1] * self.shift
-        ab0 = (middle[:, :2] / middle[:, 2:]).astype(np.float32)
-        a, b = x / z - ab0[:, :1], y / z - ab0[:, 1:]
-        L, c = slope.astype(np.float32), at.astype(np.float32)
-        return c[:, :1] + L[:, 0, :1] * a + L[:, 0, 1:] * b, c[:, 1:] + L[:, 1, :1] * a + L[:, 1, 1:] * b
-
-
 def match_surface(
     images: Sequence[SplineImage],
     cameras: Sequence[Camera],
@@ -161,11 +127,7 @@ def match_surface(
         views = [image for k, image in enumerate(images) if k != reference]
         return _Adjustment(patches, views, lines, part, settings, sigma_across_px, taking_part[span]).solve(start[span])
 
-    spans = [slice(i, min(i + CHUNK, n)) for i in range(0, max(n, 1), CHUNK)]
-    if len(spans) == 1:
-        return work(spans[0])
-    with ThreadPoolExecutor(THREADS) as pool:
-        parts = list(pool.map(work, spans))
+    parts = in_threads(work, equal_pieces(n, LARGEST, SHARED_FROM) or [slice(0, 0)])
     return SurfacePatch(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in SurfacePatch.__dataclass_fields__})
 
 
@@ -218,9 +180,10 @@ class _Adjustment:
         for iteration in range(1, s.max_iterations + 1):
             if not len(active):
                 break
-            linear, rhs = self._linearise(theta[active], across[active], active)
-            pseudo, wish = self._pseudo(theta[active], across[active], active)
-            N = self._normal(linear, self._patches, active) + pseudo[:, :, None] * np.eye(P + S)
+            rows = slice(None) if len(active) == n else active  # all: no copies
+            linear, rhs = self._linearise(theta[active], across[active], rows)
+            pseudo, wish = self._pseudo(theta[active], across[active], rows)
+            N = self._normal(linear, self._patches, rows) + pseudo[:, :, None] * np.eye(P + S)
             step = solve_normals(N, rhs + pseudo * wish)
             length = np.abs(step[:, 0]) * linear.speed
             shrink = np.minimum(1.0, MAX_STEP_PX / np.maximum(length, 1e-12))[:, None]
@@ -236,10 +199,10 @@ class _Adjustment:
             active = active[~(done | away | ~linear.held)]
         return self._judge(start, theta, across, state, iterations, status)
 
-    def _linearise(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray) -> tuple["_Linear", np.ndarray]:
+    def _linearise(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray | slice) -> tuple["_Linear", np.ndarray]:
         """The directions, weights and correlations at θ, and the right side (m, P + S) of (4) without pseudo-observations."""
         P, patches = self._P, self._patches
-        state, rhs = _Linear.empty(len(rows), self._S), np.zeros((len(rows), P + self._S))
+        state, rhs = _Linear.empty(len(theta), self._S), np.zeros((len(theta), P + self._S))
         for k, (image, line) in enumerate(zip(self._images, self._lines)):
             seen = self._seen[rows, k]
             c, e, A, L = line.centre(theta, rows)
@@ -248,9 +211,7 @@ class _Adjustment:
             normal = normal_to(e)
             c = c + across[:, k, None] * normal
             visible = image.inside(c, np.array(patches.half) * 0.5)
-            x, y = line.warp(theta, patches.monomials, rows, np.where(visible[:, None], c, 0.0), L)
-            x, y = np.where(seen[:, None], x, np.float32(0)), np.where(seen[:, None], y, np.float32(0))
-            rho, (gx, gy) = patches.compare(image.sample(x, y), rows)
+            rho, (gx, gy) = self._compare(k, theta, np.where(visible[:, None], c, 0.0), L, rows)
             s, t = _apply_inverse(A, e), _apply_inverse(A, normal)
             weight = seen / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
             rhs[:, :P] -= weight[:, None] * (s[:, :1] * gx + s[:, 1:] * gy)
@@ -259,6 +220,20 @@ class _Adjustment:
             np.maximum(state.speed, seen * np.linalg.norm(e, axis=1), out=state.speed)
             state.held &= visible | ~seen
         return state, rhs
+
+    def _compare(
+        self, k: int, theta: np.ndarray, at: np.ndarray, slope: np.ndarray, rows: np.ndarray | slice
+    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Correlation (m,) and the products with the design matrix, of the patches where search view k sees the surface θ (m, P)."""
+        patches, seen, parts = self._patches, self._seen[rows, k], []
+        for piece in pieces(len(theta), len(patches.monomials)):
+            own = piece if isinstance(rows, slice) else rows[piece]
+            x, y = self._lines[k].warp(theta[piece], patches.monomials, own, at[piece], slope[piece])
+            if not seen[piece].all():
+                x[~seen[piece]] = y[~seen[piece]] = 0
+            parts.append(patches.compare(self._images[k].sample(x, y), own))
+        rho, gx, gy = (np.concatenate(a) for a in zip(*((rho, *both) for rho, both in parts)))
+        return rho, (gx, gy)
 
     def _normal(self, a: "_Linear", patches: TemplatePatches, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Σ P_k J_kᵀ M J_k (m, P + S, P + S)."""
@@ -295,9 +270,9 @@ class _Adjustment:
         half = inverse_normals(texture)
         return half @ middle @ half
 
-    def _pseudo(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _pseudo(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
         """Weights (m, P + S) of the pseudo-observations and what they wish to be added."""
-        weight, wish = np.zeros((len(rows), self._P + self._S)), np.zeros((len(rows), self._P + self._S))
+        weight, wish = np.zeros((2, len(theta), self._P + self._S))
         weight[:, self._P :], wish[:, self._P :] = self._across_weight, -across
         if self._prior is not None:
             weight[:, : self._P] = 1 / self._prior.sigma[rows] ** 2
@@ -322,7 +297,7 @@ class _Adjustment:
         status: np.ndarray,
     ) -> SurfacePatch:
         s, P, patches, speed, correlation = self._settings, self._P, self._patches, state.speed, state.correlation
-        K = self._covariance(state, self._pseudo(theta, across, np.arange(len(theta)))[0])
+        K = self._covariance(state, self._pseudo(theta, across, slice(None))[0])
         at = monomials(patches.offset[:, 0], patches.offset[:, 1], 1 if P == 3 else 2)
         sigma = speed * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", at, K[:, :P, :P], at), 0.0))
         lost = np.clip(1 - correlation.min(axis=1) ** 2, 0, 1)

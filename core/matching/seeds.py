@@ -21,8 +21,10 @@ from ..geometry.camera import Camera
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
 from ..progress import Monitor
+from ..threads import equal_pieces, in_threads
 from .grid import TemplateGrid
-from .least_squares import MatchingSettings, patch_offsets
+from .least_squares import MatchingSettings
+from .patch_pixels import patch_offsets
 
 NEAREST_BASES, FARTHEST_BASES = 0.8, 40.0  # depth range to look in, in lengths of the longest base, when nothing else is known
 SWEEP_STEP_PX = 1.0
@@ -85,16 +87,20 @@ def sweep_seeds(
     """
     rows = grid.rows
     xy = _textured(images[reference], settings, rows, grid.every(max(1, round(spacing_px / grid.spacing_px))))
-    smooth = [image.smoothed(SWEEP_SMOOTHING_PX, rows.step) for image in images]
+    smooth = in_threads(lambda image: image.smoothed(SWEEP_SMOOTHING_PX, rows.step), images)
     near, far = depth_range_m or _default_range(cameras)
     inverse = _inverse_depths(cameras, reference, near, far)
-    block = max(1, LOOK_UP // max(1, len(inverse) * settings.patch_px**2 * len(cameras)))
-    depth, good = np.zeros(len(xy)), np.zeros(len(xy), dtype=bool)
-    for i in range(0, len(xy), block):
-        monitor.step("seeds", i, len(xy))
-        part = slice(i, i + block)
+
+    def work(part: slice) -> tuple[np.ndarray, np.ndarray]:
+        if monitor.cancelled:
+            monitor.step("seeds", part.start, len(xy))
         rho = _sweep_correlations(smooth, cameras, reference, rows, settings, xy[part], inverse)
-        depth[part], good[part] = _best_depths(rho, inverse, fewest_views(len(cameras), pairs))
+        return _best_depths(rho, inverse, fewest_views(len(cameras), pairs))
+
+    monitor.step("seeds", 0, len(xy))
+    block = max(1, LOOK_UP // max(1, len(inverse) * settings.patch_px**2 * len(cameras)))
+    parts = in_threads(work, equal_pieces(len(xy), block, 2) or [slice(0, 0)])
+    depth, good = (np.concatenate(a) for a in zip(*parts))
     return approximations_at_depth(cameras, reference, rows, xy[good], depth[good])
 
 

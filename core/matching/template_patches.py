@@ -19,7 +19,7 @@ from copy import copy
 import numpy as np
 
 from ..images.sampling import SplineImage, correlated_noise
-from .least_squares import patch_offsets
+from .patch_pixels import patch_offsets
 
 GRADIENT_NOISE = 130 / 144  # variance of the fourth-order central difference, for white noise of variance 1; 1 / 2σ² after smoothing
 MIN_CONTRAST = 0.5  # grey values
@@ -131,7 +131,7 @@ class TemplatePatches:
     def compare(self, g: np.ndarray, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Correlation (m,) and the products of M r1 g (m, P), for both directions, of search patches g (m, n)."""
         g = g - np.einsum("ij,ij->i", g, self.mean_weight[rows])[:, None]
-        power = np.maximum(np.einsum("ij,ij,ij->i", g, g, self._weight[rows]), 1e-6).astype(np.float64)
+        power = np.maximum(np.einsum("ij,ij->i", g, g * self._weight[rows]), 1e-6).astype(np.float64)
         along = np.einsum("ij,ij->i", g, self.weighted_f[rows]).astype(np.float64)
         gain = self.contrast[rows] * along / power
         px, py = self.project(g, rows)

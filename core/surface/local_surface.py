@@ -14,8 +14,10 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..matching.growing import TripletField
+from ..threads import equal_pieces, in_threads
 
 RADIUS_CELLS = 3
+LARGEST = 512  # points whose neighbours stay in the cache
 MIN_NEIGHBOURS = 8
 ROBUST_STEPS = 3
 TUKEY = 4.685
@@ -37,23 +39,27 @@ class LocalSurface:
 def local_surface(field: TripletField, camera: Camera, reference: int) -> LocalSurface:
     """Fit (1) about every point of the field, from the cells within RADIUS_CELLS."""
     depth = camera.to_camera(field.xyz_m)[:, 2]
-    neighbour = _neighbourhoods(field)
-    valid = neighbour >= 0
-    at = field.grid.rows.to_frame(field.xy[:, reference])
-    a, b = np.moveaxis(np.where(valid[..., None], at[neighbour] - at[:, None], 0.0), -1, 0)
-    D = np.where(valid, depth[neighbour], 0.0)
+    neighbour, at = _neighbourhoods(field), field.grid.rows.to_frame(field.xy[:, reference])
     spacing_m = field.grid.spacing_px * depth / camera.focal_px
-    weight = valid & (np.abs(D - depth[:, None]) < 3.0 * spacing_m[:, None] * np.hypot(a, b) / field.grid.spacing_px + spacing_m[:, None])
-    coefficients, scatter = _robust_quadric(
-        a, b, RADIUS_CELLS * field.grid.spacing_px, D - depth[:, None], weight.astype(np.float64), MIN_SCALE * spacing_m
-    )
+
+    def fit(rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        near, own, spacing = neighbour[rows], depth[rows, None], spacing_m[rows, None]
+        valid = near >= 0
+        a, b = np.moveaxis(np.where(valid[..., None], at[near] - at[rows, None], 0.0), -1, 0)
+        D = np.where(valid, depth[near], 0.0)
+        weight = valid & (np.abs(D - own) < 3.0 * spacing * np.hypot(a, b) / field.grid.spacing_px + spacing)
+        unit, scale = RADIUS_CELLS * field.grid.spacing_px, MIN_SCALE * spacing[:, 0]
+        return (*_robust_quadric(a, b, unit, D - own, weight.astype(np.float64), scale), weight.sum(axis=1) - 1)
+
+    parts = in_threads(fit, equal_pieces(len(depth), LARGEST, LARGEST) or [slice(0, 0)])
+    coefficients, scatter, neighbours = (np.concatenate(part) for part in zip(*parts))
     step = field.grid.rows.step
     across = field.spread * (1.0, step**2)
     return LocalSurface(
         depth_m=depth,
         fitted_m=depth + coefficients[:, 0],
         scatter_m=scatter,
-        neighbours=weight.sum(axis=1) - 1,
+        neighbours=neighbours,
         flattening_m=-0.5 * (coefficients[:, 3] * across[:, 0] + coefficients[:, 5] * across[:, 1]),  # (2)
         normal=_normals(field, camera, reference, depth, coefficients),
     )

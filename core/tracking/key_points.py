@@ -17,7 +17,8 @@ from ..calibration.targets import TargetStatus, find_targets
 from ..errors import InputError
 from ..geometry.intersection import forward_intersection
 from ..images.sampling import SplineImage
-from ..matching.least_squares import match_patches, patch_offsets
+from ..matching.least_squares import match_patches
+from ..matching.patch_pixels import patch_offsets
 from ..progress import Monitor
 from .published import STEPS
 from .search import search_box

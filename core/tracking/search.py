@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from ..matching.least_squares import patch_offsets
+from ..matching.patch_pixels import patch_offsets
 
 
 def search_box(

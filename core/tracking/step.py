@@ -26,7 +26,8 @@ from ..geometry.intersection import forward_intersection
 from ..geometry.small_matrices import invert_spd
 from ..images.fields import Instants, RowGrid
 from ..images.sampling import SplineImage
-from ..matching.least_squares import Matches, MatchingSettings, match_patches, patch_offsets
+from ..matching.least_squares import Matches, MatchingSettings, match_patches
+from ..matching.patch_pixels import patch_offsets
 from ..progress import Monitor
 from .control import hold, not_below
 from .neighbours import common_motion, nearest_neighbours

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..images.sampling import SplineImage
-from ..matching.least_squares import Matches, MatchingSettings, PatchTemplates, match_prepared, patch_offsets, prepare_templates
+from ..matching.least_squares import Matches, MatchingSettings, PatchTemplates, match_prepared, prepare_templates
+from ..matching.patch_pixels import patch_offsets
 from .tracked import rows_of
 
 BORDER = 5  # pixels about a patch: gradients, and where the spline still feels the tile's border

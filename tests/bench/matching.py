@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
+from tricap.core import threads as shared
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching import least_squares
-from tricap.core.matching.least_squares import MatchingSettings, match_patches, patch_offsets
+from tricap.core.matching.least_squares import MatchingSettings, match_patches
+from tricap.core.matching.patch_pixels import patch_offsets
 from tricap.core.measuring import measure_frames
 from tricap.core.pipeline import settings_of
 from tricap.core.progress import Monitor
@@ -95,10 +96,10 @@ def ours(pair: Pair, patch_px: int, threads: int, points: int | None = None) -> 
     settings = MatchingSettings(patch_px=patch_px, max_shift_px=5.0)
     shape = np.tile(np.eye(2), (len(pair.xy), 1, 1))
     rows = slice(0, points)
-    least_squares.THREADS = threads
+    shared.THREADS = threads
     found = match_patches(F, pair.xy[rows], [G], [pair.start[rows]], [shape[rows]], settings)[0]
     seconds = timed(lambda: match_patches(F, pair.xy[rows], [G], [pair.start[rows]], [shape[rows]], settings))
-    least_squares.THREADS = 2
+    shared.THREADS = 2
     z = (found.xy - pair.true[rows])[found.ok] / np.sqrt(found.covariance[found.ok][:, [0, 1], [0, 1]])
     return row(
         f"Tricap {patch_px}×{patch_px}, {threads} thread(s)",

@@ -14,7 +14,16 @@ import pytest
 from scipy.fft import fft2, fftfreq, ifft2
 
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.least_squares import Matches, MatchingSettings, MatchStatus, _spans, join_matches, match_patches, patch_offsets
+from tricap.core.matching.least_squares import (
+    Matches,
+    MatchingSettings,
+    MatchStatus,
+    join_matches,
+    match_patches,
+    match_prepared,
+    prepare_templates,
+)
+from tricap.core.matching.patch_pixels import patch_offsets, template_pixels
 from tricap.core.progress import Cancelled, Monitor
 
 SIZE, CONTRAST = 300, 20.0
@@ -309,12 +318,34 @@ def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float,
         assert found.sigma0 == pytest.approx(end.sigma0, rel=0.05) and np.mean(found.sigma0 / end.sigma0) == pytest.approx(1.0, abs=0.003)
 
 
-@pytest.mark.parametrize("n", [0, 1, 511, 512, 513, 1650, 5000])
-def test_pieces_for_the_threads_are_equal_and_cover_all(n: int) -> None:
-    spans = _spans(n)
-    assert [i for span in spans for i in range(n)[span]] == list(range(n))
-    sizes = [span.stop - span.start for span in spans]
-    assert not n or max(sizes) - min(sizes) <= 1 and max(sizes) <= 1024 and (len(spans) > 1) == (n > 512)
+def test_images_searched_together_or_alone_and_prepared_or_not_give_the_same() -> None:
+    """One patch's result is its own: it does not depend on what is matched beside it. 1400 points are several pieces."""
+    random = np.random.default_rng(2)
+    a, b = (SplineImage(g) for g in noisy_pair(1.5, 2.0, (0.4, -0.3), 0))
+    xy = random.uniform(20, SIZE - 20, (1400, 2))
+    starts = [xy + random.normal(0, 0.7, xy.shape) for _ in range(2)]
+    starts[0][::9] = np.nan
+    eye = np.tile(np.eye(2), (len(xy), 1, 1))
+    together = match_patches(a, xy, [b, a], starts, [eye, eye], OPEN, of_texture=False)
+    templates = prepare_templates(a, xy, OPEN, 1)
+    for k, (image, start) in enumerate(zip((b, a), starts)):
+        alone = match_patches(a, xy, [image], [start], [eye], OPEN, of_texture=False)[0]
+        some = np.arange(3, 1400, 2)
+        prepared = match_prepared(templates, some, image, start[some], eye[some])
+        for other, rows in ((alone, slice(None)), (prepared, some)):
+            assert np.array_equal(other.status, together[k].status[rows])
+            good = other.ok
+            assert np.abs(other.xy - together[k].xy[rows])[good].max() < 1e-4
+            assert np.allclose(other.covariance[good], together[k].covariance[rows][good], rtol=1e-3)
+
+
+def test_patches_about_whole_pixels_are_those_that_a_look_up_finds() -> None:
+    image, half = SplineImage(noisy_pair(1.5, 2.0, (0, 0), 0)[0]), (6, 3)
+    xy = np.array([[8, 5], [150, 120], [SIZE - 9, SIZE - 6]])
+    upright = np.tile(np.eye(2), (3, 1, 1))
+    whole, drawn = template_pixels(image, xy.astype(float), None, half), template_pixels(image, xy.astype(float), upright, half)
+    for name in ("f", "fx", "fy", "second"):
+        assert np.allclose(getattr(whole, name), getattr(drawn, name), rtol=1e-5, atol=1e-3), name
 
 
 @pytest.mark.slow

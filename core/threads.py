@@ -1,0 +1,28 @@
+"""Work on arrays, shared between a few threads. How it is divided does not depend on how many there are, and so neither do the results."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+_SHARE = os.environ.get("TRICAP_THREADS", "")  # `tricap batch` gives each worker its own
+THREADS = int(_SHARE) if _SHARE.isdecimal() and int(_SHARE) > 0 else 2
+
+
+def in_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """The results of all parts, in their order. Each thread takes the next part as soon as it is free."""
+    if THREADS == 1 or len(parts) < 2:
+        return [work(part) for part in parts]
+    with ThreadPoolExecutor(min(THREADS, len(parts))) as pool:
+        return list(pool.map(work, parts))
+
+
+def equal_pieces(n: int, largest: int, shared_from: int) -> list[slice]:
+    """An even number of equal pieces of n rows, none larger than `largest`; one alone below `shared_from` rows."""
+    if n < max(2, shared_from) and n <= largest:
+        return [slice(0, n)] if n else []
+    count = 2 * -(-n // (2 * largest))
+    cuts = [n * i // count for i in range(count + 1)]
+    return [slice(a, b) for a, b in zip(cuts, cuts[1:])]
