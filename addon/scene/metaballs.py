@@ -33,14 +33,14 @@ def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.O
     """For each family a metaball object per bone, child of that bone; a family is polygonised in its first object."""
     objects = []
     found = families(shape)
-    for own in found:
-        bones = list(dict.fromkeys(shape.metaballs.bone_index[own].tolist()))
+    for balls in found:
+        bones = list(dict.fromkeys(balls.bone_index.tolist()))
         words = NAME if len(found) == 1 else f"{NAME} {shape.skeleton.bones[bones[0]].name}"
         family = free_family_name(words)
         material = paint.plain_material(family, SKIN_COLOUR)
         for i, b in enumerate(bones):
             bone = shape.skeleton.bones[b].name
-            data = _data(family, shape.metaballs, own[shape.metaballs.bone_index[own] == b], shape.lengths_m, material)
+            data = _data(family, balls, np.flatnonzero(balls.bone_index == b), shape.lengths_m, material)
             member = bpy.data.objects.new(f"{family}.{i:03d}" if i else family, data)
             member.parent, member.parent_type, member.parent_bone = armature_object, "BONE", bone
             member.location = (0.0, -armature_object.data.bones[bone].length, 0.0)  # children of a bone sit at its tail

@@ -71,6 +71,10 @@ class WholeSurface:
         G, gradient = self._joined(points, part)
         return np.asarray((THRESHOLD - G) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12))
 
+    def slope(self, points: np.ndarray, part: np.ndarray) -> np.ndarray:
+        """|∇G| (N,) per metre."""
+        return np.asarray(np.linalg.norm(self._joined(points, part)[1], axis=1))
+
     def normals(self, points: np.ndarray, part: np.ndarray) -> np.ndarray:
         """Outward unit normals (N, 3)."""
         gradient = self._joined(points, part)[1]

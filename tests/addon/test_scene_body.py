@@ -158,10 +158,10 @@ def test_at_the_joints_of_a_whole_body_the_metaballs_are_the_families_surface(em
     seen = [part for part in flesh if "." not in part.name.replace(".R", "").replace(".L", "")]
     found = families(shape)
     assert len(seen) == len(found)
-    for family, own in zip(seen, found):
+    for family, balls in zip(seen, found):
         points = world_vertices(empty, family)
-        active = np.broadcast_to(np.isin(np.arange(len(shape.metaballs.weight)), own), (len(points), len(shape.metaballs.weight)))
-        F, gradient, _, _ = core_metaballs.field_and_derivatives(shape.metaballs, shape.lengths_m, R, head, points, active)
+        active = np.ones((len(points), len(balls.weight)), dtype=bool)
+        F, gradient, _, _ = core_metaballs.field_and_derivatives(balls, shape.lengths_m, R, head, points, active)
         distance = (F - core_metaballs.THRESHOLD) / np.linalg.norm(gradient, axis=1)
         assert len(points) > 1000 and np.abs(distance).max() < JOINT_MAX_M
 
