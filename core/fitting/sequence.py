@@ -35,6 +35,7 @@ from .clicks import enough, read_clicks
 from .cloud_points import CloudPoints, thinned
 from .conditions import NO_SHAPE, Conditions
 from .empty_views import EmptyViews
+from .even_flesh import evened
 from .finished import NOTHING_BEHIND, Behind, Ended, FoundShape, Stretch
 from .fit_input import FitInput
 from .frame_to_frame import follow
@@ -316,6 +317,7 @@ def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, n
 def _result(every: Recording, looked: Looked, vector: np.ndarray, covariance: np.ndarray, ends: Sequence[Ended]) -> BodyFit:
     """The body of all frames, with the shape vector (S,) of a covariance (S, S), and how the adjustments ended."""
     fit, skeleton = every.fit, every.fit.model.skeleton
+    vector, covariance = evened(fit.parameters, vector, covariance, fit.settings.evenness_sigma)
     motion = BodyMotion(frames=np.array(every.frames), time_s=every.time_s, dof_names=skeleton.dof_names, values=looked.values,
                         covariance=looked.covariance, joint_names=skeleton.joint_names, joints_m=looked.joints_m,
                         joint_sigma_m=looked.joint_sigma_m, status=_statuses(fit, looked.evidence, looked.sigma0), sigma0=looked.sigma0)

@@ -41,6 +41,8 @@ class FitSettings:
                                    low=0.001, high=1.0)
     radius_sigma: float = knob(0.2, "Relative sigma of the model's radii.", low=0.001, high=1.0)
     roundness_sigma: float = knob(0.10, "Relative sigma of the difference of a ball's two cross radii.", low=0.001, high=1.0)
+    evenness_sigma: float = knob(0.4, "Relative sigma of how much thicker than those beside it a ball is, about the model: rings that "
+                                      "nothing proves are evened out after the fit.", low=0.001, high=100.0)
     symmetry_sigma: float = knob(0.03, "Relative sigma of the difference between left and right.", low=0.001, high=1.0)
     limit_sigma_deg: float = knob(2.0, "How softly joint limits hold.", unit="deg", low=0.1, high=30.0)
     prediction_sigma_deg: float = knob(15.0, "Sigma of an angle predicted from the frames before.", unit="deg", low=0.5, high=90.0)
