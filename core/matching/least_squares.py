@@ -41,7 +41,7 @@ from .affine_steps import compose
 from .parameter_sets import PARAMETERS, reduced_sets
 from .patch_pixels import compare, patch_offsets, template_pixels
 
-LARGEST, SHARED_FROM = 3072, 513  # patches of a piece; from so many on threads share them
+LARGEST, SHARED_FROM = 4096, 513  # patches of a piece; from so many on threads share them
 STILL_WORTH = 0.75  # of the patches at work: with fewer that move, those that have ended are taken out
 CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
 REMAINS_SIGMAS, REMAINS_PX = 0.1, 0.005  # what may remain after the last step where (6) foresees it
@@ -228,38 +228,40 @@ class PatchTemplates:
 
     def find(self, images: Sequence[SplineImage], starts: Sequence[np.ndarray], shapes: Sequence[np.ndarray]) -> list[Matches]:
         """Iterate (2) and (3) for all patches in every image, then judge them. Rows go image after image."""
-        s, N = self._settings, len(self.inside)
-        start, A = (np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images]) for of_images in (starts, shapes))
-        c, status = start.copy(), self._usable(images, starts)
-        correlation, iterations = np.zeros(len(c)), np.zeros(len(c), dtype=np.int16)
+        N, transferred = len(self.inside), self._transferred()
+        start, shape = (np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images]) for of_images in (starts, shapes))
+        settled = self._settled(images, start, shape, self._usable(images, starts))
+        return [
+            self._judge(image, start[r], shape[r], transferred, *(a[r] for a in settled))
+            for image, r in ((image, slice(k * N, (k + 1) * N)) for k, image in enumerate(images))
+        ]
+
+    def _settled(self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Positions, shapes, statuses, correlations and iterations at the end of (2) and (3), of those that begin as NOT_CONVERGED."""
+        most, limit_px = self._settings.max_iterations, 2 * self._settings.max_shift_px
+        c, A, correlation, iterations = start.copy(), shape.copy(), np.zeros(len(start)), np.zeros(len(start), dtype=np.int16)
         alive = status == MatchStatus.NOT_CONVERGED
         place, at, warp = np.arange(len(c)), np.where(alive[:, None], c, 0.0), np.where(alive[:, None, None], A, np.eye(2))
         work = _AtWork(self, images, place)
-        for iteration in range(1, s.max_iterations + 1):
+        for iteration in range(1, most + 1):
             if not alive.any():
                 break
             if np.count_nonzero(alive) < STILL_WORTH * len(alive):
                 place, at, warp, alive = place[alive], at[alive], warp[alive], alive[alive]
                 work = _AtWork(self, images, place)
             step, rho, gain = work.step(at, warp)
-            to, warped, moved = compose(at, warp, step)
-            gone = (largest(to - start[place]) > 2 * s.max_shift_px) | ~np.isfinite(moved)
+            at, warp, moved = compose(at, warp, step)
+            gone = (largest(at - start[place]) > limit_px) | ~np.isfinite(moved)
             near, spared = self._converged(step, moved, work.sigma(rho))
-            rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
-            ended = np.flatnonzero(alive & (near | spared | gone)) if iteration < s.max_iterations else np.flatnonzero(alive)
+            ended = np.flatnonzero(alive & (near | spared | gone | (iteration == most)))
             here = place[ended]
-            c[here], A[here], correlation[here], iterations[here] = to[ended], warped[ended], rho[ended], iteration
+            rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
+            c[here], A[here], correlation[here], iterations[here] = at[ended], warp[ended], rho[ended], iteration
             status[here] = np.where((near | spared)[ended], MatchStatus.OK, MatchStatus.NOT_CONVERGED)
             status[place[alive & gone]] = MatchStatus.SHIFT_TOO_LARGE
             alive[ended] = False
-            at, warp = to, warped
             at[gone], warp[gone] = 0.0, np.eye(2)  # what has ended may go on, but nowhere
-        transferred = self._transferred()
-        spans = [slice(k * N, (k + 1) * N) for k in range(len(images))]
-        return [
-            self._judge(image, start[r], shape, c[r], A[r], status[r], correlation[r], iterations[r], transferred)
-            for image, shape, r in zip(images, shapes, spans)
-        ]
+        return c, A, status, correlation, iterations
 
     def _usable(self, images: Sequence[SplineImage], starts: Sequence[np.ndarray]) -> np.ndarray:
         """The statuses that patches have before they move; NOT_CONVERGED are those that can be matched."""
@@ -287,12 +289,12 @@ class PatchTemplates:
         image: SplineImage,
         start: np.ndarray,
         start_shape: np.ndarray,
+        transferred: np.ndarray | None,
         c: np.ndarray,
         A: np.ndarray,
         status: np.ndarray,
         correlation: np.ndarray,
         iterations: np.ndarray,
-        transferred: np.ndarray | None,
     ) -> Matches:
         s = self._settings
         dof = max(1, self.n_pixels - PARAMETERS)

@@ -25,9 +25,10 @@ from ..images.sampling import SplineImage
 from ..progress import Monitor
 from ..threads import equal_pieces, in_threads
 from .least_squares import MatchingSettings, MatchStatus
-from .object_space import LARGEST, MIN_NOISE, SHARED_FROM, inverse_normals, solve_normals, without_noise
+from .object_space import MIN_NOISE, SHARED_FROM, inverse_normals, solve_normals, without_noise
 from .template_patches import TemplatePatches
 
+LARGEST = 512  # points of a piece
 NEIGHBOUR_SHIFT_PX, NEIGHBOUR_SHAPE = 1.0, 0.1
 CONVERGED_SIGMAS, MAX_STEP_PX, MAX_SHAPE_STEP = 0.05, 1.5, 0.3
 

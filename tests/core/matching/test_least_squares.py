@@ -321,14 +321,14 @@ def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float,
 def test_images_searched_together_or_alone_and_prepared_or_not_give_the_same() -> None:
     """One patch's result is its own: it does not depend on what is matched beside it. 1400 points are several pieces."""
     random = np.random.default_rng(2)
-    a, b = (SplineImage(g) for g in noisy_pair(1.5, 2.0, (0.4, -0.3), 0))
+    (a, b), again = (SplineImage(g) for g in noisy_pair(1.5, 2.0, (0.4, -0.3), 0)), SplineImage(noisy_pair(1.5, 2.0, (0, 0), 0)[1])
     xy = random.uniform(20, SIZE - 20, (1400, 2))
     starts = [xy + random.normal(0, 0.7, xy.shape) for _ in range(2)]
     starts[0][::9] = np.nan
     eye = np.tile(np.eye(2), (len(xy), 1, 1))
-    together = match_patches(a, xy, [b, a], starts, [eye, eye], OPEN, of_texture=False)
+    together = match_patches(a, xy, [b, again], starts, [eye, eye], OPEN, of_texture=False)
     templates = prepare_templates(a, xy, OPEN, 1)
-    for k, (image, start) in enumerate(zip((b, a), starts)):
+    for k, (image, start) in enumerate(zip((b, again), starts)):
         alone = match_patches(a, xy, [image], [start], [eye], OPEN, of_texture=False)[0]
         some = np.arange(3, 1400, 2)
         prepared = match_prepared(templates, some, image, start[some], eye[some])
