@@ -42,9 +42,12 @@ def chain_weights(shape: BodyShape, segments: Sequence[Segment], rays: Rays, loc
 
 
 def strongest(weights: np.ndarray) -> np.ndarray:
-    """Of the shares (V, B) in every vertex the `MOST_BONES` largest, which sum to 1."""
-    least = np.sort(weights, axis=1)[:, -MOST_BONES:][:, :1]
-    found = np.where(weights >= least, weights, 0.0)
+    """Of the shares (V, B) in every vertex the `MOST_BONES` largest, less the next, which sum to 1: no bone leaves or comes at once."""
+    order = np.argsort(-weights, axis=1, kind="stable")[:, : MOST_BONES + 1]
+    largest = np.take_along_axis(weights, order, axis=1)
+    less = largest[:, MOST_BONES:] if largest.shape[1] > MOST_BONES else np.zeros((len(weights), 1))
+    found = np.zeros(weights.shape)
+    np.put_along_axis(found, order[:, :MOST_BONES], largest[:, :MOST_BONES] - (1 - 1e-9) * less, axis=1)  # five alike do not leave nothing
     return np.asarray(found / found.sum(axis=1, keepdims=True))
 
 
