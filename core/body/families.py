@@ -35,7 +35,7 @@ from .whole_surface import WholeSurface
 UPPER = 0.6  # balls of a limb up to here along its first bone count for the trunk's bone
 NEXT_TO = 0.34  # and those of the trunk's next bone up to here
 MOVED = (0.0, 0.35, -0.35)  # postures of (1): how far each DOF of a limb's first bones goes towards its upper limit, or its lower one
-SAMPLED = SkinSettings(contours=8, rays=24)
+SAMPLED = SkinSettings(contours=6, rays=16)
 ON_SURFACE_M = 5e-4  # points of a part's skin that are farther from the surface lie within another part
 SIGMA_M, SIGMA, LARGEST = 1e-3, 2.0, 4.0  # s, σ and the bound of (1); σ is of one ball against all points
 ROUNDS = 4
@@ -43,7 +43,7 @@ LEAST = 0.02  # balls of less weight are left out
 
 
 def families(shape: BodyShape) -> list[Metaballs]:
-    """The balls of each family, with their weights; first those of the parts. A whole body takes 1 s, one chain none."""
+    """The balls of each family, with their weights; first those of the parts. A whole body takes 0.7 s, one chain none."""
     parts = body_parts(shape)
     chosen = _chosen(shape, parts)
     wanted = np.zeros((len(chosen), len(shape.metaballs.weight)))
