@@ -5,7 +5,7 @@ into the one after.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from .progress import Monitor
 from .results import Results
 from .take import Footage
 from .tracking.published import STEPS
+from .tracking.relief import Relief
 from .tracking.settings import TrackingSettings
 from .tracking.step import FramePair, TrackingView
 from .tracking.surface import on_surface, regenerate, start_tracks
@@ -118,6 +119,8 @@ def _advance(
     monitor: Monitor,
     guide: Guide | None,
 ) -> TrackedFrame:
+    if view.tracking.scheme == "space":
+        view = replace(view, relief=_relief(view, m))
     if state.current is None or images is None:
         return start_tracks(m.field, m.cloud, view)
     pair = FramePair(grey=images.grey, spline=images.spline, next_grey=following.grey, next_spline=following.spline)
@@ -132,11 +135,16 @@ def _advance(
     return regenerate(tracked, m.field, m.cloud, view, state.born) if every and index % every == 0 else tracked
 
 
+def _relief(view: TrackingView, m: MeasuredFrame) -> Relief:
+    return Relief(
+        field=m.field, cloud=m.cloud, camera=view.cameras[view.reference], reference=view.reference, half_patch=view.half_patch
+    )
+
+
 def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Tiles:
     """The tiles of the key templates that begin in this frame: of new points, and of those that outgrew theirs."""
-    fresh = (tracked.key_shape == np.eye(2)).all(axis=(1, 2))
-    at = tracked.xy[fresh, view.reference]
-    return cut_tiles(images.spline[view.reference], tracked.identity[fresh], at, view.matching, view.rows.step)
+    new = tracked.renewed
+    return cut_tiles(images.spline[view.reference], tracked.identity[new], tracked.xy[new, view.reference], view.matching, view.rows.step)
 
 
 def _checkpoint(results: Results, group: str, tracked: TrackedFrame, cut: Tiles, key: str) -> None:

@@ -38,42 +38,53 @@ class LocalSurface:
 
 def local_surface(field: TripletField, camera: Camera, reference: int) -> LocalSurface:
     """Fit (1) about every point of the field, from the cells within RADIUS_CELLS."""
+    coefficients, scatter, support = _quadrics(field, camera, reference, np.arange(len(field.cell)))
     depth = camera.to_camera(field.xyz_m)[:, 2]
-    neighbour, at = _neighbourhoods(field), field.grid.rows.to_frame(field.xy[:, reference])
-    spacing_m = field.grid.spacing_px * depth / camera.focal_px
-
-    def fit(rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        near, own, spacing = neighbour[rows], depth[rows, None], spacing_m[rows, None]
-        valid = near >= 0
-        a, b = np.moveaxis(np.where(valid[..., None], at[near] - at[rows, None], 0.0), -1, 0)
-        D = np.where(valid, depth[near], 0.0)
-        weight = valid & (np.abs(D - own) < 3.0 * spacing * np.hypot(a, b) / field.grid.spacing_px + spacing)
-        unit, scale = RADIUS_CELLS * field.grid.spacing_px, MIN_SCALE * spacing[:, 0]
-        return (*_robust_quadric(a, b, unit, D - own, weight.astype(np.float64), scale), weight.sum(axis=1) - 1)
-
-    parts = in_threads(fit, equal_pieces(len(depth), LARGEST, LARGEST) or [slice(0, 0)])
-    coefficients, scatter, neighbours = (np.concatenate(part) for part in zip(*parts))
-    step = field.grid.rows.step
-    across = field.spread * (1.0, step**2)
+    across = field.spread * (1.0, field.grid.rows.step**2)
     return LocalSurface(
         depth_m=depth,
         fitted_m=depth + coefficients[:, 0],
         scatter_m=scatter,
-        neighbours=neighbours,
+        neighbours=support,
         flattening_m=-0.5 * (coefficients[:, 3] * across[:, 0] + coefficients[:, 5] * across[:, 1]),  # (2)
         normal=_normals(field, camera, reference, depth, coefficients),
     )
 
 
-def _neighbourhoods(field: TripletField) -> np.ndarray:
-    """Rows of the points in the neighbouring cells (N, m), −1 where there is none."""
+def curvatures(field: TripletField, camera: Camera, reference: int, rows: np.ndarray) -> np.ndarray:
+    """Daa and Dbb (n, 2) of (1) about these rows (n,) of the field, the depth in pixels of the reference view as well [1/px]."""
+    coefficients, _, _ = _quadrics(field, camera, reference, rows)
+    return coefficients[:, [3, 5]] * (camera.focal_px / camera.to_camera(field.xyz_m[rows])[:, 2])[:, None]
+
+
+def _quadrics(field: TripletField, camera: Camera, reference: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(1) about these rows: coefficients (n, 6), the neighbours' scatter (n,) about it and how many support it (n,)."""
+    depth, at = camera.to_camera(field.xyz_m)[:, 2], field.grid.rows.to_frame(field.xy[:, reference])
+    neighbour, spacing_m = _neighbourhoods(field, rows), field.grid.spacing_px * depth / camera.focal_px
+
+    def fit(piece: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        near, middle = neighbour[piece], rows[piece, None]
+        own, spacing, valid = depth[middle], spacing_m[middle], near >= 0
+        a, b = np.moveaxis(np.where(valid[..., None], at[near] - at[middle], 0.0), -1, 0)
+        D = np.where(valid, depth[near], 0.0)
+        weight = valid & (np.abs(D - own) < 3.0 * spacing * np.hypot(a, b) / field.grid.spacing_px + spacing)
+        unit, scale = RADIUS_CELLS * field.grid.spacing_px, MIN_SCALE * spacing[:, 0]
+        return (*_robust_quadric(a, b, unit, D - own, weight.astype(np.float64), scale), weight.sum(axis=1) - 1)
+
+    parts = in_threads(fit, equal_pieces(len(rows), LARGEST, LARGEST) or [slice(0, 0)])
+    coefficients, scatter, support = (np.concatenate(part) for part in zip(*parts))
+    return coefficients, scatter, support
+
+
+def _neighbourhoods(field: TripletField, rows: np.ndarray) -> np.ndarray:
+    """Rows of the points in the cells about these rows (n, m), −1 where there is none."""
     gh, gw = field.grid.shape
     r = RADIUS_CELLS
     row_of = np.full((gh + 2 * r, gw + 2 * r), -1, dtype=np.int64)
     j, i = field.cell // gw + r, field.cell % gw + r
     row_of[j, i] = np.arange(len(field.cell))
     dj, di = (d.ravel() for d in np.mgrid[-r : r + 1, -r : r + 1])
-    return row_of[j[:, None] + dj, i[:, None] + di]
+    return row_of[j[rows, None] + dj, i[rows, None] + di]
 
 
 def _robust_quadric(

@@ -1,5 +1,6 @@
 """Control of drift: a point's temporal result adjusted with a match of its key template (equation (1) of templates.py)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,12 +32,15 @@ def hold(
     identity: np.ndarray,
     image: SplineImage,
     min_correlation: float,
+    corrected: Callable[[Matches], Matches] | None = None,
 ) -> Held:
-    """Match the key templates of the `good` points about their temporal results, and adjust."""
+    """Match the key templates of the `good` points about their temporal results, and adjust; `corrected` mends their matches first."""
     grown = np.where(good[:, None, None], drift + temporal.covariance, drift)
     shape = np.where(good[:, None, None], temporal.shape @ key_shape, key_shape)
     start = np.where(good[:, None], temporal.xy, np.nan)
     key = templates.match(identity, image, start, shape)
+    if corrected is not None:
+        key = corrected(key)
     away = np.linalg.norm(key.xy - temporal.xy, axis=1)
     sigma = np.sqrt(np.maximum(np.trace(grown + key.covariance, axis1=1, axis2=2), 0.0))
     held = good & key.ok & (key.correlation >= min_correlation) & (away <= np.maximum(JUMP_PX, SIGMAS * sigma))

@@ -3,7 +3,8 @@
     predict   X̂ = 2 X_i − X_{i−1}, projected into every view; a new point moves as its neighbours do              (1)
     search    the box about the prediction for the largest correlation with the patch of frame i                   (2)
     temporal  least squares matching of the patch of frame i in frame i + 1, in every view                         (3)
-    control   the reference view's result is adjusted with a match of the point's key template (templates.py)      (4)
+    control   the reference view's result is adjusted with a match of the point's key template (templates.py),     (4)
+              both corrected for the turning of a round body where the frame's surface is known (relief.py)
     spatial   least squares matching of the reference view's patch in the other views of frame i + 1               (5)
     verify    Δ = x_s − x_t,  Δᵀ (K_s + K_t + Q)⁻¹ Δ ≤ s² χ²(0.999; 2), else once more in a bigger box, else stop   (6)
 
@@ -18,6 +19,7 @@ drift over the body.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -31,6 +33,7 @@ from ..matching.patch_pixels import patch_offsets
 from ..progress import Monitor
 from .control import hold, not_below
 from .neighbours import common_motion, nearest_neighbours
+from .relief import Relief
 from .search import search_box
 from .settings import TrackingSettings, TrackStatus
 from .templates import Templates
@@ -56,6 +59,7 @@ class TrackingView:
     limit_px: float  # by which rays may miss
     frame: int = 0  # that is looked at
     dt_s: float = 0.04  # from one frame to the next
+    relief: Relief | None = None  # the surface measured in that frame
 
     def at(self, frame: int) -> "TrackingView":
         """The same, to look at this frame."""
@@ -212,8 +216,10 @@ def control(
     status: np.ndarray,
 ) -> tuple[TrackedFrame, list[Matches]]:
     """The points with their drift, and the temporal matches shifted to where the key templates say.  (4)"""
+    raw = temporal[view.reference]
+    reference = raw if view.relief is None else view.relief.corrected(raw, points.relief)
     held = hold(
-        temporal[view.reference],
+        reference,
         status == TrackStatus.MEASURED,
         points.key_shape,
         points.drift,
@@ -221,11 +227,11 @@ def control(
         points.identity,
         image,
         view.tracking.drift_correlation,
+        None if view.relief is None else partial(view.relief.corrected, template=points.key_relief),
     )
-    moved = [
-        replace(m, xy=m.xy + (held.shift if k == view.reference else np.einsum("nij,nj->ni", points.shape[:, k], held.shift)))
-        for k, m in enumerate(temporal)
-    ]
+    shift = held.shift + np.nan_to_num(reference.xy - raw.xy)
+    moved = [replace(m, xy=m.xy + np.einsum("nij,nj->ni", points.shape[:, k], shift)) for k, m in enumerate(temporal)]
+    moved[view.reference] = replace(reference, xy=reference.xy + held.shift)
     renewed = held.renewed[:, None, None]
     key_drift = points.key_drift + np.where(renewed, held.drift, 0.0)
     return replace(points, key_shape=held.key_shape, key_drift=key_drift, drift=np.where(renewed, 0.0, held.drift)), moved

@@ -28,7 +28,7 @@ NEAREST = 4
 def start_tracks(field: TripletField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
     """The first tracked points: the measured surface, thinned to the tracking's spacing."""
     rows = _thinned(field, view.tracking.spacing_px)
-    return _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], 0)
+    return _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], 0, view)
 
 
 def regenerate(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, view: TrackingView, next_identity: int) -> TrackedFrame:
@@ -38,7 +38,7 @@ def regenerate(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, vi
         to_frame = field.grid.rows.to_frame
         distance, _ = cKDTree(to_frame(tracked.xy[:, view.reference])).query(to_frame(field.xy[rows, view.reference]))
         rows = rows[distance > BARE * view.tracking.spacing_px]
-    return joined(tracked, _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], next_identity))
+    return joined(tracked, _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], next_identity, view))
 
 
 def on_surface(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
@@ -67,7 +67,7 @@ def on_surface(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, vi
     reason[(reason == TrackStatus.MEASURED) & far] = TrackStatus.OFF_SURFACE
     strayed = over_the_body(view, tracked.xyz_m, tracked.key_drift + tracked.drift)
     placed = replace(tracked, xyz_m=camera.centre_m + ray * found[:, None], covariance_m2=cloud.covariance_m2[near[:, 0]] + strayed)
-    return placed.without(reason != TrackStatus.MEASURED, reason)
+    return _with_relief(placed, view).without(reason != TrackStatus.MEASURED, reason)
 
 
 def _well_inside(field: TripletField, cloud: PointCloud, rows: np.ndarray, view: TrackingView) -> np.ndarray:
@@ -97,9 +97,19 @@ def _coverage(field: TripletField, xy: np.ndarray, depth: np.ndarray, view: Trac
         return (np.abs(there - depth[:, None]) <= reach[:, None]).mean(axis=1)
 
 
-def _born(field: TripletField, cloud: PointCloud, rows: np.ndarray, first: int) -> TrackedFrame:
+def _born(field: TripletField, cloud: PointCloud, rows: np.ndarray, first: int, view: TrackingView) -> TrackedFrame:
     identity = np.arange(first, first + len(rows))
-    return born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows])
+    return _with_relief(
+        born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows]), view
+    )
+
+
+def _with_relief(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
+    """The points with the frame's relief under them, which is that of the key templates cut in it."""
+    if view.relief is None:
+        return points
+    here = view.relief.at(points.xy[:, view.reference])
+    return replace(points, relief=here, key_relief=np.where(points.renewed[:, None], here, points.key_relief))
 
 
 def _thinned(field: TripletField, spacing_px: int) -> np.ndarray:

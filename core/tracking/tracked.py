@@ -8,7 +8,7 @@ import numpy as np
 
 from .settings import TrackStatus
 
-ROWS = ("identity", "xy", "shape", "xyz_m", "covariance_m2", "key_shape", "key_drift", "drift")
+ROWS = ("identity", "xy", "shape", "xyz_m", "covariance_m2", "key_shape", "key_drift", "drift", "relief", "key_relief")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -17,6 +17,7 @@ class TrackedFrame:
 
     A point is held to its key template (templates.py), a patch of an earlier frame: `key_drift` is the covariance of that template's
     place on the body, `drift` that of the point against the template; their sum is how far the point may have strayed since its birth.
+    What the surface is like under the point, now and where its key template was cut, is its relief (relief.py).
     """
 
     frame: int
@@ -28,8 +29,15 @@ class TrackedFrame:
     key_shape: np.ndarray  # (N, 2, 2) from the key template to the reference view
     key_drift: np.ndarray  # (N, 2, 2) px²
     drift: np.ndarray  # (N, 2, 2) px²
+    relief: np.ndarray  # (N, 3)
+    key_relief: np.ndarray  # (N, 3)
     ended: np.ndarray  # (M,) identities that were lost on the way to this frame
     reason: np.ndarray  # (M,) TrackStatus
+
+    @property
+    def renewed(self) -> np.ndarray:
+        """(N,) whose key template is the patch of this frame."""
+        return np.asarray((self.key_shape == np.eye(2)).all(axis=(1, 2)))
 
     def select(self, rows: np.ndarray) -> "TrackedFrame":
         """Only these rows (a mask or indices); the ended ones stay."""
@@ -78,6 +86,8 @@ def born(frame: int, identity: np.ndarray, xy: np.ndarray, shape: np.ndarray, xy
         key_shape=np.tile(np.eye(2), (n, 1, 1)),
         key_drift=none,
         drift=none,
+        relief=np.zeros((n, 3)),
+        key_relief=np.zeros((n, 3)),
         ended=np.zeros(0, dtype=np.int64),
         reason=np.zeros(0, dtype=np.int8),
     )

@@ -123,6 +123,8 @@ class Waiting:
             return p
         centre = np.stack([view.rows.from_frame(camera.project(p.xyz_m)) for camera in view.cameras], axis=1)
         key = templates.match(p.identity, images[ref], centre[:, ref], p.key_shape)
+        if view.relief is not None:
+            key = view.relief.corrected(key, p.key_relief)
         status = np.full(p.xy.shape[:2], TrackStatus.MEASURED, dtype=np.int8)
         status[~(key.ok & (key.correlation >= view.tracking.drift_correlation)), ref] = TrackStatus.NOT_FOUND
         shift = key.xy - centre[:, ref]
