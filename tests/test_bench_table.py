@@ -13,6 +13,7 @@ MATCHING = [
     {"tool": "Tricap 13×13, 1 thread(s)", "points_per_s": 3000, "rms_px": 0.01, "over_bound": 1.2, "points": 900},
     {"tool": "Tricap 13×13, 2 thread(s)", "points_per_s": 5400, "rms_px": 0.01, "over_bound": 1.2, "points": 900},
     {"tool": "cv2.calcOpticalFlowPyrLK 13×13, 3 levels, 1 thread(s)", "points_per_s": 6000, "rms_px": 0.04},
+    {"tool": "cv2.calcOpticalFlowPyrLK 13×13, 3 levels, 2 thread(s)", "points_per_s": 7200, "rms_px": 0.04},
     {"tool": "cv2.findTransformECC 13×13, affine, per point", "points_per_s": 1000, "rms_px": 0.02},
     {"tool": "published form, per point (numpy, scipy)", "points_per_s": 100, "rms_px": 0.01},
     {"tool": "Tricap 13×13, 1 thread(s)", "points_per_s": 2000, "rms_px": 0.01, "over_bound": 1.2, "points": 1000},
@@ -34,6 +35,7 @@ def test_rows_are_ratios_to_peers_bounds_and_sizes(table: ModuleType) -> None:
     rows = {row.name: row.value for row in table.rows_of({"matching": MATCHING})}
     assert rows["matching: points a second, PyrLK, 3 levels"] == 0.5 and rows["matching: error, ECC"] == 0.5
     assert rows["matching: points a second, published form"] == 30 and rows["matching: error, 13×13, Cramér–Rao bound"] == 1.2
+    assert rows["matching: points a second, two threads, PyrLK, 3 levels"] == 0.75
     assert rows["matching: two threads, one thread"] == 1.8 and rows["matching: cost of a point, 10,000, 1,000 points"] == 0.5
 
 

@@ -49,7 +49,10 @@ def matching(rows: list[dict[str, Any]]) -> Iterator[Row]:
         yield Row("matching", "points a second", own["points_per_s"] / peer["points_per_s"], "speed", name)
         yield Row("matching", "error", own["rms_px"] / peer["rms_px"], "error", name)
     yield Row("matching", "error, 13×13", own["over_bound"], "error", "Cramér–Rao bound")
-    yield Row("matching", "two threads", of["Tricap 13×13, 2 thread(s)"]["points_per_s"] / own["points_per_s"], "speed", "one thread")
+    both = of["Tricap 13×13, 2 thread(s)"]["points_per_s"]
+    yield Row("matching", "two threads", both / own["points_per_s"], "speed", "one thread")
+    pyramid = next(row for tool, row in of.items() if tool.startswith("cv2.calcOpticalFlowPyrLK 13×13, 3 levels, 2"))
+    yield Row("matching", "points a second, two threads", both / pyramid["points_per_s"], "speed", "PyrLK, 3 levels")
     few, many = (next(r for r in rows if r.get("points") == n) for n in (1000, 10_000))
     yield Row("matching", "cost of a point, 10,000", few["points_per_s"] / many["points_per_s"], "cost", "1,000 points")
 

@@ -29,7 +29,7 @@ from tricap.core.results import Results
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take import open_take, read_take
 
-SHAPE, SPACING, NOISE, RUNS, FINE, BORDER = (576, 768), 4, 2.0, 5, 4, 24
+SHAPE, SPACING, NOISE, RUNS, FINE, BORDER = (576, 768), 4, 2.0, 7, 4, 24
 START_ERROR_PX = 0.5
 ECC_POINTS, PLAIN_POINTS = 800, 150
 
@@ -76,53 +76,70 @@ class Pair:
         return float(np.sqrt(np.mean(variances)))
 
 
-def timed(work: Callable[[], object]) -> float:
-    """Median seconds of several runs, after one to warm up."""
-    work()
-    seconds = []
-    for _ in range(RUNS):
-        began = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - began)
-    return statistics.median(seconds)
+def timed(*works: Callable[[], object]) -> list[float]:
+    """Median seconds of each, of several rounds after one to warm up. They take turns: what else the machine does meets all alike."""
+    seconds: list[list[float]] = [[] for _ in works]
+    for _ in range(RUNS + 1):
+        for work, taken in zip(works, seconds):
+            began = time.perf_counter()
+            work()
+            taken.append(time.perf_counter() - began)
+    return [statistics.median(taken[1:]) for taken in seconds]
 
 
 def rms(xy: np.ndarray, true: np.ndarray, ok: np.ndarray) -> float:
     return float(np.sqrt(np.mean((xy - true)[ok] ** 2)))
 
 
-def ours(pair: Pair, patch_px: int, threads: int, points: int | None = None) -> dict[str, object]:
+Work = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]  # positions, which were found, covariances
+
+
+def our_work(pair: Pair, patch_px: int, threads: int, points: int | None = None) -> Work:
     F, G = SplineImage(pair.f), SplineImage(pair.g)
-    settings = MatchingSettings(patch_px=patch_px, max_shift_px=5.0)
+    settings, rows = MatchingSettings(patch_px=patch_px, max_shift_px=5.0), slice(0, points)
     shape = np.tile(np.eye(2), (len(pair.xy), 1, 1))
-    rows = slice(0, points)
-    shared.THREADS = threads
-    found = match_patches(F, pair.xy[rows], [G], [pair.start[rows]], [shape[rows]], settings)[0]
-    seconds = timed(lambda: match_patches(F, pair.xy[rows], [G], [pair.start[rows]], [shape[rows]], settings))
-    shared.THREADS = 2
-    z = (found.xy - pair.true[rows])[found.ok] / np.sqrt(found.covariance[found.ok][:, [0, 1], [0, 1]])
+
+    def work() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shared.THREADS = threads
+        cv2.setNumThreads(threads)
+        found = match_patches(F, pair.xy[rows], [G], [pair.start[rows]], [shape[rows]], settings)[0]
+        shared.THREADS = 2
+        cv2.setNumThreads(-1)
+        return found.xy, found.ok, found.covariance
+
+    return work
+
+
+def ours(pair: Pair, patch_px: int, threads: int, points: int | None = None, seconds: float | None = None) -> dict[str, object]:
+    work, rows = our_work(pair, patch_px, threads, points), slice(0, points)
+    xy, ok, K = work()
+    z = (xy - pair.true[rows])[ok] / np.sqrt(K[ok][:, [0, 1], [0, 1]])
     return row(
         f"Tricap {patch_px}×{patch_px}, {threads} thread(s)",
-        len(found.xy) / seconds,
-        rms(found.xy, pair.true[rows], found.ok),
+        len(xy) / (seconds or timed(work)[0]),
+        rms(xy, pair.true[rows], ok),
         pair.bound(patch_px),
-        1 - found.ok.mean(),
+        1 - ok.mean(),
         z_rms=float(np.sqrt(np.mean(z**2))),
-        points=len(found.xy),
+        points=len(xy),
     )
 
 
-def lucas_kanade(pair: Pair, levels: int, threads: int) -> dict[str, object]:
+def pyramid_work(pair: Pair, levels: int, threads: int) -> Work:
     f, g = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in (pair.f, pair.g))
     start = pair.xy.astype(np.float32)
-    cv2.setNumThreads(threads)
 
-    def work() -> tuple[np.ndarray, np.ndarray]:
+    def work() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        cv2.setNumThreads(threads)
         xy, status, _ = cv2.calcOpticalFlowPyrLK(f, g, start, None, winSize=(13, 13), maxLevel=levels - 1, criteria=(3, 20, 0.01))
-        return xy, status.ravel() == 1
+        cv2.setNumThreads(-1)
+        return xy, status.ravel() == 1, np.zeros((0, 2, 2))
 
-    seconds, (xy, ok) = timed(work), work()
-    cv2.setNumThreads(-1)
+    return work
+
+
+def lucas_kanade(pair: Pair, levels: int, threads: int, seconds: float) -> dict[str, object]:
+    xy, ok, _ = pyramid_work(pair, levels, threads)()
     return row(
         f"cv2.calcOpticalFlowPyrLK 13×13, {levels} levels, {threads} thread(s)",
         len(xy) / seconds,
@@ -130,6 +147,14 @@ def lucas_kanade(pair: Pair, levels: int, threads: int) -> dict[str, object]:
         pair.bound(13),
         1 - ok.mean(),
     )
+
+
+def race(pair: Pair) -> list[dict[str, object]]:
+    """Ours and OpenCV's pyramid on one thread and on two, in turns."""
+    own, pyramids = (1, 2), ((3, 1), (3, 2), (1, 1))
+    seconds = timed(*(our_work(pair, 13, t) for t in own), *(pyramid_work(pair, levels, t) for levels, t in pyramids))
+    rows = [ours(pair, 13, t, seconds=s) for t, s in zip(own, seconds)]
+    return rows + [lucas_kanade(pair, levels, t, s) for (levels, t), s in zip(pyramids, seconds[len(own) :])]
 
 
 def correlation_coefficient(pair: Pair) -> dict[str, object]:
@@ -218,11 +243,7 @@ def main() -> int:
     args = parser.parse_args()
     pair = Pair()
     rows = [
-        ours(pair, 13, 1),
-        ours(pair, 13, 2),
-        lucas_kanade(pair, 3, 1),
-        lucas_kanade(pair, 3, 2),
-        lucas_kanade(pair, 1, 1),
+        *race(pair),
         correlation_coefficient(pair),
         plain(pair),
         *(ours(pair, size, 1) for size in (9, 17, 21, 25)),
