@@ -20,9 +20,9 @@ def in_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Re
 
 
 def equal_pieces(n: int, largest: int, shared_from: int) -> list[slice]:
-    """An even number of equal pieces of n rows, none larger than `largest`; one alone below `shared_from` rows."""
+    """An even number of equal pieces of n rows, none larger than `largest`; one alone below `shared_from` rows, empty where n is 0."""
     if n < max(2, shared_from) and n <= largest:
-        return [slice(0, n)] if n else []
+        return [slice(0, n)]
     count = 2 * -(-n // (2 * largest))
     cuts = [n * i // count for i in range(count + 1)]
     return [slice(a, b) for a, b in zip(cuts, cuts[1:])]

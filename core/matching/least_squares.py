@@ -169,7 +169,7 @@ def match_prepared(templates: "PatchTemplates", rows: np.ndarray, image: SplineI
 
 
 def _pieces(n: int) -> list[slice]:
-    return equal_pieces(n, LARGEST, SHARED_FROM) or [slice(0, 0)]
+    return equal_pieces(n, LARGEST, SHARED_FROM)
 
 
 def join_matches(parts: Sequence[Matches]) -> Matches:

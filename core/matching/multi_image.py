@@ -93,7 +93,7 @@ def match_multi_image(
         adjustment = _Adjustment(patches, views, rig, rows, settings, sigma_c_px, neighbours, taking_part[span])
         return adjustment.solve(xy[span], middle[span], shape[span], xyz_m[span])
 
-    parts = in_threads(work, equal_pieces(n, LARGEST, SHARED_FROM) or [slice(0, 0)])
+    parts = in_threads(work, equal_pieces(n, LARGEST, SHARED_FROM))
     names = MultiImageMatches.__dataclass_fields__
     return MultiImageMatches(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 

@@ -56,7 +56,7 @@ def fit_neighbours(
     def fit(rows: slice) -> NeighbourFit:
         return _fitted(neighbour[rows], xy, values, query_xy[rows], degree, min_scale[rows], radius_px)
 
-    parts = in_threads(fit, equal_pieces(len(neighbour), LARGEST, LARGEST) or [slice(0, 0)])
+    parts = in_threads(fit, equal_pieces(len(neighbour), LARGEST, LARGEST))
     return NeighbourFit(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(NeighbourFit)})
 
 

@@ -127,7 +127,7 @@ def match_surface(
         views = [image for k, image in enumerate(images) if k != reference]
         return _Adjustment(patches, views, lines, part, settings, sigma_across_px, taking_part[span]).solve(start[span])
 
-    parts = in_threads(work, equal_pieces(n, LARGEST, SHARED_FROM) or [slice(0, 0)])
+    parts = in_threads(work, equal_pieces(n, LARGEST, SHARED_FROM))
     return SurfacePatch(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in SurfacePatch.__dataclass_fields__})
 
 

@@ -99,7 +99,7 @@ def sweep_seeds(
 
     monitor.step("seeds", 0, len(xy))
     block = max(1, LOOK_UP // max(1, len(inverse) * settings.patch_px**2 * len(cameras)))
-    parts = in_threads(work, equal_pieces(len(xy), block, 2) or [slice(0, 0)])
+    parts = in_threads(work, equal_pieces(len(xy), block, 2))
     depth, good = (np.concatenate(a) for a in zip(*parts))
     return approximations_at_depth(cameras, reference, rows, xy[good], depth[good])
 

@@ -71,7 +71,7 @@ def _quadrics(field: TripletField, camera: Camera, reference: int, rows: np.ndar
         unit, scale = RADIUS_CELLS * field.grid.spacing_px, MIN_SCALE * spacing[:, 0]
         return (*_robust_quadric(a, b, unit, D - own, weight.astype(np.float64), scale), weight.sum(axis=1) - 1)
 
-    parts = in_threads(fit, equal_pieces(len(rows), LARGEST, LARGEST) or [slice(0, 0)])
+    parts = in_threads(fit, equal_pieces(len(rows), LARGEST, LARGEST))
     coefficients, scatter, support = (np.concatenate(part) for part in zip(*parts))
     return coefficients, scatter, support
 

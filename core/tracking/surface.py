@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..matching.growing import TripletField
 from ..surface.cloud import PointCloud
+from .relief import NEAREST
 from .settings import TrackStatus
 from .step import TrackingView, over_the_body
 from .tracked import TrackedFrame, born, joined
@@ -22,7 +23,6 @@ STEEPEST_COSINE = 0.3  # between the normal and the ray
 DEPTH_SIGMAS, DEPTH_CELLS = 4.0, 1.0
 STEEPEST_SLOPE = 3.0  # change of depth per distance across, within one surface
 MOVED_CELLS = 0.8  # a cell whose texture lies further from its middle is at the outline
-NEAREST = 4
 
 
 def start_tracks(field: TripletField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
