@@ -40,7 +40,7 @@ class Silhouettes:
     """The rays of all frames, as observations of a body."""
 
     def __init__(self, given: FitInput, surface: np.ndarray, settings: FitSettings) -> None:
-        self._surface, self._settings = surface, settings
+        self._surface, self._settings = (_closed(surface) if settings.balls == "one" else surface), settings
         used = given.contours if settings.use_contours else ()
         self._tables = [(given.rig[c.view], c) for c in used]
         self._frames = given.frames
@@ -97,6 +97,11 @@ def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: 
     outward = _unit(beside - np.einsum("ni,ni->n", beside, direction)[:, None] * direction)
     return Rays(origin_m=np.broadcast_to(camera.centre_m, direction.shape), direction=direction, outward=outward,
                 angle=sigma_px[keep] / camera.focal_px, alike=np.full(len(keep), alike))
+
+
+def _closed(surface: np.ndarray) -> np.ndarray:
+    """The parts (B, 2) of bones that are one ellipsoid each: it closes at the bone's end, and only outlines beyond keep it that long."""
+    return np.maximum(surface, [-np.inf, 1.0])
 
 
 def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:

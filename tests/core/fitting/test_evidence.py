@@ -25,6 +25,7 @@ from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.raster import rasterize
 from tricap.core.geometry.rig import Rig
 
+from . import limb_scene
 from .limb_scene import measured_cloud, outlines
 
 SETTINGS = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
@@ -211,9 +212,16 @@ def test_the_floor_steadies_a_foot_that_stands(make_scene) -> None:
     assert np.ptp(held) < 0.75 * np.ptp(free), (np.ptp(held), np.ptp(free))
 
 
-def test_views_from_around_are_witnesses_of_their_own(make_scene) -> None:
+@pytest.fixture(scope="module")
+def outlined():
+    """A scene of one frame, and its outlines."""
+    scene = limb_scene.make_scene()
+    return scene, outlines(scene)
+
+
+def test_views_from_around_are_witnesses_of_their_own(outlined) -> None:
     """Three views in a row follow the same wrong edge together; views at right angles do not."""
-    scene = make_scene()
+    scene, contours = outlined
     row = scene.rig.cameras
     around = []
     for k, camera in enumerate(row):
@@ -224,9 +232,25 @@ def test_views_from_around_are_witnesses_of_their_own(make_scene) -> None:
     state = parameters.state(scene.motion[0], parameters.vector())
     crowding = []
     for cameras in (row, tuple(around)):
-        given = _given(scene, rig=Rig(cameras=cameras), contours=outlines(scene))
+        given = _given(scene, rig=Rig(cameras=cameras), contours=contours)
         crowding.append(max(np.max(o.crowding) for o in Silhouettes(given, read_model("arm.R").surface, FitSettings()).observe(0, state)))
     assert crowding[0] > 2 * crowding[1] > 2
+
+
+def test_outlines_past_its_end_hold_an_ellipsoid_and_are_the_hands_where_a_forearm_has_more_balls(outlined) -> None:
+    scene, contours = outlined
+    parameters, given = ShapeParameters(scene.shape), _given(scene, contours=contours)
+    short = parameters.vector()
+    short[1] += np.log(0.9)
+    state = parameters.state(scene.motion[0], short)
+    wrist = state.head_m[1] + state.lengths_m[1] * state.R[1, :, 1]
+    past = []
+    for balls in ("one", "three"):
+        (rays,) = Silhouettes(given, read_model("arm.R").surface, FitSettings(balls=balls)).observe(0, state)
+        away = wrist - rays.origin_m
+        nearest = rays.origin_m + np.einsum("ni,ni->n", away, rays.direction)[:, None] * rays.direction
+        past.append(int(((nearest - wrist) @ state.R[1, :, 1] > 0).sum()))
+    assert past[0] > 10 and past[1] == 0
 
 
 def test_packed_images_come_back_from_memory_and_from_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
