@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 
 TICK_S, SHOW_S = 0.1, 0.25  # how often a job is looked at, and its progress drawn: where the machine is busy, drawing is what takes long
 PACE_S, PACE_PARTS = 20.0, 200  # the time left is told from the pace of the last seconds
+ENOUGH = 0.05  # of a stage, or one of its parts: how a part begins says nothing of the whole
 SWITCH_S = 0.0005  # how soon the worker hands the interpreter to the window: redrawn after 30…90 ms at worst; Python's 5 ms: 130 ms
 BUG = "Tricap made a mistake ({error}); the console shows where. Please report it with that text."
 
@@ -83,12 +84,14 @@ class Job:
 
     @property
     def seconds_left(self) -> float | None:
-        """Until the end of the present stage, at its pace; None as long as that cannot be told."""
+        """Until the end of the present stage, at the pace until the last sign of life; None as long as too little is done to tell it, and
+        once it is over and the stage is not."""
         pace = list(self._pace)
-        if len(pace) < 2 or pace[-1][1] <= pace[0][1]:
+        if len(pace) < 2 or pace[-1][1] - pace[0][1] < min(ENOUGH, 1.0 / max(self.total, 1.0)):
             return None
-        (since, before), (_, now) = pace[0], pace[-1]
-        return (time.monotonic() - since) / (now - before) * (1.0 - before) - (time.monotonic() - since)
+        (since, before), (last, now) = pace[0], pace[-1]
+        left = (last - since) / (now - before) * (1.0 - now) - (time.monotonic() - last)
+        return left if left > 0 else None
 
     @property
     def stage_words(self) -> str:

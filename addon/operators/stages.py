@@ -12,8 +12,9 @@ from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE
 
-STEP_WORDS = {"surface": "surface", "seeds": "surface", "matching": "surface", "tracks": "tracks", "filters": "tracks", "fit": "body",
-              "thin": "body", "skin": "body", "report": "body", "pictures": "body"}  # a stage's first word -> its step
+STEP_WORDS = {"surface": "surface", "seeds": "surface", "matching": "surface", "tracks": "tracks", "filters": "tracks",
+              **dict.fromkeys(("thin", "background", "fit", "adjust", "refine", "skin", "silhouettes", "report"), "body"),
+              **dict.fromkeys(("reading", "preparing"), "rig")}  # the first word of what a stage says of itself -> its step
 
 
 class StageOperator(JobOperator):

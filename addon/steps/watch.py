@@ -105,10 +105,10 @@ def _time(path: Any) -> tuple[int, int] | None:
 
 def _tick() -> float:
     context = bpy.context
-    scene = context.scene
-    if scene is not None and not context.window_manager.tricap.running:
+    scene, runs = context.scene, context.window_manager.tricap.running
+    if scene is not None:
         name = scene.name_full
-        if _changed or name not in _looks or _stamps.get(name) != _stamp(scene):
+        if (_changed and not runs) or name not in _looks or _stamps.get(name) != _stamp(scene):  # a run finishes step after step
             before = _looks.get(name)
             if refresh(scene) != before:
                 jobs.redraw(context)

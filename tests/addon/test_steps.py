@@ -425,6 +425,30 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
         assert watch.look(scene) is not known
 
 
+def test_while_a_run_goes_on_its_finished_steps_are_seen(blender: ModuleType, words: Words, sample: Path, tmp_path: Path,
+                                                         monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    watch, jobs = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.watch", "jobs"))
+    scene = opened(blender, sample, tmp_path)
+    monkeypatch.setattr(jobs, "_watched", [jobs.Job(lambda monitor: None)])
+    known = watch.refresh(scene)
+    watch.mark()
+    watch._tick()
+    assert watch.look(scene) is known, "a run is not disturbed by what happens in the scene"
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.json").write_text("{}")
+    watch._tick()
+    assert watch.look(scene) is not known
+
+
+def test_a_run_goes_through_the_steps_from_top_to_bottom(blender: ModuleType, states: ModuleType) -> None:
+    run = importlib.import_module(f"{NAME}.operators.run").Run
+    said = ("", "seeds", "surface", "tracks", "filters", "thin the clouds", "background", "fit the click frame", "fit frame after frame",
+            "adjust the sequence", "refine the complete model", "adjust the postures", "skin", "silhouettes", "report", "reading clouds",
+            "preparing the scene")  # fmt: skip
+    order = [states.STEPS.index(run.step_at(stage)) for stage in said]
+    assert order == sorted(order) and {states.STEPS[i] for i in order} == {"surface", "tracks", "body", "rig"}
+
+
 def test_undo_and_redo_take_the_states_along(blender: ModuleType, words: Words, sample: Path, tmp_path: Path) -> None:
     opened(blender, sample, tmp_path)
     blender.ops.ed.undo_push(message="opened")
@@ -491,9 +515,16 @@ def test_time_left(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None
     for done in range(6):
         job._note("surface", done, 20)
         clock[0] += 2.0
-    assert job.seconds_left == pytest.approx(12 / (5 / 20) - 12)
+    assert job.seconds_left == pytest.approx(15 * 2 - 2)
+    clock[0] += 20.0
+    assert job.seconds_left == pytest.approx(8), "it does not grow while nothing is heard"
+    clock[0] += 20.0
+    assert job.seconds_left is None and job.left_words == "", "nothing is told once it is over"
     job._note("tracks", 0, 20)
     assert job.seconds_left is None, "another stage, another pace"
+    clock[0] += 5.0
+    job._note("tracks", 0.04, 20)
+    assert job.seconds_left is None, "how the first frame begins says nothing of the others"
     assert [jobs.time_words(s) for s in (40.2, 100, 3600, 7260)] == ["40 s", "2 min", "60 min", "2 h 1 min"]
 
 
