@@ -99,14 +99,15 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Write args.file in args.format; the lines to show.
+    """Write args.file (with the format's ending) in args.format; the lines to show.
 
     Raises:
         InputError: what is asked for is not in OUT, or the input needs mending.
         Cancelled: the monitor was cancelled.
     """
-    from .export import BY_BLENDER, IN_BLENDER, export_file
+    from .export import BY_BLENDER, IN_BLENDER, export_file, named_for
 
+    file = named_for(args.format, args.file)
     if args.format in BY_BLENDER or args.out.suffix.lower() in IN_BLENDER and not args.out.is_dir():
         _need_blender("export")
-    return [f"{args.file}: {export_file(args.out, args.format, args.file, args.preset, monitor, up=args.up, unit=args.unit)}"]
+    return [f"{file}: {export_file(args.out, args.format, file, args.preset, monitor, up=args.up, unit=args.unit)}"]

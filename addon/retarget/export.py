@@ -22,6 +22,22 @@ BY_BLENDER = ("fbx", "glb", "usd", "abc")
 IN_BLENDER = (".blend", ".fbx", ".glb", ".gltf", ".vrm")  # sources that Blender reads
 POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")}  # axes and unit that are the format's own
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
+ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "fbx", "abc", *POINTS)} | {
+    "glb": (".glb", ".gltf"), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
+
+
+def named_for(kind: str, file: Path) -> Path:
+    """The file to write in a format: with the format's ending, where the name has none. Skins go into a folder of any name.
+
+    Raises:
+        InputError: the name ends as files of another format do.
+    """
+    ending = file.suffix.lower()
+    if kind == "ply" or ending in ENDINGS[kind]:
+        return file
+    if any(ending in others for others in ENDINGS.values()):
+        raise InputError(f"{file.name} ends as files of another format do; let it end with {ENDINGS[kind][0]}, or choose that format.")
+    return file if ending else file.with_name(file.name + ENDINGS[kind][0])
 
 
 def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor, *, up: str = "", unit: str = "") -> str:

@@ -12,7 +12,7 @@ from ...core.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
 from ..retarget.by_blender import export_motion
-from ..retarget.export import BY_BLENDER, export_file
+from ..retarget.export import BY_BLENDER, export_file, named_for
 from ..retarget.programs import PROGRAMS
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -53,7 +53,8 @@ class Export(JobOperator, bpy.types.Operator):
         """Which results, and which file."""
         if not self.filepath:
             raise InputError("Choose the file to write.")
-        out, file, kind, preset = folders.output_folder(self.out, context.scene), folders.absolute(self.filepath), self.kind, self.preset
+        out, kind, preset = folders.output_folder(self.out, context.scene), self.kind, self.preset
+        file = named_for(kind, folders.absolute(self.filepath))
         self._out, self._file = out, file
         if kind in BY_BLENDER:
             return lambda monitor: read_motion_source(out)

@@ -10,7 +10,8 @@ import pytest
 
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
-from tricap.addon.retarget.export import export_file, points_of
+from tricap.addon.retarget.export import export_file, named_for, points_of
+from tricap.core.errors import InputError
 from tricap.core.motion.bvh import read_bvh
 from tricap.core.motion.c3d import read_c3d
 from tricap.core.motion.markers import AXES
@@ -161,6 +162,18 @@ def test_a_blend_file_goes_out(empty: ModuleType, tmp_path: Path, kind: str) -> 
         np.testing.assert_allclose(armature.matrix_world @ knee.head, source.head_m[4, source.rig.index["shin.L"]], atol=PLACE_M)
     elif kind == "bvh":
         np.testing.assert_allclose(read_motion_source(file).head_m[:, 0], source.head_m[:, 0], atol=1e-5)
+
+
+def test_a_file_is_named_as_its_format(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    named = {("bvh", "a"): "a.bvh", ("usd", "a.usda"): "a.usda", ("glb", "a.GLTF"): "a.GLTF", ("csv", "a.txt"): "a.txt", ("ply", "a"): "a"}
+    assert {key: named_for(key[0], Path(key[1])).name for key in named} == named
+    with pytest.raises(InputError, match="a.fbx ends as files of another format do; let it end with .trc"):
+        named_for("trc", Path("a.fbx"))
+    file, out = tmp_path / "moved", str(small_run.out)
+    assert blender.ops.tricap.export(kind="bvh", out=out, filepath=str(file)) == {"FINISHED"} and file.with_suffix(".bvh").is_file()
+    with pytest.raises(RuntimeError, match="another format"):
+        blender.ops.tricap.export(kind="trc", out=out, filepath=str(tmp_path / "b.fbx"))
+    assert main(["export", out, "--format", "trc", "--out", str(tmp_path / "b.fbx")]) == 2 and not (tmp_path / "b.fbx").exists()
 
 
 def test_the_panel_exports_and_leaves_the_scene(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
