@@ -1,7 +1,8 @@
-"""Which files are a camera's footage, and what the views are called: guessed from the names that cameras and people give."""
+"""Which files are a camera's footage, and what the views are called: guessed from the names that cameras and people give. Where footage
+is now that was moved."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from .errors import InputError
@@ -30,7 +31,7 @@ def find_footage(folder: Path, names: Sequence[str]) -> list[Path]:
             inside = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=natural)
         except OSError as error:
             raise InputError(f"Cannot read the folder {folder}: {error.strerror or error}.") from error
-        chosen = [p for p in inside if _is_movie(p) or p.is_dir() and any(map(_is_image, p.iterdir()))]
+        chosen = [p for p in inside if _is_movie(p) or _has_images(p)]
         chosen = chosen or [p for p in inside if _is_image(p)][:1]
     if not chosen:
         raise InputError(f"{folder} holds no footage; choose the movies, or the folder that has a folder of images for every camera.")
@@ -61,6 +62,38 @@ def name_views(sources: Sequence[Path], taken: Sequence[str] = ()) -> list[tuple
     return named
 
 
+def find_moved(links: Mapping[str, Path], place: Path) -> dict[Path, Path]:
+    """Where the footage is now whose links in the take lead nowhere: link → movie or folder of images.
+
+    `links` are all of them, by view. Footage is looked for under the name that it had, in the folder `place` and in those beside and
+    below it.
+
+    Raises:
+        InputError: some is not there.
+    """
+    lost = {view: link for view, link in links.items() if not link.exists()}
+    found = {view: _moved(link, place) for view, link in lost.items()}
+    if missing := [view for view, path in found.items() if path is None]:
+        names = ", ".join(_former(lost[view]) for view in missing)
+        raise InputError(f"{place} does not hold {names} (the footage of {', '.join(missing)}); choose the folder in which that lies now.")
+    return {lost[view]: path for view, path in found.items() if path is not None}
+
+
+def _former(link: Path) -> str:
+    """What the footage was called for which a link stands."""
+    return link.readlink().name if link.is_symlink() else link.name
+
+
+def _moved(link: Path, place: Path) -> Path | None:
+    try:
+        below = sorted((p for p in place.iterdir() if p.is_dir()), key=natural)
+    except OSError as error:
+        raise InputError(f"Cannot read the folder {place}: {error.strerror or error}.") from error
+    tried = [root / _former(link) for root in (place, place.parent, *below)]
+    is_footage = _is_movie if link.suffix.lower() in MOVIE_ENDINGS else _has_images
+    return next((path for path in tried if is_footage(path)), None)
+
+
 def _side(stem: str) -> str | None:
     """L, C or R if exactly one side is said in a file's name."""
     words = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", stem).lower())
@@ -82,3 +115,7 @@ def _is_movie(path: Path) -> bool:
 
 def _is_image(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in IMAGE_ENDINGS
+
+
+def _has_images(path: Path) -> bool:
+    return path.is_dir() and any(map(_is_image, path.iterdir()))

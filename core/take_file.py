@@ -149,6 +149,20 @@ def link_footage(folder: Path, links: Sequence[Link]) -> list[Path]:
     return made
 
 
+def relink_footage(moved: Mapping[Path, Path]) -> None:
+    """Let links in a take's folder stand for footage elsewhere (`footage_files.find_moved`).
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    for link, source in moved.items():
+        try:
+            link.unlink(missing_ok=True)
+            _link(link, source)
+        except OSError as error:
+            raise InputError(f"Cannot link {source} into the take as {link}: {error.strerror or error}.") from error
+
+
 def toml_text(table: Table) -> str:
     """A table as TOML: plain values, then [tables] and [[lists of tables]]; what lies deeper than two levels stands in one line."""
     return "\n".join(_lines(table, ())).lstrip("\n") + "\n"

@@ -81,6 +81,8 @@ def _mend_footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_nex
     state, scene = watch.look(context.scene).states["footage"], context.scene
     if any(view.clip is None for view in scene.tricap.views) or project.shows_other_lines(scene):
         primary(layout, "tricap.reload_footage", True, icon="FILE_REFRESH")
+    elif states.FIND in state.why:
+        primary(layout, "tricap.find_footage", True, icon="VIEWZOOM")
     elif "changed outside" in state.why:
         row = layout.row()
         row.operator("tricap.reload_take", icon="FILE_REFRESH")

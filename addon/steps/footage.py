@@ -1,5 +1,5 @@
 """bpy.ops.tricap.add_footage(directory="…", files=[…]), .open_take(directory="…"), .reload_take(), .keep_mine(), .move_view(up=True),
-.remove_view(), .reload_footage(), .common_frames()"""
+.remove_view(), .reload_footage(), .find_footage(directory="…"), .common_frames()"""
 
 from pathlib import Path
 from typing import Any
@@ -7,13 +7,13 @@ from typing import Any
 import bpy
 
 from ...core.errors import InputError
-from ...core.footage_files import find_footage, name_views
+from ...core.footage_files import find_footage, find_moved, name_views
 from ...core.images.fields import BOTH
 from ...core.images.sequence import open_sequence
-from ...core.take_file import footage_entry, link_footage, read_table, unlink_footage
+from ...core.take_file import footage_entry, link_footage, read_table, relink_footage, unlink_footage
 from .. import folders, project
 from ..panels import sentence
-from . import watch
+from . import states, watch
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -215,6 +215,32 @@ class ReloadFootage(Told, bpy.types.Operator):
         return f"{len(lost)} clips were made again."
 
 
+class FindFootage(Told, bpy.types.Operator):
+    """Say where the footage is now that was moved: the folder with the movies, or with a folder of images for every camera"""
+
+    bl_idname = "tricap.find_footage"
+    bl_label = states.FIND
+
+    directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=RELATIVE)  # type: ignore[valid-type]
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask for the folder."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def do(self, context: bpy.types.Context) -> str:
+        """Let the project's links stand for what lies there; clicks, offsets and results stay."""
+        folder, views = project.existing_folder(context.scene), context.scene.tricap.views
+        links = {v.name: folder / v.movie if v.movie else (folder / v.images).parent for v in views}
+        relink_footage(find_moved(links, folders.absolute(self.directory)))
+        for view in views:
+            if view.clip is not None:
+                view.clip.filepath = view.clip.filepath  # Blender reads it again
+        return "The footage is there again."
+
+
 class CommonFrames(Told, bpy.types.Operator):
     """Measure the frames that all views have"""
 
@@ -268,4 +294,4 @@ def _spans(scene: bpy.types.Scene, folder: Path) -> list[tuple[int, int]]:
     return [(-per * view.offset_frames, per * (count(view) - view.offset_frames)) for view in scene.tricap.views]
 
 
-CLASSES = (AddFootage, OpenTake, ReloadTake, KeepMine, MoveView, RemoveView, ReloadFootage, CommonFrames)
+CLASSES = (AddFootage, OpenTake, ReloadTake, KeepMine, MoveView, RemoveView, ReloadFootage, FindFootage, CommonFrames)

@@ -28,6 +28,7 @@ STEPS = ("footage", "cameras", "seeds", "surface", "tracks", "body", "rig", "ret
 TITLES = ("Footage", "Cameras", "Seeds (Joint Clicks)", "Surface", "Tracks", "Body", "Rig", "Retarget and Export")
 STAGE = {"surface": "measure", "tracks": "track", "body": "fit"}  # the stage of core that a step runs
 WRITES = {"surface": "clouds", "tracks": "trajectories.npz", "body": "motion.csv"}
+FIND = "Find Footage"
 SAVE_FIRST = "Save this file first: the project lies in a folder beside it. Then add the films of your cameras."
 NEEDED_JOINTS = 2  # the fit's own least number
 MOST_REMEMBERED = 500  # joints
@@ -295,7 +296,7 @@ def _sequence(folder: Path, view: Any) -> Sequence:
     try:
         state = where.stat()
     except OSError as error:
-        raise InputError(f"The footage of view {view.name} is not at {where} any more; move it back, or add it again.") from error
+        raise InputError(f"The footage of view {view.name} is not at {where.resolve()} any more; move it back, or press {FIND}.") from error
     key = (str(where), view.images, view.movie, state.st_mtime_ns, state.st_size)
     if key not in _opened:
         _opened.clear() if len(_opened) > 50 else None

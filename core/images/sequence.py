@@ -186,6 +186,9 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
     pattern = images if images is not None else movie or ""
     if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
         raise InputError(f"View {view} reads “{pattern}”, which lies outside the take {folder}; move or link the footage into the take.")
+    link = folder / movie if movie is not None else (folder / pattern).parent
+    if link.is_symlink() and not link.exists():
+        raise InputError(f"The footage of view {view} is not at {link.resolve()} any more; move it back, or mend the link {link}.")
     if movie is not None:
         path = folder / movie
         if not path.is_file():

@@ -425,6 +425,20 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
         assert watch.look(scene) is not known
 
 
+def test_moved_footage_is_found_again(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
+    scene = new_project(blender, sample, tmp_path)
+    assert blender.ops.tricap.click(name="elbow.R", view="L", x=100, y=100) == {"FINISHED"}
+    (tmp_path / "film").rename(tmp_path / "other film")
+    assert words().startswith("failed") and why("footage").endswith("move it back, or press Find Footage.")
+    assert str(tmp_path / "film" / "L") in why("footage"), "where it was, not the link in the project"
+    with pytest.raises(RuntimeError, match="does not hold L, C, R"):
+        blender.ops.tricap.find_footage(directory=str(tmp_path / "shot_tricap"))
+    assert blender.ops.tricap.find_footage(directory=str(tmp_path / "other film")) == {"FINISHED"}
+    assert words().startswith("done") and len(scene.tricap.views) == 3
+    clip = scene.tricap.views[0].clip
+    assert "elbow.R" in clip.tracking.tracks and clip.size[0] == 512
+
+
 def test_while_a_run_goes_on_its_finished_steps_are_seen(blender: ModuleType, words: Words, sample: Path, tmp_path: Path,
                                                          monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     watch, jobs = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.watch", "jobs"))

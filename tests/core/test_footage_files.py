@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from tricap.core.errors import InputError
-from tricap.core.footage_files import find_footage, name_views
+from tricap.core.footage_files import find_footage, find_moved, name_views
+from tricap.core.images.sequence import open_sequence
 
 
 def made(folder: Path, *names: str) -> list[Path]:
@@ -53,3 +54,20 @@ def test_what_is_no_footage_is_told(tmp_path: Path) -> None:
                                  (tmp_path, ["gone.mp4"], "is missing"), (tmp_path / "gone", [], "Cannot read the folder")):  # fmt: skip
         with pytest.raises(InputError, match=words):
             find_footage(folder, names)
+
+
+def test_moved_footage_is_found_by_the_names_that_it_had(tmp_path: Path) -> None:
+    made(tmp_path / "new" / "shot 1", "left.mp4", "C/0.png", "C/1.png")
+    take = tmp_path / "take"
+    take.mkdir()
+    links = {"L": take / "L.mp4", "C": take / "centre", "R": take / "right"}
+    links["L"].symlink_to(tmp_path / "old" / "left.mp4")
+    links["C"].symlink_to(tmp_path / "old" / "C")
+    made(take, "right/0.png")
+    found = {links["L"]: tmp_path / "new" / "shot 1" / "left.mp4", links["C"]: tmp_path / "new" / "shot 1" / "C"}
+    for place in ("new", "new/shot 1", "new/shot 1/C"):
+        assert {link: path.resolve() for link, path in find_moved(links, tmp_path / place).items()} == found
+    with pytest.raises(InputError, match=r"take does not hold left.mp4, C \(the footage of L, C\)"):
+        find_moved(links, take)
+    with pytest.raises(InputError, match="view L is not at .*old/left.mp4 any more"):
+        open_sequence(take, images=None, movie="L.mp4", view="L")
