@@ -53,6 +53,8 @@ class AddFootage(Told, bpy.types.Operator):
     directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=RELATIVE)  # type: ignore[valid-type]
     files: bpy.props.CollectionProperty(type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
     filename: bpy.props.StringProperty(subtype="FILE_NAME", options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
+    fps: bpy.props.FloatProperty(name="Images a Second", default=0.0, min=0.0, max=10000.0, options={"SKIP_SAVE"},  # type: ignore[valid-type]
+                                 description="Images do not tell it, movies do. 0: as in step 1")
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
@@ -64,7 +66,7 @@ class AddFootage(Told, bpy.types.Operator):
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.filename = ""  # not the name of what was saved last
+        self.filename, self.fps = "", context.scene.tricap.fps  # not the name of what was saved last
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
@@ -72,6 +74,8 @@ class AddFootage(Told, bpy.types.Operator):
         """Beside the file browser: what to choose."""
         sentence(self.layout, context, "Movies: choose those of all cameras, with Shift or Ctrl.", "FILE_MOVIE")
         sentence(self.layout, context, "Images: go into the folder that holds a folder for each camera, and choose nothing.", "FILE_IMAGE")
+        if not project.bound(context.scene):
+            self.layout.prop(self, "fps")
 
     def do(self, context: bpy.types.Context) -> str:
         """Link the footage into the project and show it as clips."""
@@ -89,14 +93,15 @@ class AddFootage(Told, bpy.types.Operator):
             unlink_footage(linked)
             raise
         if first:
-            use_rate_of(scene)
+            use_rate_of(scene, self.fps)
             show_frames(scene)
         if lengths_differ(scene, folder):
             use_common_frames(scene, folder)
         if len(entries) > 1:
             project.write(scene)
         names = ", ".join(entry["name"] for entry, _ in made)
-        return f"{len(made)} views added, from left to right: {names}. Where that is not so, unfold step 1."
+        rate = f"{round(scene.tricap.fps, 3):g} frames a second"
+        return f"{len(made)} views added, {rate}, from left to right: {names}. Where that is not so, unfold step 1."
 
 
 class OpenTake(Told, bpy.types.Operator):
@@ -254,9 +259,9 @@ class CommonFrames(Told, bpy.types.Operator):
         return ""
 
 
-def use_rate_of(scene: bpy.types.Scene) -> None:
-    """The frame rate of the first movie; images have none."""
-    rate = next((view.clip.fps for view in scene.tricap.views if view.clip.source == "MOVIE" and view.clip.fps > 0), None)
+def use_rate_of(scene: bpy.types.Scene, of_images: float) -> None:
+    """The frame rate of the first movie; images have none, theirs is told (0: it stays as it is)."""
+    rate = next((view.clip.fps for view in scene.tricap.views if view.clip.source == "MOVIE" and view.clip.fps > 0), of_images)
     if rate:
         scene.tricap.fps = rate
 

@@ -131,7 +131,8 @@ def _footage(scene: bpy.types.Scene, found: _Found) -> State:
         raise InputError(f"The views do not end with the same frame ({lengths}): press Use Common Frames, or mend the offsets.")
     found.frames, found.take = footage_frames(take, found.sequences), take
     sizes = " and ".join(sorted({f"{view.clip.size[0]}×{view.clip.size[1]}" for view in props.views}))
-    return State(word="done", why=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels.")
+    rate = f"{round(props.fps * project.fields_of(scene).per_image, 3):g} a second"
+    return State(word="done", why=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.")
 
 
 def _cameras(scene: bpy.types.Scene, found: _Found) -> State:

@@ -80,7 +80,8 @@ def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, 
     assert words() == "empty empty empty empty empty empty empty empty"
     scene = new_project(blender, sample, tmp_path)
     assert [(v.name, v.images) for v in scene.tricap.views] == [("L", "L/*.png"), ("C", "C/*.png"), ("R", "R/*.png")]
-    assert words() == "done ready ready empty empty empty empty empty" and why("footage") == "3 views, 3 frames of 512×384 pixels."
+    assert words() == "done ready ready empty empty empty empty empty"
+    assert why("footage") == "3 views, 3 frames of 512×384 pixels, 25 a second."
     assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "film" / "rig.toml")) == {"FINISHED"}
     scene.tricap.model = "arm.R"
     assert words() == "done done ready ready empty empty empty empty"
@@ -425,6 +426,13 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
         assert watch.look(scene) is not known
 
 
+def test_the_rate_of_images_is_asked_for(blender: ModuleType, why: Any, sample: Path, tmp_path: Path) -> None:
+    shutil.copytree(sample, tmp_path / "film")
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film"), fps=120.0) == {"FINISHED"}
+    assert blender.context.scene.tricap.fps == 120.0 and why("footage").endswith("120 a second.")
+
+
 def test_moved_footage_is_found_again(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
     scene = new_project(blender, sample, tmp_path)
     assert blender.ops.tricap.click(name="elbow.R", view="L", x=100, y=100) == {"FINISHED"}
@@ -565,7 +573,8 @@ def test_both_fields_are_shown_one_by_one(blender: ModuleType, why: Callable[[st
         project.write(scene)
     assert read_table(folder) == before and blender.ops.tricap.reload_footage() == {"FINISHED"}
     clip = scene.tricap.views["C"].clip
-    assert clip.frame_duration == 6 and tuple(clip.size) == (512, 384) and why("footage") == "3 views, 6 frames of 512×384 pixels."
+    assert clip.frame_duration == 6 and tuple(clip.size) == (512, 384)
+    assert why("footage") == "3 views, 6 frames of 512×384 pixels, 50 a second."
     said = read_table(folder)
     assert said["interlaced"] == "both" and said["seeds"]["joints"] == before["seeds"]["joints"] and said["fps"] == before["fps"]
     scene.tricap.views["C"].offset_frames = 1
