@@ -18,6 +18,7 @@ import cv2
 from . import batch_command, calibrate_command, check_command, contour_command, fields_command, pipeline, points_command, track2d_command
 from .arguments import frame_range, overrides, pictured
 from .bar_file import read_bar, write_bar
+from .body.model_file import model_names, read_model
 from .calibration.rig_files import read_any
 from .errors import InputError
 from .images.fields import BOTH, INTERLACE
@@ -78,9 +79,9 @@ def _new_command(commands: Any) -> None:
     new.add_argument("take", type=Path, metavar="TAKE", help="the folder to make")
     new.add_argument("--views", nargs="+", required=True, metavar="NAME=FILE", help="movies or image folders, in the order of the cameras")
     new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="which lines to measure of interlaced video")
-    new.add_argument("--fps", type=float, default=25.0, metavar="F", help="frames per second")
+    new.add_argument("--fps", type=float, default=25.0, metavar="F", help="images per second (default: 25)")
     new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or another tool's calibration")
-    new.add_argument("--model", default=None, metavar="NAME", help="body model, such as arm.R")
+    new.add_argument("--model", default=None, metavar="NAME", help=f"the body: {', '.join(model_names())}, or a .toml file of your own")
     new.set_defaults(run=_new)
 
 
@@ -166,6 +167,8 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
     table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
+    if args.model and not args.model.endswith(".toml"):  # a model of one's own may come into the folder later
+        read_model(args.model)
     rig = read_any(args.rig) if args.rig else None
     if rig:
         for view in take.views:
@@ -173,8 +176,9 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     make_take(folder, table, links, rig)
     if rig and (bar := read_bar(args.rig, rig)):
         write_bar(folder / "rig.toml", rig, *bar)
-    note = "" if rig else " Copy or calibrate rig.toml into it."
-    return [f"{folder}: a take of {len(views)} views.{note}"]
+    todo = [] if rig else ["copy or calibrate rig.toml into it"]
+    todo += ["write clicked joints into its take.toml, or open it in Blender and click"] if args.model else []
+    return [f"{folder}: a take of {len(views)} views, {args.fps:g} images a second. Next: {', '.join([*todo, f'tricap check {folder}'])}."]
 
 
 def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any
 from . import store
 from .errors import InputError
 from .geometry.rig import Rig, write_rig
-from .images.sequence import IMAGE_ENDINGS
+from .images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS
 from .take import FORMAT, VERSION, Take, take_of_text
 
 Link = tuple[Path, Path]  # where in the take's folder, and the footage that it stands for
@@ -106,6 +106,8 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
                 f"The folder {source} of view {name} holds {'no images' if not endings else 'images of several kinds'}; it needs one kind."
             )
         entry, target = {"name": name, "images": f"{glob.escape(name)}/*{endings[0]}"}, folder / name
+    elif source.suffix.lower() not in MOVIE_ENDINGS:
+        raise InputError(f"The footage {source} of view {name} is neither a folder of images nor a movie ({', '.join(MOVIE_ENDINGS)}).")
     else:
         entry, target = {"name": name, "movie": name + source.suffix}, folder / f"{name}{source.suffix}"
     if target.exists() and not target.samefile(source):

@@ -22,6 +22,7 @@ from ...core.run_json import read_run
 from ...core.stages import stage_keys
 from ...core.take import Footage, Take, footage_frames, open_take
 from .. import folders, project
+from ..clicking import session
 from ..scene.build import KEYS_KEY, OUT_KEY
 
 STEPS = ("footage", "cameras", "seeds", "surface", "tracks", "body", "rig", "retarget")
@@ -32,7 +33,6 @@ FIND = "Find Footage"
 SAVE_FIRST = "Save this file first: the project lies in a folder beside it. Then add the films of your cameras."
 NEEDED_JOINTS = 2  # the fit's own least number
 MOST_REMEMBERED = 500  # joints
-INSIDE = ("spine", "chest", "clavicle.L", "clavicle.R")  # in the trunk: hardly anyone can say where
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,8 +168,12 @@ def _seeds(scene: bpy.types.Scene, found: _Found) -> State:
         return State(word="ready", why=f"Click the joints in two views at least: {len(whole)} of {len(wanted)} so far.")
     missing = [name for name in wanted if name not in whole]
     if missing:
-        return State(word="done", why=f"{len(whole)} of {len(wanted)} joints; {missing[0]} and others would make it safer.")
+        return State(word="done", why=f"{len(whole)} of {len(wanted)} joints; {_and_others(missing)} would make it safer.")
     return State(word="done", why=f"All {len(wanted)} joints are clicked.")
+
+
+def _and_others(names: list[str]) -> str:
+    return " and ".join(names) if len(names) < 3 else f"{names[0]}, {names[1]} and others"
 
 
 def _check_clicks(footage: Footage) -> None:
@@ -267,13 +271,13 @@ def _retarget(scene: bpy.types.Scene, rig: State) -> State:
 
 
 def joints_of(model: str) -> tuple[str, ...]:
-    """The joints of a body model that one can see and click.
+    """The joints of a body model that one is asked to click.
 
     Raises:
         InputError: there is no such model.
     """
     if model not in _joints or model.endswith(".toml"):  # a file may change
-        _joints[model] = tuple(name for name in read_model(model).skeleton.joint_names if name not in INSIDE)
+        _joints[model] = tuple(session.joints_of(read_model(model).skeleton.joint_names))
     return _joints[model]
 
 

@@ -1,14 +1,39 @@
-"""Clicks that contradict each other or lie on the room instead of the person."""
+"""Clicks that are missing, contradict each other or lie on the room instead of the person."""
 
 import numpy as np
 
+from ..body.model_file import read_model
 from ..clicked_points import clicked_depth
 from ..errors import InputError
 from ..matching.foreground import unchanged
-from ..take import Clicks, Footage
+from ..take import Clicks, Footage, Take
 from .findings import Finding, doubtful, wrong
 
 FAR_M = 1.0  # in depth: more than a stretched-out arm reaches from the body
+
+LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joints) for side in ("right", "left")
+         for limb, joints in (("arm", ("shoulder", "elbow", "wrist")), ("leg", ("hip", "knee", "ankle")))}  # fmt: skip
+
+
+def joint_findings(take: Take) -> list[Finding]:
+    """A body that is wanted and not clicked, or limbs of it: which way a limb goes is what the fit takes from clicks.
+
+    Raises:
+        InputError: there is no such body model.
+    """
+    if take.body_model is None or take.keypoints:
+        return []
+    joints = read_model(take.body_model).skeleton.joint_names
+    clicked = {name for seeds in (take.seeds, *take.keyframes) for name, at in seeds.joints.items() if len(at) > 1}
+    advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
+    if not clicked:
+        sentence = f"No joint of the body “{take.body_model}” is clicked: there will be surface and tracks, but no body."
+        return [doubtful("no clicks", sentence, advice)]
+    bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
+    if not bare:
+        return []
+    said = ", ".join(bare)
+    return [doubtful("few clicks", f"Fewer than two joints are clicked of: {said}. The fit has to guess where they are.", advice)]
 
 
 def seed_findings(footage: Footage) -> list[Finding]:

@@ -10,7 +10,7 @@ from ..matching.least_squares import MatchingSettings
 from ..progress import Monitor
 from ..settings import from_table
 from ..take import Footage, open_take, read_take
-from .clicks import seed_findings
+from .clicks import joint_findings, seed_findings
 from .findings import Checked, Finding, doubtful, wrong
 from .rig_check import geometry_findings, unit_findings
 from .rig_fit import ENOUGH, rig_findings, same_views, share, stale_finding
@@ -56,7 +56,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     alike = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
     found += alike or rig_findings(pairs, footage.rig.cameras, names)
-    found += [*weak, *seed_findings(footage)]
+    found += [*weak, *joint_findings(footage.take), *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
         "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},

@@ -252,9 +252,18 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
     assert opened.frames == range(8) and opened.take.fps == 50 and opened.take.interlaced == "both" and opened.take.body_model == "arm.R"
     decoder = opened.sequences[1]._capture  # type: ignore[attr-defined]
     assert len(opened.read(2)) == len(opened.read(3)) == 3  # the second field's image need not be decoded again
-    assert opened.sequences[1]._capture is decoder and "a take of 3 views" in capfd.readouterr().out
+    said = capfd.readouterr().out
+    assert opened.sequences[1]._capture is decoder and "a take of 3 views, 25 images a second. Next: write clicked joints" in said
     assert commands.main(argv) == 2
     assert "is a take already" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(("change", "said"), [({"--model": "fulll"}, "no body model “fulll”. Did you mean “full”"),
+                                              ({"L": "rig.toml"}, "neither a folder")])
+def test_new_refuses_what_no_run_could_read(take: Path, tmp_path: Path, capfd: Capture, change: dict[str, str], said: str) -> None:
+    views = [f"{name}={take / change.get(name, name)}" for name in "LCR"]
+    assert commands.main(["new", str(tmp_path / "new"), "--views", *views, "--model", change.get("--model", "full")]) == 2
+    assert said in capfd.readouterr().err and not (tmp_path / "new").exists()
 
 
 def test_new_takes_cameras_of_another_tool_and_the_bar_beside_them(take: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """`tricap check TAKE`: every fault is made and must be named, and sound recordings pass without a complaint."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -142,6 +143,16 @@ def contradicting_click(take: Path) -> None:
     (take / "take.toml").write_text(text[: text.index('"wrist.R"')] + '"wrist.R" = { L = [20.0, 20.0], C = [290.0, 210.0] }\n')
 
 
+def nobody_clicked(take: Path) -> None:
+    text = (take / "take.toml").read_text()
+    (take / "take.toml").write_text(text[: text.index("[seeds")])
+
+
+def one_joint_clicked(take: Path) -> None:
+    text = (take / "take.toml").read_text()
+    (take / "take.toml").write_text(re.sub('(?m)^"(shoulder|elbow)[.]R".*$', "", text))
+
+
 def image_gone(take: Path) -> None:
     pictures(take, "C")[5].unlink()
 
@@ -156,7 +167,7 @@ FAULTS = {
     swapped: "swapped views", foreign_rig: "foreign rig", knocked_camera: "stale calibration", no_texture: "no texture",
     plain_clothes: "no texture",
     smooth_sleeve: "weak texture", dark: "dark", overexposed: "overexposed", repeated: "repeated frames", frozen: "frozen view",
-    a_frame_late: "out of step",
+    a_frame_late: "out of step", nobody_clicked: "no clicks", one_joint_clicked: "few clicks",
     seed_on_the_wall: "seed on the background", contradicting_click: "clicks", image_gone: "input", other_size: "input",
 }  # fmt: skip
 
