@@ -134,10 +134,10 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
         InputError: an unknown table or name, or a value that cannot be.
     """
     groups: dict[str, dict[str, Any]] = {name: {} for name in SETTINGS}
-    for source, label in ((take_settings, where), (overrides, "the settings")):
+    for source, place in ((take_settings, f" in {where}"), (overrides, "")):
         for name, table in source.items():
             if name not in SETTINGS:
-                raise InputError(f"{label} has no group of settings “{name}”.{nearest_name(name, list(SETTINGS))}")
+                raise InputError(f"There is no group of settings “{name}”{place}.{nearest_name(name, list(SETTINGS))}")
             groups[name].update(table)
     return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
 

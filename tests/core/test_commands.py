@@ -61,7 +61,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "path outside": (lambda t: edit(t, "L/*.png", "../L/*.png"), "lies outside the take"),
     "unknown setting": (lambda t: click(t, "[settings.matching]\npatch = 13\n"), "has no setting “patch”. Did you mean “patch_px”?"),
     "setting out of range": (lambda t: click(t, "[settings.matching]\npatch_px = 1000\n"), "it must lie between 5 and 51"),
-    "unknown group": (lambda t: click(t, "[settings.matchin]\npatch_px = 13\n"), "group of settings “matchin”. Did you mean “matching”?"),
+    "unknown group": (lambda t: click(t, "[settings.matchin]\npatch_px = 13\n"), "There is no group of settings “matchin” in "),
     "seed outside": (lambda t: click(t, '[seeds.joints]\n"elbow.R" = { L = [96.0, 3], C = [3, 3] }\n'), "outside the image of 96×72"),
     "seed in one view": (lambda t: click(t, '[seeds.joints]\n"elbow.R" = { L = [6, 3] }\n'), "click it in two views at least"),
     "contradicting clicks": (
@@ -103,7 +103,7 @@ def test_input_that_needs_mending(small: Path, tmp_path: Path, capfd: Capture, f
         (["--set", "matching.patch_px=x"], "a number in px is needed"),
         (["--set", "matching.patch_px="], "a number in px is needed"),
         (["--set", "matching.patch=13"], "Did you mean “patch_px”"),
-        (["--set", "match.patch_px=13"], "Did you mean “matching”"),
+        (["--set", "match.patch_px=13"], "There is no group of settings “match”. Did you mean “matching”"),
         (["--set", "surface.correct_curvature=1"], "write true or false"),
     ],
 )
