@@ -4,7 +4,8 @@
 
 Between Newton's steps that take it onto the surface (whole_surface) a vertex near a seam goes half way to the middle of its neighbours.
 The bones' shares are those of the parts, smoothed about the seams, or the skin would tear where one part ends. Where the surface of
-the whole folds near a seam (thighs that touch, an arm close to the flank), the mesh leaves it and goes smoothly over the fold.
+the whole folds near a seam (thighs that touch, an arm close to the flank), the mesh leaves it and goes smoothly over the fold. Where a quad
+is turned over after all, what is about it is evened out until none is.
 """
 
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ CUT_STEPS = 2  # Newton's, from the middle of an edge or quad: a millimetre
 FOLD = 0.4  # cosine: a face that stands so steeply on what is about its corners is in a fold
 UNFOLDING_STEPS = 40
 LOOSE_RINGS = 4  # over so many quads the mesh comes back to the surface
+MENDING_STEPS = 200  # at most: a quad or two at the fingertips takes ten
+MENDING_RING = 20  # … and a ring more is evened out after so many
 SMOOTHED_M = 0.03  # shares are smoothed over about this distance
 
 
@@ -80,13 +83,14 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
         vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, loose]), part, faces, uv, pieces)
         weights, kept = strongest(both[:, :-1]), 1 - both[:, -1:]
         vertices = vertices + kept * (surface.reached(vertices, part, CUT_STEPS) - vertices)
-    return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
+    return OneSkin(vertices_m=_mended(vertices, faces), faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
 
 
 def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneSkin:
     skin = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
     skin = refined(skin, detail) if detail > 1 else skin
-    return OneSkin(vertices_m=skin.vertices_m, faces=skin.faces, uv=corner_uv(skin), weights=skin.weights, bone_names=skin.bone_names,
+    vertices = _mended(skin.vertices_m, skin.faces)
+    return OneSkin(vertices_m=vertices, faces=skin.faces, uv=corner_uv(skin), weights=skin.weights, bone_names=skin.bone_names,
                    part=np.zeros(len(skin.vertices_m), dtype=np.int64))
 
 
@@ -145,6 +149,29 @@ def _in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     mean = np.stack([np.bincount(faces.ravel(), np.repeat(normal[:, k], 4), len(vertices)) for k in range(3)], axis=1)
     mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     return np.asarray((np.einsum("fk,fck->fc", normal, mean[faces]) < FOLD).any(axis=1))
+
+
+def turned_over(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Which quads (F,) look, at one of their corners, away from what is about that corner: flipped ones, and those folded in themselves."""
+    corner = vertices[faces]
+    normal = np.cross(np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner)
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
+    mean = np.stack([np.bincount(faces.ravel(), normal[..., k].ravel(), len(vertices)) for k in range(3)], axis=1)[faces]
+    whole = np.broadcast_to(normal.sum(axis=1, keepdims=True), normal.shape)
+    return np.asarray(((np.einsum("fck,fck->fc", normal, mean) <= 0) | (np.einsum("fck,fck->fc", whole, mean) <= 0)).any(axis=1))
+
+
+def _mended(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3) of which those about quads that are turned over go half way to their neighbours' middle, until none is."""
+    found, near = np.array(vertices), None
+    for step in range(MENDING_STEPS):
+        bad = turned_over(found, faces)
+        if not bad.any():
+            break
+        near = _mean_of_neighbours(faces, len(found)) if near is None else near
+        moved = _within(near, np.isin(np.arange(len(found)), faces[bad]), 1 + step // MENDING_RING)
+        found[moved] = 0.5 * (found[moved] + near[moved] @ found)
+    return found
 
 
 def _smoothed(weights: np.ndarray, vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray) -> np.ndarray:

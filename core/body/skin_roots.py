@@ -1,10 +1,9 @@
 """Where the rays of a skin meet the implicit surface: a march inwards, then a secant on ln F.
 
 A limb of one chain has the field of its bones, F_b = own + parent's + children's balls, and the surface F_b = T. Where two parts
-of a body meet, the sum would bulge and the larger of the two would leave a crease; their fields are joined by the blend of
-constructive solid geometry (Ricci 1973, Comput. J. 16),
+of a body meet, the sum would bulge and the larger of the two would leave a crease; their fields are blended (`blend`),
 
-    G = (M^n + max M_other^n)^(1/n) ,   n = 4 ,   M = Σ_b u_b F_b   over a part's bones                    (1)
+    G = max blend(M, M_other) ,   M = Σ_b u_b F_b   over a part's bones                                    (1)
 
 with the bones of the other part next to b in M_other. F_b and the next bone's field differ by the balls beyond both, which at a short neck
 are a tenth of the field: so along a chain u passes from bone to bone about their joint X_j,
@@ -12,9 +11,8 @@ are a tenth of the field: so along a chain u passes from bone to bone about thei
     u_1 = 1 − S_1 ,   u_2 = S_1 (1 − S_2) , … ,   S_j = smooth((1 + s/h)/2) ,   s = (X − X_j)·(y_j + y_j+1)/(1 + cos β)          (1b)
 
 with h half of the shorter bone, s = 0 on the plane that halves the bend β and the distance from the joint on both axes,
-or there would be a step around the neck. G is 2^(1/n) of the larger field where both are equal, and the larger field
-elsewhere: a fillet of 4 mm on a radius of 60 mm. Both parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A
-part ends inside its neighbour:
+or there would be a step around the neck. Both parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A part ends
+inside its neighbour:
 
     first exit of the ray, beyond the outermost F_b = T, from  min( G/T , F_own/(τ T) ) ≥ 1 ,   τ = 0.4    (2)
 
@@ -26,19 +24,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .blend import NOTHING, blended
 from .metaballs import THRESHOLD, active_balls, field, field_and_derivatives
 from .shape import BodyShape
 from .skin_parts import Part
 from .skin_rays import SHARPEST_COS, Rays, smooth
 
-BLEND_POWER = 4.0  # n of (1)
 OWN_SHARE = 0.4  # τ of (2): below ½, or two that reach T together would both stay below it
 PASSING = 0.5  # h of (1b) over the shorter bone
 STEP = 0.05  # march, in units of the reach
 FINE_STEP = 0.02  # … outwards, where a gap between two parts must not be stepped over
 SECANT_STEPS = 7
 LEAST_RHO_M = 1e-3  # where the field is too weak to surround the axis
-NOTHING = 1e-300
 
 LogField = Callable[[np.ndarray, np.ndarray], np.ndarray]  # ρ (N,), which rays (N,) -> ln of the field over its threshold (N,)
 
@@ -140,11 +137,9 @@ class _JoinedField:
         """ln of (2) at ρ (N',) on the rays `which` (N',)."""
         points = self.origin[which] + rho[:, None] * self.direction[which]
         terms = self._terms(points)[1]
-        own = np.einsum("nm,nm->n", terms, self.own.shares(points) @ self.chosen)
-        if not self.others:
-            return _log(own)
-        G = (own**BLEND_POWER + self._others(points, terms, which)[0] ** BLEND_POWER) ** (1 / BLEND_POWER)  # (1)
-        return _log(np.minimum(G, terms @ self.of_part / OWN_SHARE))  # (2)
+        own = self.own.shares(points) @ self.chosen
+        G = self._blended(points, terms, own, which)[0]
+        return _log(np.minimum(G, terms @ self.of_part / OWN_SHARE) if self.others else G)  # (2)
 
     def log_own(self, rho: np.ndarray, which: np.ndarray) -> np.ndarray:
         """ln of M/T at ρ (N',) on the rays `which` (N',)."""
@@ -154,11 +149,7 @@ class _JoinedField:
     def normals(self, points: np.ndarray) -> np.ndarray:
         """−∇G/|∇G| (N, 3) at a point of each ray."""
         q, terms = self._terms(points)
-        factors = self.own.shares(points) @ self.chosen
-        factors = np.einsum("nm,nm->n", terms, factors)[:, None] ** (BLEND_POWER - 1) * factors
-        if self.others:
-            other, balls = self._others(points, terms, np.arange(len(points)))
-            factors = factors + other[:, None] ** (BLEND_POWER - 1) * balls
+        factors = self._blended(points, terms, self.own.shares(points) @ self.chosen, np.arange(len(points)))[1]
         return _unit(np.einsum("nm,mij,nmj->ni", terms * factors, self.frame, q, optimize=True))
 
     def _terms(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -166,15 +157,14 @@ class _JoinedField:
         q = flat.reshape(len(points), len(self.weight), 3)
         return q, self.weight * np.exp(-2 * np.einsum("nmi,nmi->nm", q, q))
 
-    def _others(self, points: np.ndarray, terms: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The largest M (N',) of other parts, as far as they count there, and the balls that make it (N', m), as factors."""
-        M, balls = np.zeros(len(points)), np.zeros(terms.shape)
+    def _blended(self, points: np.ndarray, terms: np.ndarray, own: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """G (N',) of (1) from the part's own factors (N', m), and the balls' factors in it (N', m)."""
+        G, factors = np.einsum("nm,nm->n", terms, own), own
         for chain, chosen in self.others:
-            factors = self.fade[which, None] * (chain.shares(points) @ chosen)
-            found = np.einsum("nm,nm->n", terms, factors)
-            balls = np.where((found > M)[:, None], factors, balls)
-            M = np.maximum(M, found)
-        return M, balls
+            found, balls = blended(terms, own, chain.shares(points) @ chosen, self.fade[which])
+            factors = np.where((found > G)[:, None], balls, factors)
+            G = np.maximum(found, G)
+        return G, factors
 
 
 @dataclass(frozen=True, eq=False, slots=True)

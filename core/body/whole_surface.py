@@ -1,29 +1,28 @@
 """The fitted surface of a whole body as a field of places, near the seams of its parts: what skin_roots finds along rays.
 
-    G = (M_trunk^n + M_limb^n)^(1/n) = T ,   M_part = Σ_b u_b F_b   over the part's bones b ,   n = 4          (1)
+    G = M_trunk + (Σ E_limb^m)^(1/m) = T ,   E_limb = blend(M_trunk, M_limb) − M_trunk ,   m = 12          (1)
 
-F_b is the sum of the balls of bone b and of the bones that it meets, as in the fit; u_b is 1 at the bone's middle and passes to the next
-bone's about the joint (1b in skin_roots). A place on a limb sees the trunk the less the farther out it lies; a place on the trunk sees its
-limbs,
-
-    M_limbs = (Σ M_limb^m)^(1/m) ,   m = 12                                                               (2)
-
-which is the largest, but smooth between two legs. M_trunk is at most 1/τ times what its own balls give (τ = 0.4, skin_roots): two thighs
-that nearly touch are no trunk.
+M_part = Σ_b u_b F_b over the part's bones b. F_b is the sum of the balls of bone b and of the bones that it meets, as in the fit; u_b is 1
+at the bone's middle and passes to the next bone's about the joint (1b in skin_roots); what a limb adds to the trunk is by `blend`. A place
+on the trunk sees all its limbs, a place on a limb the trunk alone, or two thighs that touch would be one; and far out, from the middle of
+the last bone that may meet the trunk to its end, it sees the trunk less and less. M_trunk is at most 1/τ times what its own balls give
+(τ = 0.4, skin_roots; bent, not cut off, at that), and what it then lacks is the limb's: two thighs that nearly touch are no trunk.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from .blend import joined
 from .metaballs import THRESHOLD, active_balls, local_points, squared_distances
 from .shape import BodyShape
 from .skeleton import bone_frames
 from .skin_parts import body_parts
 from .skin_rays import smooth
-from .skin_roots import BLEND_POWER, OWN_SHARE, Chain
+from .skin_roots import OWN_SHARE, Chain
 
-TAKING_OVER = 12.0  # m of (2)
+TOGETHER = 12.0  # m of (1)
+BENDING = 8.0  # how suddenly the trunk gives way where it has too little of its own
 NEWTON_STEPS = 4
 LONGEST_STEP_M = 0.005
 CHUNK = 4000
@@ -38,7 +37,6 @@ class WholeSurface:
         self._R, self._head = bone_frames(shape.skeleton, shape.lengths_m, np.asarray(motion, dtype=np.float64))
         balls, neighbours = shape.metaballs, shape.skeleton.neighbours
         self._own = np.stack([np.isin(balls.bone_index, part.bones) for part in self._parts], axis=1).astype(np.float64)
-        self._part_of = {b: p for p, part in enumerate(self._parts) for b in part.bones}
         self._of_bone = {b: active_balls(balls, neighbours, b).astype(np.float64) for part in self._parts for b in part.bones}
 
     def of_others(self, points: np.ndarray) -> np.ndarray:
@@ -50,7 +48,10 @@ class WholeSurface:
         found = np.zeros((len(points), len(self._parts)))
         for p, part in enumerate(self._parts):
             if part.parent is not None:
-                without = self._of_bones(self._parts[part.parent].bones, points, terms * (1 - self._own[:, p]))[0]
+                counted = self._factors(self._parts[part.parent].bones, points)
+                without = np.einsum("nm,nm->n", terms * (1 - self._own[:, p]), counted)
+                if self._parts[part.parent].parent is None:
+                    without = np.minimum(without, terms @ self._own[:, part.parent] / OWN_SHARE)
                 found[:, p] = without / np.maximum(terms @ self._own[:, p], NOTHING)
         return found
 
@@ -90,38 +91,57 @@ class WholeSurface:
         G, of_ball = np.empty(len(points)), np.empty(terms.shape)
         for p in np.unique(part):
             rows = np.flatnonzero(part == p)
-            own, own_balls = self._of_bones(self._parts[p].bones, points[rows], terms[rows])
-            other, other_balls = self._others(int(p), points[rows], terms[rows])
-            fade = self._fade(int(p), points[rows])
-            G[rows] = (own**BLEND_POWER + (fade * other) ** BLEND_POWER) ** (1 / BLEND_POWER)
-            share = (own / G[rows]) ** (BLEND_POWER - 1), fade * (fade * other / G[rows]) ** (BLEND_POWER - 1)
-            of_ball[rows] = terms[rows] * (share[0][:, None] * own_balls + share[1][:, None] * other_balls)
+            G[rows], factors = self._seen_from(int(p), points[rows], terms[rows])
+            of_ball[rows] = terms[rows] * factors
         balls = self._shape.metaballs
         return G, -4 * np.einsum("nm,nmi,mji->nj", of_ball, q / balls.radii_m, self._R[balls.bone_index], optimize=True)
 
-    def _others(self, p: int, points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """M (N,) of the parts that may join part p, and the balls that make it (N, M), as factors; smooth where one takes over.  (2)"""
-        parent = self._parts[p].parent
-        seen = [other.junction for other in self._parts if other.parent == p] + ([self._parts[parent].bones] if parent is not None else [])
-        if not seen:
-            return np.full(len(points), NOTHING), np.zeros(terms.shape)
-        found = [self._of_bones(bones, points, terms) for bones in seen]
-        each = np.stack([value for value, _ in found])
-        M = (each**TAKING_OVER).sum(axis=0) ** (1 / TAKING_OVER)
-        share = (each / M) ** (TAKING_OVER - 1)
-        return M, sum((k[:, None] * balls for k, (_, balls) in zip(share, found)), np.zeros(terms.shape))
+    def _seen_from(self, p: int, points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """G (N,) at places of part p, and the balls' factors in it and in its gradient (N, m).  (1)"""
+        parts, parent = self._parts, self._parts[p].parent
+        trunk = p if parent is None or any(other.parent == p for other in parts) else parent
+        limbs = [part.bones if i == p else part.junction for i, part in enumerate(parts) if part.parent == trunk and p in (i, trunk)]
+        if trunk == p and parent is not None:
+            limbs.append(parts[parent].bones)
+        G, factors = self._together(trunk, limbs, points, terms)
+        if trunk == p:
+            return G, factors
+        own_factors, fade = self._factors(parts[p].bones, points), self._fade(p, points)
+        own = np.einsum("nm,nm->n", terms, own_factors)
+        return own + fade * (G - own), own_factors + fade[:, None] * (factors - own_factors)
 
-    def _of_bones(self, bones: Sequence[int], points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """M (N,) of bones of one part, and the balls that make it (N, M), as factors.  (1)"""
+    def _together(self, trunk: int, limbs: Sequence[tuple[int, ...]], points: np.ndarray, terms: np.ndarray
+                  ) -> tuple[np.ndarray, np.ndarray]:
+        """(1) for a trunk and the bones of its limbs."""
+        counted = self._factors(self._parts[trunk].bones, points)
+        M = np.maximum(np.einsum("nm,nm->n", terms, counted), NOTHING)
+        s, slope = self._bounded(trunk, terms, counted, M)
+        G, factors = s * M, s[:, None] * counted + M[:, None] * slope
+        excess, of_excess = np.full((len(limbs), len(points)), NOTHING), np.zeros((len(limbs), *terms.shape))
+        for i, bones in enumerate(limbs):
+            limb = self._factors(bones, points)
+            both = np.minimum(counted, limb)
+            C = np.einsum("nm,nm->n", terms, both)[:, None]
+            found, balls = joined(terms, s[:, None] * both + C * slope, s[:, None] * (counted - both) + (M[:, None] - C) * slope,
+                                  limb - s[:, None] * both - C * slope)
+            excess[i], of_excess[i] = np.maximum(found - G, NOTHING), balls - factors
+        E = (excess**TOGETHER).sum(axis=0) ** (1 / TOGETHER) if len(limbs) else np.zeros(len(points))
+        return G + E, factors + np.einsum("ln,lnm->nm", (excess / np.maximum(E, NOTHING)) ** (TOGETHER - 1), of_excess)
+
+    def _bounded(self, trunk: int, terms: np.ndarray, counted: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By what share (N,) of M (N,) it is within 1/τ of what the trunk's own balls give, and its derivatives to them (N, m)."""
+        if self._parts[trunk].parent is not None:
+            return np.ones(len(M)), np.zeros(terms.shape)
+        own_balls = self._own[:, trunk]
+        own = np.maximum(terms @ own_balls, NOTHING)
+        lack = (OWN_SHARE * M / own) ** BENDING
+        s = (1 + lack) ** (-1 / BENDING)
+        return s, (s * lack / (1 + lack))[:, None] * (own_balls / own[:, None] - counted / M[:, None])
+
+    def _factors(self, bones: Sequence[int], points: np.ndarray) -> np.ndarray:
+        """How much each ball counts (N, M) in the field of bones of one part."""
         balls = np.stack([self._of_bone[b] for b in bones])
-        factors = Chain.of(bones, self._shape.lengths_m, self._R, self._head).shares(points) @ balls
-        M = np.einsum("nm,nm->n", terms, factors)
-        p = self._part_of[bones[0]]
-        if self._parts[p].parent is not None:
-            return np.maximum(M, NOTHING), factors
-        own_balls = self._own[:, p] / OWN_SHARE
-        own = terms @ own_balls
-        return np.maximum(np.minimum(M, own), NOTHING), np.where((own < M)[:, None], own_balls, factors)
+        return Chain.of(bones, self._shape.lengths_m, self._R, self._head).shares(points) @ balls
 
     def _station(self, b: int, points: np.ndarray) -> np.ndarray:
         return np.asarray((points - self._head[b]) @ self._R[b, :, 1] / self._shape.lengths_m[b])

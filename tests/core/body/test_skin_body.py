@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tricap.core.body.metaballs import Metaballs
+from tricap.core.body.metaballs import THRESHOLD, Metaballs, active_balls, field_and_derivatives
 from tricap.core.body.model_file import model_names, read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
@@ -95,6 +95,24 @@ def test_no_collar_where_the_neck_passes_to_the_head() -> None:
     rings = skin.vertices_m[1 : skin.part_sizes[0] - 1].reshape(-1, skin.rays, 3)[1:-1].mean(axis=1)
     beside = np.abs(rings[:, 2] - joint[2]) < 0.03
     assert beside.sum() > 5 and turns[beside].max() < 8  # measured 6.1°
+
+
+def test_chest_and_pelvis_are_as_thick_as_fitted() -> None:
+    """Balls that a trunk and its limbs both count are counted once; when they were counted twice, chest and pelvis were 8 mm too thick."""
+    shape = default_shape(read_model("full"))
+    rest = np.zeros(len(shape.skeleton.dof_names))
+    R, head = bone_frames(shape.skeleton, shape.lengths_m, rest)
+    skin, names = body_skin(shape, rest), [bone.name for bone in shape.skeleton.bones]
+    trunk = skin.vertices_m[: skin.part_sizes[0]]
+    for name, least in (("chest", 60), ("pelvis", 20)):
+        b = names.index(name)
+        along = (trunk - head[b]) @ R[b, :, 1] / shape.lengths_m[b]
+        own = trunk[(np.abs(along - 0.5) < 0.3) & (np.abs(trunk[:, 0]) < 0.06)]
+        active = active_balls(shape.metaballs, shape.skeleton.neighbours, b)
+        every = np.broadcast_to(active, (len(own), len(active)))
+        F, slope, *_ = field_and_derivatives(shape.metaballs, shape.lengths_m, R, head, own, every)
+        off = np.abs(F - THRESHOLD) / np.linalg.norm(slope, axis=1)
+        assert len(own) > least and np.median(off) < 2e-3, name
 
 
 @pytest.mark.parametrize("model", [name for name in model_names() if name.startswith(("arm", "leg"))])
