@@ -7,14 +7,15 @@ to the flank beside it, and a leg to the other. So each family has the balls of
     a trunk           … and the short bones within it on which limbs hang: shoulders
     a limb            … that hangs on the trunk by a long bone, a thigh: and the trunk's bone there
     a trunk's bone    on which such limbs hang: its own, what is next to it of the trunk, and the limbs'
+    a shoulder        the trunk's bone on which it hangs, its own, and those of the upper arm
 
 and those beside a joint with one of its bones, with weights a of their own, as near 1 (or 0 of the latter) as the surface lets them be:
 
     Σ_m a_m f_m(X) = T ± s |∇G| ,   a_m = 1 ± σ ,   0 ≤ a_m ≤ 4                                               (1)
 
 at points X of the surface, s = 1 mm, in rest and with the limbs moved, each for the family whose field is the largest there; and where
-another's is above T, for that one, too. At rest and in a step, five bodies: 0.6 to 0.8 mm RMS, hips 0.1 to 0.6, neck 0.4 to 0.9, shoulders
-1.3 to 2.2 (14 at most, in the armpit); with all weights 1 it was 2.1, hips 8.9 and shoulders 5.8, since that surface has no fillets.
+another's is above T, for that one, too. At rest and in a step, three bodies: 0.24 to 0.32 mm RMS, hips 0.2 to 0.4, neck 0.4 to 0.6,
+shoulders 0.6 to 0.7, where they hang on the chest 0.5 to 0.8 (4 mm at most, in the armpit; 6 between the thighs).
 Where limbs touch, as in a squat, the sum is up to 40 mm thicker.
 """
 
@@ -32,7 +33,7 @@ from .skin_mesh import SkinSettings
 from .skin_parts import Part, body_parts
 from .whole_surface import WholeSurface
 
-UPPER = 0.6  # balls of a limb up to here along its first bone count for the trunk's bone
+UPPER = 0.6  # balls of a limb up to here along its first long bone count for the trunk's bone
 NEXT_TO = 0.34  # and those of the trunk's next bone up to here
 MOVED = (0.0, 0.35, -0.35)  # postures of (1): how far each DOF of a limb's first bones goes towards its upper limit, or its lower one
 SAMPLED = SkinSettings(contours=6, rays=16)
@@ -109,6 +110,9 @@ def _chosen(shape: BodyShape, parts: tuple[Part, ...]) -> list[np.ndarray]:
         trunk = next(part for part in parts if attachment in part.bones)
         beyond = trunk.bones[trunk.bones.index(attachment) + 1 :][:1]
         found.append(np.concatenate([_balls(shape, (attachment,)), _balls(shape, beyond, NEXT_TO), _balls(shape, limbs, UPPER)]))
+    for part in parts:
+        if part.attachment is not None and not _is_long(part):
+            found.append(np.concatenate([_balls(shape, (part.attachment, part.bones[0])), _balls(shape, part.bones[1:2], UPPER)]))
     return found
 
 

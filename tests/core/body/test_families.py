@@ -27,7 +27,7 @@ def found(shape: BodyShape) -> list[Metaballs]:
 
 
 def test_the_largest_family_has_the_skins_surface(shape: BodyShape, found: list[Metaballs]) -> None:
-    """In a step, which the weights have not seen: 0.6 mm RMS, 0.3 about the hips, 1.4 about the shoulders."""
+    """In a step, which the weights have not seen: 0.32 mm RMS, 0.24 about the hips, 0.66 about the shoulders; they were 1.4."""
     motion = np.zeros(len(shape.skeleton.dof_names))
     for name, degrees in {"shoulder.R flexion": 40, "shoulder.L flexion": -30, "hip.R flexion": 30, "hip.L flexion": -15}.items():
         motion[shape.skeleton.layout[name]] = np.radians(degrees)
@@ -44,7 +44,8 @@ def test_the_largest_family_has_the_skins_surface(shape: BodyShape, found: list[
                     for balls in chosen], axis=0)
         return float(np.sqrt((((F - THRESHOLD) / slope[near]) ** 2).mean()))
 
-    assert rms_m(found, None) < 0.8e-3 and rms_m(found, "thigh.R") < 0.6e-3 and rms_m(found, "upper_arm.L") < 1.8e-3
+    assert rms_m(found, None) < 0.5e-3 and rms_m(found, "thigh.R") < 0.5e-3
+    assert rms_m(found, "upper_arm.L") < 1e-3 and rms_m(found, "upper_arm.R") < 1e-3  # promised
     of = shape.metaballs.bone_index
     alone = [replace(shape.metaballs, weight=np.where(np.isin(of, each.bones), shape.metaballs.weight, 1e-9)) for each in body_parts(shape)]
     assert rms_m(alone, "thigh.R") > 5e-3
