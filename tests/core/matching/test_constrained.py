@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.images.fields import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import constrain
@@ -217,6 +218,25 @@ def test_constraints_earn_their_place(surfaces: ModuleType, kind: str) -> None:
         assert np.isfinite(found.covariance_m2).all()
     assert rms["object"] < 0.9 * rms["none"]
     assert rms["epipolar"] < rms["none"]
+
+
+@pytest.mark.slow
+def test_a_rig_that_is_half_a_pixel_off_still_helps(surfaces: ModuleType) -> None:
+    """The outer views look 0.55 px too high and too low, where calibration was not good or the person moved between exposures. What the
+    pieces of surface hold together counts for more: measured 0.86 mm RMS, 1.27 mm without constraint."""
+    scene, rms, residual = Scene(surfaces, surfaces.cylinder(0.15), "weak"), {}, {}
+    for k, up in ((0, 1.0), (2, -1.0)):
+        camera, turn = scene.rig[k], rotation_from_vector(np.array([up * 0.55 / surfaces.FOCAL_PX, 0.0, 0.0]))
+        scene.rig[k] = replace(camera, R_cam_world=turn @ camera.R_cam_world, t_cam_world_m=turn @ camera.t_cam_world_m)
+    field = scene.grown()
+    for constraint in ("none", "object"):
+        settings = replace(SETTINGS, constraint=constraint)
+        found = constrain(field, scene.images, scene.rig, 1, settings, foreground=EVERYWHERE, monitor=Monitor())
+        error = scene.surface.distance_m(found.xyz_m)
+        assert len(found.cell) > 0.85 * len(field.cell)
+        rms[constraint], residual[constraint] = np.sqrt(np.mean(error[np.abs(error) < 0.02] ** 2)), np.median(found.residual_px)
+    assert rms["object"] < 0.8 * rms["none"]
+    assert residual["object"] < 0.8 * residual["none"]
 
 
 def test_points_on_which_two_ways_of_matching_disagree_are_rejected(surfaces: ModuleType) -> None:
