@@ -5,7 +5,7 @@
 Between Newton's steps that take it onto the surface (whole_surface) a vertex near a seam goes half way to the middle of its neighbours.
 The bones' shares are those of the parts, smoothed about the seams, or the skin would tear where one part ends. Where the surface of
 the whole folds near a seam (thighs that touch, an arm close to the flank), the mesh leaves it and goes smoothly over the fold. Where a quad
-is turned over after all, what is about it is evened out until none is.
+near a seam is turned over after all, what is about it is evened out until none is.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ CUT_STEPS = 2  # Newton's, from the middle of an edge or quad: a millimetre
 FOLD = 0.4  # cosine: a face that stands so steeply on what is about its corners is in a fold
 UNFOLDING_STEPS = 40
 LOOSE_RINGS = 4  # over so many quads the mesh comes back to the surface
-MENDING_STEPS = 200  # at most: a quad or two at the fingertips takes ten
+MENDING_STEPS = 200  # at most
 MENDING_RING = 20  # … and a ring more is evened out after so many
 SMOOTHED_M = 0.03  # shares are smoothed over about this distance
 
@@ -79,18 +79,19 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     vertices, loose = _unfolded(_evened(whole.vertices_m, near, free, whole.part, surface), faces, near, free)
     weights = _smoothed(whole.weights, vertices, faces, near, free)
     part, pieces = whole.part, detail * settings.detail
+    seam = np.isin(np.arange(len(vertices)), free).astype(np.float64)
     if pieces > 1:
-        vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, loose]), part, faces, uv, pieces)
-        weights, kept = strongest(both[:, :-1]), 1 - both[:, -1:]
+        vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, seam, loose]), part, faces, uv, pieces)
+        weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1:]
         vertices = vertices + kept * (surface.reached(vertices, part, CUT_STEPS) - vertices)
-    return OneSkin(vertices_m=_mended(vertices, faces), faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
+    vertices = _mended(vertices, faces, seam > 0)
+    return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
 
 
 def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneSkin:
     skin = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
     skin = refined(skin, detail) if detail > 1 else skin
-    vertices = _mended(skin.vertices_m, skin.faces)
-    return OneSkin(vertices_m=vertices, faces=skin.faces, uv=corner_uv(skin), weights=skin.weights, bone_names=skin.bone_names,
+    return OneSkin(vertices_m=skin.vertices_m, faces=skin.faces, uv=corner_uv(skin), weights=skin.weights, bone_names=skin.bone_names,
                    part=np.zeros(len(skin.vertices_m), dtype=np.int64))
 
 
@@ -161,15 +162,16 @@ def turned_over(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.asarray(((np.einsum("fck,fck->fc", normal, mean) <= 0) | (np.einsum("fck,fck->fc", whole, mean) <= 0)).any(axis=1))
 
 
-def _mended(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3) of which those about quads that are turned over go half way to their neighbours' middle, until none is."""
+def _mended(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3): those that `may` (V,), about quads that are turned over, go half way to their neighbours' middle until none is."""
     found, near = np.array(vertices), None
     for step in range(MENDING_STEPS):
-        bad = turned_over(found, faces)
+        bad = turned_over(found, faces) & may[faces].all(axis=1)
         if not bad.any():
             break
         near = _mean_of_neighbours(faces, len(found)) if near is None else near
         moved = _within(near, np.isin(np.arange(len(found)), faces[bad]), 1 + step // MENDING_RING)
+        moved = moved[may[moved]]
         found[moved] = 0.5 * (found[moved] + near[moved] @ found)
     return found
 
