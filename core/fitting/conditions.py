@@ -42,6 +42,7 @@ class Conditions:
     clicks: Clicks
     click: int  # index of the frame where the fit begins
     located: np.ndarray  # (J,) whether a joint has a place in space of its own, in any frame
+    stature_sigma: float  # relative, of a person about the parameters' template
     frames: int  # for how many a belief of a single bone's length counts
     priors: list[Observation]  # of every frame's motion
     clicked: Mapping[int, ClickedJoints]  # by frame index
@@ -104,7 +105,7 @@ class Conditions:
         """What is believed of the bone lengths; of a single bone, against the error that the model has in all frames alike."""
         s = self.settings
         return proportions(self.model, self.parameters.template.lengths_m, self.located, s.length_sigma,
-                           s.proportion_sigma / np.sqrt(self.frames))
+                           s.proportion_sigma / np.sqrt(self.frames), self.stature_sigma)
 
     def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
         """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the proportions is

@@ -22,7 +22,8 @@ LITTLE = np.radians(65.0)  # what bends less belongs to the trunk
 LASTS_S = 0.5
 ENOUGH_BONES = 4
 OWN_SIGMA = 0.10  # of a clicked bone about its person's proportions
-CLICK_SIGMA_M = 0.03
+ANYONES_SIGMA = 0.15  # of a person, a child or a giant, about the model
+CLICKED_STATURE_SIGMA = 0.02  # some sixteen lengths of about 8 % each
 
 
 def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], lengths: Proportions) -> Solution:
@@ -38,23 +39,22 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
     return solve(problem, start[None], vector, steps=STEPS)
 
 
-def clicked_stature(skeleton: Skeleton, lengths_m: np.ndarray, clicks: Clicks) -> float:
-    """The person's stature over the model's, from the bones (B,) that have both ends clicked and the distances between trunk joints.
+def clicked_stature(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation]) -> tuple[float, float]:
+    """The person's stature over that of the parameters' template, and its relative sigma.
+
+    It is that of the lengths and the posture that explain the clicks together. Clicks from a short base scatter along the view by many
+    centimetres, which makes the distance between any two of them longer than it is; a posture takes that up.
 
     Few bones say less about a stature than their own clicks say about them: then 1.
     """
-    rest = joint_positions(skeleton, lengths_m, np.zeros(len(skeleton.dofs)))
-    place = dict(zip(skeleton.joint_names, clicks.xyz_m))
-    trunk = [j for j in trunk_joints(skeleton) if np.isfinite(place[j]).all()]
-    pairs = [(bone.head_joint, bone.tail_joint) for bone in skeleton.bones if bone.head_joint not in trunk or bone.tail_joint not in trunk]
-    pairs += [(a, b) for i, a in enumerate(trunk) for b in trunk[i + 1 :]]
-    clicked = [(a, b) for a, b in pairs if np.isfinite(place[a]).all() and np.isfinite(place[b]).all()]
-    wanted = np.array([np.linalg.norm(rest[a] - rest[b]) for a, b in clicked])
-    found = np.array([np.linalg.norm(place[a] - place[b]) for a, b in clicked])
-    if len(clicked) < ENOUGH_BONES or wanted.min() <= 0 or found.min() <= 0:
-        return 1.0
-    weight = 1 / (OWN_SIGMA**2 + (CLICK_SIGMA_M / wanted) ** 2)
-    return float(np.exp(weight @ np.log(found / wanted) / (weight.sum() + 1 / STATURE_SIGMA**2)))
+    skeleton, place = parameters.skeleton, dict(zip(parameters.skeleton.joint_names, clicks.xyz_m))
+    clicked = [bone for bone in skeleton.bones if np.isfinite([place[bone.head_joint], place[bone.tail_joint]]).all()]
+    if len(clicked) < ENOUGH_BONES:
+        return 1.0, STATURE_SIGMA
+    lengths = np.log(parameters.template.lengths_m)
+    covariance = ANYONES_SIGMA**2 + OWN_SIGMA**2 * np.eye(len(lengths))
+    found = inverse_kinematics(parameters, clicks, priors, Proportions(mean=lengths, covariance=covariance))
+    return float(np.exp(np.mean(found.vector[parameters.layout.set("lengths")] - lengths))), CLICKED_STATURE_SIGMA
 
 
 def trunk_joints(skeleton: Skeleton) -> list[str]:

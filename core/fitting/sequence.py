@@ -213,10 +213,11 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     clicks = enough(known, names, [*([clicked[begin]] if begin in clicked else []), *tracks.observe(begin)])
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
     shape = one_ball_shape(default_shape(model)) if settings.balls == "one" else default_shape(model)
-    shape = scaled_shape(shape, clicked_stature(model.skeleton, shape.lengths_m, clicks))
+    stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
+    shape = scaled_shape(shape, stature)
     parameters = ShapeParameters(shape, settings.weights)
     return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,
-                      click=begin, priors=priors, clicked=clicked, tracks=tracks,
+                      click=begin, priors=priors, clicked=clicked, tracks=tracks, stature_sigma=stature_sigma,
                       frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
                       located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
                       silhouettes=Silhouettes(given, model.surface, settings), empty=EmptyViews(given, parameters, settings),

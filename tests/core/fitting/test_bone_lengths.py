@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
-from tricap.core.body.shape import default_shape
+from tricap.core.body.shape import default_shape, scaled_shape
+from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.bone_lengths import clicked_chains, proportions
+from tricap.core.fitting.clicks import enough, read_clicks
+from tricap.core.fitting.inverse_kinematics import clicked_stature, dof_priors
 from tricap.core.fitting.observations import Proportions
 from tricap.core.fitting.silhouettes import Rays, touched
 from tricap.core.fitting.state import ShapeParameters
+
+from .limb_scene import front_rig
 
 CLICKED = ["neck", "head", *(f"{joint}.{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR")]
 
@@ -96,3 +101,23 @@ def test_an_outline_beyond_the_hand_is_the_fingers_and_one_over_the_crown_is_the
 
     assert owners("hand.R", 0.6).tolist() == [at["hand.R"]] and not len(owners("hand.R", 1.2))
     assert owners("head", 1.1).tolist() == [at["head"]]
+
+
+@pytest.mark.parametrize("small", [0.7, 0.88, 1.0])
+def test_clicks_that_scatter_along_the_view_do_not_lengthen_the_person(full, small: float) -> None:
+    shape, rng, rig = scaled_shape(default_shape(full), small), np.random.default_rng(3), front_rig()
+    motion = np.zeros(len(full.skeleton.dofs))
+    motion[1] = 2.0  # further from the cameras: 1 px is 20 mm along the view
+    joints = joint_positions(full.skeleton, shape.lengths_m, motion)
+    clicked = {name: {c.name: c.project(joints[name]) + rng.normal(0, 3, 2) for c in rig.cameras} for name in CLICKED}
+    observed, places = read_clicks(rig, full.skeleton.joint_names, clicked, 5.0)
+    clicks = enough(places, full.skeleton.joint_names, [observed])
+    found, sigma = clicked_stature(ShapeParameters(default_shape(full)), clicks, dof_priors(full.skeleton, 0.035, motion[:3]))
+    assert abs(np.log(found / small)) < 2 * sigma
+
+
+def test_a_head_that_is_seen_too_long_makes_no_other_person_of_one_whose_joints_were_clicked(full) -> None:
+    names, lengths = [bone.name for bone in full.skeleton.bones], default_shape(full).lengths_m
+    at = [names.index(name) for name in ("head", "hand.R")]
+    told = [_told(proportions(full, lengths, _located(full), 0.15, 0.01, sigma), at[:1], 0.15)[0][at[1]] for sigma in (0.02, 0.07)]
+    assert told[0] < 0.13 < told[1]
