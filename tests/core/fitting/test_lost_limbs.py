@@ -74,6 +74,20 @@ def test_a_forearm_is_found_whose_upper_arm_was_never_lost(standing) -> None:
     assert not found_again(fit, points_of(shape, bent, seen), before, vector)
 
 
+def test_the_foot_of_one_who_squats_is_found_flat_on_the_floor(standing) -> None:
+    fit, shape, _ = standing
+    layout, before = shape.skeleton.layout, np.zeros(len(shape.skeleton.dof_names))
+    for name, degrees in (("hip.R flexion", 75.0), ("knee.R flexion", 115.0)):
+        before[layout[name]] = np.radians(degrees)
+    squatting = before.copy()
+    squatting[layout["ankle.R flexion"]] = np.radians(-40.0)  # the shin leans forwards by as much
+    seen = {"chest": 200, "spine": 100, "thigh.R": 60, "shin.R": 60, "thigh.L": 60, "shin.L": 60, "foot.L": 40, "upper_arm.R": 60,
+            "forearm.R": 60, "upper_arm.L": 60, "forearm.L": 60}
+    (found,) = found_again(fit, points_of(shape, squatting, seen | {"foot.R": 80}), before, fit.parameters.vector(shape))
+    true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)["toe.R"] for m in (squatting, before, found))
+    assert np.linalg.norm(was - true) > 0.09 and np.linalg.norm(now - true) < 0.02
+
+
 def test_at_the_click_frame_a_forearm_bent_the_wrong_way_is_found(standing) -> None:
     fit, shape, before = standing
     layout, bent = shape.skeleton.layout, before.copy()
