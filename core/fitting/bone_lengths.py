@@ -29,7 +29,7 @@ CLICKS_OFF_M = 0.02  # of both ends of a length together
 
 def proportions(model: BodyModel, lengths_m: np.ndarray, located: np.ndarray, clicked_sigma: float, own_sigma: float,
                 stature_sigma: float = STATURE_SIGMA) -> Proportions:
-    """(1) about the lengths (B,) of a model, when some joints (J,) have places: σ_c, σ_d and σ_g. Lengths that are known fix the size too."""
+    """(1) about the lengths (B,) of a model, when some joints (J,) have places: σ_c, σ_d and σ_g. Lengths that are known fix the size."""
     stature = min(stature_sigma, clicked_sigma)
     of_joints = np.minimum(model.length_sigma, 2 * clicked_sigma)
     covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(own_sigma**2 + of_joints**2)
