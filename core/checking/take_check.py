@@ -36,6 +36,7 @@ def check_take(folder: Path, monitor: Monitor) -> Checked:
     try:
         footage = open_take(read_take(folder))
         findings, figures = check_footage(footage, monitor)
+        findings += joint_findings(footage.take)
     except InputError as error:
         findings, figures = [wrong("input", str(error))], {}
     return Checked(subject=str(folder), kind="take", findings=tuple(findings), figures=figures)
@@ -56,7 +57,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     alike = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
     found += alike or rig_findings(pairs, footage.rig.cameras, names)
-    found += [*weak, *joint_findings(footage.take), *seed_findings(footage)]
+    found += [*weak, *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
         "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},

@@ -254,7 +254,7 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
     assert names == {"Base", "Trunk", "Arm right", "Leg right", "Arm left", "Leg left"}
     flesh = metaballs.add_metaballs(empty.context.scene.collection, body, shape)
     families = [part for part in flesh if len(world_vertices(empty, part))]
-    assert len(families) == 6  # trunk, limbs, and where both legs meet the pelvis
+    assert len(families) == 8  # trunk, limbs, where both legs meet the pelvis, and each arm the chest
     skin_object = skin.add_skin(empty.context.scene.collection, body, shape)
     assert skin_object.data.uv_layers and all(len(face.vertices) == 4 for face in skin_object.data.polygons)
     np.testing.assert_allclose(world_vertices(empty, skin_object), one_skin(shape, SkinSettings()).vertices_m, atol=2e-5)
