@@ -25,6 +25,7 @@ from ..images.sampling import SplineImage
 from ..progress import Monitor
 from .epipolar import Epipolar
 from .foreground import Foreground
+from .grid import TemplateGrid
 from .growing import RETRY_SMOOTHING_PX, TripletField, loosened
 from .least_squares import MatchingSettings, MatchStatus
 from .multi_image import MultiImageMatches, match_multi_image
@@ -46,12 +47,11 @@ MAX_RIG_SIGMA_PX = 1.0  # a rig that is worse is not that of these images; one t
 SAMPLE = 1000  # points that tell the rig's quality
 NEIGHBOUR_NOISE_PX = 0.05
 MEDIAN_OF_CHI2 = 0.4549
-SCATTER_SHARE = 0.3  # of the neighbours' scatter about their quadric: what the model does not follow
 # Limits of a piece of surface: held by all views and its neighbours, it may look less alike in each; and its sigma is honest,
 # on skin up to four times the naive one.
 LOOSER = 2.0
 MAX_STEEPNESS = 5.0  # change of depth per distance across
-OUTLINE_SIGMA_PX = 1.3  # across the ray where no neighbour supports a point: at an outline the patch hangs over the edge
+OUTLINE_ACROSS_PX, OUTLINE_ALONG_PX = 1.6, 0.6  # across the ray and along it, where all of a patch's window hung over an outline
 
 Found = TypeVar("Found", SurfacePatch, MultiImageMatches)
 
@@ -154,7 +154,8 @@ def _object_space(
             smooth = [image.smoothed(RETRY_SMOOTHING_PX, rows.step) for image in images]
             _replace(found, again, match(again, stiff, sigma_c, smooth, SMOOTH_EXTRA_PX))
     agrees = _agrees(field, found, cameras[reference], reference, settings.patch_px)
-    result = _from_surface(field, found, around, cameras, reference, rig_sigma_px)
+    outline = _over_outline(around, field.grid, settings.patch_px)
+    result = _from_surface(field, found, outline, cameras, reference, rig_sigma_px)
     return _kept(result, found.ok & agrees, foreground, cameras[reference])
 
 
@@ -223,9 +224,12 @@ def _replace(found: Found, rows: np.ndarray, other: Found) -> None:
 
 
 def _from_surface(
-    field: TripletField, found: SurfacePatch, around: NeighbourFit, cameras: Sequence[Camera], reference: int, rig_sigma_px: float
+    field: TripletField, found: SurfacePatch, outline: np.ndarray, cameras: Sequence[Camera], reference: int, rig_sigma_px: float
 ) -> TripletField:
-    """The field with the positions, shapes and covariances of pieces of surface, at the texture's centre of gravity."""
+    """The field with the positions, shapes and covariances of pieces of surface, at the texture's centre of gravity.
+
+    `outline` (N,) is the share of each patch that hangs over the edge.
+    """
     base, rows, o = cameras[reference], field.grid.rows, found.offset
     curved = found.theta.shape[1] == 6
     m = monomials(o[:, 0], o[:, 1], 2 if curved else 1).astype(np.float64)
@@ -261,7 +265,7 @@ def _from_surface(
         correlation=found.correlation.min(axis=1),
         xyz_m=base.centre_m + ray / w[:, None],
         covariance_m2=ray[:, :, None] * ray[:, None] * (variance / w**4)[:, None, None]
-        + _model_covariance(ray, w, speed, around, rig_sigma_px, base),
+        + _model_covariance(ray, w, speed, outline, rig_sigma_px, base),
         residual_px=np.sqrt(square / (1 + found.seen.sum(axis=1))),
         sigma0=np.sqrt(np.sum(excess**2, axis=1) / found.seen.sum(axis=1)),
         spread=np.zeros_like(field.spread) if curved else found.spread,  # with curvatures adjusted nothing is left to correct
@@ -269,12 +273,25 @@ def _from_surface(
 
 
 def _model_covariance(
-    ray: np.ndarray, w: np.ndarray, speed: np.ndarray | float, around: NeighbourFit, rig_sigma_px: float, base: Camera
+    ray: np.ndarray, w: np.ndarray, speed: np.ndarray | float, outline: np.ndarray, rig_sigma_px: float, base: Camera
 ) -> np.ndarray:
-    """What matching cannot know of itself (N, 3, 3): the rig's own quality, what a quadric does not follow, and the body's outline."""
-    along = (rig_sigma_px / np.maximum(speed, 1e-9)) ** 2 + (SCATTER_SHARE * around.scatter) ** 2
-    side_px2 = RAY_SIGMA_PX**2 + rig_sigma_px**2 + (OUTLINE_SIGMA_PX * (1 - around.support)) ** 2
-    return ray[:, :, None] * ray[:, None] * (along / w**4)[:, None, None] + (side_px2 / (base.focal_px * w) ** 2)[:, None, None] * np.eye(3)
+    """What matching cannot know of itself (N, 3, 3): the rig's own quality, and the body's outline.
+
+    A patch of which a share `outline` (N,) hangs over the edge is drawn across the ray: off a surface that turns away there, and hardly off
+    one that faces the camera up to its edge.
+    """
+    px_m2 = 1 / (base.focal_px * w) ** 2
+    less_along = (OUTLINE_ACROSS_PX**2 - OUTLINE_ALONG_PX**2) * outline**2 * px_m2 / np.einsum("ni,ni->n", ray, ray)
+    of_ray = (rig_sigma_px / np.maximum(speed, 1e-9)) ** 2 / w**4 - less_along
+    of_all = (RAY_SIGMA_PX**2 + rig_sigma_px**2 + (OUTLINE_ACROSS_PX * outline) ** 2) * px_m2
+    return ray[:, :, None] * ray[:, None] * of_ray[:, None, None] + of_all[:, None, None] * np.eye(3)
+
+
+def _over_outline(around: NeighbourFit, grid: TemplateGrid, patch_px: int) -> np.ndarray:
+    """Which share (N,) of each patch's window lies where no neighbour is of the same surface."""
+    cells = np.arange(-RADIUS_CELLS, RADIUS_CELLS + 1) * grid.spacing_px
+    window = np.exp(-0.5 * np.add.outer(cells**2, cells**2).ravel() / (WINDOW_SIGMA * patch_px) ** 2)
+    return (1 - around.weights) @ (window / window.sum())
 
 
 def _epipolar(
@@ -315,6 +332,7 @@ def _epipolar(
     at[:, reference] = xy + found.offset
     at[:, views], A[:, views], K[:, views] = np.where(found.seen[..., None], found.xy, np.nan), found.shape, found.covariance
     square = np.sum(found.residual_px**2, axis=(1, 2))
+    outline = _over_outline(around, field.grid, settings.patch_px)
     result = replace(
         field,
         xy=at,
@@ -322,7 +340,7 @@ def _epipolar(
         covariance=K,
         correlation=found.correlation.min(axis=1),
         xyz_m=found.xyz_m,
-        covariance_m2=found.covariance_m2 + _model_covariance(ray, theta[:, 0], speed, around, rig_sigma_px, base),
+        covariance_m2=found.covariance_m2 + _model_covariance(ray, theta[:, 0], speed, outline, rig_sigma_px, base),
         residual_px=np.sqrt(square / rays),
         sigma0=np.sqrt(square / (2 * rays - 3)) / max(MIN_SIGMA_C_PX, rig_sigma_px),
         spread=found.spread,

@@ -27,7 +27,12 @@ class NeighbourFit:
 
     coefficients: np.ndarray  # (M, P)
     scatter: np.ndarray  # (M,) robust scatter of the neighbours about (1)
-    support: np.ndarray  # (M,) the share of the neighbourhood's cells that lie on (1); at an outline half of them or less
+    weights: np.ndarray  # (M, m) how far each neighbour lies on (1): 1 to 0, and 0 where there is none
+
+    @property
+    def support(self) -> np.ndarray:
+        """(M,) the share of the neighbourhood's cells that lie on (1); at an outline half of them or less."""
+        return np.asarray(self.weights.mean(axis=1))
 
 
 def neighbours_of(
@@ -82,7 +87,7 @@ def _fitted(
             robust = valid * np.clip(1 - ratio**2, 0, 1) ** 2
     c[:, 0] += base
     power = np.array([0, 1, 1, 2, 2, 2])[: m.shape[2]]
-    return NeighbourFit(coefficients=c / radius_px**power, scatter=scatter, support=robust.mean(axis=1))
+    return NeighbourFit(coefficients=c / radius_px**power, scatter=scatter, weights=robust)
 
 
 def unlike_neighbours(grid: TemplateGrid, cell: np.ndarray, parameters: np.ndarray, *, sigmas: float, least: np.ndarray) -> np.ndarray:

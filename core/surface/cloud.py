@@ -1,7 +1,7 @@
 """From triplets to a clean cloud: filters, the correction for curvature, normals and covariances.
 
 Filters (D'Apuzzo et al. 2000, §2.3): a point must agree with its neighbours and must not stand alone. The sigma of a point contains the ray
-intersection's covariance and half of the curvature correction, for what remains of it.
+intersection's covariance, what its neighbours scatter by beyond it, and half of the curvature correction, for what remains of it.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -18,6 +18,8 @@ from .local_surface import LocalSurface, local_surface
 FILTERS = ("other surface", "small island", "depth in doubt")  # what they find; why a point went is 1 + its filter's number
 IN_DOUBT = 3  # told by the images (matching/middle.py)
 REMAINING_BIAS = 0.5  # of the curvature correction
+LIMB_SCATTER = 0.06  # of the spacing on the surface: what a round limb's own shape makes neighbours scatter about a quadric
+ROUGHNESS = 0.7  # of the variance by which they scatter beyond that and beyond their own
 MAX_CORRECTION_PX = 3.0
 
 
@@ -98,9 +100,12 @@ def point_cloud(field: TripletField, grey: np.ndarray, camera: Camera, reference
     xyz, K, normal = field.xyz_m, field.covariance_m2, np.zeros((0, 3))
     if n:
         surface = local_surface(field, camera, reference)
-        normal = surface.normal
+        rays = camera.rays(field.grid.rows.to_frame(field.xy[:, reference]))
+        explained_m = LIMB_SCATTER * field.grid.spacing_px * surface.depth_m / camera.focal_px
+        normal, K = surface.normal, K + _roughness(K, rays, surface.scatter_m, explained_m)
         if settings.correct_curvature:
-            xyz, K = _corrected(field, surface, camera, reference)
+            shift = rays * _correction_m(surface, camera.focal_px)[:, None]
+            xyz, K = xyz + shift, K + REMAINING_BIAS**2 * shift[:, :, None] * shift[:, None]
     pixel = np.rint(field.xy[:, reference]).astype(int)
     return PointCloud(
         frame=frame,
@@ -113,12 +118,17 @@ def point_cloud(field: TripletField, grey: np.ndarray, camera: Camera, reference
     )
 
 
-def _corrected(field: TripletField, surface: LocalSurface, camera: Camera, reference: int) -> tuple[np.ndarray, np.ndarray]:
-    rays = camera.rays(field.grid.rows.to_frame(field.xy[:, reference]))
-    limit = MAX_CORRECTION_PX * surface.depth_m / camera.focal_px  # rounder than a body: the quadric follows noise there
-    shift = np.clip(surface.flattening_m, -limit, limit)
-    along = rays * (REMAINING_BIAS * shift)[:, None]
-    return field.xyz_m + rays * shift[:, None], field.covariance_m2 + along[:, :, None] * along[:, None, :]
+def _roughness(covariance_m2: np.ndarray, rays: np.ndarray, scatter_m: np.ndarray, explained_m: np.ndarray) -> np.ndarray:
+    """Covariance (N, 3, 3) along the rays: by how much the neighbours scatter more than their covariances and what is explained say."""
+    own = np.einsum("ni,nij,nj->n", rays, covariance_m2, rays) / np.einsum("ni,ni->n", rays, rays) ** 2
+    more = ROUGHNESS * np.maximum(0.0, scatter_m**2 - own - explained_m**2)
+    return more[:, None, None] * rays[:, :, None] * rays[:, None]
+
+
+def _correction_m(surface: LocalSurface, focal_px: float) -> np.ndarray:
+    """(N,) what is added to the depths for the curvature."""
+    limit = MAX_CORRECTION_PX * surface.depth_m / focal_px  # rounder than a body: the quadric follows noise there
+    return np.clip(surface.flattening_m, -limit, limit)
 
 
 def _island_size(field: TripletField) -> np.ndarray:

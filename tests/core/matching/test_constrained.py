@@ -10,7 +10,14 @@ import pytest
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.images.fields import RowGrid
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.constraints import constrain
+from tricap.core.matching.constraints import (
+    OUTLINE_ACROSS_PX,
+    OUTLINE_ALONG_PX,
+    RAY_SIGMA_PX,
+    _model_covariance,
+    _over_outline,
+    constrain,
+)
 from tricap.core.matching.epipolar import Epipolar
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
@@ -18,6 +25,7 @@ from tricap.core.matching.growing import GrowingSettings, TripletField, grow, ro
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
 from tricap.core.matching.middle import believed, depth_doubt, in_doubt
 from tricap.core.matching.multi_image import match_multi_image
+from tricap.core.matching.neighbourhood import NeighbourFit
 from tricap.core.matching.object_space import SurfacePrior, match_surface
 from tricap.core.matching.patch_pixels import patch_offsets
 from tricap.core.matching.seeds import sweep_seeds
@@ -237,6 +245,25 @@ def test_a_rig_that_is_half_a_pixel_off_still_helps(surfaces: ModuleType) -> Non
         rms[constraint], residual[constraint] = np.sqrt(np.mean(error[np.abs(error) < 0.02] ** 2)), np.median(found.residual_px)
     assert rms["object"] < 0.8 * rms["none"]
     assert residual["object"] < 0.8 * residual["none"]
+
+
+def test_an_outline_moves_points_across_the_ray(surfaces: ModuleType) -> None:
+    """Neighbours on one side only: what that costs is hardly said of a surface that faces the camera, and in full of one seen edge-on."""
+    base, w, grid = surfaces.cameras()[1], np.array([0.5]), template_grid((80, 100), RowGrid(), 4)
+    ray = base.rays(np.array([[40.0, 200.0]]))
+    facing = ray[0] / np.linalg.norm(ray[0])
+    edge_on = np.cross(facing, [0.0, 1.0, 0.0]) / np.linalg.norm(np.cross(facing, [0.0, 1.0, 0.0]))
+    there = (np.arange(49) % 7 < 4).astype(float)[None]
+    half, near, far = (
+        _over_outline(NeighbourFit(coefficients=np.zeros((1, 6)), scatter=np.zeros(1), weights=a), grid, 13)[0]
+        for a in (there, np.where(np.arange(49) % 7 < 6, 1.0, 0.0)[None], np.ones((1, 49)))
+    )
+    assert 0.3 < half < 0.5 and near < 0.1 * half and far == 0.0  # the window hardly reaches the last column
+    K, whole = (_model_covariance(ray, w, 100.0, np.array([share]), 0.0, base)[0] for share in (half, 0.0))
+    sigma, least = (np.array([np.sqrt(n @ k @ n) * w[0] * base.focal_px for n in (facing, edge_on)]) for k in (K, whole))
+    assert (np.linalg.eigvalsh(K) > 0).all()
+    assert least == pytest.approx(RAY_SIGMA_PX, rel=1e-3)
+    assert sigma == pytest.approx(np.hypot(RAY_SIGMA_PX, half * np.array([OUTLINE_ALONG_PX, OUTLINE_ACROSS_PX])), rel=1e-3)
 
 
 def test_points_on_which_two_ways_of_matching_disagree_are_rejected(surfaces: ModuleType) -> None:

@@ -10,7 +10,7 @@ import pytest
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.surface.cloud import PointCloud, SurfaceSettings, why_removed
+from tricap.core.surface.cloud import LIMB_SCATTER, ROUGHNESS, PointCloud, SurfaceSettings, point_cloud, why_removed
 from tricap.core.take import open_take, read_take
 
 TILT = rotation_from_vector(np.array([0.1, 0.25, 0.0]))
@@ -105,6 +105,7 @@ def test_a_rounder_bodys_sigma_tells_what_is_left(tmp_path: Path, scenes: Any) -
     distance, sigma = (k[on_it] for k in along_normal(cylinder, m.cloud))
     assert abs(np.median(distance)) < 2.5e-4
     assert np.mean(np.abs(distance) < 2 * sigma) > 0.85
+    assert 0.4 < np.sqrt(np.mean((distance / sigma) ** 2)) < 1.5
     normal = (own * [1, 0, 1])[on_it]
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True) @ cylinder.R.T
     assert np.median(np.degrees(np.arccos(np.clip((normal * m.cloud.normals[on_it]).sum(axis=1), -1, 1)))) < 5
@@ -176,3 +177,21 @@ def test_each_filter_says_what_it_took(plane_take: Path, tmp_path: Path, scenes:
     assert near.sum() >= 6 and (why[moved] == 1).all() and (why[near[near | far]] == 2).all()
     assert (why[~moved & far[near | far]] == 0).mean() > 0.97
     assert not (why_removed(kept, camera, ref, SurfaceSettings(min_island=1)) == 2).any()
+
+
+def test_neighbours_that_scatter_make_a_point_less_sure(tmp_path: Path, scenes: Any) -> None:
+    """Depths of a plane, whose noise its covariances tell: nothing is added. Rougher than that: what is more counts, along the ray."""
+    take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[scenes.Body()]], noise=0.5)
+    (m,) = scenes.measure(take, tmp_path / "out")
+    camera, sigma_m, random = scenes.three_cameras().cameras[1], 1e-3, np.random.default_rng(0)
+    ray = camera.rays(m.cloud.xy_px[:, 1])
+    depth = camera.to_camera(m.cloud.xyz_m)[:, 2]
+    explained_m = LIMB_SCATTER * m.field.grid.spacing_px * scenes.pixel_m
+    added = []
+    for scatter_m in (0.3e-3, 4e-3):
+        xyz = camera.centre_m + ray * (depth + scatter_m * random.standard_normal(len(ray)))[:, None]
+        K = sigma_m**2 * ray[:, :, None] * ray[:, None]
+        cloud = point_cloud(replace(m.field, xyz_m=xyz, covariance_m2=K), np.zeros((150, 200)), camera, 1, 0, SurfaceSettings())
+        added.append(np.einsum("ni,nij,nj->n", ray, cloud.covariance_m2 - K, ray) / np.einsum("ni,ni->n", ray, ray) ** 2)
+    assert np.abs(added[0]).max() < 1e-12
+    assert np.median(added[1]) == pytest.approx(ROUGHNESS * (4e-3**2 - sigma_m**2 - explained_m**2), rel=0.25)
