@@ -5,7 +5,8 @@
 Between Newton's steps that take it onto the surface (whole_surface) a vertex near a seam goes half way to the middle of its neighbours.
 The bones' shares are those of the parts, smoothed about the seams, or the skin would tear where one part ends. Where the surface of
 the whole folds near a seam (thighs that touch, an arm close to the flank), the mesh leaves it and goes smoothly over the fold. Where a quad
-near a seam is turned over after all, what is about it is evened out until none is.
+near a seam is turned over after all, what is about it is evened out until none is; edges along seams are rounded (seams). Where contours
+across the trunk miss what lies level, under a chin, vertices are evened out along the surface.
 """
 
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from ..values import frozen
+from .seams import faired, in_a_fold, mean_of_neighbours, turned_over, within
 from .shape import BodyShape
 from .skin import body_skin
 from .skin_mesh import SkinSettings
@@ -24,12 +26,12 @@ from .skin_weights import strongest
 from .welding import welded
 from .whole_surface import WholeSurface
 
-DETAIL = 2  # of a scene: at 32 rays the quads are 0.2 to 0.3 mm RMS from the surface, with 1 they are 0.7, being flat
+DETAIL = 2  # of a scene: at 32 rays the quads are 0.15 to 0.25 mm RMS from the surface, with 1 they are 0.7, being flat
 SEAM_RINGS = 4  # so many quads on either side of a seam are evened out
+SPARSE_M = 0.005  # … and about quads whose middle is so far from the surface
 EVENING_STEPS = 40
 UNTANGLING_STEPS = 30  # the first of them, which move vertices also across the surface
 CUT_STEPS = 2  # Newton's, from the middle of an edge or quad: a millimetre
-FOLD = 0.4  # cosine: a face that stands so steeply on what is about its corners is in a fold
 UNFOLDING_STEPS = 40
 LOOSE_RINGS = 4  # over so many quads the mesh comes back to the surface
 MENDING_STEPS = 200  # at most
@@ -74,17 +76,18 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     whole = welded(skin, body_parts(shape), surface)
     faces = np.concatenate([net_faces(net) for net in whole.nets])
     uv = face_uv(whole)
-    near = _mean_of_neighbours(faces, len(whole.vertices_m))
-    free = _within(near, whole.sewn, SEAM_RINGS)
-    vertices, loose = _unfolded(_evened(whole.vertices_m, near, free, whole.part, surface), faces, near, free)
+    near = mean_of_neighbours(faces, len(whole.vertices_m))
+    free = within(near, whole.sewn, SEAM_RINGS)
+    uneven = np.union1d(free, within(near, _sparse(whole.vertices_m, faces, whole.part, surface), SEAM_RINGS))
+    vertices, loose = _unfolded(_evened(whole.vertices_m, near, uneven, free, whole.part, surface), faces, near, free)
     weights = _smoothed(whole.weights, vertices, faces, near, free)
-    part, pieces = whole.part, detail * settings.detail
+    part, pieces, kept = whole.part, detail * settings.detail, 1 - loose
     seam = np.isin(np.arange(len(vertices)), free).astype(np.float64)
     if pieces > 1:
         vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, seam, loose]), part, faces, uv, pieces)
-        weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1:]
-        vertices = vertices + kept * (surface.reached(vertices, part, CUT_STEPS) - vertices)
-    vertices = _mended(vertices, faces, seam > 0)
+        weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1]
+        vertices = vertices + kept[:, None] * (surface.reached(vertices, part, CUT_STEPS) - vertices)
+    vertices = faired(_mended(vertices, faces, seam > 0), faces, part, kept)
     return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
 
 
@@ -95,29 +98,27 @@ def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneS
                    part=np.zeros(len(skin.vertices_m), dtype=np.int64))
 
 
-def _mean_of_neighbours(faces: np.ndarray, count: int) -> sparse.csr_matrix:
-    ends = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
-    both = np.concatenate([ends, ends[:, ::-1]])
-    joined = sparse.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), (count, count))
-    joined.data[:] = 1.0
-    return sparse.csr_matrix(sparse.diags(1.0 / np.maximum(np.asarray(joined.sum(axis=1)).ravel(), 1.0)) @ joined)
+def _sparse(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, surface: WholeSurface) -> np.ndarray:
+    """Which vertices (V,) of the trunk are corners of quads that cut short what is between them, as under the chin above a short neck.
+
+    Of limbs none: evened out, a thumb has fewer quads.
+    """
+    trunk = faces[(part[faces] == 0).all(axis=1)]
+    found = np.zeros(len(vertices), dtype=bool)
+    found[trunk[np.abs(surface.distance_m(vertices[trunk].mean(axis=1), np.zeros(len(trunk), dtype=np.int64))) > SPARSE_M]] = True
+    return found
 
 
-def _within(near: sparse.csr_matrix, chosen: np.ndarray, rings: int) -> np.ndarray:
-    """Which vertices are at most so many edges from the chosen ones."""
-    found = chosen.astype(np.float64)
-    for _ in range(rings):
-        found = np.maximum(found, near @ found > 0)
-    return np.flatnonzero(found)
-
-
-def _evened(vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, part: np.ndarray, surface: WholeSurface) -> np.ndarray:
+def _evened(vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, sewn: np.ndarray, part: np.ndarray,
+            surface: WholeSurface) -> np.ndarray:
+    """Vertices (V, 3), the free ones evened out on the surface; those about a seam first in all directions."""
     found, part = vertices.copy(), part[free]
+    along, towards = np.flatnonzero(~np.isin(free, sewn)), np.arange(len(free))
     for i in range(EVENING_STEPS if len(free) else 0):
         step = 0.5 * (near[free] @ found - found[free])
-        if i >= UNTANGLING_STEPS:
-            normals = surface.normals(found[free], part)
-            step -= np.einsum("nk,nk->n", step, normals)[:, None] * normals
+        rows = along if i < UNTANGLING_STEPS else towards
+        normals = surface.normals(found[free[rows]], part[rows])
+        step[rows] -= np.einsum("nk,nk->n", step[rows], normals)[:, None] * normals
         found[free] = surface.reached(found[free] + step, part, steps=1)
     found[free] = surface.reached(found[free], part)
     return found
@@ -131,35 +132,15 @@ def _unfolded(
     loose = np.zeros(len(vertices))
     for _ in range(UNFOLDING_STEPS):
         folded = np.zeros(len(vertices), dtype=bool)
-        folded[faces[_in_a_fold(found, faces) & may[faces].all(axis=1)]] = True
+        folded[faces[in_a_fold(found, faces) & may[faces].all(axis=1)]] = True
         if not folded.any():
             break
-        moved = np.intersect1d(_within(near, folded, 2), free)
+        moved = np.intersect1d(within(near, folded, 2), free)
         found[moved] = 0.5 * (found[moved] + near[moved] @ found)
         loose[moved] = 1.0
     for _ in range(LOOSE_RINGS):
         loose = np.maximum(loose, near @ loose)
     return found, loose
-
-
-def _in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which faces (F,) stand steeply on the mean of the faces about one of their corners."""
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    mean = np.stack([np.bincount(faces.ravel(), np.repeat(normal[:, k], 4), len(vertices)) for k in range(3)], axis=1)
-    mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    return np.asarray((np.einsum("fk,fck->fc", normal, mean[faces]) < FOLD).any(axis=1))
-
-
-def turned_over(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which quads (F,) look, at one of their corners, away from what is about that corner: flipped ones, and those folded in themselves."""
-    corner = vertices[faces]
-    normal = np.cross(np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner)
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
-    mean = np.stack([np.bincount(faces.ravel(), normal[..., k].ravel(), len(vertices)) for k in range(3)], axis=1)[faces]
-    whole = np.broadcast_to(normal.sum(axis=1, keepdims=True), normal.shape)
-    return np.asarray(((np.einsum("fck,fck->fc", normal, mean) <= 0) | (np.einsum("fck,fck->fc", whole, mean) <= 0)).any(axis=1))
 
 
 def _mended(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
@@ -169,8 +150,8 @@ def _mended(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndar
         bad = turned_over(found, faces) & may[faces].all(axis=1)
         if not bad.any():
             break
-        near = _mean_of_neighbours(faces, len(found)) if near is None else near
-        moved = _within(near, np.isin(np.arange(len(found)), faces[bad]), 1 + step // MENDING_RING)
+        near = mean_of_neighbours(faces, len(found)) if near is None else near
+        moved = within(near, np.isin(np.arange(len(found)), faces[bad]), 1 + step // MENDING_RING)
         moved = moved[may[moved]]
         found[moved] = 0.5 * (found[moved] + near[moved] @ found)
     return found

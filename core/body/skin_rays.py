@@ -12,6 +12,8 @@ parent p and child c, cut by its bisecting plane,
 so the contour at the joint lies in the bisecting plane, and the planes of the contours near it form a pencil through one line, at the
 distance D/tan(β/2) from the axis on the inner side. Rays end there, so contours never cross. Both bones give the joint the same
 contour, because e(φ) is carried over the joint by the smallest rotation; a twist of the child is spread over its length.
+
+Where flesh goes on beyond the last bone (fingers, toes) so do its contours, about a line that bends from the bone's middle to their tips.
 """
 
 from collections.abc import Sequence
@@ -20,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.rotation import rotation_from_vector
+from .metaballs import VISIBLE
 from .shape import BodyShape
 from .skin_mesh import SkinSettings
 
@@ -29,6 +32,7 @@ DEEPEST_CAP = 0.45  # … but no deeper than this fraction of a stout bone
 RADIUS_OF_L = 0.65  # seen radius of a limb of three balls / l
 TILT_NEEDED = 1.3  # reach of the tilted contours, in limb radii times tan(β/2); > 1, or contours would cross
 TILT_LEAST = 0.30  # … and at least this fraction of the bone
+BENT_FROM = 0.5  # from here on along the last bone the contours' middles go over to that of the tips
 SHARPEST_COS = -0.96  # bends beyond 164° are cut as if 164°
 
 
@@ -59,6 +63,8 @@ class Segment:
     k_tail: np.ndarray
     first: bool
     last: bool
+    beyond: float  # of the last bone: where the cap of its tips, fingers or toes, begins, over its length; counts beyond 1
+    aside: np.ndarray  # (3,) from the bone's line to the middle of their tips
 
     def tilt_reach(self, k: np.ndarray) -> float:
         """D of (1): how far from the joint contours are tilted."""
@@ -82,12 +88,23 @@ def segments_of(shape: BodyShape, chain: Sequence[int], R: np.ndarray, head: np.
             delta = float(np.arctan2(np.cross(across, carried)[1], across @ carried))
         widest = balls.radii_m[balls.bone_index == b][:, [0, 2]].max()
         ahead = chain[i + 1] if i + 1 < len(chain) else None
+        beyond, aside = _tips(shape, b) if ahead is None else (0.0, np.zeros(3))
         segments.append(Segment(
             bone=b, head=head[b], y=y, e1=R[b] @ across, length=float(shape.lengths_m[b]), radius=RADIUS_OF_L * widest,
             reach=reach, delta=delta,
             k_head=_bend(y, R[chain[i - 1], :, 1], -1) if i else np.zeros(3),
-            k_tail=_bend(y, R[ahead, :, 1], 1) if ahead is not None else np.zeros(3), first=i == 0, last=ahead is None))
+            k_tail=_bend(y, R[ahead, :, 1], 1) if ahead is not None else np.zeros(3), first=i == 0, last=ahead is None,
+            beyond=beyond, aside=R[b] @ aside))
     return segments
+
+
+def _tips(shape: BodyShape, b: int) -> tuple[float, np.ndarray]:
+    """How far along a bone, over its length, a cap of what ends farthest from its head begins; and (3,) aside, in the bone's axes."""
+    balls, own = shape.metaballs, np.flatnonzero(shape.metaballs.bone_index == b)
+    centre, half = balls.centres_m(shape.lengths_m)[own], VISIBLE * balls.radii_m[own]
+    tip = int(np.argmax(centre[:, 1] + half[:, 1]))
+    end = centre[tip, 1] + half[tip, 1] - CAP_START * half[tip, [0, 2]].min()
+    return float(end / shape.lengths_m[b]), centre[tip] * [1.0, 0.0, 1.0]
 
 
 def _reach(shape: BodyShape, chain: Sequence[int]) -> float:
@@ -116,6 +133,7 @@ def cast(segments: list[Segment], settings: SkinSettings) -> Rays:
     for segment in segments:
         inset = min(CAP_START * segment.radius / segment.length, DEEPEST_CAP)
         start, stop = inset if segment.first else 0.0, 1 - inset if segment.last else 1.0
+        stop = segment.beyond if segment.beyond > 1 else stop
         fraction = np.linspace(start, stop, settings.contours + 1)[0 if segment.first else 1:]
         if segment.first:
             rise = _cap_angles(segment, settings)
@@ -147,7 +165,8 @@ def _contours(segment: Segment, fraction: np.ndarray, rise: np.ndarray, settings
         reach = np.where(inner * reach > limit, limit / np.maximum(inner, 1e-9), reach)  # the pencil's line
     u = np.cos(rise)[:, None, None] * (e + tilt[..., None] * segment.y) + np.sin(rise)[:, None, None] * segment.y
     reach = np.where(rise[:, None] == 0, reach, np.maximum(reach, CAP_START * segment.radius + segment.length / 2))
-    origin = segment.head + a[:, None, None] * segment.y + 0 * u
+    bent = np.maximum(fraction - BENT_FROM, 0.0) / (segment.beyond - BENT_FROM) if segment.beyond > 1 else 0 * fraction
+    origin = segment.head + a[:, None, None] * segment.y + bent[:, None, None] * segment.aside + 0 * u
     return Rays(origin=origin.reshape(-1, 3), direction=u.reshape(-1, 3), reach=reach.ravel(), bone=np.full(u[..., 0].size, segment.bone),
                  station=np.repeat(a, settings.rays))
 

@@ -5,10 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
+from tricap.__main__ import main
 from tricap.core.errors import InputError
 
 from .conftest import FPS, FRAMES, SmallRun
@@ -174,6 +176,20 @@ def test_a_place_that_cannot_be_written_is_told(empty: ModuleType, small_run: Sm
         build_scene(small_run.out, tmp_path / "body.obj")
 
 
+def test_a_file_that_is_there_is_kept_as_blender_keeps_it(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    """It may be the user's own, with clicks in it; only a run's body.blend is replaced."""
+    from tricap.addon.scene.build import save_blend
+
+    for name in ("mine.blend", "body.blend"):
+        (tmp_path / name).write_text("clicks")
+        save_blend(tmp_path / name)
+        assert (tmp_path / name).with_suffix(".blend1").read_text() == "clicks" and (tmp_path / name).stat().st_size > 1000
+        (tmp_path / name).with_suffix(".blend1").unlink()
+    (tmp_path / "run.json").write_text("{}")
+    save_blend(tmp_path / "body.blend")
+    assert not list(tmp_path.glob("*.blend1"))
+
+
 def test_the_operator_builds_saves_and_keeps_the_open_file(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     assert blender.ops.tricap.build_scene(out=str(small_run.out), blend=str(tmp_path / "copy.blend")) == {"FINISHED"}
@@ -188,6 +204,19 @@ def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> 
     assert done.stdout.splitlines() == [done.stdout.strip()] and "2 bones" in done.stdout  # nothing of Blender's own
     wrong = subprocess.run([*line[:4], str(tmp_path), *line[5:]], capture_output=True, text=True, timeout=120)
     assert wrong.returncode == 2 and "Traceback" not in wrong.stderr and "no run.json" in wrong.stderr
+
+
+@pytest.mark.parametrize(("more", "said"), [
+    (["--frame", "99", "--preview", "a.png"], "--frame 99 is not among the frames 2 to 7"), (["--simplify", "-1"], "--simplify -1 is no"),
+    (["--simplify", "nan"], "is no tolerance"), (["--preview", "a.jpg"], "--preview a.jpg is no .png"),
+    (["--turntable", "a"], "is no .mp4"),
+])  # fmt: skip
+def test_what_a_scene_cannot_be_made_of_is_told_before_it_is_written(
+    empty: ModuleType, small_run: SmallRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any, more: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["scene", str(small_run.out), "--blend", "a.blend", *more, "--quiet"]) == 2
+    assert said in capfd.readouterr().err and not list(tmp_path.glob("a*"))
 
 
 def test_clips_that_were_deleted_are_made_again(empty: ModuleType, small_run: SmallRun) -> None:

@@ -6,9 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tricap.core.body.ends import person_shape
 from tricap.core.body.model_file import read_model
-from tricap.core.body.one_skin import DETAIL, OneSkin, one_skin, turned_over
-from tricap.core.body.shape import default_shape
+from tricap.core.body.one_skin import DETAIL, OneSkin, one_skin
+from tricap.core.body.seams import seam_jumps, turned_over
+from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skin import body_skin
 from tricap.core.body.skin_mesh import SkinSettings
 from tricap.core.body.skin_weights import MOST_BONES, hinge, strongest
@@ -18,6 +20,14 @@ from tricap.core.body.whole_surface import WholeSurface
 @cache
 def skin_of(model: str, detail: int = 1) -> OneSkin:
     return one_skin(default_shape(read_model(model)), SkinSettings(), detail)
+
+
+def with_thighs(thickness: float) -> BodyShape:
+    """A whole body with thighs so many times as thick."""
+    shape = default_shape(read_model("full"))
+    thigh = np.array([shape.skeleton.bones[b].name.startswith("thigh") for b in shape.metaballs.bone_index])
+    radii_m = np.where(thigh[:, None], thickness, 1.0) * shape.metaballs.radii_m
+    return replace(shape, metaballs=replace(shape.metaballs, radii_m=radii_m))
 
 
 def face_normals(skin: OneSkin) -> np.ndarray:
@@ -39,11 +49,7 @@ def test_it_is_closed_and_faces_outwards(model: str, detail: int) -> None:
 
 def test_thighs_that_touch_leave_no_fold_between_them() -> None:
     """Thighs a sixth thicker, which are one at the crotch: no two faces along a common edge turn against each other."""
-    shape = default_shape(read_model("full"))
-    balls, bones = shape.metaballs, shape.skeleton.bones
-    thigh = np.array([bones[b].name.startswith("thigh") for b in balls.bone_index])
-    thick = replace(shape, metaballs=replace(balls, radii_m=np.where(thigh[:, None], 1.15, 1.0) * balls.radii_m))
-    skin = one_skin(thick, SkinSettings())
+    skin = one_skin(with_thighs(1.15), SkinSettings())
     normals = face_normals(skin) / np.linalg.norm(face_normals(skin), axis=1, keepdims=True)
     edges = np.sort(np.concatenate([skin.faces[:, [i, (i + 1) % 4]] for i in range(4)]), axis=1)
     order = np.lexsort(edges.T)
@@ -57,31 +63,56 @@ def test_seams_are_on_the_surface_and_the_parts_skin_is_kept_elsewhere() -> None
     parts = {tuple(v) for v in body_skin(shape, rest, SkinSettings()).vertices_m.round(9).tolist()}
     made = np.array([tuple(v) not in parts for v in skin.vertices_m.round(9).tolist()])
     off = np.abs(WholeSurface(shape, rest).distance_m(skin.vertices_m, skin.part))
-    assert 0.1 < made.mean() < 0.6 and np.sqrt((off[made] ** 2).mean()) < 1e-4 and off[made].max() < 1e-3  # measured 0.02 and 0.45 mm
+    assert 0.1 < made.mean() < 0.6 and np.sqrt((off[made] ** 2).mean()) < 0.15e-3 and off[made].max() < 1e-3  # measured 0.08 and 0.67 mm
 
 
 def test_limbs_leave_the_trunk_without_an_edge() -> None:
-    """Across an edge between two parts the normal turns by no more than 5° other than across the edges beside; it did by 84° in armpits."""
-    skin = skin_of("upper_body", DETAIL)
-    edges = np.stack([skin.faces, np.roll(skin.faces, -1, axis=1)], axis=-1)  # (F, 4, 2)
-    face_of = {tuple(edge): (f, i) for f, four in enumerate(edges.tolist()) for i, edge in enumerate(four)}
-    normals, middle = face_normals(skin), skin.vertices_m[skin.faces].mean(axis=1)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    part = np.array([np.bincount(own).argmax() for own in skin.part[skin.faces]])
+    """The normal turns by no more than 5° other than beside; it did by 84° in armpits, and with few points by 12 and 15° at the crotch."""
+    few = SkinSettings(rays=16, contours=5, cap_contours=2)
+    coarse = [one_skin(with_thighs(thickness), few, DETAIL) for thickness in (1.0, 1.1)]  # beside each other, and pressed together
+    for skin in (skin_of("upper_body", DETAIL), *coarse):
+        jumps = np.degrees(seam_jumps(skin.vertices_m, skin.faces, skin.part))
+        assert (jumps > 0).sum() > 200 and jumps.max() < 5.0
 
-    def turn(f: int, i: int) -> float:
-        """Of the normal over edge i of face f, in degrees, valleys positive."""
-        a, b = edges[f, i].tolist()
-        g = face_of[b, a][0]
-        angle = np.degrees(np.arccos(np.clip(normals[f] @ normals[g], -1, 1)))
-        return float(angle * np.sign((middle[g] - middle[f]) @ normals[f]))
 
-    jumps = []
-    for (a, b), (f, i) in face_of.items():
-        g, j = face_of[b, a]
-        if a < b and part[f] != part[g]:
-            jumps.append(abs(turn(f, i) - (turn(f, (i + 2) % 4) + turn(g, (j + 2) % 4)) / 2))
-    assert len(jumps) > 100 and max(jumps) < 5.0
+def test_a_jump_is_the_turn_less_that_of_the_edges_beside() -> None:
+    """A prism of 12 sides, closed: between its sides the normal turns by 30° everywhere; drawn out at one corner it turns by more."""
+    angle = np.arange(12) * np.pi / 6
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    vertices = np.concatenate([ring, ring + [0, 0, 1], [[0, 0, 0], [0, 0, 1]]])
+    i = np.arange(12)
+    sides = np.stack([i, (i + 1) % 12, (i + 1) % 12 + 12, i + 12], axis=1)
+    k = np.arange(0, 12, 2)
+    below = np.stack([np.full(6, 24), (k + 2) % 12, k + 1, k], axis=1)
+    above = np.stack([np.full(6, 25), k + 12, k + 13, (k + 2) % 12 + 12], axis=1)
+    faces = np.concatenate([sides, below, above])
+    part = np.isin(np.arange(26) % 12, (3, 4, 5, 6, 7, 8)).astype(np.int64)
+    upright = np.degrees(seam_jumps(vertices, faces, part))[:12, [1, 3]]
+    assert upright.max() < 1e-6
+    vertices[[2, 14], :2] *= 1.1  # an edge between the parts is drawn out
+    upright = np.degrees(seam_jumps(vertices, faces, part))[:12, [1, 3]]
+    assert (upright > 10).sum() == 2  # seen from both its quads
+
+
+def test_hands_are_as_near_to_the_surface_as_the_rest() -> None:
+    """Contours go on to the fingers' tips; when those were left to the end's cap, hands were 0.8 mm off, and 20 quads turned over there."""
+    shape = person_shape(default_shape(read_model("upper_body")))
+    skin = one_skin(shape, SkinSettings(), DETAIL)
+    assert rms_of_quads(shape, skin) < 0.2e-3 and not turned_over(skin.vertices_m, skin.faces).any()  # measured 0.164 mm; it was 0.244
+    hands = np.isin(skin.weights.argmax(axis=1), [i for i, name in enumerate(skin.bone_names) if name.startswith("hand")])
+    assert rms_of_quads(shape, skin, hands) < 0.4e-3
+
+
+def test_the_throat_above_a_short_neck_is_on_the_surface() -> None:
+    """A neck of 3 cm: the head's underside is level there, contours across miss it, and their quads were 5 mm off until evened out."""
+    shape = person_shape(default_shape(read_model("upper_body")))
+    balls, names = shape.metaballs, [bone.name for bone in shape.skeleton.bones]
+    stout = np.array([{"neck": 0.8, "head": 1.1}.get(names[b], 1.0) for b in balls.bone_index])
+    short = replace(shape, lengths_m=np.where(np.array(names) == "neck", 0.03, shape.lengths_m),
+                    metaballs=replace(balls, radii_m=stout[:, None] * balls.radii_m))
+    skin = one_skin(short, SkinSettings(), DETAIL)
+    throat = np.isin(skin.weights.argmax(axis=1), [names.index(name) for name in ("chest", "neck", "head")])
+    assert rms_of_quads(short, skin, throat) < 0.25e-3  # measured 0.21 mm; 0.32
 
 
 def test_quads_that_are_turned_over_are_mended() -> None:
@@ -91,13 +122,17 @@ def test_quads_that_are_turned_over_are_mended() -> None:
     assert not turned_over(square, faces).any()
     square[4] = 0.5, 0.6, 0.0
     assert turned_over(square, faces)[1]
-    shape = default_shape(read_model("full"))
-    thigh = np.array([shape.skeleton.bones[b].name.startswith("thigh") for b in shape.metaballs.bone_index])
-    balls = replace(shape.metaballs, radii_m=np.where(thigh[:, None], 1.3, 1.0) * shape.metaballs.radii_m)
-    skin = one_skin(replace(shape, metaballs=balls), SkinSettings())
-    hands = [i for i, name in enumerate(skin.bone_names) if name.startswith("hand")]  # the tips' fans are as they were
-    about = skin.weights[:, hands].sum(axis=1)[skin.faces].max(axis=1) < 0.5
-    assert not turned_over(skin.vertices_m, skin.faces)[about].any()
+    skin = one_skin(with_thighs(1.3), SkinSettings())
+    assert not turned_over(skin.vertices_m, skin.faces).any()
+
+
+def rms_of_quads(shape: BodyShape, skin: OneSkin, of: np.ndarray | None = None) -> float:
+    """How far the middles of the quads, or of those `of` (V,) vertices, are from the surface, weighted by area."""
+    chosen = np.ones(len(skin.faces), dtype=bool) if of is None else of[skin.faces].all(axis=1)
+    area, faces = np.linalg.norm(face_normals(skin), axis=1)[chosen], skin.faces[chosen]
+    surface = WholeSurface(shape, np.zeros(len(shape.skeleton.dof_names)))
+    off = surface.distance_m(skin.vertices_m[faces].mean(axis=1), skin.part[faces[:, 0]])
+    return float(np.sqrt((area * off**2).sum() / area.sum()))
 
 
 def test_cut_finer_it_is_the_same_surface() -> None:
@@ -110,10 +145,7 @@ def test_cut_finer_it_is_the_same_surface() -> None:
 def test_a_scenes_quads_are_near_the_surface() -> None:
     """At 32 points a ring and a scene's own detail; 0.17 mm RMS, with half as many 0.7."""
     shape, skin = default_shape(read_model("upper_body")), skin_of("upper_body", DETAIL)
-    corner = skin.vertices_m[skin.faces]
-    area = np.linalg.norm(face_normals(skin), axis=1)
-    off = WholeSurface(shape, np.zeros(len(shape.skeleton.dof_names))).distance_m(corner.mean(axis=1), skin.part[skin.faces[:, 0]])
-    assert np.sqrt((area * off**2).sum() / area.sum()) < 0.3e-3
+    assert rms_of_quads(shape, skin) < 0.2e-3
 
 
 def test_both_sides_are_mirror_images() -> None:
