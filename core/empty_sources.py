@@ -1,7 +1,8 @@
 """Where the views show the still background and so no part of the person, for the fit.
 
-A pixel is empty when it shows what it shows most of the time (`images.background`). What stands still may also be the person: nothing
-is empty near a measured point, nor along the clicked limbs if the pixels there have not changed since the click.
+A pixel is empty when it shows what it shows when no measured point is near, or most of the time (`images.background`). What stands still
+most of the time may also be the person: of that, nothing is empty near a measured point, nor along the clicked limbs if the pixels there
+have not changed since the click.
 """
 
 from collections.abc import Sequence
@@ -20,6 +21,8 @@ from .take import Footage, Seeds
 
 SAMPLES = 11  # frames for the background
 STEP_PX, UNIT_PX = 4, 0.5
+SPECK = 9  # squares: noise in one window of the comparison spoils no more
+STILL = 0.25  # of a limb's line shows the background, if the limb stands still
 LIMB_M = 0.06  # nothing is empty so near to a measured point or a clicked limb
 
 
@@ -31,37 +34,53 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
         Cancelled: the user asked to stop.
     """
     frames = np.array([cloud.frame for cloud in clouds])
-    backgrounds = still_backgrounds(footage, frames)
+    backgrounds = still_backgrounds(footage, frames, clouds)
     distances = [Packed() for _ in backgrounds]
     if any(b is None for b in backgrounds):
         return []
     known = [b for b in backgrounds if b is not None]
-    persons = _clicked_limbs(footage, known)
+    persons, bare = _clicked_limbs(footage, known), [_coarse(b.bare) if b.bare is not None else np.False_ for b in known]
     for t, cloud in enumerate(clouds):
         monitor.step("background", t, len(clouds))
         for k, (camera, image) in enumerate(zip(footage.rig.cameras, footage.read(cloud.frame))):
-            empty = _coarse(known[k].shown_by(image)) & ~persons[k] & ~_near(camera, cloud.xyz_m, persons[k].shape)
+            apart = bare[k] | ~_near(camera, cloud.xyz_m, persons[k].shape)
+            empty = _shown(known[k], image) & ~persons[k] & apart
             far = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) * (STEP_PX / UNIT_PX)
             distances[k].append(np.minimum(far, 255).astype(np.uint8))
     return [EmptyView(view=view.name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
             for view, d in zip(footage.take.views, distances)]
 
 
-def still_backgrounds(footage: Footage, frames: np.ndarray) -> list[Background | None]:
+def still_backgrounds(footage: Footage, frames: np.ndarray, clouds: Sequence[PointCloud] | None = None) -> list[Background | None]:
     """The still background of every view, from some of the frames (T,); None where they are too few to tell.
+
+    `clouds` (T,): what was measured of the person. A frame in which that is nothing does not tell where the background shows.
 
     Raises:
         InputError: an image cannot be read.
     """
-    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int))].tolist()
-    return [still_background([s.read(footage.number(k, frame)) for frame in chosen]) for k, s in enumerate(footage.sequences)]
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int)).tolist()
+    persons = [] if clouds is None else [clouds[t].xyz_m for t in chosen]
+    found = []
+    for k, (s, camera) in enumerate(zip(footage.sequences, footage.rig.cameras)):
+        images = [s.read(footage.number(k, int(frames[t]))) for t in chosen]
+        near = [_near_pixels(camera, xyz_m, images[0].shape) for xyz_m in persons] if any(map(len, persons)) else None
+        found.append(still_background(images, near))
+    return found
 
 
 def _coarse(mask: np.ndarray) -> np.ndarray:
-    """The squares of `STEP_PX` that lie wholly in a mask (h, w), less single specks of what does not."""
-    whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    """The squares of `STEP_PX` that lie wholly in a mask (h, w)."""
     h, w = (n // STEP_PX * STEP_PX for n in mask.shape)
-    return np.asarray(whole[:h, :w].reshape(h // STEP_PX, STEP_PX, w // STEP_PX, STEP_PX).all(axis=(1, 3)))
+    return np.asarray(mask[:h, :w].reshape(h // STEP_PX, STEP_PX, w // STEP_PX, STEP_PX).all(axis=(1, 3)))
+
+
+def _shown(background: Background, image: np.ndarray) -> np.ndarray:
+    """The squares (h, w) in which an image shows the background, and the specks between them that are smaller than a hand."""
+    whole = _coarse(background.shown_by(image))
+    _, label, stats, _ = cv2.connectedComponentsWithStats((~whole).astype(np.uint8), connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] < SPECK
+    return np.asarray(whole | small[label])
 
 
 def _near(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -77,24 +96,39 @@ def _near(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarr
     return cv2.dilate(seen, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))).astype(bool)
 
 
+def _near_pixels(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Pixels (h, w) near the images of points (N, 3); all of them where there are none."""
+    if not len(xyz_m):
+        return np.ones(shape, dtype=bool)
+    squares = _near(camera, xyz_m, tuple(-(-n // STEP_PX) for n in shape))
+    return squares.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[: shape[0], : shape[1]]
+
+
 def _clicked_limbs(footage: Footage, backgrounds: Sequence[Background]) -> list[np.ndarray]:
-    """Squares (h, w) of every view along clicked limbs that look in the click's frame as they do most of the time."""
+    """Squares (h, w) of every view along the clicked limbs whose middle looks in the click's frame as it does most of the time."""
     take = footage.take
     masks = [np.zeros(_coarse(b.grey > 0).shape, bool) for b in backgrounds]
     skeleton = read_model(str(take.body_model)).skeleton
     for clicked in (take.seeds, *take.keyframes):
         if clicked.joints and clicked.frame in footage.frames:
             for mask, view, background, image in zip(masks, take.views, backgrounds, footage.read(clicked.frame)):
-                mask |= _limbs(skeleton, clicked, view.name, mask.shape) & _coarse(background.shown_by(image))
+                _add_still(mask, _lines(skeleton, clicked, view.name), _shown(background, image))
     return masks
 
 
-def _limbs(skeleton: Skeleton, clicked: Seeds, view: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Squares along the lines between clicked joints; a quarter of the mean line's length wide."""
+def _lines(skeleton: Skeleton, clicked: Seeds, view: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """From clicked joint to clicked joint, in squares."""
     at = {joint: pixels[view] / STEP_PX for joint, pixels in clicked.joints.items() if view in pixels}
-    lines = [(at[b.head_joint], at[b.tail_joint]) for b in skeleton.bones if b.head_joint in at and b.tail_joint in at]
-    drawn = np.zeros(shape, np.uint8)
-    width = max(2, round(0.5 * float(np.mean([np.linalg.norm(a - b) for a, b in lines])))) if lines else 1
-    for a, b in lines:
-        cv2.line(drawn, tuple(np.rint(a).astype(int).tolist()), tuple(np.rint(b).astype(int).tolist()), 1, width)
-    return drawn.astype(bool)
+    return [(at[b.head_joint], at[b.tail_joint]) for b in skeleton.bones if b.head_joint in at and b.tail_joint in at]
+
+
+def _add_still(mask: np.ndarray, lines: Sequence[tuple[np.ndarray, np.ndarray]], shown: np.ndarray) -> None:
+    """Add to a mask (h, w) the lines along which the background shows, half the lines' mean length wide."""
+    if not lines:
+        return
+    width = max(2, round(0.5 * float(np.mean([np.linalg.norm(a - b) for a, b in lines]))))
+    for line in lines:
+        a, b = (np.rint(end).astype(int).tolist() for end in line)
+        middle, band = (cv2.line(np.zeros(mask.shape, np.uint8), a, b, 1, wide) > 0 for wide in (1, width))
+        if (shown & middle).sum() > STILL * middle.sum():
+            mask |= band

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from .body.model_file import read_model, with_limits
 from .contour_table import ContourTable
 from .errors import InputError
+from .fitting.clicks import enough, read_clicks
 from .fitting.fit_input import ClickedAt, EmptyView, FitInput, JointPlaces, Outline
+from .fitting.settings import FitSettings
 from .keypoint_sources import KeypointSource
 from .motion.c3d import read_c3d
 from .motion.keypoints_json import natural_order, read_keypoints
@@ -57,6 +60,23 @@ def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Traj
 def clicks_in(footage: Footage) -> dict[int, ClickedAt]:
     """The clicked joints in the footage's frames, by frame."""
     return {s.frame: _clicked(s) for s in _with_joints(footage.take) if s.frame in footage.frames}
+
+
+def check_body(footage: Footage, settings: FitSettings) -> None:
+    """See that clicks and degrees of freedom are those of the body that is wanted, before anything is computed for hours.
+
+    Raises:
+        InputError: the model has no such degree of freedom, clicks contradict each other, or too few joints are clicked.
+    """
+    take, clicks = footage.take, clicks_in(footage)
+    if missing_for_fit(footage):
+        return
+    model = with_limits(read_model(str(take.body_model)), take.limits, take.locked)
+    names = model.skeleton.joint_names
+    places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
+    if not take.keypoints:
+        best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
+        enough(places.get(take.seeds.frame, places[best]), names, [])
 
 
 def missing_for_fit(footage: Footage) -> str:

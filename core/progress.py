@@ -29,6 +29,15 @@ class Monitor:
         if self._report is not None:
             self._report(stage, done, total)
 
+    def check(self) -> None:
+        """Nothing new is to be said, but somebody may have asked to stop; for loops within a step.
+
+        Raises:
+            Cancelled: `cancel()` was called.
+        """
+        if self.cancelled:
+            raise Cancelled("Stopped.")
+
     def part(self, stage: str, index: int, total: int) -> "Monitor":
         """A monitor for part `index` of `total`: what it reports counts as a fraction of that part, and it is cancelled with this one."""
         return _Part(self, stage, index, total)

@@ -15,6 +15,7 @@ from typing import Any
 from . import following, measuring, store
 from .body.model_file import model_files
 from .errors import InputError
+from .fitting.settings import ALGORITHM
 from .settings import to_table
 from .take import Footage, Seeds, Take, View
 
@@ -55,7 +56,7 @@ def _fitted(footage: Footage) -> Any:
     take = footage.take
     model = take.body_model
     own = store.digest(*model_files(model)) if model and Path(model).is_file() else ""
-    return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take)
+    return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take), ALGORITHM
 
 
 CONCERNS: dict[str, Concern] = {

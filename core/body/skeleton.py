@@ -154,7 +154,7 @@ class Skeleton:
     @cached_property
     def moved_by(self) -> np.ndarray:
         """(B, D) whether a DOF moves a bone."""
-        return self._ancestors[:, self.dof_bone]
+        return self.ancestors[:, self.dof_bone]
 
     @cached_property
     def offset_by(self) -> np.ndarray:
@@ -219,7 +219,8 @@ class Skeleton:
         return tuple(where[joint] for joint in self.joint_names)
 
     @cached_property
-    def _ancestors(self) -> np.ndarray:
+    def ancestors(self) -> np.ndarray:
+        """(B, B) whether the second bone is the first, or what it hangs on."""
         table = np.eye(len(self.bones), dtype=bool)
         for b, p in enumerate(self.parents):
             if p >= 0:

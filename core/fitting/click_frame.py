@@ -26,6 +26,7 @@ SUSPICIOUS = 3.0  # sigma0 of a posture behind the limb or beside it
 ALTERNATIONS, ALTERNATION_STEPS = 8, 5
 OTHERS_AROUND, AROUND_RAD, AROUND_M = 6, float(np.radians(20.0)), 0.05  # of new starts: six found the true arm in all of 20 trials
 MOST_OTHERS = 12  # of the starts for limbs that nobody clicked, those that explain most points
+STAGE = "fit the click frame"
 DEPTH_SHIFT_M = 0.04  # clicks from a short base are least certain along the view
 
 
@@ -35,52 +36,64 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     Raises:
         InputError: neither measured points nor outlines lie near the clicked joints, and there are no keypoints.
     """
+    monitor.step(STAGE, 0, 1)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     best, best_support = None, -1.0
-    starts = _starts(fit, points, clicked.motion[0], clicked.vector)
-    for i, motion in enumerate(starts):
-        monitor.step("fit the click frame", i, len(starts))
-        solution = fit_posture_and_shape(fit, points, motion, clicked.vector)
+    starts = _starts(fit, points, clicked.motion[0], clicked.vector, monitor)
+    parts = [monitor.part(STAGE, i, len(starts) + 1) for i in range(len(starts) + 1)]
+    for part, motion in zip(parts, starts):
+        solution = fit_posture_and_shape(fit, points, motion, clicked.vector, part)
         support = fit.support(fit.click, points, solution.motion[0], solution.vector)
         if support > best_support:
             best, best_support = solution, support
     if best is None or (best_support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
         raise InputError(f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
                          "rig, or click in a frame where the limb was measured.")
-    return _with_lost_limbs(fit, points, best, best_support)
+    return _with_lost_limbs(fit, points, best, best_support, parts[-1])
 
 
-def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_support: float) -> Solution:
+def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_support: float, monitor: Monitor) -> Solution:
     """The solution, or one from where a limb without points explains points that nothing else does.
 
     Clicks from a short base leave a limb's depth open: bent towards the cameras and away from them look alike.
     """
-    for start in found_again(fit, points, best.motion[0], best.vector):
-        solution = fit_posture_and_shape(fit, points, start, best.vector)
+    found = found_again(fit, points, best.motion[0], best.vector, _try(monitor, 0))
+    for i, start in enumerate(found):
+        solution = fit_posture_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
         support = fit.support(fit.click, points, solution.motion[0], solution.vector)
         if support > best_support + fit.settings.min_points / 4:
             best, best_support = solution, support
     return best
 
 
-def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
+def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray,
+                          monitor: Monitor | None = None) -> Solution:
     """From a motion (D,) and shape (S,) to the points and outlines.
 
     When the residuals stay suspiciously large, again from the posture of the clicks and from others around it; the best supported is kept.
+
+    Raises:
+        Cancelled: the user asked to stop.
     """
-    best = _to_surface(fit, points, motion, vector)
+    monitor = monitor or Monitor()
+    best = _to_surface(fit, points, motion, vector, _try(monitor, 0))
     if _plausible(best):
         return best
     best_support = fit.support(fit.click, points, best.motion[0], best.vector)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
-    for start in _around(fit, clicked.motion[0]):
-        solution = _to_surface(fit, points, start, clicked.vector)
+    for i, start in enumerate(_around(fit, clicked.motion[0])):
+        solution = _to_surface(fit, points, start, clicked.vector, _try(monitor, i + 1))
         support = fit.support(fit.click, points, solution.motion[0], solution.vector)
         if support > best_support:
             best, best_support = solution, support
         if _plausible(best):
             break
     return best
+
+
+def _try(monitor: Monitor, number: int) -> Monitor:
+    """The monitor of one of several tries, of which nobody knows how many it will take: each counts for half of what is left."""
+    return monitor.part(STAGE, 2 ** (number + 1) - 2, 2 ** (number + 1))
 
 
 def _plausible(solution: Solution) -> bool:
@@ -99,19 +112,22 @@ def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
     return np.concatenate([motion[None], within])
 
 
-def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> Solution:
+def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> Solution:
     """First the posture, then posture and shape, together or in turns as published: each holds the other."""
     near = crop(points, fit.parameters.state(motion, vector), REACH_M)
-    solution = solve(fit.problem(_observe(fit, near, WIDE)), motion[None], vector, steps=POSE_STEPS, furthest=FURTHEST)
+    ways = 2 if fit.settings.method == "joint" else 2 * ALTERNATIONS
+    parts = iter([monitor.part(STAGE, i, 1 + ways) for i in range(1 + ways)])
+    begun = fit.problem(_observe(fit, near, WIDE))
+    solution = solve(begun, motion[None], vector, steps=POSE_STEPS, furthest=FURTHEST, monitor=next(parts))
     if fit.settings.method == "joint":
-        for wide in (WIDE, 1.0):
+        for wide, part in zip((WIDE, 1.0), parts):
             problem = fit.problem(_observe(fit, near, wide), "shape")
-            solution = solve(problem, solution.motion, solution.vector, steps=STEPS, scales=solution.scales)
+            solution = solve(problem, solution.motion, solution.vector, steps=STEPS, scales=solution.scales, monitor=part)
         return solution
     for _ in range(ALTERNATIONS):
-        for free in ("shape", None):
+        for free, part in zip(("shape", None), parts):
             problem = fit.problem(_observe(fit, near, 1.0), free, hold_motion=free is not None)
-            solution = solve(problem, solution.motion, solution.vector, steps=ALTERNATION_STEPS, scales=solution.scales)
+            solution = solve(problem, solution.motion, solution.vector, steps=ALTERNATION_STEPS, scales=solution.scales, monitor=part)
     return solution
 
 
@@ -125,10 +141,13 @@ def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) ->
     return solution.vector[lengths], np.where(between, np.sqrt(np.diag(covariance)[lengths]), np.inf)
 
 
-def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> list[np.ndarray]:
+def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> list[np.ndarray]:
     others = other_postures(fit.parameters, fit.clicks, motion)
     if len(others) > MOST_OTHERS:
-        support = [fit.support(fit.click, points, other, vector) for other in others]
+        support = []
+        for other in others:
+            monitor.step(STAGE, 0, 1)
+            support.append(fit.support(fit.click, points, other, vector))
         others = [others[i] for i in np.argsort(support)[::-1][:MOST_OTHERS]]
     starts = [motion, *others]
     view = np.mean([camera.R_cam_world[2] for camera in fit.cameras], axis=0)

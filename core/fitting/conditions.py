@@ -1,7 +1,7 @@
 """What stays the same throughout one fit: the model, the clicks, what is believed beforehand, and how points become observations."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import cast
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ..body.model_file import BodyModel
 from ..geometry.camera import Camera
+from ..progress import Monitor
 from .acceleration import Acceleration
 from .bone_lengths import proportions
 from .clicks import Clicks
@@ -50,6 +51,7 @@ class Conditions:
     silhouettes: Silhouettes
     empty: EmptyViews
     limbs: LimbsApart
+    monitor: Monitor = field(default_factory=Monitor)  # asked within the steps whether to stop
 
     def stretch(self, frames: Sequence[int]) -> "Conditions":
         """The same for some of the frames, which count from 0 then; only `click` stays the index in the recording."""
@@ -127,7 +129,7 @@ class Conditions:
         shape = self.parameters.layout.set(free) if free else NO_SHAPE
         held = np.arange(len(self.model.skeleton.dofs)) if hold_motion else self.model.skeleton.held
         return Problem(parameters=self.parameters, observe=observe, of_shape=self.of_shape(), free_shape=shape, smoothness=smoothness,
-                       held=held, robust=self.settings.robust, robust_width=self.settings.robust_width)
+                       held=held, robust=self.settings.robust, robust_width=self.settings.robust_width, monitor=self.monitor)
 
     def support(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
         """How many points and rays of frame index `t` a body explains: the sum of their weights at a fixed width."""

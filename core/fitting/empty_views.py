@@ -1,6 +1,7 @@
 """Where the views show the background, frame by frame, as observations of a body: no limb is there.
 
-Only limbs whose posture must be seen: a hand that the model holds straight would pull its forearm.
+Only limbs whose posture must be seen; and of a hand, which the model believes to be straight, the middle, less exactly: the tip of one that
+is bent would pull its forearm.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from .settings import FitSettings
 from .state import ShapeParameters, free_bones
 
 ALONG = (0.2, 0.5, 0.8, 1.0)  # where on a bone's axis
+MIDDLE, BENT = 0.5, 3.0  # where on a hand's, and how many of the outline's sigmas it may be wrong
 
 
 class EmptyViews:
@@ -23,11 +25,15 @@ class EmptyViews:
     def __init__(self, given: FitInput, parameters: ShapeParameters, settings: FitSettings) -> None:
         skeleton = parameters.skeleton
         names = {joint: i for i, joint in enumerate(skeleton.joint_names)}
-        limbs = [bone for bone, free in zip(skeleton.bones, free_bones(parameters)) if free]
-        self._head = np.repeat([names[bone.head_joint] for bone in limbs], len(ALONG))
-        self._tail = np.repeat([names[bone.tail_joint] for bone in limbs], len(ALONG))
-        self._fraction = np.tile(ALONG, len(limbs))
-        self._given, self._sigma_px = (given.empty if settings.use_background else ()), settings.empty_sigma_px
+        free = free_bones(parameters)
+        ends = ~free & free[skeleton.parents] & ~np.isin(np.arange(len(free)), skeleton.parents)
+        places = [(bone, along, 1.0) for bone, seen in zip(skeleton.bones, free) if seen for along in ALONG]
+        places += [(bone, MIDDLE, BENT) for bone, last in zip(skeleton.bones, ends) if last and bone.dofs]
+        self._head = np.array([names[bone.head_joint] for bone, _, _ in places], dtype=np.intp)
+        self._tail = np.array([names[bone.tail_joint] for bone, _, _ in places], dtype=np.intp)
+        self._fraction = np.array([along for _, along, _ in places])
+        self._sigma_px = settings.empty_sigma_px * np.array([wider for _, _, wider in places])
+        self._given = given.empty if settings.use_background else ()
         self._rig, self._frames = given.rig, given.frames
 
     def stretch(self, frames: Sequence[int]) -> "EmptyViews":

@@ -28,6 +28,7 @@ COASTING = 5  # after so many frames without points the prediction stands still
 REACH_M = 0.20  # of the points looked at in one frame
 MOST_POINTS = 1000  # of a frame: enough for a start of the adjustment over the sequence
 SLOWING = 0.7  # per frame, of what is not seen
+STAGE = "fit frame after frame"
 WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per frame, and at most
 
 
@@ -42,10 +43,11 @@ def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, f
     way = way.goes_on(kept.load("way") if kept else None)
     ahead, back = [(t, 1) for t in range(fit.click + 1, T)], [(t, -1) for t in range(fit.click - 1, -1, -1)]
     for t, direction in [*ahead, *back][way.done - 1 :]:
-        monitor.step("fit frame after frame", way.done, T)
+        part = monitor.part(STAGE, way.done, T)
+        part.step(STAGE, 0, 1)
         if t == fit.click + direction:
             way.support, way.seen, way.unseen = None, [fit.click], at_click
-        _step(fit, way, t, direction, points[t], time_s, first, tracks)
+        _step(fit, way, t, direction, points[t], time_s, first, tracks, part)
         way.done += 1
         if kept is not None and way.done % KEEP_EVERY == 0:
             kept.save("way", way.arrays())
@@ -55,21 +57,27 @@ def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, f
 
 
 def _step(fit: Conditions, way: Way, t: int, direction: int, points: CloudPoints, time_s: np.ndarray, first: Solution,
-          tracks: MaterialTracks | None) -> None:
+          tracks: MaterialTracks | None, monitor: Monitor) -> None:
     """The posture of frame t from that of the frame before."""
     motion, seen = way.motion, way.seen
     before = fit.parameters.state(motion[t - direction], first.vector)
     moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else []
-    near = _some(crop(points, before, REACH_M))
+    near = _some(crop(points, before, _reach(fit, before)))
     predictions = _predictions(motion, time_s, seen, t, np.where(_came_out(way.known, seen), 0.0, _slowing(fit, way.unseen)))
     wide = 1 + np.minimum(WIDENING * way.unseen, WIDEST - 1)
-    motion[t], found = _next_posture(fit, t, near, moved, predictions, first, way.support, wide)
+    motion[t], found = _next_posture(fit, t, near, moved, predictions, first, way.support, wide, monitor)
     way.known[t] = False
     if found is not None:
         way.support = found
         seen.append(t)
         way.unseen = _unseen(fit, t, near, motion[t], first.vector, way.unseen)
         way.known[t] = _slowing(fit, way.unseen) == 1
+
+
+def _reach(fit: Conditions, state: BodyState) -> np.ndarray:
+    """How far from each bone (B,) points are looked at: about a limb, as far as what hangs on it may have swung."""
+    hanging = state.skeleton.ancestors.T @ state.lengths_m
+    return np.where(free_bones(fit.parameters) & (state.skeleton.parents >= 0), np.maximum(hanging, REACH_M), REACH_M)
 
 
 def _some(points: CloudPoints) -> CloudPoints:
@@ -112,7 +120,7 @@ def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, di
 
 
 def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[StepsFromFixed], predictions: list[np.ndarray], first: Solution,
-                  last_support: float | None, wide: np.ndarray) -> tuple[np.ndarray, float | None]:
+                  last_support: float | None, wide: np.ndarray, monitor: Monitor) -> tuple[np.ndarray, float | None]:
     """The posture (D,) of frame index `i` and its support; None if the frame shows too little, and the posture is the prediction."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
@@ -126,7 +134,7 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
             return [*fit.seen_surface(i, points, state, wide, held), *fit.joints(i), *fit.empty.observe(i), *moved, prior,
                     *fit.beliefs(state)]
 
-        solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales)
+        solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales, monitor=monitor)
         return solution.motion[0], fit.support(i, points, solution.motion[0], first.vector)
 
     for start in predictions:
@@ -135,7 +143,7 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
             best, best_support = posture, support
         if last_support is None or best_support > LOST_SUPPORT * last_support:
             break
-    for start in found_again(fit, points, best, first.vector):
+    for start in found_again(fit, points, best, first.vector, monitor):
         posture, support = adjusted(start)
         if support > best_support + s.min_points / 4:
             best, best_support = posture, support

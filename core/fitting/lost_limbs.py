@@ -1,8 +1,8 @@
-"""Limbs that have lost their points are looked for among the points that no part of the body explains.
+"""Limbs that have lost their points are looked for among the points that no part of the body explains, and so are those that leave many.
 
-A limb that moved on while it was not measured is no longer where it is predicted, and its points lie beyond the gate. Postures all over
-what its joints allow are tried, evenly spread (Halton 1960), then closer ones around the best; the last best is a new start for the
-adjustment.
+A limb that moved on while it was not measured is no longer where it is predicted, and its points lie beyond the gate; it may have taken
+points of something else. Postures all over what its joints allow are tried, evenly spread (Halton 1960), then closer ones around the best;
+the last best is a new start for the adjustment.
 """
 
 from functools import lru_cache
@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.stats import qmc
 
+from ..progress import Monitor
 from .cloud_points import CloudPoints
 from .conditions import Conditions
 from .segmentation import from_bone, segment
@@ -24,36 +25,56 @@ def lost_limbs(fit: Conditions, counts: np.ndarray) -> list[np.ndarray]:
 
     `counts` (B,) of a posture. A part that belongs to a larger one is not named for itself.
     """
-    skeleton, free = fit.model.skeleton, free_bones(fit.parameters)
-    few = counts < fit.settings.min_points / 2
-    of_limbs = [int(b) for b in np.flatnonzero(free) if skeleton.parents[b] >= 0 and _limb(fit, int(b))]
-    outer = {b: np.array([c for c in np.flatnonzero(free) if b in _line(skeleton.parents, int(c))]) for b in of_limbs}
+    few, outer = counts < fit.settings.min_points / 2, _limbs(fit)
     lost = [b for b, bones in outer.items() if few[bones].all()]
-    return [outer[b] for b in lost if int(skeleton.parents[b]) not in lost]
+    return [outer[b] for b in lost if int(fit.model.skeleton.parents[b]) not in lost]
 
 
-def found_again(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> list[np.ndarray]:
-    """Postures (D,) in which limbs without points explain points that nothing else does; none where there are too few such points.
+def found_again(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray,
+                monitor: Monitor | None = None) -> list[np.ndarray]:
+    """Postures (D,) in which limbs explain points that nothing else does; none where there are too few such points.
 
-    At most one for each lost limb; each includes those before it.
+    At most one for each limb; each includes those before it. First the limbs without points; then, from the hands and feet inwards, those
+    that have points, perhaps another limb's, and leave more of them beside it.
+
+    Raises:
+        Cancelled: the user asked to stop.
     """
-    state = fit.parameters.state(motion, vector)
+    monitor, state = monitor or Monitor(), fit.parameters.state(motion, vector)
     _, owners = segment(points, state, fit.model.surface, fit.settings.gate_m)
-    counts = np.bincount(owners, minlength=len(state.lengths_m))
-    found, now = [], motion
-    for limb in lost_limbs(fit, counts):
-        rows = _unexplained(fit, points, state, limb)
-        if len(rows) < fit.settings.min_points / 2:
+    lost = lost_limbs(fit, np.bincount(owners, minlength=len(state.lengths_m)))
+    found, now, moved = [], motion, np.zeros(len(state.lengths_m), dtype=bool)
+    tries = [*((limb, _unexplained, 0.5) for limb in lost), *((limb, _astray, 1.0) for limb in sorted(_limbs(fit).values(), key=len))]
+    for i, (limb, rows_of, least) in enumerate(tries):
+        if moved[limb].any():
             continue
-        kept = now[None]
-        for count, spread, width, best in ROUNDS:
-            tried = np.concatenate([_postures(fit, m, limb, count, np.radians(spread)) for m in kept])
-            support = np.array([_explained(fit, points, rows, s, limb, width) for s in fit.parameters.states(tried, vector)])
-            kept = tried[np.argsort(-support, kind="stable")[:best]]
-        if support.max() > fit.settings.min_points / 4:
-            now = kept[0]
+        rows = rows_of(fit, points, fit.parameters.state(now, vector), limb)
+        if len(rows) < least * fit.settings.min_points:
+            continue
+        posture = _found(fit, points, rows, limb, now, vector, monitor.part("look for a limb", i, len(tries)))
+        if posture is not None:
+            now, moved[limb] = posture, True
             found.append(now)
     return found
+
+
+def _found(fit: Conditions, points: CloudPoints, rows: np.ndarray, limb: np.ndarray, now: np.ndarray, vector: np.ndarray,
+           monitor: Monitor) -> np.ndarray | None:
+    """The posture (D,) in which a limb explains most of these points; None if it explains too few."""
+    kept = now[None]
+    for k, (count, spread, width, best) in enumerate(ROUNDS):
+        monitor.step("look for a limb", k, len(ROUNDS))
+        tried = np.concatenate([_postures(fit, m, limb, count, np.radians(spread)) for m in kept])
+        support = np.array([_explained(fit, points, rows, s, limb, width) for s in fit.parameters.states(tried, vector)])
+        kept = tried[np.argsort(-support, kind="stable")[:best]]
+    return kept[0] if support.max() > fit.settings.min_points / 4 else None
+
+
+def _limbs(fit: Conditions) -> dict[int, np.ndarray]:
+    """Limbs and the lower parts of limbs: the first bone of each, and all that must be seen, from the body outwards."""
+    skeleton, free = fit.model.skeleton, free_bones(fit.parameters)
+    first = [int(b) for b in np.flatnonzero(free) if skeleton.parents[b] >= 0 and _limb(fit, int(b))]
+    return {b: np.array([c for c in np.flatnonzero(free) if b in _line(skeleton.parents, int(c))]) for b in first}
 
 
 def _limb(fit: Conditions, bone: int) -> bool:
@@ -82,6 +103,14 @@ def _unexplained(fit: Conditions, points: CloudPoints, state: BodyState, limb: n
             along = np.clip(w @ axis, 0.0, state.lengths_m[b] + BEYOND_M)
             near[rows] = np.linalg.norm(w - along[:, None] * axis, axis=1) > BEYOND_M
     return np.flatnonzero(near)
+
+
+def _astray(fit: Conditions, points: CloudPoints, state: BodyState, limb: np.ndarray) -> np.ndarray:
+    """Rows of the points that neither a limb nor anything else explains."""
+    rows = _unexplained(fit, points, state, limb)
+    for b in limb:
+        rows = rows[from_bone(points.xyz_m[rows], points.normals[rows], state, int(b))[0] > max(fit.settings.gate_m, BEYOND_M)]
+    return rows
 
 
 def _postures(fit: Conditions, motion: np.ndarray, limb: np.ndarray, count: int, spread: float) -> np.ndarray:

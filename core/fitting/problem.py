@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ..progress import Monitor
 from .block_band import NormalEquations
 from .observations import Block, FromBlocks, MaterialSteps, Observation
 from .robust import robust_scale, robust_weights, variance_factor
@@ -65,6 +66,7 @@ class Problem:
     held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))  # DOFs that keep their values
     robust: str = "geman-mcclure"
     robust_width: float = 3.0
+    monitor: Monitor = field(default_factory=Monitor)  # asked at every frame whether to stop
 
     @cached_property
     def place_of_shape(self) -> np.ndarray:
@@ -97,14 +99,19 @@ def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: 
     """Weights, cost and normal equations at a motion (T, D) and shape vector (S,).
 
     `understated`: factors by which the variances of points and steps are understated (`variance_factors`); for covariances only.
+
+    Raises:
+        Cancelled: the user asked to stop.
     """
     factor = understated or Scales()
     T, D = motion.shape
     lin = Linearised(observations=[], steps=[], equations=NormalEquations.empty(T, D, len(problem.free_shape)))
     states = problem.parameters.states(motion, vector)
     for t, state in enumerate(states):
+        problem.monitor.check()
         _add_frame(problem, lin, t, state, scales, factor)
     for t in range(T - 1):
+        problem.monitor.check()
         _add_step(problem, lin, t, states[t], states[t + 1], scales.steps, factor.steps)
     for o in problem.of_shape if len(problem.free_shape) else ():
         r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, D + problem.free_shape], problem.of_shape_weight
@@ -121,7 +128,11 @@ def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: 
 def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarray) -> float:
     """(1) at another motion and shape, with the observations and weights of `lin`."""
     states = problem.parameters.states(motion, vector)
-    total = sum(float(np.sum(w * o.residual(state) ** 2)) for state, frame in zip(states, lin.observations) for o, w in frame)
+    total = 0.0
+    for state, frame in zip(states, lin.observations):
+        problem.monitor.check()
+        for o, w in frame:
+            total += float(np.sum(w * o.residual(state) ** 2))
     total += sum(float(np.sum(step[1] * step[0].residual(a, b) ** 2)) for a, b, step in zip(states, states[1:], lin.steps) if step)
     if len(problem.free_shape):
         total += problem.of_shape_weight * sum(float(np.sum(o.residual(states[0]) ** 2)) for o in problem.of_shape)
@@ -138,6 +149,7 @@ def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, befor
     """The scales of the residuals before the first step."""
     states, residuals = problem.parameters.states(motion, vector), dict[str, list[np.ndarray]]()
     for t, state in enumerate(states):
+        problem.monitor.check()
         for o in problem.observe(t, state):
             if o.kind:
                 residuals.setdefault(o.kind, []).append(o.residual(state))

@@ -63,11 +63,11 @@ class HeldSegments:
         self._made[key] = found, made
 
 
-def crop(points: CloudPoints, state: BodyState, reach_m: float) -> CloudPoints:
-    """The points within `reach_m` of the bones: what a fit near this posture can ever need."""
-    near = np.zeros(len(points.xyz_m), dtype=bool)
-    for b, rows in candidates(points.xyz_m, state, np.full(len(state.lengths_m), reach_m)):
-        near[rows] |= _gap(points.xyz_m[rows], state, b)[0] < reach_m
+def crop(points: CloudPoints, state: BodyState, reach_m: np.ndarray | float) -> CloudPoints:
+    """The points within `reach_m` (of each bone (B,), or of all) of the bones: what a fit near this posture can ever need."""
+    near, reach = np.zeros(len(points.xyz_m), dtype=bool), np.broadcast_to(reach_m, (len(state.lengths_m),))
+    for b, rows in candidates(points.xyz_m, state, reach):
+        near[rows] |= _gap(points.xyz_m[rows], state, b)[0] < reach[b]
     return points.take(np.flatnonzero(near))
 
 

@@ -58,6 +58,7 @@ from .way import Kept
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
 
+SIGMAS = "sigmas of the fit"  # a stage, for people
 SUSPICIOUS = 3.0  # times the usual sigma0
 ERRORS_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
 MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that give the simplified body's surface
@@ -75,7 +76,7 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
         Cancelled: the user asked to stop.
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
-    fit = conditions(given, settings)
+    fit = replace(conditions(given, settings), monitor=monitor)
     points: Sequence[CloudPoints] = Lazy(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
     if len(points) <= AT_ONCE:
         points = _read(points, monitor)
@@ -105,7 +106,11 @@ def _at_once(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: 
     """All frames in one adjustment, from a motion (T, D) and a shape vector (S,)."""
     frames = range(len(motion))
     part, problem, (*_, solution) = _adjusted(every.stretch(frames, motion, vector), motion, vector, monitor)
-    covariance = _covariance(problem, solution, _factors(part, problem, solution))
+    monitor.step(SIGMAS, 0, 3)
+    factors = _factors(part, problem, solution)
+    monitor.step(SIGMAS, 1, 3)
+    covariance = _covariance(problem, solution, factors)
+    monitor.step(SIGMAS, 2, 3)
     return _result(part, _looked(part, solution, covariance, frames), solution.vector, covariance[2], [Ended.of(solution)])
 
 
@@ -304,6 +309,7 @@ def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, n
     sigma0 = np.array([_sigma0(fit, t, points[t], solution) for t in frames])
     counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
     for i, t in enumerate(frames):
+        fit.monitor.check()
         state = fit.parameters.state(solution.motion[t], solution.vector)
         joints[i], A = state.joint_jacobian
         K = np.block([[pose[t], mixed[t]], [mixed[t].T, shape]])

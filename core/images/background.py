@@ -1,4 +1,5 @@
-"""The still background of a view: what each pixel shows most of the time, and where an image shows it again.
+"""The still background of a view: what each pixel shows most of the time, or when nobody is known to be near, and where an image shows it
+again.
 
 A pixel shows the background when the images around it differ from the background's by no more than the noise. That noise is found from the
 differences of the images that the background is made of, since most of them is background (Rousseeuw & Croux 1993, the median of
@@ -13,7 +14,7 @@ import numpy as np
 
 from ..values import frozen
 
-FEWEST = 5  # images that tell what stands still
+FEWEST, FEWEST_BARE = 5, 3  # images that tell what stands still, and of these without anybody near
 ROWS = 64
 WINDOW_PX = 7  # side of the window in which two images are compared
 LOOSE = 1.6  # times the noise: a window of 7×7 has a root mean square of 1.0 ± 0.1 times it
@@ -23,10 +24,14 @@ EMPTY_SHARE = 0.25  # of a picture shows the background, whoever stands before i
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Background:
-    """The still background (h, w) of a view and the standard deviation of an image against it, in grey values."""
+    """The still background (h, w) of a view and the standard deviation of an image against it, in grey values.
+
+    `bare` (h, w): where it was seen with nobody near; None if nobody's places were known.
+    """
 
     grey: np.ndarray
     noise: float
+    bare: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "grey", frozen(self.grey, (None, None), np.float32, "grey"))
@@ -44,12 +49,22 @@ def empty_view(grey: np.ndarray, image: np.ndarray) -> Background:
     return Background(grey=grey, noise=float(np.sqrt(np.quantile(square, EMPTY_SHARE))))
 
 
-def still_background(images: Sequence[np.ndarray]) -> Background | None:
-    """The median of images (h, w) spread over time; None if they are too few to tell."""
+def still_background(images: Sequence[np.ndarray], near: Sequence[np.ndarray] | None = None) -> Background | None:
+    """The median of images (h, w) spread over time; None if they are too few to tell.
+
+    `near` (h, w) of each: where somebody is known to be near. Pixels that were seen often enough without are made of these images alone.
+    """
     if len(images) < FEWEST:
         return None
     median = np.empty(images[0].shape, np.float32)
+    bare = None if near is None else np.zeros(median.shape, dtype=bool)
     for row in range(0, len(median), ROWS):  # piece by piece: a copy of all images would take too much memory
-        median[row : row + ROWS] = np.median([image[row : row + ROWS] for image in images], axis=0)
+        part = slice(row, row + ROWS)
+        stack = np.array([image[part] for image in images], dtype=np.float32)
+        median[part] = np.median(stack, axis=0)
+        if near is not None and bare is not None:
+            stack[np.array([there[part] for there in near])] = np.nan
+            bare[part] = np.isfinite(stack).sum(axis=0) >= FEWEST_BARE
+            median[part][bare[part]] = np.nanmedian(stack[:, bare[part]], axis=0)
     noise = np.median([1.4826 * float(np.median(np.abs(image - median))) for image in images])
-    return Background(grey=median, noise=float(noise))
+    return Background(grey=median, noise=float(noise), bare=bare)

@@ -49,7 +49,7 @@ class EmptySpace(FromBlocks):
     head: np.ndarray  # (P,) index in Skeleton.joint_names
     tail: np.ndarray  # (P,)
     fraction: np.ndarray  # (P,)
-    sigma_px: float
+    sigma_px: np.ndarray  # (P,)
     kind: str = ""
     crowding: np.ndarray | float = 1.0
 
@@ -73,7 +73,7 @@ class EmptySpace(FromBlocks):
                 continue
             dX = state.joint_jacobian[1]
             dxyz = self._mix(dX[:, :, : dX.shape[2] if shape else state.n_motion], out)
-            across = (_bent(d[out] / self.sigma_px)[1] / self.sigma_px)[:, None] * gradient[out]
+            across = (_bent(d[out] / self.sigma_px[out])[1] / self.sigma_px[out])[:, None] * gradient[out]
             in_image = view.camera.project_with_jacobian(xyz[out])[1]
             yield k * len(self.head) + out, np.arange(dxyz.shape[2]), np.einsum("pa,pai,pik->pk", across, in_image, dxyz, optimize=True)
 

@@ -12,6 +12,7 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import limb_skin
 from tricap.core.errors import InputError
 from tricap.core.fitting import fit_input
+from tricap.core.fitting.empty_views import EmptyViews
 from tricap.core.fitting.fit_input import EmptyView, FitInput, JointPlaces, Packed
 from tricap.core.fitting.limbs_apart import LimbsApart
 from tricap.core.fitting.observations import MotionPrior
@@ -67,6 +68,20 @@ def test_a_limb_without_points_keeps_out_of_the_background(make_scene) -> None:
         fit = fit_sequence(_given(scene, clouds=clouds, empty=empty), SETTINGS)
         errors.append(np.linalg.norm((fit.motion.joints_m - scene.joints_m)[last, wrist]))
     assert errors[1] < 0.5 * errors[0], errors
+
+
+def test_of_a_hand_the_middle_alone_keeps_out_of_the_background_and_less_exactly() -> None:
+    parameters, far = ShapeParameters(default_shape(read_model("full"))), np.full((200, 250), 80, np.uint8)
+    empty = [EmptyView(view="C", frame=np.arange(1), distance=Packed([far]), step_px=4, unit_px=0.5)]
+    given = FitInput(rig=limb_scene.front_rig(), model="full", clouds=[SimpleNamespace(frame=0)], clicks={}, time_s=np.zeros(1),
+                     empty=empty)
+    seen = EmptyViews(given, parameters, FitSettings(empty_sigma_px=4.0)).observe(0)[0]
+    joints = np.array(parameters.skeleton.joint_names)
+    hands = seen.sigma_px > 4.0
+    assert sorted(joints[seen.head[hands]]) == ["wrist.L", "wrist.R"]
+    assert (seen.sigma_px[hands] == 12.0).all() and (seen.fraction[hands] == 0.5).all() and (seen.sigma_px[~hands] == 4.0).all()
+    r = seen.residual(parameters.state(np.zeros(len(parameters.skeleton.dofs)), parameters.vector()))
+    assert (0 < r[hands]).all() and (r[hands] < 0.6 * r.max()).all()  # hands and arms are 40 px outside, each
 
 
 def test_outlines_tell_the_thickness_that_points_from_one_side_do_not(make_scene, other_person) -> None:

@@ -11,10 +11,13 @@ from tricap.core.body.skeleton import joint_positions
 from tricap.core.fitting.click_frame import _with_lost_limbs
 from tricap.core.fitting.cloud_points import CloudPoints
 from tricap.core.fitting.fit_input import FitInput
-from tricap.core.fitting.lost_limbs import found_again
+from tricap.core.fitting.frame_to_frame import REACH_M, _reach
+from tricap.core.fitting.lost_limbs import found_again, lost_limbs
+from tricap.core.fitting.segmentation import crop, segment
 from tricap.core.fitting.sequence import conditions
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solver import Scales, Solution
+from tricap.core.progress import Monitor
 
 from .limb_scene import front_rig, measured_cloud, surface
 
@@ -74,6 +77,39 @@ def test_a_forearm_is_found_whose_upper_arm_was_never_lost(standing) -> None:
     assert not found_again(fit, points_of(shape, bent, seen), before, vector)
 
 
+def test_a_shin_that_has_somebody_elses_points_is_found_where_its_own_are(standing) -> None:
+    fit, shape, straight = standing
+    folded = straight.copy()
+    folded[shape.skeleton.layout["knee.L flexion"]] = np.radians(60.0)
+    seen = {"chest": 200, "spine": 100, "thigh.L": 200, "thigh.R": 60, "shin.R": 60, "foot.R": 40, "upper_arm.R": 60, "forearm.R": 60,
+            "upper_arm.L": 60, "forearm.L": 60}
+    vector, other = fit.parameters.vector(shape), points_of(shape, folded, {"shin.L": 60})
+
+    def with_other(points: CloudPoints) -> CloudPoints:
+        return replace(points, **{n: np.concatenate([getattr(points, n), getattr(other, n)]) for n in ("xyz_m", "normals", "sigma_m")})
+
+    both = with_other(points_of(shape, straight, seen | {"shin.L": 120}))
+    owners = segment(both, fit.parameters.state(folded, vector), fit.model.surface, fit.settings.gate_m)[1]
+    names = [bone.name for bone in shape.skeleton.bones]
+    counts = np.bincount(owners, minlength=len(names))
+    assert not any(names.index("shin.L") in limb for limb in lost_limbs(fit, counts))  # it has points
+    found = found_again(fit, both, folded, vector)
+    true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)["ankle.L"] for m in (straight, folded, found[-1]))
+    assert np.linalg.norm(was - true) > 0.4 and np.linalg.norm(now - true) < 0.08
+    assert not found_again(fit, with_other(points_of(shape, straight, seen)), folded, vector)  # nothing says that it is elsewhere
+
+
+def test_points_are_looked_for_as_far_as_a_limb_may_have_swung(standing) -> None:
+    fit, shape, before = standing
+    bent = before.copy()
+    bent[shape.skeleton.layout["elbow.R flexion"]] = np.radians(120.0)
+    points = points_of(shape, bent, {"forearm.R": 80, "hand.R": 40})
+    state = fit.parameters.state(before, fit.parameters.vector(shape))
+    far = points.xyz_m + [0.0, -1.5, 0.0]  # of somebody else
+    assert len(crop(points, state, _reach(fit, state)).xyz_m) == len(points.xyz_m) > len(crop(points, state, REACH_M).xyz_m)
+    assert not len(crop(replace(points, xyz_m=far), state, _reach(fit, state)).xyz_m)
+
+
 def test_the_foot_of_one_who_squats_is_found_flat_on_the_floor(standing) -> None:
     fit, shape, _ = standing
     layout, before = shape.skeleton.layout, np.zeros(len(shape.skeleton.dof_names))
@@ -99,7 +135,7 @@ def test_at_the_click_frame_a_forearm_bent_the_wrong_way_is_found(standing) -> N
     fit, points = replace(fit, clicked={0: clicks}), points_of(shape, bent, {"chest": 100, "upper_arm.R": 80, "forearm.R": 80})
     wrong = Solution(motion=before[None], vector=fit.parameters.vector(shape), cost=1.0, scales=Scales(), iterations=1, converged=True)
     support = fit.support(0, points, before, wrong.vector)
-    found = _with_lost_limbs(fit, points, wrong, support)
+    found = _with_lost_limbs(fit, points, wrong, support, Monitor())
     true, now = (joint_positions(shape.skeleton, shape.lengths_m, m)[WRIST] for m in (bent, found.motion[0]))
     assert np.linalg.norm(now - true) < 0.05 and fit.support(0, points, found.motion[0], found.vector) > support + 25
-    assert _with_lost_limbs(fit, points, found, support + 1000) is found
+    assert _with_lost_limbs(fit, points, found, support + 1000, Monitor()) is found

@@ -76,7 +76,7 @@ def _empty(camera: Camera, joints: int, rng) -> EmptySpace:
     rise = 0.05 * np.arange(201)[None, :] + 0.03 * np.arange(151)[:, None]
     view = Distances(camera=camera, values_px=rise, step_px=4.0, first_px=0.0)
     return EmptySpace(views=[view, view], head=np.arange(joints), tail=(np.arange(joints) + 1) % joints,
-                      fraction=rng.uniform(0.1, 0.9, joints), sigma_px=4.0)
+                      fraction=rng.uniform(0.1, 0.9, joints), sigma_px=np.linspace(2.0, 6.0, joints))
 
 
 def _rays(state, near, bone, sigma, rng):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tricap.core.errors import InputError
-from tricap.core.fitting import click_frame
+from tricap.core.fitting import click_frame, lost_limbs, problem, solver
 from tricap.core.fitting.click_frame import fit_posture_and_shape
 from tricap.core.fitting.cloud_points import thinned
 from tricap.core.fitting.inverse_kinematics import inverse_kinematics
@@ -207,6 +207,63 @@ def test_cancelling_stops_the_fit(make_scene) -> None:
     monitor.cancel()
     with pytest.raises(Cancelled):
         fit_sequence(_given(scene), KNOWN, monitor)
+
+
+class _Heard(Monitor):
+    """What was told, and how many adjustments and searches were made since the last word."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__()
+        self.told: list[tuple[str, float]] = []
+        self.most, self.since = 0, 0
+        for module, name in ((solver, "linearise"), (lost_limbs, "_postures")):
+            monkeypatch.setattr(module, name, self._counted(getattr(module, name)))
+
+    def _counted(self, work):
+        def counted(*args):
+            self.since += 1
+            self.most = max(self.most, self.since)
+            return work(*args)
+
+        return counted
+
+    def step(self, stage: str, done: float, total: float) -> None:
+        self.since = 0
+        self.told.append((stage, done / total))
+        super().step(stage, done, total)
+
+
+@pytest.mark.parametrize("method", ["joint", "alternating"])
+def test_every_step_of_the_click_frame_is_told_and_can_be_stopped(make_scene, monkeypatch, method: str) -> None:
+    """A whole body's click frame can take a minute: a word comes before every adjustment of it, and the bar never goes back."""
+    scene = make_scene(frames=2, seed=1, points=80)
+    monkeypatch.setattr(click_frame, "OTHERS_AROUND", 1)
+    monkeypatch.setattr(click_frame, "SUSPICIOUS", 0.0)  # all other starts are tried too
+    monkeypatch.setattr(lost_limbs, "lost_limbs", lambda fit, counts: [np.array([1])])
+    monkeypatch.setattr(lost_limbs, "_unexplained", lambda fit, points, state, limb: np.arange(40))
+    monitor = _Heard(monkeypatch)
+    fit_sequence(_given(scene), replace(KNOWN, method=method), monitor)
+    parts = [part for stage, part in monitor.told if stage == "fit the click frame"]
+    assert len(set(parts)) > 40 and np.diff(parts).min() >= 0 and np.diff(parts).max() < 0.2 and parts[-1] > 0.9
+    assert monitor.most < 8  # the posture of the clicks alone takes a few, quick ones
+
+
+def test_a_stop_is_obeyed_within_a_frame(make_scene, monkeypatch) -> None:
+    """Adjusting a long sequence is minutes between two words of the bar: whoever stops there waits for the work on one frame."""
+    scene, monitor, frames = make_scene(frames=6, seed=1, points=80), Monitor(), []
+    observed = problem._add_frame
+
+    def stopping(problem, lin, t, *rest) -> None:
+        if len(lin.equations.g) > 1:
+            frames.append(t)
+            if len(frames) == 9:
+                monitor.cancel()
+        observed(problem, lin, t, *rest)
+
+    monkeypatch.setattr(problem, "_add_frame", stopping)
+    with pytest.raises(Cancelled):
+        fit_sequence(_given(scene), KNOWN, monitor)
+    assert len(frames) == 9
 
 
 def test_paper_mode_fits_too(make_scene) -> None:

@@ -22,11 +22,12 @@ class Stopper(Monitor):
         super().__init__()
         self.at, self.frames = at, 0
 
-    def step(self, stage: str, done: float, total: float) -> None:
-        if stage == "fit frame after frame":
+    def part(self, stage: str, index: int, total: int) -> Monitor:
+        if stage == frame_to_frame.STAGE:
             if self.frames == self.at:
                 raise Cancelled("Stopped by the test.")
             self.frames += 1
+        return super().part(stage, index, total)
 
 
 def arrays(fit: object) -> dict[str, bytes]:
@@ -78,8 +79,9 @@ class StoppedStretches(Monitor):
         if stage == "adjust the sequence" and done == 0:
             self._begin("shape")
 
-    def part(self, stage: str, index: int, count: int) -> Monitor:
-        self._begin(f"{index + 1} of {count}")
+    def part(self, stage: str, index: int, total: int) -> Monitor:
+        if stage == "adjust the postures":
+            self._begin(f"{index + 1} of {total}")
         return Monitor()
 
     def _begin(self, what: str) -> None:
