@@ -52,7 +52,7 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """
     if importlib.util.find_spec("bpy") is None:
         raise InputError("`tricap scene` needs Blender: install bpy in this Python, or use `blender --command tricap scene …`.")
-    with _standard_output_kept_clean():
+    with standard_output_kept_clean(args):
         import bpy
 
         from .scene.build import SceneOptions, write_scene
@@ -60,9 +60,13 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         from .scene.contents import read_contents
         from .scene.preview import preview, turntable
 
+        _check(args)
+        contents = read_contents(args.out, monitor, skins=args.exact_skin)
+        first, last = contents.frames
+        if args.frame is not None and not first <= args.frame <= last:
+            raise InputError(f"--frame {args.frame} is not among the frames {first} to {last}; choose another.")
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
         look_through()
-        contents = read_contents(args.out, monitor, skins=args.exact_skin)
         options = SceneOptions(detail=args.detail, exact_skin=args.exact_skin, rest_pose=args.rest_pose,
                                simplify_deg=args.simplify, colour=args.colour, arrows=args.arrows, implicit=args.implicit,
                                field=args.field, frame=args.frame)
@@ -74,15 +78,42 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     return [*report.warnings, f"{args.blend}: {report}", *(str(path) for path in (args.preview, args.turntable) if path is not None)]
 
 
+def _check(args: argparse.Namespace) -> None:
+    """Whether the arguments can be, before anything is read.
+
+    Raises:
+        InputError: one of them cannot.
+    """
+    check_simplify(args.simplify)
+    named = (("--blend", args.blend, ".blend"), ("--preview", args.preview, ".png"), ("--turntable", args.turntable, ".mp4"))
+    for flag, path, ending in named:
+        if path is not None and path.suffix.lower() != ending:
+            raise InputError(f"{flag} {path} is no {ending}; let its name end so.")
+
+
+def check_simplify(degrees: float) -> None:
+    """Whether keys can be left out within so many degrees.
+
+    Raises:
+        InputError: they cannot.
+    """
+    if not 0 <= degrees <= 180:
+        raise InputError(f"--simplify {degrees:g} is no tolerance; write degrees, such as 0.5.")
+
+
 @contextmanager
-def _standard_output_kept_clean() -> Iterator[None]:
-    """Blender itself, below Python, writes notes to standard output; they go to standard error, so that ours can be read by machines."""
+def standard_output_kept_clean(args: argparse.Namespace) -> Iterator[None]:
+    """Blender and its exporters write notes to standard output, also below Python; they go to standard error, so that ours can be read by
+    machines, and nowhere with --quiet."""
     sys.stdout.flush()
     kept = os.dup(1)
-    os.dup2(2, 1)
+    away = os.open(os.devnull, os.O_WRONLY) if getattr(args, "quiet", False) else os.dup(2)
+    os.dup2(away, 1)
+    os.close(away)
     try:
         yield
     finally:
+        sys.stdout.flush()
         os.dup2(kept, 1)
         os.close(kept)
 

@@ -143,7 +143,8 @@ class JobState(bpy.types.PropertyGroup):
 _current: list[Job] = []  # the one job that runs, or nothing
 _watching: list["JobOperator"] = []  # the modal operator that watches it
 _watched: list[Job] = []  # the job that it watches
-ENDED: list[Callable[[bpy.types.Context, str, str], None]] = []  # told of the end of every job: its step, and what went wrong or ""
+Ended = Callable[[bpy.types.Context, str, str, str], None]
+ENDED: list[Ended] = []  # told of the end of every job: its step, what went wrong or "", and what was kept when it was stopped or ""
 
 
 def current() -> Job | None:
@@ -250,9 +251,10 @@ class JobOperator:
                 error, job.trace = bug, traceback.format_exc()
         if error is not None:
             self._tell(job, error)
+        stopped = str(error) if isinstance(error, Cancelled) else ""
         failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else _sentence(error)
         for listener in ENDED:
-            listener(context, job.step, failed)
+            listener(context, job.step, failed, stopped)
         return ended
 
     def _tell(self, job: Job, error: BaseException) -> None:

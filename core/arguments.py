@@ -1,6 +1,10 @@
 """Arguments that several commands share."""
 
+import argparse
+import os
+import re
 import tomllib
+from pathlib import Path
 from typing import Any
 
 from .errors import InputError
@@ -40,13 +44,30 @@ def frame_range(text: str | None) -> tuple[int, int] | None:
     return int(first), int(last)
 
 
-def pictured(frames: range, wanted: list[int]) -> list[int]:
-    """--pictures FRAME …: frames that are there.
+def named_path(text: str) -> Path:
+    """A file or folder that an argument names; an empty one would mean the working folder.
 
     Raises:
-        InputError: a frame is not.
+        argparse.ArgumentTypeError: it names none.
     """
-    for frame in wanted:
-        if frame not in frames:
-            raise InputError(f"--pictures {frame} is not among the frames {frames.start} to {frames.stop - 1}; choose others.")
-    return wanted
+    if not text.strip():
+        raise argparse.ArgumentTypeError("is empty; name a file or a folder")
+    return Path(text)
+
+
+def joined(argv: list[str]) -> list[str]:
+    """The arguments with a negative first frame as part of its flag: argparse takes `--frames -5:3` for two flags."""
+    frames = [i for i, flag in enumerate(argv[:-1]) if flag == "--frames" and re.match(r"-\d", argv[i + 1])]
+    merged = [f"{word}={argv[i + 1]}" if i in frames else word for i, word in enumerate(argv)]
+    return [word for i, word in enumerate(merged) if i - 1 not in frames]
+
+
+def check_not_read(flag: str, out: Path, *read: Path | None) -> None:
+    """A file or folder that a command is to write is none that it reads: that would be lost.
+
+    Raises:
+        InputError: it is.
+    """
+    for path in read:
+        if path is not None and path.exists() and out.exists() and os.path.samefile(path, out):
+            raise InputError(f"{flag} {out} is what is read; give another name, so that it is not lost.")

@@ -23,6 +23,7 @@ from typing import Any
 from . import pipeline, store
 from .errors import InputError
 from .progress import Monitor
+from .results import check_apart
 
 FORMAT, VERSION = "tricap-batch", 1
 TOPIC = "tricap"  # under which workers report
@@ -81,7 +82,7 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     """The folder of each take's results: named after the take, or after the folder that holds it too where two have the same name.
 
     Raises:
-        InputError: that does not tell them apart.
+        InputError: that does not tell them apart, or results would go into a take.
     """
     folder, takes = Path(folder).resolve(), [Path(take).resolve() for take in takes]
     names = [take.name for take in takes]
@@ -89,6 +90,8 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     twice = next((take for take, name in zip(takes, names) if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"The take {twice} is named twice, or like another one; rename its folder, or leave it out.")
+    for out in (folder, *(folder / name for name in names)):
+        check_apart(out)
     return [folder / name for name in names]
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from .arguments import overrides
-from .batch import BUG, LOST, MEND, Engine, as_json, run_batch, summary
+from .batch import BUG, DONE, LOST, MEND, Engine, as_json, run_batch, summary
 from .errors import InputError
 from .progress import Cancelled, Monitor
 
@@ -42,4 +42,6 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         raise Cancelled(f"Stopped; {args.out / 'batch.json'} says what is done, and the same command goes on from there.") from stop
     states = {o.status for o in outcomes}
     args.exit_code = 1 if states & {BUG, LOST} else 2 if MEND in states else 0
-    return [as_json(outcomes)] if args.json else summary(outcomes)
+    lines = summary(outcomes)
+    args.told_anyway = [line for line, outcome in zip(lines, outcomes) if outcome.status != DONE]
+    return [as_json(outcomes)] if args.json else lines

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from .arguments import check_not_read
 from .bar_file import write_bar
 from .calibrating import calibrate_rig, measure_bar, open_bar, write_report
 from .calibration import account
@@ -56,6 +57,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def _convert(args: argparse.Namespace) -> list[str]:
+    if args.format:
+        check_not_read("--out", args.out, args.source)
     rig = read_any(args.source)
     world = _world(args)
     if world.floor_frames or world.level_frames:

@@ -16,23 +16,25 @@ from typing import Any
 import cv2
 
 from . import batch_command, calibrate_command, check_command, contour_command, fields_command, pipeline, points_command, track2d_command
-from .arguments import frame_range, overrides, pictured
+from .arguments import frame_range, joined, named_path, overrides
 from .bar_file import read_bar, write_bar
 from .body.model_file import model_names, read_model
 from .calibration.rig_files import read_any
 from .errors import InputError
 from .images.fields import BOTH, INTERLACE
 from .progress import Cancelled, Monitor
+from .results import check_apart
 from .take import open_take, read_take
 from .take_file import footage_entry, make_take, new_table, take_of_table
 
 Adder = Callable[[Any], None]  # adds a sub-command to the parser; the command's `run(args, monitor)` gives the lines to show
+# (and leaves in `args.told_anyway` those that --quiet does not keep back: findings, and what has failed)
 
 
 def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     """Run one command of the core, or of those that `adders` join; gives the exit code."""
     parser = build_parser(adders)
-    args = parser.parse_args(argv)
+    args = parser.parse_args(joined(sys.argv[1:] if argv is None else argv))
     args.parser = parser
     _quiet_decoders()
     monitor = Monitor(_progress_line if sys.stderr.isatty() and not args.quiet else None if args.quiet else _plain_progress())
@@ -45,9 +47,9 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     except Cancelled as stop:
         _say(f"tricap: {stop}", sys.stderr)
         return 130
-    if not args.quiet or getattr(args, "json", False):
-        for line in lines:
-            _say(line, sys.stdout)
+    told = lines if not args.quiet or getattr(args, "json", False) else getattr(args, "told_anyway", [])
+    for line in told:
+        _say(line, sys.stdout)
     return int(getattr(args, "exit_code", 0))
 
 
@@ -70,7 +72,9 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     for add in (*(module.add_command for module in of_core), *adders):
         add(commands)
     for sub in commands.choices.values():
-        sub.add_argument("--quiet", action="store_true", help="say nothing but errors")
+        for action in sub._actions:
+            action.type = named_path if action.type is Path else action.type
+        sub.add_argument("--quiet", action="store_true", help="no progress, and no words but errors and findings")
     return parser
 
 
@@ -112,20 +116,21 @@ def _track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), restart=args.restart) as job:
-        job.pictured = pictured(job.footage.frames, args.pictures)
+    given = args.take, args.out, overrides(args.set), frame_range(args.frames)
+    with pipeline.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
         pipeline.all_stages(job, monitor)
-        scene = _build_scene(job, args.parser, monitor)
+        scene = _build_scene(job, args, monitor)
         return _summary(job, args.json) + ([] if args.json else scene)
 
 
-def _build_scene(job: pipeline.Run, parser: argparse.ArgumentParser, monitor: Monitor) -> list[str]:
+def _build_scene(job: pipeline.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
     """body.blend, through the command `scene` of the add-on where there is a Blender."""
     blend = job.results.path("body.blend")
-    if "scene" not in _names_of(parser):
+    if "scene" not in _names_of(given.parser):
         return []
     try:
-        args = parser.parse_args(["scene", str(job.results.folder), "--blend", str(blend)])
+        quiet = ["--quiet"] if given.quiet else []
+        args = given.parser.parse_args(["scene", str(job.results.folder), "--blend", str(blend), *quiet])
         return [str(line) for line in args.run(args, monitor)]
     except InputError as error:
         job.warn(f"No body.blend was written: {error}")
@@ -147,10 +152,11 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
     where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor, settings["enhance"])
     near, far = where.depth_range_m
-    return [
+    args.told_anyway = [
         f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (from {where.method}), "
         f"{len(footage.take.seeds.joints)} clicked joints, {len(where.planes)} planes of the room left out."
     ]
+    return list(args.told_anyway)
 
 
 def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -164,6 +170,10 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     views = [tuple(v.split("=", 1)) for v in args.views]
     if any(len(v) != 2 or not all(v) for v in views):
         raise InputError("Write each view as NAME=FILE, such as L=left.mp4.")
+    sources = [Path(source).resolve() for _, source in views]
+    for (name, _), source in zip(views, sources):
+        if sources.count(source) > 1:
+            raise InputError(f"View {name} has the same footage as another, {source}; give each view that of its own camera.")
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
     table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
@@ -187,10 +197,11 @@ def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from .synthetic.score import score_run
 
     take, out = args.out / "take", args.out
+    check_apart(out)
     if not (take / "take.toml").exists():
         make_arm_take(take, monitor=monitor)
     job = pipeline.run(take, out, None, monitor)
-    lines = _build_scene(job, args.parser, monitor)
+    lines = _build_scene(job, args, monitor)
     return [
         str(job),
         *lines,

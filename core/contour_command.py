@@ -14,12 +14,14 @@ from . import pipeline, store
 from .arguments import frame_range, overrides
 from .contour_table import HEAD, contour_rows
 from .errors import InputError
+from .geometry.rig import read_rig
 from .images.sequence import read_image
 from .inspection import body_outline
 from .measuring import NothingMeasured
 from .progress import Monitor
 from .settings import nearest_name
 from .surface.cloud import PointCloud
+from .take import Take, read_take
 from .tracking.contour import (
     Contour,
     ContourSettings,
@@ -73,13 +75,30 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     Raises:
         InputError: the arguments or the take need mending.
     """
+    start = Start(
+        polygon=read_polygon(args.polygon) if args.polygon else None,
+        background=read_image(args.background) if args.background else None,
+        body=args.from_body,
+    )
+    take = read_take(args.take)
+    _check_views(take, args.view)
+    if start.polygon is not None and not read_rig(take.rig_path)[args.view[0]].sees(start.polygon).any():
+        raise InputError(f"The polygon {args.polygon} lies outside the image of view {args.view[0]}; write its pixels in the first frame.")
     with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), contours_aside=True) as job:
-        start = Start(
-            polygon=read_polygon(args.polygon) if args.polygon else None,
-            background=read_image(args.background) if args.background else None,
-            body=args.from_body,
-        )
         return write_contours(job, args.view, monitor, start)
+
+
+def _check_views(take: Take, views: list[str]) -> list[str]:
+    """The names of a take's views.
+
+    Raises:
+        InputError: one that is asked for is not among them.
+    """
+    names = [v.name for v in take.views]
+    for name in views:
+        if name not in names:
+            raise InputError(f"{take.folder} has no view “{name}”.{nearest_name(name, names)}")
+    return names
 
 
 def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
@@ -94,10 +113,7 @@ def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start:
     Raises:
         InputError: there is no such view, or nothing to start from.
     """
-    names = [v.name for v in job.footage.take.views]
-    for name in views:
-        if name not in names:
-            raise InputError(f"{job.footage.take.folder} has no view “{name}”.{nearest_name(name, names)}")
+    names = _check_views(job.footage.take, views)
     if len(views) > 1 and (start.polygon is not None or start.background is not None):
         raise InputError("A polygon or a background is that of one view; give one --view with it.")
     if start.body and not job.results.path("skin").is_dir():

@@ -24,7 +24,7 @@ from .checking.timing import in_step
 from .clicked_points import clicked_depth
 from .correcting import corrected_cloud, corrected_tracks, missed_clicks
 from .errors import InputError
-from .fit_sources import clicks_left_out, fit_input, missing_for_fit
+from .fit_sources import check_body, clicks_left_out, fit_input, missing_for_fit
 from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
 from .fitting.settings import FitSettings
@@ -39,9 +39,9 @@ from .measuring import NothingMeasured, measure_frames
 from .motion.ply import write_mesh
 from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
-from .report.pages import write_report
+from .report.pages import check_pictured, write_report
 from .report.silhouettes import Silhouettes, by_view, silhouettes_of
-from .results import KeptFit, Results
+from .results import KeptFit, Results, check_apart
 from .settings import from_table, nearest_name
 from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
@@ -145,10 +145,11 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
 @contextmanager
 def open_run(
     take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None, *,
-    restart: bool = False, contours_aside: bool = False) -> Iterator[Run]:  # fmt: skip
+    restart: bool = False, contours_aside: bool = False, pictures: Sequence[int] = ()) -> Iterator[Run]:  # fmt: skip
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
     What an earlier run of other input left in OUT is removed (with `contours_aside` not for new contours alone); `restart` removes it all.
+    `pictures`: the frames of the report's, by default a few.
 
     Raises:
         InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
@@ -162,6 +163,8 @@ def open_run(
         clicked_depth(footage, name, at)
     if take.body_model is not None:
         read_model(take.body_model)
+    check_apart(out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_pictured(footage.frames, pictures)
     keys = stage_keys(footage, settings, Path(out))
     with Results(out).opened() as results:
         if restart:
@@ -171,7 +174,7 @@ def open_run(
         account["stages"] = kept = still_good(before, keys, contours_aside=contours_aside)
         if before:  # what was made otherwise must not stand beside the new
             results.remove(*(name for stage, c in CONCERNS.items() if stage not in kept for name in c.files))
-        yield Run(footage=footage, settings=settings, results=results, keys=keys, account=account)
+        yield Run(footage=footage, settings=settings, results=results, keys=keys, account=account, pictured=pictures)
 
 
 def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:
@@ -205,9 +208,8 @@ def measure(run: Run, monitor: Monitor) -> None:
             done.append(note_of(m))
             room = room or m.foreground
     except Cancelled as stop:
-        raise Cancelled(
-            f"Stopped: the surface of {len(done)} of {len(run.footage.frames)} frames is kept; the same command goes on from there."
-        ) from stop
+        of = len(run.footage.frames)
+        raise Cancelled(f"Stopped: the surface of {len(done)} of {of} frames is kept; run it again to go on.") from stop
     except NothingMeasured as error:
         if can_do_without(run.footage, run.results):
             run.warn(f"{error} The body rests on outlines and keypoints.")
@@ -265,9 +267,7 @@ def _follow(run: Run, monitor: Monitor, guide: Guide | None = None) -> dict[str,
         steps = track_frames(run.footage, run.measured, limit_px, s["matching"], s["tracking"], run.results, monitor, s["enhance"], guide)
         filtered, reasons = trajectories_of(steps, take.fps, s["tracking"], decide)
     except Cancelled as stop:
-        raise Cancelled(
-            "Stopped: the surface of all frames is kept, and the tracks as far as they are; the same command goes on from there."
-        ) from stop
+        raise Cancelled("Stopped: the surface of all frames is kept, and the tracks as far as they are; run it again to go on.") from stop
     run.trajectories = filtered.kept
     run.results.write_trajectories(filtered, take.fps)
     figures, warnings = track_figures(filtered.kept, reasons)
@@ -284,6 +284,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         InputError: the clicks contradict each other, or the limb has no points.
         Cancelled: surface and tracks are kept.
     """
+    check_body(run.footage, run.settings["fitting"])
     if not run.settings["fitting"].use_surface and not run.surfaceless:
         run.do_without_surface("fitting.use_surface is false")
     if run.trajectories is None:
@@ -308,7 +309,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], *known, monitor)
     except Cancelled as stop:
         run.results.remove("body.toml", "joints.csv", "motion.csv", "skin")
-        raise Cancelled("Stopped during the fit: surface and tracks are kept; the same command goes on from there.") from stop
+        raise Cancelled("Stopped during the fit: surface and tracks are kept; run it again to go on.") from stop
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.notes[0].frame) if run.measured else error from error
     states = _told_states(run, body)
@@ -369,6 +370,7 @@ def run(
 
 def all_stages(run: Run, monitor: Monitor) -> None:
     """Measure, track, fit and report, as `run` does, of an opened take."""
+    check_body(run.footage, run.settings["fitting"])
     for stage in (measure, track, fit, report) if run.settings["fitting"].use_surface else (fit, report):
         stage(run, monitor)
 

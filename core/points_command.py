@@ -12,7 +12,7 @@ from .arguments import frame_range, overrides
 from .errors import InputError
 from .following import tracking_view
 from .progress import Monitor
-from .results import Results
+from .results import Results, check_apart
 from .take import Footage, open_take, read_take
 from .tracking.key_points import KeyPoints, track_key_points
 from .tracking.point_tables import ChosenPoints, read_points, write_key_points
@@ -34,14 +34,15 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     take = read_take(args.take)
     settings = pipeline.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
     footage, frames = open_take(take), frame_range(args.frames)
+    check_apart(args.out, take.folder, (s.files()[0] for s in footage.sequences))
     footage = footage if frames is None else pipeline.only_frames(footage, frames)
     first = footage.frames.start if args.points_frame is None else args.points_frame
     if first not in footage.frames:
         raise InputError(f"--points-frame {first} is not among the frames {footage.frames.start} to {footage.frames.stop - 1}.")
     points = _by_name(read_points(args.points, with_views=True), footage, args.points)
-    tracked = follow_points(footage, points, first, settings, monitor)
     views = tuple(c.name for c in footage.rig.cameras)
     with Results(args.out).opened() as results:
+        tracked = follow_points(footage, points, first, settings, monitor)
         write_key_points(results.path("points3d.csv"), results.path("points2d.csv"), tuple(points), views, take.fps, tracked)
     whole = int((tracked.status == TrackStatus.MEASURED).all(axis=0).sum())
     return [f"{results.folder}: {len(points)} points over {len(tracked.frames)} frames, {whole} of them seen in every frame."]

@@ -5,7 +5,7 @@ A checkpoint carries the digest of everything that it depends on; one that does 
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,35 @@ OURS = (  # what a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report",
     "body.blend",
 )  # fmt: skip
+
+
+def check_apart(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
+    """Results are kept apart from what is measured: mixed with it, one could replace the other.
+
+    Raises:
+        InputError: OUT is a take's own folder or one in which its footage lies, or the take lies where results are replaced.
+    """
+    where = Path(out).resolve()
+    advice = f"give the results a folder of their own, such as {(where if take is None else take) / 'results'}."
+    if (where / "take.toml").exists():
+        raise InputError(f"{out} is itself a take; {advice}")
+    for path in footage:
+        if where in (path.parent.resolve(), path.resolve().parent):
+            raise InputError(f"{out} holds the footage {path.name}; {advice}")
+    if take is not None and any(take.resolve().is_relative_to(where / name) for name in ("cache", "contours", *OURS)):
+        raise InputError(f"The take {take} lies where results of {out} are replaced; choose another folder for the results.")
+
+
+def check_not_result(file: Path, out: Path) -> None:
+    """What is written of a run is none of its results, and what is made of a motion's file is not that file.
+
+    Raises:
+        InputError: it is.
+    """
+    path, read = Path(file).resolve(), Path(out).resolve()
+    own = path.relative_to(read).parts[:1] if path != read and path.is_relative_to(read) else ()
+    if path == read or set(own) & {"cache", "contours", "fields", "run.json", *OURS} - {"body.blend"}:
+        raise InputError(f"{file} is what is read; give another name, so that it is not lost.")
 
 
 class Results:
@@ -107,7 +136,7 @@ class Results:
     def keep_clouds(self, frames: range) -> None:
         """Remove the clouds of all other frames."""
         for path in self.path("clouds").glob("*.ply"):
-            if not path.stem.isdigit() or int(path.stem) not in frames:
+            if not path.stem.isdecimal() or int(path.stem) not in frames:
                 path.unlink()
 
     def write_cloud(self, cloud: PointCloud) -> None:

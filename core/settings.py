@@ -56,7 +56,7 @@ def _checked(value: Any, field: "dataclasses.Field[Any]", where: str) -> Any:
             raise InputError(f"{label} is {value!r}; choose one of: {', '.join(meta.get('choices') or ('a text',))}.")
         return value
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST_NUMBER:
-        raise InputError(f"{label} is {str(value)[:40]}; a number{' in ' + meta['unit'] if meta.get('unit') else ''} is needed.")
+        raise InputError(f"{label} is {repr(value)[:40]}; a number{' in ' + meta['unit'] if meta.get('unit') else ''} is needed.")
     if isinstance(default, int) and value != int(value):
         raise InputError(f"{label} is {value!r}; a whole number is needed.")
     low, high = meta.get("low"), meta.get("high")

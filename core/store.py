@@ -70,6 +70,17 @@ def written(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"Cannot write {path}: {error.strerror or error}. Choose another folder or free some space.") from error
 
 
+def try_writing(path: Path) -> None:
+    """Make the folder of a file that somebody else is to write, and see that it can be written there.
+
+    Raises:
+        OSError: it cannot.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    path.unlink()
+
+
 def write_text(path: Path, text: str) -> None:
     """`write_bytes` of UTF-8 text."""
     write_bytes(path, text.encode("utf-8"))

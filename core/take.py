@@ -23,6 +23,7 @@ from .toml_values import check_keys, frame_pair, inside, is_number, is_pixel, ta
 from .values import frozen
 
 FORMAT, VERSION = "tricap-take", 1
+MOST_FRAMES = 100_000_000
 SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
 KEYS = ("format", "version", "fps", "interlaced", "first_field", "rig", "reference_view", "frames", "views", "body", "seeds", "keyframes",
@@ -302,8 +303,10 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         label = f"view {entry.get('name')!r} of {where}"
         check_keys(entry, ("name", "images", "movie", "offset_frames", *PERSON_SOURCES), label)
         offset = entry.get("offset_frames", 0)
-        if not isinstance(entry.get("name"), str) or not entry["name"] or not isinstance(offset, int):
-            raise InputError(f"A {label} needs a name (text); `offset_frames` is a whole number.")
+        if not isinstance(entry.get("name"), str) or not entry["name"]:
+            raise InputError(f"A {label} needs a name (text), such as \"L\".")
+        if isinstance(offset, bool) or not isinstance(offset, int) or abs(offset) > MOST_FRAMES:
+            raise InputError(f"`offset_frames` of {label} is {str(offset)[:40]}; write a whole number of frames, such as -2.")
         if UNFIT_FOR_NAMES.search(entry["name"]):
             raise InputError(f"The {label} has a character in its name that file names cannot have; choose a plain name such as \"L\".")
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):

@@ -98,7 +98,8 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
         InputError: the footage is missing, or something else has its place in the folder.
     """
     if not source.exists():
-        raise InputError(f"The footage {source} of view {name} is missing; check the path.")
+        whole = f" (for a pattern give its folder, {source.parent})" if "*" in source.name else ""
+        raise InputError(f"The footage {source} of view {name} is missing; check the path{whole}.")
     if source.is_dir():
         endings = sorted({p.suffix for p in source.iterdir() if p.suffix.lower() in IMAGE_ENDINGS})
         if len(endings) != 1:

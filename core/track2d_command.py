@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from . import store
-from .arguments import frame_range, overrides
+from .arguments import check_not_read, frame_range, overrides
 from .errors import InputError
 from .images.fields import INTERLACE, row_grid
 from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence
@@ -50,6 +50,9 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
                                              **tables.get("matching", {})}, "[matching]")  # fmt: skip
     tracking = from_table(TrackingSettings, {"wait_frames": WAIT_FRAMES, **tables.get("tracking", {})}, "[tracking]")
     points, sequence = read_points(args.points), open_footage(args.sequence)
+    check_not_read("--out", args.out, args.points, args.sequence)
+    if args.pictures is not None:
+        check_not_read("--pictures", args.pictures, *{path.parent for path in sequence.files()[:1]})
     frames = range(*(frame_range(args.frames) or (0, sequence.count)))
     if not frames or frames[0] < 0 or frames[-1] >= sequence.count:
         raise InputError(f"--frames {args.frames} are not among the frames 0 to {sequence.count - 1} of {args.sequence}.")

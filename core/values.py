@@ -5,6 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from .errors import InputError
+
+LEAST_CELLS, SPARSEST = 1_000_000, 20  # cells of a table: so many in any case, and so many for every one that is known
+
 
 def frozen(array: Any, shape: Sequence[int | None], dtype: Any = np.float64, name: str = "array") -> np.ndarray:
     """A read-only copy of `array` as `dtype`, whose shape agrees with `shape` (None: any length).
@@ -20,3 +24,14 @@ def frozen(array: Any, shape: Sequence[int | None], dtype: Any = np.float64, nam
         raise ValueError(f"{name} has shape {copy.shape}, expected {tuple(shape)}")
     copy.flags.writeable = False
     return copy
+
+
+def check_sparse(rows: int, frames: int, names: int, where: object) -> None:
+    """See that a table of frames × names is worth its memory, when a file has so many rows of one frame and name each.
+
+    Raises:
+        InputError: next to none of it is known: a file of a megabyte could ask for gigabytes.
+    """
+    if frames * names > max(LEAST_CELLS, SPARSEST * rows):
+        raise InputError(f"{where} has {rows} rows for {frames} frames and {names} names, so that nearly all is missing; "
+                         "it is damaged, export it again.")

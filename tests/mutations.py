@@ -26,6 +26,7 @@ KINDS = (b'"text"', b"[]", b"{}", b"[[1, 2], [3]]", b"null", b"true", b"''", b"-
 WORDS = (struct.pack("<I", 0xFFFFFFFF), struct.pack("<I", 0x7FFFFFFF), struct.pack("<I", 0x10000000), struct.pack("<H", 0xFFFF),
          struct.pack("<f", float("nan")), struct.pack("<f", 1e38), struct.pack("<d", float("inf")), struct.pack(">I", 0x00FFFFFF),
          b"\0" * 8, struct.pack("<I", 1 << 24))  # fmt: skip
+NODES: tuple[Any, ...] = (None, True, "", "9" * 5000, "\u00b2", "1e999", -1, 2**80, 1e308, -0.5, [], {}, [[1], 2], {"a": []}, ["x"] * 3000)
 NEST = (b"[", b'{"a":', b"<a>", b"((", b"a = [[", b"{ ", b"- ")
 
 
@@ -91,6 +92,37 @@ def _lines(data: bytes, r: random.Random) -> bytes:
     return b"\n".join(lines)
 
 
+def _node(data: bytes, r: random.Random) -> bytes:
+    """A value of a JSON file becomes one of another kind, or has one, whatever it is that stands there."""
+    try:
+        table = json.loads(data)
+    except (ValueError, RecursionError):
+        return _value(data, r)
+    places: list[tuple[Any, Any]] = []
+    waiting = [table]
+    while waiting and len(places) < 5000:
+        value = waiting.pop()
+        inside = list(value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ())
+        places += [(value, key) for key, _ in inside]
+        waiting += [v for _, v in inside]
+    if not places:
+        return _value(data, r)
+    holder, key = r.choice(places[: r.choice((10, len(places)))])
+    holder[key] = r.choice(NODES)
+    return json.dumps(table).encode()
+
+
+def _all_different(data: bytes, r: random.Random) -> bytes:
+    """Many rows like one of a table, each with numbers and names of its own: as many columns as rows, for who makes a table of them."""
+    lines = data.split(b"\n")
+    i, many = r.randrange(len(lines)), r.choice((300, 30_000))
+    def renamed(k: int) -> bytes:
+        numbered = re.sub(rb"\b\d+\b", b"%d" % k, lines[i], count=r.choice((1, 2)))
+        return re.sub(rb"[A-Za-z][A-Za-z_.]*", lambda m: m.group() + b"%d" % k, numbered, count=1)
+
+    return b"\n".join([*lines[:i], *(renamed(k) for k in range(min(many, LARGEST // (len(lines[i]) + 8)))), *lines[i:]])
+
+
 def _insert(data: bytes, r: random.Random) -> bytes:
     i = _place(data, r)
     deep, long = r.choice((20, 600, 100_000)), r.choice((1000, 300_000))
@@ -115,7 +147,8 @@ def _sound_sums(data: bytes, r: random.Random) -> bytes:
 
 
 DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    _cut, _flip, _flip, _word, _word, _value, _value, _value, _name, _lines, _insert, _nothing, _sound_sums)  # fmt: skip
+    _cut, _flip, _flip, _word, _word, _value, _value, _value, _name, _lines, _node, _node, _all_different, _insert, _nothing,
+    _sound_sums)  # fmt: skip
 
 
 def memory_mb() -> tuple[float, float]:

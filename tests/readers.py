@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from tricap.core import frame_table, store
+from tricap.core.bar_file import read_bar, write_bar
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
@@ -19,8 +20,10 @@ from tricap.core.checking.run_check import check_run
 from tricap.core.contour_table import ContourTable
 from tricap.core.errors import InputError
 from tricap.core.geometry.rig import read_rig, write_rig
+from tricap.core.images.fields import row_grid
 from tricap.core.images.sequence import open_sequence
-from tricap.core.inspection import read_tracks
+from tricap.core.inspection import patch_boxes, read_removed, read_tracks
+from tricap.core.inspection import read_points as read_shown
 from tricap.core.motion import bvh, c3d, keypoints_json, points_csv, tables, trc
 from tricap.core.motion.markers import Markers
 from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
@@ -33,7 +36,8 @@ from tricap.core.results import Results
 from tricap.core.stages import still_good
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.take import read_take
-from tricap.core.tracking.point_tables import read_points, read_polygon
+from tricap.core.take_file import read_table
+from tricap.core.tracking.point_tables import read_planar, read_points, read_polygon
 from tricap.core.tracking.settings import TrackStatus
 
 __all__ = ["FAULTY", "READERS", "InputError"]
@@ -179,6 +183,28 @@ def looked_at(folder: Path) -> None:
         [TrackStatus(int(status)).words for status in history.at(RIG.cameras[0], frame)[1]]
 
 
+def surface(folder: Path) -> list[Path]:
+    """A cloud and its checkpoint, as the overlays show them."""
+    random, n, k, results = np.random.default_rng(4), 20, len(RIG.cameras), Results(folder)
+    cloud(folder)
+    (folder / "clouds").mkdir(exist_ok=True)
+    (folder / "a.ply").rename(folder / "clouds" / "0000.ply")
+    xyz = read_ply(folder / "clouds" / "0000.ply").xyz_m
+    results.save_checkpoint("surface", "0000", "k", dict(
+        cloud_xyz_m=xyz, grid=np.array([4, 0, 8, 6]), field_xy=random.uniform(0, 90, (n, k, 2)), field_cell=np.arange(n),
+        field_shape=random.uniform(0, 1, (n, k, 2, 2)), field_residual_px=np.ones(n), field_correlation=np.ones(n),
+        removed_px=random.uniform(0, 90, (5, k, 2)), removed_why=np.ones(5, np.uint8)))
+    return [folder / "clouds" / "0000.ply", folder / "cache" / "surface" / "0000.npz"]
+
+
+def shown(folder: Path) -> None:
+    found = read_shown(folder, 0, RIG.cameras, row_grid("none"))
+    assert found is not None
+    if len(found.xyz_m):
+        patch_boxes(found, 0, RIG.cameras, 1, row_grid("none"), 13)
+    read_removed(folder, 0)
+
+
 def body(path: Path) -> None:
     write_body(path, default_shape(read_model("arm.R")))
 
@@ -227,6 +253,10 @@ def bvh_file(path: Path) -> None:
     path.write_text(f"HIERARCHY\n{joints}\nMOTION\nFrames: 4\nFrame Time: 0.04\n{frames}\n")
 
 
+def bar_file(folder: Path) -> list[Path]:
+    return [write_bar(folder / "rig.toml", RIG, np.arange(4), np.random.default_rng(3).uniform(-1, 1, (4, 2, 3)))]
+
+
 def _raise(folder: Path) -> None:
     if (folder / "a").read_bytes() != b"sound":
         raise KeyError("what nobody caught")
@@ -262,6 +292,8 @@ READERS: dict[str, tuple[Make, Read]] = {
     "run.json": (run_folder, lambda f: Results(f).read_run()),
     "what a run keeps": (run_folder, done),
     "trajectories": (written("trajectories_raw.npz", tracked), looked_at),
+    "surface to be shown": (surface, shown),
+    "table of a take": (text("take.toml", TAKE), read_table),
     "contours": (text("C.csv", CONTOURS), lambda f: list(ContourTable(f / "C.csv").values())),
     "check of a run": (run_folder, lambda f: check_run(f, Monitor())),
     "trc": (written("a.trc", lambda p: trc.write_trc(p, points())), lambda f: trc.read_trc(f / "a.trc")),
@@ -276,6 +308,11 @@ READERS: dict[str, tuple[Make, Read]] = {
                    lambda f: frame_table.read_frame_table(f / "frames.csv")),
     "chosen points": (text("points.csv", "point,x,y,joined_to\na,10,12,b\nb,20,30,\nc,5,6.5,a\n"),
                       lambda f: read_points(f / "points.csv")),
+    "2-D tracks": (text("a.csv", "frame,point,x,y,sigma,correlation,status\n0,a,10,12,0.1,0.9,measured\n1,a,11,12,,,lost\n"),
+                   lambda f: read_planar(f / "a.csv")),
+    "bar": (bar_file, lambda f: read_bar(f / "rig.toml", RIG)),
+    "chosen points in views": (text("points.csv", "point,view,x,y\na,L,10,12\na,C,20,30\n"),
+                               lambda f: read_points(f / "points.csv", with_views=True)),
     "polygon": (text("polygon.csv", "x,y\n10,12\n40,13\n38,60\n9,55\n"), lambda f: read_polygon(f / "polygon.csv")),
     "body.toml": (written("body.toml", body), lambda f: read_body(f / "body.toml")),
     "own model": (written("own.toml", own_model), lambda f: read_model(f / "own.toml")),

@@ -12,10 +12,15 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.errors import InputError
+from tricap.core.fitting.conditions import Conditions
+from tricap.core.fitting.sequence import FitInput, fit_sequence
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.motion import sources
 from tricap.core.motion.markers import Markers
+from tricap.core.motion.retarget.mapping import find_map
 
+from .core.fitting.limb_scene import make_scene
+from .core.motion.persons import person
 from .mutations import mutate
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -71,9 +76,26 @@ def test_the_field_function() -> None:
         np.testing.assert_allclose(difference, gradient[:, axis], atol=1e-5 * np.abs(gradient).max())
 
 
+def test_the_observation_moves_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Given to `Conditions.of_shape`, as the page says: the forearm comes out as long as the tape, and not as it was without."""
+    taped, of_shape = made("An observation for the fit")["TapedBone"], Conditions.of_shape
+    scene = make_scene(frames=1, seed=1, points=120)
+    given = FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={0: scene.clicks}, click_frame=0, time_s=scene.time_s)
+    free = fit_sequence(given).shape.lengths_m[1]
+    tape = taped(bone=1, tape_m=1.08 * free, sigma_m=1e-4)
+    monkeypatch.setattr(Conditions, "of_shape", lambda self, lengths=None: [*of_shape(self, lengths), tape])
+    assert abs(fit_sequence(given).shape.lengths_m[1] / free - 1.08) < 0.005
+
+
 def test_the_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert made("A rig preset")["preset"].name == "Puppet"
+    puppet = made("A rig preset")["preset"]
+    names = {"hips": "puppet:Root", "spine": "puppet:Belly", "neck": "puppet:Neck", "head": "puppet:Head"}
+    for role, bone in {"upper_arm": "Arm", "forearm": "Elbow", "hand": "Hand", "thigh": "Leg", "shin": "Knee", "foot": "Foot"}.items():
+        names |= {f"{role}.{side}": f"puppet:{word}{bone}" for side, word in (("L", "left"), ("R", "right"))}
+    found = find_map(person(names=names, without=("clavicle", "toe")), [puppet])
+    assert found.bones["forearm.L"] == ("puppet:leftElbow",) and found.bones["foot.R"] == ("puppet:rightFoot",)
+    assert "Puppet" in found.origin
 
 
 def test_the_file_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

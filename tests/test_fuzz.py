@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 import zlib
 from pathlib import Path
 
@@ -18,7 +19,10 @@ from tricap.core import store
 from tricap.core.errors import LONGEST, InputError
 from tricap.core.images.headers import claimed_size
 from tricap.core.images.sequence import read_image
+from tricap.core.motion.keypoints_json import natural_order, read_keypoints
+from tricap.core.motion.tables import read_joints
 from tricap.core.results import Results
+from tricap.core.tracking.point_tables import read_planar, read_points
 
 HERE = Path(__file__).resolve().parent
 COUNT = 100
@@ -66,6 +70,44 @@ def test_bombs_are_refused_before_they_unpack(tmp_path: Path) -> None:
     assert (tmp_path / "a.npz").stat().st_size < 1_000_000
     with pytest.raises(InputError, match="would unpack to 0.5 GB"):
         store.load(tmp_path / "a.npz")
+
+
+def test_a_row_for_every_frame_and_name_of_its_own_makes_no_square_table(tmp_path: Path) -> None:
+    """As many columns as rows: a megabyte of them asked for gigabytes."""
+    rows = "".join(f"{i},{i},p{i},1,2,3,0.1\n" for i in range(3_000))
+    (tmp_path / "joints.csv").write_text("frame,time_s,joint,x,y,z,sigma\n" + rows)
+    (tmp_path / "planar.csv").write_text("frame,time,point,x,y,z,sigma\n" + rows)
+    names = [f"n{i}" for i in range(3_000)]
+    people = [{"image_id": i, "keypoints": []} for i in range(3_000)]
+    table = {"categories": [{"keypoints": names}], "annotations": [*people, {"image_id": 0, "keypoints": [1, 2, 1]}]}
+    (tmp_path / "coco.json").write_text(json.dumps(table))
+    for read in (lambda: read_joints(tmp_path / "joints.csv"), lambda: read_planar(tmp_path / "planar.csv"),
+                 lambda: read_keypoints([tmp_path / "coco.json"])):  # fmt: skip
+        with pytest.raises(InputError, match="nearly all is missing"):
+            read()
+
+
+def test_many_points_that_are_joined_are_read_in_a_moment(tmp_path: Path) -> None:
+    rows = "".join(f"p{i},1,2,p{i - 1}\n" for i in range(30_000))
+    (tmp_path / "a.csv").write_text("point,x,y,joined_to\n" + rows.replace("p-1", ""))
+    began = time.process_time()
+    assert len(read_points(tmp_path / "a.csv").joined) == 29_999
+    (tmp_path / "a.csv").write_text("point,x,y,joined_to\n" + rows)
+    with pytest.raises(InputError, match="which is no point"):
+        read_points(tmp_path / "a.csv")
+    assert time.process_time() - began < 2.0  # seconds a file, when every name was looked for among all
+
+
+def test_names_of_images_are_numbers_or_words(tmp_path: Path) -> None:
+    path, points = tmp_path / "a.json", [1.0, 2.0, 1.0] * 17
+    for name in ([1], {"a": 1}):
+        path.write_text(json.dumps([{"image_id": name, "keypoints": points}]))
+        with pytest.raises(InputError, match="has an image named"):
+            read_keypoints([path])
+    for name in ("9" * 5000, "b\u00b2", None, 1.5, True):
+        path.write_text(json.dumps([{"image_id": name, "keypoints": points}]))
+        assert len(read_keypoints([path]).names) == 17
+    assert sorted(["a10", "a\u00b2", "a9", "a" + "1" * 5000], key=natural_order) == ["a9", "a10", "a" + "1" * 5000, "a\u00b2"]
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".tif", ".bmp", ".webp", "portable"])

@@ -8,6 +8,7 @@ import numpy as np
 from ..overlay import canvas
 from ..overlay.canvas import Canvas, Colour
 from .figure import figure
+from .labels import MARK, place_labels
 from .session import ClickSession
 
 PRESENT: Colour = (1.0, 0.75, 0.1, 1.0)
@@ -19,6 +20,7 @@ DONE: Colour = (0.3, 0.9, 0.4, 1.0)
 OPEN: Colour = (0.25, 0.25, 0.28, 1.0)
 FIGURE_PX, MARGIN_PX, TIMELINE_PX = 190.0, 12.0, 22.0
 OFFER_PX = 11.0
+NAME_PX, UNDER_MOUSE_PX = 11.0, 12.0
 
 _handle: list[Any] = []
 _shown: dict[str, Any] = {"session": None, "mouse": (-1, -1)}
@@ -56,7 +58,8 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
     for other, curve in session.curves(view).items():
         colour = LINES[session.views.index(other) % len(LINES)]
         canvas.draw_lines(canvas.line_batch(canvas.chain(sheet.to_region(curve))), 1.5, colour)
-    _draw_others(session, view, sheet)
+    x, y = mouse[0] - sheet.region.x, mouse[1] - sheet.region.y
+    _draw_others(session, view, sheet, np.array([x, y]))
     at = session.clicks().get(view)
     if at is not None:
         canvas.draw_lines(canvas.line_batch(canvas.cross(sheet.to_region(at), 12.0, 3.0)), 2.0, PRESENT)
@@ -68,19 +71,32 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
         canvas.text(f"{session.name}? ±{max(offer.sigma_px, 0.1):.1f} px", centre[0] + OFFER_PX + 6, centre[1] - 20, OFFER, size=11)
     _draw_headline(session, view, sheet)
     draw_figure(session, sheet)
-    x, y = mouse[0] - sheet.region.x, mouse[1] - sheet.region.y
     if session.name and 0 <= x < sheet.region.width and 0 <= y < sheet.region.height:
         canvas.text(session.name, x + 16, y + 10, PRESENT, size=15)
 
 
-def _draw_others(session: ClickSession, view: str, sheet: Canvas) -> None:
-    """What else was clicked in this frame, with names: Blender's own markers are seen in frames in which nothing was clicked, too."""
-    for name in session.names[: session.turn + 1] if session.endless else session.names:
-        at = session.clicks(name).get(view) if name != session.name else None
-        if at is not None:
-            place = sheet.to_region(at)
-            canvas.draw_lines(canvas.line_batch(canvas.cross(place, 6.0)), 1.5, DONE)
-            canvas.text(name, place[0] - 10, place[1] + 18, DONE, size=11)  # above the marker's box and handle
+def _draw_others(session: ClickSession, view: str, sheet: Canvas, mouse: np.ndarray) -> None:
+    """What else was clicked in this frame: Blender's own markers are seen in frames in which nothing was clicked, too.
+
+    With names, as far as there is room for them; that under the mouse in any case.
+    """
+    names = session.names[: session.turn + 1] if session.endless else session.names
+    clicked = {name: at for name in names if name != session.name and (at := session.clicks(name).get(view)) is not None}
+    if not clicked:
+        return
+    marks = sheet.to_region(np.array([*clicked.values()]))
+    widths = np.array([canvas.text_width(name, size=NAME_PX) for name in clicked])
+    height, region = canvas.text_height(size=NAME_PX), (sheet.region.width, sheet.region.height)
+    corners = place_labels(marks, widths, height, region)
+    near = int(np.linalg.norm(marks - mouse, axis=1).argmin())
+    for i, name in enumerate(clicked):
+        canvas.draw_lines(canvas.line_batch(canvas.cross(marks[i], MARK)), 1.5, DONE)
+        if np.isfinite(corners[i]).all():
+            canvas.text(name, *corners[i], DONE, size=NAME_PX)
+        elif i == near and np.linalg.norm(marks[i] - mouse) < UNDER_MOUSE_PX:
+            x, y = marks[i] + (-10.0, -3 * height)
+            canvas.fill(canvas.rectangle(x - 3, y - 4, widths[i] + 6, height + 8), PAPER)
+            canvas.text(name, x, y, DONE, size=NAME_PX)
 
 
 def headline(session: ClickSession, view: str) -> str:

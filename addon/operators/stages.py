@@ -7,13 +7,14 @@ from typing import Any, ClassVar
 import bpy
 
 from ...core import pipeline
+from ...core.fit_sources import check_body
 from ...core.progress import Monitor
 from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE
 
 STEP_WORDS = {"surface": "surface", "seeds": "surface", "matching": "surface", "tracks": "tracks", "filters": "tracks",
-              **dict.fromkeys(("thin", "background", "fit", "adjust", "refine", "skin", "silhouettes", "report"), "body"),
+              **dict.fromkeys(("thin", "background", "fit", "adjust", "refine", "sigmas", "skin", "silhouettes", "report"), "body"),
               **dict.fromkeys(("reading", "preparing"), "rig")}  # the first word of what a stage says of itself -> its step
 
 
@@ -44,6 +45,8 @@ class StageOperator(JobOperator):
 def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> pipeline.Run:
     """The computation, free of bpy. What is checkpointed is not computed again."""
     with pipeline.open_run(take, out, overrides) as run:
+        if "fit" in names:
+            check_body(run.footage, run.settings["fitting"])
         for name in names:
             getattr(pipeline, name)(run, monitor)
     return run

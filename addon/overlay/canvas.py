@@ -166,6 +166,12 @@ def text(words: str, x: float, y: float, colour: Colour = (1.0, 1.0, 1.0, 1.0), 
     blf.disable(0, blf.SHADOW)
 
 
+def text_height(*, size: float = TEXT_PX) -> float:
+    """Height of a line of words in region pixels."""
+    blf.size(0, size * bpy.context.preferences.system.ui_scale)
+    return float(blf.dimensions(0, "Ag")[1])
+
+
 def text_width(words: str, *, size: float = TEXT_PX) -> float:
     """Width of words in region pixels."""
     blf.size(0, size * bpy.context.preferences.system.ui_scale)

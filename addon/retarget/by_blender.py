@@ -17,6 +17,7 @@ from typing import Any
 import bpy
 from mathutils import Matrix
 
+from ...core import store
 from ...core.body.shape import read_body
 from ...core.errors import InputError
 from ...core.motion.markers import metres_per
@@ -108,13 +109,14 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     file = Path(file).resolve()
     part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+        store.try_writing(part)
         export(str(part))
         if not part.is_file():
             raise InputError(f"Blender wrote nothing to {file}; choose another folder.")
         os.replace(part, file)
     except (OSError, RuntimeError, shutil.Error) as error:
-        raise InputError(f"Cannot write {file}: {str(error).strip()[:200]}") from error
+        said = getattr(error, "strerror", None) or str(error).strip()[:200]
+        raise InputError(f"Cannot write {file}: {said}. Choose another name or folder, or free some space.") from error
     finally:
         if part.exists():
             part.unlink()

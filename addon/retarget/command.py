@@ -2,14 +2,18 @@
 
 import argparse
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from ...core import store
+from ...core.arguments import check_not_read
 from ...core.errors import InputError
 from ...core.motion.markers import UNITS_M
 from ...core.progress import Monitor
+from ...core.results import check_not_result
 from ...core.settings import from_table
+from ..command import check_simplify, standard_output_kept_clean
 from .programs import PROGRAMS
 
 FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
@@ -35,7 +39,7 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0, help="leave out keys within this tolerance")
     parser.add_argument("--report", action="store_true", help="also write figures (JSON) and a picture beside FILE.blend")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    parser.set_defaults(run=retarget)
+    parser.set_defaults(run=_clean(retarget))
     about = "write a run's motion or points in another format"
     parser = subparsers.add_parser("export", help=about, description=about.capitalize())
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
@@ -44,7 +48,16 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain",
                         help="names, units and axes for a program")
     _add_axes(parser)
-    parser.set_defaults(run=export)
+    parser.set_defaults(run=_clean(export))
+
+
+def _clean(run: Callable[[argparse.Namespace, Monitor], list[str]]) -> Callable[[argparse.Namespace, Monitor], list[str]]:
+    """A command on whose standard output nothing of Blender's own is written."""
+    def kept_clean(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+        with standard_output_kept_clean(args):
+            return run(args, monitor)
+
+    return kept_clean
 
 
 def _add_axes(parser: argparse.ArgumentParser) -> None:
@@ -74,6 +87,11 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
     if args.blend.suffix != ".blend":
         raise InputError(f"{args.blend.name} is no name of a Blender file; let it end in .blend.")
+    check_simplify(args.simplify)
+    check_not_result(args.blend, args.out)
+    check_not_read("--out", args.blend, args.rig)
+    if args.report:
+        check_not_read("--report would write over what is read:", args.blend.with_suffix(".json"), args.map)
     table = {"root": args.root, "hands": args.hands, "twist": args.twist, "scale": args.scale}
     settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
@@ -107,7 +125,7 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """
     from .export import BY_BLENDER, IN_BLENDER, export_file, named_for
 
-    file = named_for(args.format, args.file)
+    file = named_for(args.format, args.file, args.out)
     if args.format in BY_BLENDER or args.out.suffix.lower() in IN_BLENDER and not args.out.is_dir():
         _need_blender("export")
     return [f"{file}: {export_file(args.out, args.format, file, args.preset, monitor, up=args.up, unit=args.unit)}"]

@@ -16,6 +16,7 @@ from ...core.motion.sources import read_motion_source
 from ...core.motion.tables import read_joints
 from ...core.motion.trc import write_trc
 from ...core.progress import Monitor
+from ...core.results import check_not_result
 from .programs import PROGRAMS, Program, bone_names, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")
@@ -26,18 +27,20 @@ ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "fbx", "abc", *POINTS)} | {
     "glb": (".glb", ".gltf"), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
 
 
-def named_for(kind: str, file: Path) -> Path:
-    """The file to write in a format: with the format's ending, where the name has none. Skins go into a folder of any name.
+def named_for(kind: str, file: Path, out: Path) -> Path:
+    """The file to write in a format, of what is in `out`: with the format's ending, where the name has none. Skins go into a folder of any
+    name.
 
     Raises:
-        InputError: the name ends as files of another format do.
+        InputError: the name ends as files of another format do, or is that of what is read.
     """
     ending = file.suffix.lower()
-    if kind == "ply" or ending in ENDINGS[kind]:
-        return file
-    if any(ending in others for others in ENDINGS.values()):
-        raise InputError(f"{file.name} ends as files of another format do; let it end with {ENDINGS[kind][0]}, or choose that format.")
-    return file if ending else file.with_name(file.name + ENDINGS[kind][0])
+    if kind != "ply" and ending not in ENDINGS[kind]:
+        if any(ending in others for others in ENDINGS.values()):
+            raise InputError(f"{file.name} ends as files of another format do; let it end with {ENDINGS[kind][0]}, or choose that format.")
+        file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
+    check_not_result(file, out)
+    return file
 
 
 def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor, *, up: str = "", unit: str = "") -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ...core import store
 from ...core.body.fields import EXPONENTIAL, potential_named
 from ...core.body.one_skin import DETAIL
 from ...core.errors import InputError
@@ -137,7 +138,8 @@ def set_time(scene: bpy.types.Scene, contents: Contents) -> None:
 
 
 def save_blend(path: Path) -> None:
-    """Save a copy of the open file as `path`, whole or not at all; the open file keeps its name.
+    """Save a copy of the open file as `path`, whole or not at all; the open file keeps its name. What was there stays as .blend1, unless
+    it is that of a run.
 
     Raises:
         InputError: the file cannot be written.
@@ -147,12 +149,15 @@ def save_blend(path: Path) -> None:
         raise InputError(f"{path.name} is no name of a Blender file; let it end in .blend.")
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.blend")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        store.try_writing(part)
         with _caches_beside(path):
             bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, relative_remap=True, compress=True)
+        if path.exists() and not (path.name == "body.blend" and (path.parent / "run.json").exists()):
+            os.replace(path, path.with_suffix(".blend1"))  # as Blender keeps the version before
         os.replace(part, path)
     except (OSError, RuntimeError) as error:
-        raise InputError(f"Cannot write {path}: {str(error).strip()} Choose another folder or free some space.") from error
+        said = getattr(error, "strerror", None) or str(error).strip()
+        raise InputError(f"Cannot write {path}: {said}. Choose another folder or free some space.") from error
     finally:
         if part.exists():
             part.unlink()

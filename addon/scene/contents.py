@@ -115,7 +115,7 @@ def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage 
 
 
 def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Ply]:
-    files = {int(path.stem): path for path in sorted(folder.glob("*.ply")) if path.stem.isdigit()}
+    files = {int(path.stem): path for path in sorted(folder.glob("*.ply")) if path.stem.isdecimal()}
     if not files:
         warnings.append(f"No point cloud in the scene: {folder} holds no clouds.")
     clouds = {}
@@ -126,7 +126,7 @@ def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Pl
 
 
 def _skins(settings: SkinSettings, folder: Path, monitor: Monitor, warnings: list[str]) -> FrameSkins | None:
-    files = {int(path.stem): path for path in folder.glob("*.ply") if path.stem.isdigit()}
+    files = {int(path.stem): path for path in folder.glob("*.ply") if path.stem.isdecimal()}
     if not files:
         warnings.append(f"No exact skin in the scene: {folder} holds no skins; run the fit again.")
         return None

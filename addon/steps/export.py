@@ -54,7 +54,7 @@ class Export(JobOperator, bpy.types.Operator):
         if not self.filepath:
             raise InputError("Choose the file to write.")
         out, kind, preset = folders.output_folder(self.out, context.scene), self.kind, self.preset
-        file = named_for(kind, folders.absolute(self.filepath))
+        file = named_for(kind, folders.absolute(self.filepath), out)
         self._out, self._file = out, file
         if kind in BY_BLENDER:
             return lambda monitor: read_motion_source(out)

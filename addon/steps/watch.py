@@ -15,7 +15,7 @@ from .states import STEPS, Look, State
 TICK_S = 1.0
 _looks: dict[str, Look] = {}  # by scene
 _stamps: dict[str, Any] = {}
-_failures: dict[tuple[str, str], tuple[str, str]] = {}  # (scene, step) -> the input with which it failed, and the sentence
+_ends: dict[tuple[str, str], tuple[str, str, str]] = {}  # (scene, step) -> the input with which it failed or was stopped, the word, why
 _changed: set[str] = {"scene"}
 
 
@@ -34,7 +34,7 @@ def look(scene: bpy.types.Scene) -> Look:
 
 def refresh(scene: bpy.types.Scene) -> Look:
     """Look at everything now. The next step is unfolded when it becomes another one, and what is done is folded, but the last."""
-    before, now = _looks.get(scene.name_full), _with_failures(scene, states.compute(scene))
+    before, now = _looks.get(scene.name_full), _with_ends(scene, states.compute(scene))
     _looks[scene.name_full], _stamps[scene.name_full] = now, _stamp(scene)
     _changed.clear()
     if before is None or before.next != now.next:
@@ -53,15 +53,15 @@ def state_of(context: bpy.types.Context, step: str) -> State:
     return State(word="running", why=job.left) if job.running and job.step == step else look(context.scene).states[step]
 
 
-def _with_failures(scene: bpy.types.Scene, now: Look) -> Look:
-    """A step that failed with the input that it still has stays failed."""
+def _with_ends(scene: bpy.types.Scene, now: Look) -> Look:
+    """A step that failed with the input that it still has stays failed, and one that was stopped says what was kept."""
     found = dict(now.states)
-    for (name, step), (given, sentence) in list(_failures.items()):
+    for (name, step), (given, word, sentence) in list(_ends.items()):
         if name == scene.name_full and step in found:
             if given == _input(step, now) and found[step].word in ("ready", "stale"):
-                found[step] = State(word="failed", why=sentence)
+                found[step] = State(word=word or found[step].word, why=sentence)
             elif given != _input(step, now) or found[step].word == "done":
-                del _failures[name, step]
+                del _ends[name, step]
     return Look(states=found, keys=now.keys)
 
 
@@ -69,12 +69,12 @@ def _input(step: str, now: Look) -> str:
     return now.keys.get(states.STAGE.get(step, ""), "")
 
 
-def _ended(context: bpy.types.Context, step: str, failed: str) -> None:
+def _ended(context: bpy.types.Context, step: str, failed: str, stopped: str) -> None:
     scene = context.scene
-    _failures.pop((scene.name_full, step), None)
+    _ends.pop((scene.name_full, step), None)
     now = refresh(scene)
-    if failed and step in STEPS:
-        _failures[scene.name_full, step] = _input(step, now), failed
+    if (failed or stopped) and step in STEPS:
+        _ends[scene.name_full, step] = _input(step, now), "failed" if failed else "", failed or stopped
         refresh(scene)
 
 
@@ -122,7 +122,7 @@ def _scene_changed(*_: Any) -> None:
 
 @bpy.app.handlers.persistent
 def _file_loaded(*_: Any) -> None:
-    for known in (_looks, _stamps, _failures):
+    for known in (_looks, _stamps, _ends):
         known.clear()
     mark()
 

@@ -101,7 +101,8 @@ def read_body(path: Path) -> BodyShape:
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"Cannot read the body {path}: {error}; run the fit again.") from error
+        said = getattr(error, "strerror", None) or error
+        raise InputError(f"Cannot read the body {path}: {said}; run the fit again.") from error
     if table.get("format") != "tricap-body" or table.get("version") != 1:
         raise InputError(f"{path} is no body of this version of Tricap; run the fit again.")
     try:

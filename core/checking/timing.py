@@ -113,8 +113,7 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
     found = {reference: none}
     while len(found) < len(names):
         base, k = film.best_link(set(found))
-        monitor.step("synchronization", len(found) - 1, len(names) - 1)
-        link = _between(film, base, k, names[k], monitor)
+        link = _between(film, base, k, names[k], monitor.part("synchronization", len(found) - 1, len(names) - 1))
         late, sigma = link.late_frames + found[base].late_frames, float(np.hypot(link.sigma_frames, found[base].sigma_frames))
         found[k] = Offset(
             view=names[k],

@@ -199,7 +199,9 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
     except (ValueError, IndexError, NotImplementedError):  # what pathlib raises for a pattern that is none
         paths = ()
     if not paths:
-        raise InputError(f"View {view} has no images: nothing in {folder} agrees with “{pattern}”. Mend `images` in take.toml.")
+        inside = pattern and (folder / pattern).is_dir()
+        hint = f"“{pattern}” is a folder; write “{pattern.rstrip('/')}/*.png” for its PNG files." if inside else "Mend `images` there."
+        raise InputError(f"View {view} has no images: nothing in {folder} agrees with “{pattern}”, as take.toml has it. {hint}")
     _check_numbering(paths, view)
     for path in paths:
         _check_signature(path)

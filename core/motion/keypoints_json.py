@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..values import frozen
+from ..values import check_sparse, frozen
 
 COCO = ("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow",
         "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
@@ -26,7 +26,7 @@ HALPE = (*COCO, "crown", "neck", "mid_hip", "left_big_toe", "right_big_toe", "le
 LAYOUTS = {17: COCO, 18: (*ARMS, *LEGS, *FACE), 25: (*ARMS, "MidHip", *LEGS, *FACE, *FEET), 26: HALPE}  # by the number of keypoints
 WHOLE_BODY = 133  # COCO with feet, face and hands: the body's come first
 NUMBER = re.compile(r"(\d{1,12})(?:_keypoints)?$", re.IGNORECASE)  # in the name of an image's file
-LARGEST_BYTES = 1 << 28
+LARGEST_BYTES, MOST_DIGITS = 1 << 28, 15
 Person = np.ndarray  # (K, 3) x, y, confidence
 
 
@@ -79,6 +79,7 @@ def _numbers_of(paths: Sequence[Path]) -> Sequence[int]:
 def _followed(people: list[tuple[int, list[Person]]], names: tuple[str, ...]) -> ImagePoints:
     """One person through the images."""
     k = len(names)
+    check_sparse(sum(p.size for _, those in people for p in those), len(people), k, "The file of keypoints")
     before: Person | None = None
     table = np.full((len(people), k, 3), np.nan)
     people = sorted(people, key=lambda row: row[0])
@@ -112,14 +113,14 @@ def _coco(table: Any, path: Path) -> tuple[list[tuple[int, list[Person]]], tuple
         categories = [c for c in _dicts(table.get("categories", []), path) if c.get("keypoints")]
         names = tuple(str(n) for n in categories[0]["keypoints"]) if categories else ()
         images = sorted(_dicts(table.get("images", []), path), key=lambda i: natural_order(str(i.get("file_name", i.get("id")))))
-        order = {image.get("id"): n for n, image in enumerate(images)}
+        order = {_name(image.get("id"), path): n for n, image in enumerate(images)}
     by_image: dict[Any, list[Person]] = {}
     for row in _dicts(rows, path):
         if "image_id" not in row:
             raise InputError(f"{path} is of no known kind of keypoints; give OpenPose's or COCO's JSON.")
-        by_image.setdefault(row["image_id"], []).append(_numbers(row.get("keypoints"), path))
+        by_image.setdefault(_name(row["image_id"], path), []).append(_numbers(row.get("keypoints"), path))
     ids = sorted(by_image, key=lambda i: natural_order(str(i)))
-    last = {i: re.findall(r"\d+", str(i))[-1:] for i in ids}
+    last = {i: [n for n in re.findall(r"\d+", str(i))[-1:] if len(n) <= MOST_DIGITS] for i in ids}
     number = order or {i: int(last[i][0]) if all(last.values()) else n for n, i in enumerate(ids)}
     return [(number[i], by_image[i]) for i in ids if i in number], names
 
@@ -143,6 +144,13 @@ def _json(path: Path) -> Any:
         raise InputError(f"{path} is no JSON file: {error}.") from error
 
 
+def _name(value: Any, path: Path) -> Any:
+    """The name or number of an image."""
+    if not isinstance(value, (str, int, float)) and value is not None:
+        raise InputError(f"{path} has an image named {str(value)[:40]}; give OpenPose's or COCO's JSON.")
+    return value
+
+
 def _dicts(rows: Any, path: Path) -> list[dict[str, Any]]:
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError(f"{path} is of no known kind of keypoints; give OpenPose's or COCO's JSON.")
@@ -159,4 +167,5 @@ def _numbers(values: Any, path: Path) -> Person:
 
 def natural_order(text: str) -> list[Any]:
     """A key that sorts 2 before 10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part]
+    parts = [(part, part.lstrip("0")) for part in re.split(r"(\d+)", text) if part]
+    return [(0, len(number), number) if part.isdecimal() else (1, 0, part) for part, number in parts]

@@ -17,7 +17,7 @@ from .. import store
 from ..body.skeleton import Skeleton
 from ..errors import InputError
 from ..fitting.body_motion import BodyMotion
-from ..values import frozen
+from ..values import check_sparse, frozen
 
 LARGEST_FRAME = 2**53
 JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")
@@ -105,6 +105,7 @@ def read_joints(path: Path) -> JointTable:
         times[frame] = _number(row[columns["time_s"]], path, line)
         found.setdefault(row[columns["joint"]], {})[frame] = [_number(row[columns[c]], path, line) for c in ("x", "y", "z", "sigma")]
     frames = sorted(times)
+    check_sparse(len(rows), len(frames), len(found), path)
     tables = {joint: np.array([places.get(f, [np.nan] * 4) for f in frames]) for joint, places in found.items()}
     return JointTable(frames=np.array(frames, dtype=np.int64), time_s=np.array([times[f] for f in frames]),
                       joints_m={joint: t[:, :3] for joint, t in tables.items()}, sigma_m={joint: t[:, 3] for joint, t in tables.items()})

@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import store
 from ..body.skin import SkinSettings
+from ..errors import InputError
 from ..fitting.body_motion import BodyFit
 from ..progress import Monitor
 from ..results import Results
@@ -34,6 +35,17 @@ LABELS = {
     "outline_mm": "outlines from the body [mm], median",
     "mean_length_frames": "mean length [frames]",
 }
+
+
+def check_pictured(frames: range, wanted: Sequence[int]) -> None:
+    """The frames of the report's pictures, all of them there.
+
+    Raises:
+        InputError: one is not.
+    """
+    for frame in wanted:
+        if frame not in frames:
+            raise InputError(f"--pictures {frame} is not among the frames {frames.start} to {frames.stop - 1}; choose others.")
 
 
 def write_report(

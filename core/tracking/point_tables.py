@@ -11,9 +11,12 @@ import numpy as np
 from .. import store
 from ..errors import InputError
 from ..settings import nearest_name
+from ..values import check_sparse
 from .key_points import KeyPoints
 from .planar import PlanarTracks
 from .settings import TrackStatus
+
+MOST_COMPARED = 1000  # names, when the nearest is looked for
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -38,21 +41,23 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
     except OSError as error:
         raise InputError(f"Cannot read the points {path}: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} is not a CSV table: {error}.") from error
+        raise InputError(f"{path} is not a CSV table ({error}); save it as CSV in UTF-8.") from error
     if not rows:
         raise InputError(f"{path} holds no points; write a line {','.join(needed)} and one line for each point.")
     for name in needed:
         if name not in rows[0]:
-            raise InputError(f"{path} has no column “{name}”; its first line must name the columns {', '.join(needed)}.")
+            mend = "separate them by commas, not semicolons" if ";" in str(next(iter(rows[0]))) else "its first line must name them"
+            raise InputError(f"{path} has no column “{name}”; the columns are {', '.join(needed)}: {mend}.")
     xy = np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
     names = tuple((row["point"] or "").strip() for row in rows)
     views = tuple((row["view"] or "").strip() if with_views else "" for row in rows)
     if "" in names or len(set(zip(names, views))) < len(names):
         raise InputError(f"{path} names a point twice or not at all; give every point its own name.")
     joined = tuple((n, row["joined_to"].strip()) for n, row in zip(names, rows) if (row.get("joined_to") or "").strip())
+    known = set(names)
     for name, other in joined:
-        if other not in names:
-            raise InputError(f"{path} joins “{name}” to “{other}”, which is no point.{nearest_name(other, names)}")
+        if other not in known:
+            raise InputError(f"{path} joins “{name}” to “{other}”, which is no point.{nearest_name(other, names[:MOST_COMPARED])}")
     return ChosenPoints(names=names, views=views, xy_px=xy, joined=joined)
 
 
@@ -62,7 +67,7 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"Line {line} of {path} has {column} = {text!r}; write a pixel coordinate.")
+        raise InputError(f"Line {line} of {path} has {column} = {text!r}; write a pixel coordinate, with a point for decimals.")
     return value
 
 
@@ -98,14 +103,15 @@ def read_planar(path: Path) -> PlanarTable:
     """
     try:
         rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
-        places = {(int(r["frame"]), r["point"]): (float(r["x"] or "nan"), float(r["y"] or "nan")) for r in rows}
+        places = {(int(np.int32(int(r["frame"]))), r["point"]): (float(r["x"] or "nan"), float(r["y"] or "nan")) for r in rows}
     except OSError as error:
         raise InputError(f"Cannot read the tracks {path}: {error.strerror or error}.") from error
-    except (UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError) as error:
+    except (UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is no table of 2-D tracks ({error}); choose what `tricap track2d` wrote.") from error
     if not places:
         raise InputError(f"{path} holds no tracks; choose what `tricap track2d` wrote.")
     frames, names = sorted({frame for frame, _ in places}), tuple(dict.fromkeys(name for _, name in places))
+    check_sparse(len(places), len(frames), len(names), path)
     xy = np.array([[places.get((frame, name), (np.nan, np.nan)) for name in names] for frame in frames])
     return PlanarTable(frames=np.array(frames), names=names, xy_px=np.where(np.isfinite(xy).all(axis=2, keepdims=True), xy, np.nan))
 

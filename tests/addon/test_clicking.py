@@ -343,3 +343,37 @@ def test_the_order_of_the_joints(blender: ModuleType) -> None:
     asked = joints_of(every)
     assert asked[0] == "head" and "chest" not in asked and "crown" not in asked and "chest" in joints_of(every, hidden=True)
     assert joints_of(read_model("leg.L").skeleton.joint_names) == ["hip.L", "knee.L", "ankle.L"]
+
+
+@pytest.mark.parametrize("height_px", [600.0, 150.0, 60.0])
+def test_names_of_joints_lie_over_nothing(blender: ModuleType, height_px: float) -> None:
+    """On a small figure some names are left out rather than written over others."""
+    labels, shape = module("clicking.labels"), module("clicking.figure").figure()
+    marks = np.array([300.0, 60.0]) + height_px * np.array([*shape.joints.values()])
+    widths = np.array([7.0 * len(name) for name in shape.joints])
+    corners = labels.place_labels(marks, widths, 11.0, (800, 700))
+    placed = np.flatnonzero(np.isfinite(corners).all(axis=1))
+    low, high = corners[placed], corners[placed] + np.stack([widths[placed], np.full(len(placed), 11.0)], axis=1)
+    boxes = np.concatenate([low, high], axis=1)
+    others = np.concatenate([boxes, np.concatenate([marks - labels.MARK, marks + labels.MARK], axis=1)])
+    over = (boxes[:, None, :2] < others[:, 2:]).all(axis=2) & (others[:, :2] < boxes[:, None, 2:]).all(axis=2)
+    assert over.sum() == len(placed), "each lies over itself alone"
+    assert (low >= 0).all() and (high <= (800, 700)).all()
+    assert len(placed) >= {600.0: len(marks), 150.0: 10, 60.0: 4}[height_px]
+
+
+def test_names_that_have_no_room_are_seen_under_the_mouse(session: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    draw = module("clicking.draw")
+    joints = list(session.names)
+    clicks = {name: {"C": np.array([100.0 + 2 * i, 80.0])} for i, name in enumerate(joints)}
+    monkeypatch.setattr(type(session), "clicks", lambda self, name=None: clicks.get(name, {}))
+    sheet = SimpleNamespace(region=SimpleNamespace(width=130, height=130, x=0, y=0), to_region=lambda xy: np.asarray(xy, dtype=float))
+    told: list[str] = []
+    monkeypatch.setattr(draw.canvas, "text", lambda words, *rest, **more: told.append(words))
+    for name in ("draw_lines", "line_batch", "fill"):
+        monkeypatch.setattr(draw.canvas, name, lambda *rest: None)
+    monkeypatch.setattr(draw, "place_labels", lambda marks, *rest: np.full((len(marks), 2), np.nan))
+    draw._draw_others(session, "C", sheet, np.array([500.0, 500.0]))
+    assert told == []
+    draw._draw_others(session, "C", sheet, clicks[joints[1]]["C"])
+    assert told == [joints[1]]

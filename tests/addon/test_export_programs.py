@@ -1,6 +1,11 @@
 """Presets for other programs: names, units and axes in the files themselves, and skins, by readers that are not ours."""
 
+import errno
+import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,7 +17,7 @@ from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.export import export_file, named_for, points_of
 from tricap.core.errors import InputError
-from tricap.core.motion.bvh import read_bvh
+from tricap.core.motion.bvh import read_bvh, write_bvh
 from tricap.core.motion.c3d import read_c3d
 from tricap.core.motion.markers import AXES
 from tricap.core.motion.points_csv import read_points_csv
@@ -166,14 +171,47 @@ def test_a_blend_file_goes_out(empty: ModuleType, tmp_path: Path, kind: str) -> 
 
 def test_a_file_is_named_as_its_format(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     named = {("bvh", "a"): "a.bvh", ("usd", "a.usda"): "a.usda", ("glb", "a.GLTF"): "a.GLTF", ("csv", "a.txt"): "a.txt", ("ply", "a"): "a"}
-    assert {key: named_for(key[0], Path(key[1])).name for key in named} == named
+    assert {key: named_for(key[0], Path(key[1]), tmp_path).name for key in named} == named
     with pytest.raises(InputError, match="a.fbx ends as files of another format do; let it end with .trc"):
-        named_for("trc", Path("a.fbx"))
+        named_for("trc", Path("a.fbx"), tmp_path)
     file, out = tmp_path / "moved", str(small_run.out)
     assert blender.ops.tricap.export(kind="bvh", out=out, filepath=str(file)) == {"FINISHED"} and file.with_suffix(".bvh").is_file()
     with pytest.raises(RuntimeError, match="another format"):
         blender.ops.tricap.export(kind="trc", out=out, filepath=str(tmp_path / "b.fbx"))
     assert main(["export", out, "--format", "trc", "--out", str(tmp_path / "b.fbx")]) == 2 and not (tmp_path / "b.fbx").exists()
+
+
+def test_no_export_takes_the_place_of_what_it_reads(blender: ModuleType, small_run: SmallRun, tmp_path: Path, capfd: Any) -> None:
+    out = small_run.out
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
+    write_bvh(tmp_path / "walk.bvh", squat(person(), frames=2))
+    walk = (tmp_path / "walk.bvh").read_bytes()
+    for what, kind, file in ((out, "csv", out / "joints.csv"), (out, "ply", out / "clouds"), (out, "ply", out / "skin" / ".." / "skin"),
+                             (out, "csv", out / "cache" / "a.csv"), (tmp_path / "walk.bvh", "bvh", tmp_path / "walk")):  # fmt: skip
+        assert main(["export", str(what), "--format", kind, "--out", str(file), "--quiet"]) == 2
+        assert "is what is read; give another name" in capfd.readouterr().err
+    with pytest.raises(RuntimeError, match="is what is read"):
+        blender.ops.tricap.export(kind="csv", out=str(out), filepath=str(out / "motion.csv"))
+    argv = ["retarget", str(tmp_path / "walk.bvh"), "--rig", str(tmp_path / "rig.blend"), "--out", str(tmp_path / "rig.blend"), "--quiet"]
+    (tmp_path / "rig.blend").write_text("a rig")
+    assert main(argv) == 2 and (tmp_path / "rig.blend").read_text() == "a rig" and (tmp_path / "walk.bvh").read_bytes() == walk
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == before
+    assert main(["export", str(out), "--format", "csv", "--out", str(out / "for Maya.csv"), "--quiet"]) == 0
+    (out / "for Maya.csv").unlink()
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_blender_tries(
+    empty: ModuleType, small_run: SmallRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    """Its exporters print a traceback there."""
+    def refused(path: Path, *args: object, **more: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr(Path, "touch", refused)
+    for argv in (["export", "--format", "fbx", "--out", "a.fbx"], ["scene", "--blend", "a.blend"]):
+        argv[-1] = str(tmp_path / argv[-1])
+        assert main([argv[0], str(small_run.out), *argv[1:], "--quiet"]) == 2
+        assert capfd.readouterr().err.startswith(f"tricap: Cannot write {argv[-1]}: Read-only file system. Choose another")
 
 
 def test_the_panel_exports_and_leaves_the_scene(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
@@ -188,3 +226,20 @@ def test_the_panel_exports_and_leaves_the_scene(blender: ModuleType, small_run: 
     assert {kind: list(getattr(blender.data, kind).keys()) for kind in kinds} == before
     assert blender.context.scene.name == before["scenes"][0] and mine.name in blender.context.scene.objects
     assert blender.context.scene.tricap_retarget.last.startswith("Exported ")
+
+
+@pytest.mark.slow
+def test_nothing_of_blenders_own_is_written_among_the_answers(small_run: SmallRun, tmp_path: Path) -> None:
+    """Its exporters print, and it tells of every file that it saves: programs read our standard output."""
+    write_bvh(tmp_path / "rig.bvh", squat(person(), frames=2))
+    walk, fbx = str(tmp_path / "rig.bvh"), str(tmp_path / "a.fbx")
+    lines = {"retarget": [walk, "--rig", walk, "--out", str(tmp_path / "a.blend"), "--json"],
+             "export": [str(small_run.out), "--format", "fbx", "--out", fbx]}  # fmt: skip
+    said = {}
+    for command, more in lines.items():
+        done = subprocess.run([sys.executable, "-m", "tricap", command, *more], capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        said[command] = done.stdout
+    assert json.loads(said["retarget"])["frames"] == 2 and said["export"] == f"{fbx}: 2 bones in 6 frames\n"
+    quiet = subprocess.run([sys.executable, "-m", "tricap", "export", *lines["export"], "--quiet"], capture_output=True, text=True)
+    assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")

@@ -181,7 +181,7 @@ def test_a_bug_in_the_scene_is_told_too_and_the_panel_hears_of_the_end(
             return {"FINISHED"} if result["nothing"] else {"CANCELLED"}
 
     heard: list[tuple[str, str]] = []
-    listener = lambda context, step, failed: heard.append((step, failed))  # noqa: E731
+    listener = lambda context, step, failed, stopped: heard.append((step, failed))  # noqa: E731
     blender.utils.register_class(BrokenEnd)
     jobs.ENDED.append(listener)
     try:

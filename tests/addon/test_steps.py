@@ -512,20 +512,28 @@ def test_the_check_is_kept_until_its_input_changes(blender: ModuleType, words: W
 
 
 @pytest.mark.parametrize("step", ["surface", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tracks", "fit"))])
-def test_stopping_at_each_stage_is_one_sentence_and_goes_on(blender: ModuleType, words: Words, sample: Path, tmp_path: Path, step: str,
-                                                           monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+def test_stopping_at_each_stage_says_what_is_kept_and_goes_on(
+    blender: ModuleType, words: Words, why: Callable[[str], str], sample: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After Esc, the panel too says how far the stopped step came, until its input changes or it is done."""
     jobs = importlib.import_module(f"{NAME}.jobs")
     opened(blender, sample, tmp_path).tricap.growing.spacing_px = 10
     plain = jobs.Job._note
 
     def stopping(self: Any, stage: str, done: float, total: float) -> None:
         plain(self, stage, done, total)
-        if stage.startswith(step):
+        if stage.startswith(step) and done >= 1:
             self.monitor.cancel()
 
-    monkeypatch.setattr(jobs.Job, "_note", stopping)
-    assert blender.ops.tricap.fit() == {"CANCELLED"}
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs.Job, "_note", stopping)
+        assert blender.ops.tricap.fit() == {"CANCELLED"}
     assert "failed" not in words() and words().startswith("done done done")
+    kept = {"surface": "the surface of 1 of 3 frames is kept", "tracks": "the surface of all frames is kept", "fit": "surface and tracks"}
+    panel = {"surface": "surface", "tracks": "tracks", "fit": "body"}[step]
+    assert kept[step] in why(panel) and "run it again to go on" in why(panel)
+    blender.context.scene.tricap.growing.spacing_px = 11
+    assert "kept" not in why(panel)
 
 
 def test_time_left(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

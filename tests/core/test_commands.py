@@ -58,6 +58,10 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "rig with NaN": (lambda t: edit(t, "translation = [", "translation = [nan, 1.0, 2.0] # ", "rig.toml"), "must be 3 finite numbers"),
     "unknown key": (lambda t: edit(t, "fps", "fqs"), "unknown key “fqs”. Did you mean “fps”?"),
     "wrong version": (lambda t: edit(t, "version = 1", "version = 7"), "version = 1; it says 'tricap-take' and 7"),
+    "a folder for a pattern": (lambda t: edit(t, "L/*.png", "L"), "“L” is a folder; write “L/*.png”"),
+    "offset true": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = true\n'), "`offset_frames` of view 'L' of"),
+    "offset in parts": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = 1.5\n'), "is 1.5; write a whole number"),
+    "offset endless": (lambda t: edit(t, 'name = "L"\n', f'name = "L"\noffset_frames = {10**30}\n'), "write a whole number of frames"),
     "path outside": (lambda t: edit(t, "L/*.png", "../L/*.png"), "lies outside the take"),
     "unknown setting": (lambda t: click(t, "[settings.matching]\npatch = 13\n"), "has no setting “patch”. Did you mean “patch_px”?"),
     "setting out of range": (lambda t: click(t, "[settings.matching]\npatch_px = 1000\n"), "it must lie between 5 and 51"),
@@ -114,6 +118,47 @@ def test_options_that_need_mending(small: Path, tmp_path: Path, capfd: Capture, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("argv", [["run", "TAKE", "--out", ""], ["run", "", "--out", "o"], ["check", " "], ["batch", "TAKE", "--out", ""]])
+def test_an_empty_name_is_not_the_working_folder(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture, argv: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        commands.main([str(small) if word == "TAKE" else word for word in argv])
+    assert stop.value.code == 2 and "is empty; name a file or a folder" in capfd.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == [small.name]
+
+
+def test_negative_frames_are_frames(small: Path, tmp_path: Path, capfd: Capture) -> None:
+    for more in (["--frames", "-5:3"], ["--frames=-5:3"]):
+        assert commands.main(["measure", str(small), "--out", str(tmp_path / "out"), *more]) == 2
+        assert "--frames -5:3 cannot be read; write the first frame" in capfd.readouterr().err
+
+
+BODY = '[body]\nmodel = "{model}"\n{more}\n[seeds.joints]\n"elbow.R" = {{ {at} }}\n"{second}" = {{ {at} }}\n'
+BODY_FAULTS = {
+    "one joint": (dict(second="hip.R"), "needs at least two of the joints"),
+    "another limb": (dict(model="leg.L"), "needs at least two of the joints"),
+    "locked": (dict(more='locked = ["elbow twist"]'), "has no joint angle “elbow twist”"),
+    "limits": (dict(more='limits = { "knee.L flexion" = [0, 90] }'), "has no joint angle “knee.L flexion”"),
+}
+
+
+@pytest.mark.parametrize("fault", BODY_FAULTS)
+@pytest.mark.parametrize("command", ["run", "fit"])
+def test_a_body_that_cannot_be_fitted_is_told_before_anything_is_measured(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture, fault: str, command: str
+) -> None:
+    changed, said = BODY_FAULTS[fault]
+    rig = read_rig(small / "rig.toml")
+    places = {name: rig[name].project(np.array([0.02, 0.01, 2.1])) for name in "CR"}
+    at = ", ".join(f"{view} = [{x:.1f}, {y:.1f}]" for view, (x, y) in places.items())
+    click(small, BODY.format(**{"model": "arm.R", "more": "", "second": "wrist.R", "at": at, **changed}))
+    monkeypatch.setattr(pipeline, "measure_frames", lambda *args: pytest.fail("measured first"))
+    assert commands.main([command, str(small), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert said in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("argv", [[], ["measure"], ["mesure", "x"], ["measure", "x", "--out"], ["run", "x", "--out", "y", "--nonsense"]])
 def test_a_wrong_command_line_has_exit_code_2(argv: list[str], capfd: Capture) -> None:
     with pytest.raises(SystemExit) as stop:
@@ -161,8 +206,19 @@ def test_measuring_from_the_command_line(take: Path, tmp_path: Path, capfd: Capt
 
 
 def test_seeds_from_the_command_line(take: Path, capfd: Capture) -> None:
-    assert commands.main(["seeds", str(take)]) == 0
+    assert commands.main(["seeds", str(take), "--quiet"]) == 0
     assert "surface seeds between" in capfd.readouterr().out
+
+
+def test_quiet_keeps_no_finding_back(take: Path, capfd: Capture) -> None:
+    """What is asked for is the answer of `check`; quiet are progress, and what is good."""
+    assert commands.main(["check", str(take / "rig.toml"), "--quiet"]) == 0
+    assert capfd.readouterr() == ("", "")
+    edit(take, 'unit = "m"', 'unit = "m"\nsigma0_px = 9.0', "rig.toml")
+    assert commands.main(["check", str(take / "rig.toml")]) == 1
+    told = capfd.readouterr().out
+    assert commands.main(["check", str(take / "rig.toml"), "--quiet"]) == 1
+    assert capfd.readouterr() == (told, "") and told
 
 
 def test_progress_on_stderr_is_a_line_per_tenth(capfd: Capture) -> None:
@@ -190,7 +246,7 @@ def test_ctrl_c_stops_within_a_second_and_says_what_is_kept(take: Path, tmp_path
     assert took < 1.0 and signal.getsignal(signal.SIGINT) is before
     printed = capfd.readouterr()
     last = printed.err.splitlines()[-1]
-    assert last.startswith("tricap: Stopped: the surface of ") and "is kept; the same command goes on from there." in last
+    assert last.startswith("tricap: Stopped: the surface of ") and "is kept; run it again to go on." in last
     kept = int(last.split("surface of ")[1].split()[0])
     assert sorted(p.name for p in (out / "clouds").iterdir()) == [f"{i:04d}.ply" for i in range(kept)]
     assert len(list((out / "cache" / "surface").iterdir())) == kept and not list(out.rglob("*.part"))
@@ -287,6 +343,8 @@ NEW_FAULTS = {
     "no name": (["{t}/L", "C={t}/C"], [], "Write each view as NAME=FILE"),
     "empty name": (["={t}/L", "C={t}/C"], [], "Write each view as NAME=FILE"),
     "missing": (["L={t}/L", "C={t}/missing.mp4"], [], "missing.mp4 of view C is missing"),
+    "pattern": (["L={t}/L", "C={t}/C/*.png"], [], "for a pattern give its folder"),
+    "twice": (["L={t}/L", "C={t}/C/../L"], [], "View L has the same footage as another"),
     "no images": (["L={t}/L", "C={t}"], [], "holds no images"),
     "one view": (["L={t}/L"], [], "needs at least two"),
     "two alike": (["L={t}/L", "L={t}/C"], [], "have the same name"),

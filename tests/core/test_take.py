@@ -137,7 +137,7 @@ FAULTS = {
     "view that leaves the folder": (text(views=VIEWS + '[[views]]\nname = "../x"\nimages = "x"\n'), "a character in its name"),
     "view with a line in its name": (text(views=VIEWS + '[[views]]\nname = "a\\nb"\nimages = "x"\n'), "a character in its name"),
     "two views alike": (text(views=VIEWS + '[[views]]\nname = "L"\nimages = "x"\n'), "Two views of .* have the same name"),
-    "offset": (text(views=VIEWS + "offset_frames = 0.5\n"), "`offset_frames` is a whole number"),
+    "offset": (text(views=VIEWS + "offset_frames = 0.5\n"), "`offset_frames` of view .* write a whole number of frames"),
     "view without footage": (text(views=VIEWS + '[[views]]\nname = "X"\n'), "needs either `images`"),
     "view with two kinds": (text(views=VIEWS + 'movie = "a.mp4"\n'), "needs either `images`"),
     "footage a number": (text(views=VIEWS + '[[views]]\nname = "X"\nimages = 3\n'), "needs either `images`"),

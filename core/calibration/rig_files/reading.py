@@ -9,7 +9,7 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.camera import Camera
 
-LARGEST_FILE = 50_000_000
+LARGEST_FILE, LARGEST_PX = 50_000_000, 100_000
 NO_UNIT = "the file has no unit, so its lengths were taken as metres"
 
 
@@ -71,7 +71,7 @@ def make_camera(
     Raises:
         InputError: it is impossible: no focal length, no size, a matrix that does not turn.
     """
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or min(size_px) < 8:
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not 8 <= min(size_px) <= max(size_px) <= LARGEST_PX:
         raise InputError(f"Camera “{name}” has an impossible matrix or size; the file is damaged.")
     if np.abs(R_cam_world @ R_cam_world.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R_cam_world) < 0:
         raise InputError(f"The rotation of camera “{name}” is none; the file is damaged or mirrored.")

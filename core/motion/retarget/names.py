@@ -119,5 +119,5 @@ def _finger(core: str, plain: list[str], words: list[str]) -> str:
     if named:
         metacarpal_first = finger == "thumb" and 0 in named
         return f"{finger}.{1 if metacarpal_first else named[0]}"
-    numbers = [int(word) for word in words if word.isdigit()]
+    numbers = [int(word) for word in words if word.isdecimal()]
     return f"{finger}.{numbers[0] if numbers else 1}"

@@ -207,7 +207,11 @@ def test_the_development_recordings_pass(take: Path) -> None:
 @pytest.mark.parametrize("late", [0.5, 0.25, -1.3])
 def test_a_late_view_is_found_to_a_twentieth_of_a_frame(arm_recording: Record, late: float) -> None:
     """Measured: 0.010 frames at worst at 480 and 384 px."""
-    offsets = {o.view: o for o in estimate_offsets(open_take(read_take(arm_recording(late_frames=late))), Monitor())}
+    told: list[tuple[str, float]] = []
+    monitor = Monitor(lambda stage, done, total: told.append((stage, done / total)))
+    offsets = {o.view: o for o in estimate_offsets(open_take(read_take(arm_recording(late_frames=late))), monitor)}
+    parts = [part for stage, part in told if stage == "synchronization"]
+    assert parts == sorted(parts) and len(parts) > 1, "the bar never goes back"
     assert abs(offsets["R"].late_frames - late) < 0.05 and offsets["R"].significant
     assert abs(offsets["L"].late_frames) < 0.02 and not offsets["L"].significant
     assert (offsets["C"].method, offsets["C"].late_frames) == ("reference", 0.0)

@@ -223,6 +223,19 @@ def test_cameras_of_more_bits_fill_the_range(tmp_path: Path, bits: int, shape: t
     assert np.allclose(found, [85, 170, 255], atol=0.3)
 
 
+def test_a_movie_of_more_bits(tmp_path: Path) -> None:
+    """A frame of 16 bits fills the range of greys as one of 8 does, in the right order and with no wrap-around."""
+    ramp = np.linspace(0, 65535, 48 * 64).reshape(48, 64)
+    kind = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    writer = cv2.VideoWriter(str(tmp_path / "a.mkv"), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 25.0, (64, 48), kind)
+    for i in range(3):
+        writer.write((ramp * (3 - i) / 3).astype(np.uint16))
+    writer.release()
+    movie = open_sequence(tmp_path, images=None, movie="a.mkv", view="C")
+    for i in range(3):
+        assert np.abs(movie.read(i) - ramp * (3 - i) / 3 / 257).max() < 3.0
+
+
 def turned_movie(path: Path) -> Path:
     """A movie of 64×48, bright at the left, whose header says that it is shown a quarter turn to the right."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, (64, 48))

@@ -92,11 +92,3 @@ def test_results_of_other_settings_do_not_stay(plane_take: Path, out: Path) -> N
     assert commands.main(["measure", str(plane_take), "--out", str(out), "--set", "matching.patch_px=11", "--quiet"]) == 0
     run = json.loads((out / "run.json").read_text())
     assert not (out / "trajectories.npz").exists() and "track" not in run["stages"]
-
-
-def test_take_and_results_in_one_folder(plane_take: Path, tmp_path: Path) -> None:
-    take = Path(shutil.copytree(plane_take, tmp_path / "take"))
-    pipeline.run(take, take, frames=(0, 1))
-    assert len(list((take / "C").iterdir())) == 4 and (take / "clouds" / "0000.ply").exists()
-    pipeline.run(take, take, frames=(0, 1), restart=True)
-    assert (take / "take.toml").exists()

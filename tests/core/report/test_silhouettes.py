@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core.arguments import pictured
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin import SkinSettings
@@ -14,6 +13,7 @@ from tricap.core.errors import InputError
 from tricap.core.images.background import Background
 from tricap.core.progress import Monitor
 from tricap.core.report.figures import figure_rows
+from tricap.core.report.pages import check_pictured
 from tricap.core.report.pictures import BODY_OUTLINE, PERSON_OUTLINE, body_over_footage
 from tricap.core.report.silhouettes import body_masks, by_view, outlines_of, silhouettes_of
 
@@ -69,6 +69,6 @@ def test_outlines_are_drawn_over_the_footage(scenes: Any) -> None:
 
 
 def test_pictures_of_frames_that_are_not_there_are_refused() -> None:
-    assert pictured(range(3, 9), [8, 3]) == [8, 3]
+    check_pictured(range(3, 9), [8, 3])
     with pytest.raises(InputError, match="--pictures 9"):
-        pictured(range(3, 9), [9])
+        check_pictured(range(3, 9), [9])

@@ -123,7 +123,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     table_read = read_planar(out)
     assert table_read.names == ("nose", "chin") and table_read.frames.tolist() == [0, 1, 2, 3] and np.allclose(table_read.xy_px[3, 1], last)
     for text, said in (("point,x,y\na,1,nan\n", "line 2"), ("point,x\na,1\n", "“y”"), ("point,x,y\na,500,5\n", "outside"),
-                       ("", "no points"), ("point,x,y,joined_to\na,5,5,b\n", "joins"), ("point,x,y\na,5,5\na,6,6\n", "twice")):  # fmt: skip
+                       ("", "no points"), ("point,x,y,joined_to\na,5,5,b\n", "joins"), ("point,x,y\na,5,5\na,6,6\n", "twice"),
+                       ("point;x;y\na;5;5\n", "by commas, not semicolons"),
+                       ('point,x,y\na,"5,5",5\n', "with a point for decimals")):  # fmt: skip
         table.write_text(text, encoding="utf-8")
         capsys.readouterr()
         assert main(["track2d", str(sequence), "--points", str(table), "--out", str(tmp_path / "bad.csv"), "--quiet"]) == 2

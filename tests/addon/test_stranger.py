@@ -1,0 +1,119 @@
+"""A project from a stranger, opened in Blender: none of its code runs, nothing outside of it is read or written, no file of it takes the
+memory, and each fault is one sentence."""
+
+import json
+import os
+import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from tricap.__main__ import main
+from tricap.addon.retarget.build import build_armature
+from tricap.core.motion.bvh import write_bvh
+
+from ..core.motion.persons import person, squat
+from .conftest import SmallRun
+from .test_wrong_moves import refused
+
+
+class Runs:
+    """Unpickled, it writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
+        return os.mkdir, (str(self._path),)
+
+
+@pytest.fixture
+def ran(tmp_path: Path) -> Path:
+    """What code of the stranger's would make."""
+    return tmp_path / "ran"
+
+
+def with_code(folder: Path, ran: Path) -> None:
+    """Modules that somebody may import by their names, and a start-up file."""
+    for name in ("click.py", "numpy.py", "sitecustomize.py", "startup.py", "__init__.py", "L.py"):
+        (folder / name).write_text(f"import os; os.mkdir({str(ran)!r})\n")
+
+
+def pickled(path: Path, ran: Path) -> None:
+    """An .npz whose array is code."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, xyz_m=np.array([Runs(ran)], dtype=object), header_json=np.array([Runs(ran)], dtype=object))
+
+
+def test_the_harm_is_real(ran: Path) -> None:
+    pickle.loads(pickle.dumps(Runs(ran)))
+    assert ran.is_dir()
+
+
+def test_no_code_of_a_project_runs(blender: ModuleType, small_run: SmallRun, ran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    for folder in (small_run.take, small_run.out):
+        with_code(folder, ran)
+    for name in ("surface/0003", "tracks/0003", "fit/way"):
+        pickled(small_run.out / "cache" / f"{name}.npz", ran)
+    monkeypatch.chdir(small_run.take)
+    scene = blender.context.scene
+    scene.tricap.take = str(small_run.take)
+    assert blender.ops.tricap.open_take() == {"FINISHED"}
+    scene.tricap.out = str(small_run.out)
+    assert blender.ops.tricap.build_scene(out=str(small_run.out)) == {"FINISHED"}
+    pickled(small_run.out / "trajectories.npz", ran)
+    refused(lambda: blender.ops.tricap.build_scene(out=str(small_run.out)), "trajectories.npz")
+    pickled(small_run.out / "trajectories.npz", ran)
+    refused(lambda: blender.ops.tricap.run(take=str(small_run.take), out=str(small_run.out)))
+    assert not ran.exists()
+
+
+@pytest.mark.parametrize("line", ['rig = "../secret/rig.toml"', 'rig = "/etc/hostname"', 'model = "../secret/m.toml"',
+                                  'images = "../secret/*.png"', 'images = "/etc/*"'])
+def test_a_take_reads_nothing_outside_its_folder(blender: ModuleType, small_run: SmallRun, tmp_path: Path, line: str) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    (tmp_path / "secret").mkdir()
+    for name in ("rig.toml", "m.toml"):
+        (tmp_path / "secret" / name).write_text("my secret")
+    path, key = small_run.take / "take.toml", line.split(" ")[0]
+    text = re.sub(rf'\b{key} = "[^"]*"', line, path.read_text(), count=1)
+    path.write_text(text if line in text else text.replace("version = 1", f"version = 1\n{line}"))
+    blender.context.scene.tricap.take = str(small_run.take)
+    with pytest.raises(RuntimeError) as caught:
+        blender.ops.tricap.open_take()
+    assert re.search("must be a file inside the take's folder|lies outside the take", str(caught.value))
+    assert "my secret" not in str(caught.value)
+    assert not blender.context.scene.tricap.views
+
+
+def test_results_that_would_fill_the_memory(blender: ModuleType, small_run: SmallRun) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 2000000000\n" + "".join(f"property float {a}\n" for a in "xyz")
+    (small_run.out / "clouds" / "0003.ply").write_bytes(head.encode() + b"end_header\n" + b"\0" * 120)
+    refused(lambda: blender.ops.tricap.build_scene(out=str(small_run.out)), "0003.ply")
+
+
+def test_scripts_in_the_file_of_a_rig_do_not_run(blender: ModuleType, empty: ModuleType, ran: Path, tmp_path: Path) -> None:
+    build_armature(squat(person(), frames=2), "Hero")
+    text = empty.data.texts.new("register.py")
+    text.from_string(f"import os\nos.makedirs({str(ran)!r}, exist_ok=True)\n")
+    text.use_module = True
+    empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "hero.blend"))
+    write_bvh(tmp_path / "move.bvh", squat(person(), frames=3))
+    argv = ["retarget", str(tmp_path / "move.bvh"), "--rig", str(tmp_path / "hero.blend"), "--out", str(tmp_path / "out.blend"), "--quiet"]
+    assert main(argv) == 0 and not ran.exists()
+    empty.ops.wm.open_mainfile(filepath=str(tmp_path / "hero.blend"), load_ui=False, use_scripts=True)
+    assert ran.exists(), "they would run where they are let"
+
+
+def test_a_map_of_a_stranger_is_data_alone(small_run: SmallRun, tmp_path: Path, ran: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "map.json").write_text(json.dumps({"name": f"__import__('os').mkdir({str(ran)!r})", "bones": {"hips": "__class__"}}))
+    write_bvh(tmp_path / "rig.bvh", squat(person(), frames=2))
+    argv = ["retarget", str(small_run.out), "--rig", str(tmp_path / "rig.bvh"), "--out", str(tmp_path / "o.blend"), "--quiet"]
+    assert main([*argv, "--map", str(tmp_path / "map.json")]) == 2
+    assert "Traceback" not in capfd.readouterr().err and not ran.exists() and not (tmp_path / "o.blend").exists()
