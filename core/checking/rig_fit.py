@@ -1,4 +1,9 @@
-"""Does the rig belong to the footage? What looks alike in two views must lie on the rig's epipolar lines, before both cameras."""
+"""Does the rig belong to the footage? What looks alike in two views must lie on the rig's epipolar lines, before both cameras.
+
+Views from very different sides, carpets and rows of chairs give matches that are none. So only pairs of views are asked most of whose
+matches agree with one epipolar geometry, a fundamental matrix of their own (MAGSAC++, Barath 2020, doi:10.1109/CVPR42600.2020.00138),
+and of those pairs only the matches that do. What was clicked in both views of such a pair may speak for the rig against them.
+"""
 
 from collections.abc import Sequence
 from itertools import combinations, permutations
@@ -6,12 +11,17 @@ from itertools import combinations, permutations
 import cv2
 import numpy as np
 
+from ..clicked_points import CLICK_SIGMA_PX
 from ..geometry.camera import Camera
+from ..take import Take
 from .findings import Finding, doubtful, wrong
 from .view_matches import PairMatches
 
 LIMIT_PX = 2.0
 ENOUGH = 12  # matches of a pair
+DEFINE = 7  # matches that a fundamental matrix fits whatever they are
+OWN, OWN_MATCHES = 0.6, 24  # share of the others that must fit it; different matches of a pair
+FEWEST_CLICKS = 6
 AGREES, AGREES_SWAPPED, AGREES_WELL, MORE = 0.5, 0.7, 0.9, 0.15  # share of the matches
 SAME_PLACE_PX, SAME_SHARE = 0.7, 0.8
 MOST_PERMUTED = 5  # views of which every order is tried; of more, every pair is exchanged
@@ -43,9 +53,14 @@ def share(pairs: Sequence[PairMatches], cameras: Sequence[Camera]) -> float:
     return float(sum(p.agreeing(cameras, LIMIT_PX).sum() for p in pairs) / total) if total else 0.0
 
 
-def rig_findings(pairs: Sequence[PairMatches], cameras: Sequence[Camera], names: Sequence[str]) -> list[Finding]:
-    """Views that are exchanged, or a rig of another recording; nothing where there is too little to judge by."""
-    usable = [p for p in pairs if len(p.xi_px) >= ENOUGH]
+def rig_findings(
+    pairs: Sequence[PairMatches], clicks: Sequence[PairMatches], cameras: Sequence[Camera], names: Sequence[str]
+) -> list[Finding]:
+    """Views that are exchanged, or a rig of another recording; nothing where there is too little to judge by.
+
+    `clicks` are what was clicked in each pair of views (`clicked_pairs`).
+    """
+    usable = [own for p in pairs if (own := consistent(p)) is not None]
     agreeing = share(usable, cameras)
     if not usable or agreeing >= AGREES_WELL:
         return []
@@ -66,7 +81,10 @@ def rig_findings(pairs: Sequence[PairMatches], cameras: Sequence[Camera], names:
                 **(figures | {"agreeing_swapped_share": best}),
             )
         ]
-    if agreeing >= AGREES or _own_geometry(usable) < AGREES:
+    asked = [c for c in clicks if len(c.xi_px) and (c.i, c.j) in {(p.i, p.j) for p in usable}]
+    clicked = _misses(asked, cameras) if asked else np.zeros(0)
+    vouched = len(clicked) >= FEWEST_CLICKS and np.median(clicked) < min(CLICK_SIGMA_PX, 0.5 * figures["miss_px"])
+    if agreeing >= AGREES or vouched:
         return []
     return [
         wrong(
@@ -115,13 +133,26 @@ def _exchanged(order: tuple[int, ...], a: int, b: int) -> tuple[int, ...]:
     return tuple(changed)
 
 
-def _own_geometry(pairs: Sequence[PairMatches]) -> float:
-    """The part of the matches that agree with a fundamental matrix of its own, in the best pair: no noise (MAGSAC++)."""
-    best = 0.0
-    for pair in pairs:
-        F, inlier = cv2.findFundamentalMat(
-            np.ascontiguousarray(pair.xi_px), np.ascontiguousarray(pair.xj_px), cv2.USAC_MAGSAC, LIMIT_PX, 0.999, 4000
-        )
-        if F is not None and inlier is not None:
-            best = max(best, float(np.mean(inlier)))
-    return best
+def consistent(pair: PairMatches) -> PairMatches | None:
+    """The matches that agree with a fundamental matrix of their own, each once; None where it is not most of them, or too few."""
+    matches = np.unique(np.rint(np.hstack([pair.xi_px, pair.xj_px])), axis=0, return_index=True)[1]  # what rests is seen in every frame
+    if len(matches) < OWN_MATCHES:
+        return None
+    xi, xj = np.ascontiguousarray(pair.xi_px[matches]), np.ascontiguousarray(pair.xj_px[matches])
+    F, inlier = cv2.findFundamentalMat(xi, xj, cv2.USAC_MAGSAC, LIMIT_PX, 0.999, 4000)
+    if F is None or inlier is None or inlier.sum() - DEFINE < OWN * (len(xi) - DEFINE):
+        return None
+    kept = inlier.ravel() > 0
+    return PairMatches(i=pair.i, j=pair.j, xi_px=xi[kept], xj_px=xj[kept])
+
+
+def clicked_pairs(take: Take) -> list[PairMatches]:
+    """The joints that were clicked in both of each two views, in all frames with clicks."""
+    names = [v.name for v in take.views]
+    clicks = [at for seeds in (take.seeds, *take.keyframes) for at in seeds.joints.values()]
+    pairs = []
+    for i, j in combinations(range(len(names)), 2):
+        both = [np.stack([at[names[i]], at[names[j]]]) for at in clicks if names[i] in at and names[j] in at]
+        xy = np.array(both, dtype=np.float64).reshape(-1, 2, 2)
+        pairs.append(PairMatches(i=i, j=j, xi_px=xy[:, 0], xj_px=xy[:, 1]))
+    return pairs

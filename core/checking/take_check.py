@@ -13,7 +13,7 @@ from ..take import Footage, open_take, read_take
 from .clicks import joint_findings, seed_findings
 from .findings import Checked, Finding, doubtful, wrong
 from .rig_check import geometry_findings, unit_findings
-from .rig_fit import ENOUGH, rig_findings, same_views, share, stale_finding
+from .rig_fit import ENOUGH, clicked_pairs, rig_findings, same_views, share, stale_finding
 from .survey import frozen_view, picture_findings, rate_findings, survey
 from .texture import texture_findings
 from .timing import Film, Offset, estimate_offsets
@@ -56,7 +56,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     pairs = film.matches()
     alike = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
-    found += alike or rig_findings(pairs, footage.rig.cameras, names)
+    found += alike or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names)
     found += [*weak, *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
@@ -137,7 +137,7 @@ def first_look(footage: Footage, frame: int) -> list[Finding]:
     still = still_views(footage, frame, pictures)
     pairs = match_views([[rows.rows(image) for image in pictures]], rows)
     beside = [*unit_findings(footage.rig), *(frozen_view(name) for name in still)]
-    return same_views(pairs, names) or [*beside, *rig_findings(pairs, footage.rig.cameras, names)]
+    return same_views(pairs, names) or [*beside, *rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names)]
 
 
 def still_views(footage: Footage, frame: int, pictures: list[np.ndarray]) -> list[str]:
@@ -165,10 +165,17 @@ def timing_finding(offset: Offset) -> Finding:
         steps.append("set `correct = true` under [settings.timing], which puts its pictures to the others' moment")
     advice = " and ".join(steps or ["measure it as it is"]) + "; or synchronize the cameras."
     advice = advice[0].upper() + advice[1:]
-    costs = f"; the rays of moving points miss by up to {offset.effect_px:.1f} px" if offset.method == "rays" else ""
+    if offset.method == "energy":
+        return doubtful(
+            "out of step",
+            f"View {offset.view} seems to be {abs(late):.0f} frames {word} than the reference view, going by when how much moves.",
+            f"Compare the views at a sudden movement. If it is so: {advice[0].lower()}{advice[1:]}",
+            **offset.to_table(),
+        )
     return (wrong if abs(late) > SPARE else doubtful)(
         "out of step",
-        f"View {offset.view} is {abs(late):.2f} ± {sigma:.2g} frames {word} than the reference view{costs}.",
+        f"View {offset.view} is {abs(late):.2f} ± {sigma:.2g} frames {word} than the reference view; "
+        f"the rays of moving points miss by up to {offset.effect_px:.1f} px.",
         advice,
         **offset.to_table(),
     )

@@ -4,10 +4,15 @@
     e(s) = e_0 + s (e_+ − e_−) / 2 + s² (e_+ − 2 e_0 + e_−) / 2                          (2)   miss of a point followed in view k
     Σ ρ(e_i(s) − b) → min over s, b ,   late = −(L + s)                                  (3)   ρ: Cauchy's; b: the rig's own miss
     Σ ρ(e_i(s − r (y_i/h − ½)) − b) → min over r, s, b                                   (4)   y: the point's row of h in view k
+    z = (artanh c(L) − artanh c(0)) √((n − 3) / 2) ,   n = T / Σ α_r(l) α_k(l)           (5)   α: autocorrelation of the T energies
 
 A point seen in the reference at t and in view k at t + L is followed in view k to the frames before and after; (2) is its signed distance
 from the epipolar line as if view k had been exposed s frames later. Points that rest, or move along the line, say nothing of s and much
 of b. The sigma of `late` comes from the adjustment (3).
+
+Where no moving points can be followed, (1) alone may tell whole frames: of views not too far apart, for from other sides a motion has
+another rhythm, and where L goes together better than 0 by several sigmas (5). One rise and fall of the energy is one sample, however many
+frames it takes (Bartlett 1946, doi:10.2307/2983611).
 
 A rolling shutter exposes one row after the other: r in (4) is by how many frames view k takes longer for it, from the first row to the
 last, than the view it is compared with. Between alike cameras that see a point in the same row it shows nothing, and harms no rays.
@@ -28,12 +33,15 @@ from .view_matches import Features, PairMatches, alike, eight_bits, epipolar_mis
 
 FRAMES = 6  # looked at for the part of a frame
 MOST_LAG = 50
+METHODS = ("reference", "rays", "energy", "nothing")  # energy tells whole frames only
 BANDS = 8  # of rows, for the sigma of (4)
 FEWEST = 10  # moving matches
 LEAST = 0.3  # part of the moving matches that must fit
 FARTHEST = 0.95  # frames that (2) reaches; what lies beyond belongs to another L
 CLEAR = 0.7  # frames within which whole frames need not be looked for
 GOES_TOGETHER = 0.7  # correlation of the motion energies
+SURE = 4.0  # sigmas by which it must exceed that without a lag
+FARTHEST_DEG = 50.0  # between the axes of views whose motion energies are compared
 SCALE_PX, MOVES_PX, FITS_PX = 0.5, 0.3, 0.5
 ROUND_TRIP_PX = 0.5
 STEPS = 12
@@ -47,7 +55,7 @@ class Offset:
     view: str
     late_frames: float
     sigma_frames: float
-    method: str  # reference, rays, energy (whole frames only) or nothing
+    method: str  # one of METHODS, the weakest on the way to the reference view
     moving: int = 0  # matches that move across the epipolar lines and fit
     speed_px: float = 0.0  # the speed across them that a tenth exceeds, per frame
     miss_px: float = np.nan  # median miss once the offset is allowed for
@@ -61,8 +69,8 @@ class Offset:
 
     @property
     def doubtful(self) -> bool:
-        """Significant, or told from the motion's rhythm alone by more than that can err."""
-        return self.significant or (self.method == "energy" and abs(self.late_frames) > self.sigma_frames)
+        """Significant, or told from the motion's rhythm alone by more than three times its sigma."""
+        return self.significant or (self.method == "energy" and abs(self.late_frames) > 3 * self.sigma_frames)
 
     @property
     def rolls(self) -> bool:
@@ -119,7 +127,7 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
             view=names[k],
             late_frames=late,
             sigma_frames=sigma,
-            method=link.method,
+            method=max(link.method, found[base].method, key=METHODS.index),
             moving=link.moving,
             speed_px=link.speed_px,
             miss_px=link.miss_px,
@@ -137,7 +145,7 @@ def in_step(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str, dict
     """
     offsets = estimate_offsets(footage.single(), monitor)
     for o in offsets:
-        if o.method in ("rays", "energy") and abs(o.late_frames) > LARGEST:
+        if o.doubtful and abs(o.late_frames) > LARGEST:
             raise InputError(
                 f"View {o.view} is {o.late_frames:+.2f} frames late, too much to interpolate; add {-round(o.late_frames):+d} to its "
                 "`offset_frames` in take.toml, the rest is then corrected."
@@ -174,7 +182,9 @@ class Film:
         return self._features[k, frame]
 
     def frames(self) -> list[int]:
-        """Frames in which most moves, apart from each other, in the order of time."""
+        """Frames in which most moves, apart from each other, in the order of time; none of fewer than three."""
+        if len(self.seen.frames) < 3:
+            return []
         energy = np.nan_to_num(self.seen.energy / np.maximum(np.nanmedian(self.seen.energy, axis=1, keepdims=True), 1e-6)).min(axis=0)
         apart, chosen = max(1, len(energy) // (2 * FRAMES)), list[int]()
         for t in np.argsort(-energy):
@@ -209,7 +219,9 @@ def _between(film: Film, base: int, k: int, name: str, monitor: Monitor) -> Offs
             break
     if best is not None:
         return best
-    if correlation > GOES_TOGETHER:
+    ca, cb = film.cameras[base], film.cameras[k]
+    near = float(ca.R_cam_world[2] @ cb.R_cam_world[2]) > np.cos(np.radians(FARTHEST_DEG))
+    if near and correlation > GOES_TOGETHER and (not lags[0] or lag_sigmas(film.seen.energy[base], film.seen.energy[k], lags[0]) > SURE):
         return Offset(view=name, late_frames=float(-lags[0]), sigma_frames=0.5, method="energy")
     return Offset(view=name, late_frames=np.nan, sigma_frames=np.inf, method="nothing")
 
@@ -218,15 +230,31 @@ def energy_lags(a: np.ndarray, b: np.ndarray) -> tuple[list[int], float]:
     """Whole-frame lags L (best first, then its neighbours) at which the motion energies a(t) and b(t + L) (T,) go together, and how
     well the best of them does.  (1)"""
     most = min(MOST_LAG, len(a) // 3)
-    scores = {}
-    for lag in range(-most, most + 1):
-        x, y = a[max(0, -lag) : len(a) - max(0, lag)], b[max(0, lag) : len(b) - max(0, -lag)]
-        known = np.isfinite(x) & np.isfinite(y)
-        x, y = x[known] - x[known].mean() if known.any() else x[known], y[known] - y[known].mean() if known.any() else y[known]
-        length = float(np.sqrt((x @ x) * (y @ y)))
-        scores[lag] = float(x @ y) / length if len(x) > 4 and length > 1e-9 else 0.0
+    scores = {lag: _correlation(*_shifted(a, b, lag)) for lag in range(-most, most + 1)}
     best = max(scores, key=lambda lag: (scores[lag], -abs(lag)))
     return [best, best - 1, best + 1], scores[best]
+
+
+def lag_sigmas(a: np.ndarray, b: np.ndarray, lag: int) -> float:
+    """By how many sigmas the motion energies a(t) and b(t + lag) (T,) go together better than a(t) and b(t).  (5)"""
+    x, y = _shifted(a, b, lag)
+    alpha = [np.correlate(v, v, "full") / (v @ v) for v in (x, y)]
+    samples = min(len(x) / max(float(alpha[0] @ alpha[1]), 1e-9), len(x))
+    more = np.arctanh(min(_correlation(x, y), 0.999)) - np.arctanh(np.clip(_correlation(*_shifted(a, b, 0)), -0.999, 0.999))
+    return float(more * np.sqrt(max(samples - 3, 0.0) / 2))
+
+
+def _shifted(a: np.ndarray, b: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    """a(t) and b(t + lag) (n,) without their means, where both are known."""
+    x, y = a[max(0, -lag) : len(a) - max(0, lag)], b[max(0, lag) : len(b) - max(0, -lag)]
+    known = np.isfinite(x) & np.isfinite(y)
+    return (x[known] - x[known].mean(), y[known] - y[known].mean()) if known.any() else (x[known], y[known])
+
+
+def _correlation(x: np.ndarray, y: np.ndarray) -> float:
+    """Of series (n,) without means; 0 of too short or constant ones."""
+    length = float(np.sqrt((x @ x) * (y @ y)))
+    return float(x @ y) / length if len(x) > 4 and length > 1e-9 else 0.0
 
 
 def _misses(film: Film, base: int, k: int, frame: int, lag: int) -> np.ndarray | None:

@@ -3,9 +3,12 @@
 import json
 import re
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -13,9 +16,10 @@ import pytest
 
 from tricap.core import commands, pipeline
 from tricap.core.checking.findings import Checked
-from tricap.core.checking.take_check import check_take, doubts, sudden_step
-from tricap.core.checking.timing import Offset, energy_lags, estimate_offsets
+from tricap.core.checking.take_check import check_take, doubts, sudden_step, timing_finding
+from tricap.core.checking.timing import Film, Offset, _between, energy_lags, estimate_offsets, lag_sigmas
 from tricap.core.errors import InputError
+from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.progress import Monitor
@@ -225,9 +229,52 @@ def test_whole_frames_from_the_motion_alone() -> None:
     assert energy_lags(motion[:40], np.ones(40))[1] == 0
 
 
-def test_a_fraction_of_a_frame_is_no_finding_where_only_whole_frames_are_told() -> None:
-    late = {lag: Offset(view="R", late_frames=lag, sigma_frames=0.5, method="energy") for lag in (0.0, 0.15, -1.0)}
-    assert [lag for lag, offset in late.items() if offset.doubtful] == [-1.0]
+def rhythm(n: int, seed: int = 0) -> np.ndarray:
+    """The energy (n,) of a motion that never repeats."""
+    random = np.random.default_rng(seed)
+    return np.asarray(np.abs(np.convolve(random.normal(size=n + 6), np.hanning(7), "valid"))) + 0.1
+
+
+def told(a: np.ndarray, b: np.ndarray, *, degrees: float = 20.0) -> Offset:
+    """What is said of views, so far apart, in which nothing can be followed, by how much moves in them when."""
+    beside = Camera(name="R", size_px=(9, 9), matrix=np.eye(3), R_cam_world=rotation_from_vector(np.array([0, np.radians(degrees), 0])))
+    seen = SimpleNamespace(energy=np.stack([a, b]))
+    film = SimpleNamespace(seen=seen, cameras=(replace(beside, name="C", R_cam_world=np.eye(3)), beside), frames=list)
+    return _between(cast(Film, film), 0, 1, "R", Monitor())
+
+
+def test_views_that_show_one_movement_from_two_sides_are_not_called_out_of_step() -> None:
+    """Ten frames, one rise and fall, sooner in one view than in the other: that is one sample, however well it goes together."""
+    t = np.arange(10)
+    a, b = 1 + np.exp(-(((t - 6) / 3) ** 2)), 1 + np.exp(-(((t - 4) / 3) ** 2))
+    lags, correlation = energy_lags(a, b)
+    assert lags[0] == -2 and correlation > 0.99 and lag_sigmas(a, b, -2) < 2
+    assert told(a, b).method == "nothing" and not told(a, b).doubtful
+    assert (told(a, a).method, told(a, a).late_frames) == ("energy", 0.0)
+
+
+def test_many_movements_tell_whole_frames_of_views_that_are_not_far_apart() -> None:
+    motion, noise = rhythm(154), 0.1 * rhythm(150, seed=1)
+    late = told(motion[:150], motion[4:] + noise)
+    assert (late.method, late.late_frames) == ("energy", 4.0) and late.doubtful
+    said = timing_finding(late)
+    assert not said.certain and "View R seems to be 4 frames later" in said.sentence and "add -4 to" in said.advice
+    assert told(motion[:150], motion[4:] + noise, degrees=60).method == "nothing"
+
+
+def test_what_only_the_rhythm_tells_is_a_finding_from_three_sigmas_on() -> None:
+    late = {lag: Offset(view="R", late_frames=lag, sigma_frames=0.5, method="energy") for lag in (0.0, 0.15, -1.0, 2.0)}
+    assert [lag for lag, offset in late.items() if offset.doubtful] == [2.0]
+
+
+def test_a_take_of_one_frame_has_no_motion_to_look_for(arm_recording: Record, tmp_path: Path) -> None:
+    take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
+    said = take / "take.toml"
+    said.write_text(said.read_text(encoding="utf-8").replace("fps", "frames = [0, 1]\nfps"), encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checked = check_take(take, Monitor())
+    assert not checked.findings, checked.lines()
 
 
 def test_exit_codes_and_json(arm_recording: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
