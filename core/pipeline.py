@@ -18,7 +18,7 @@ from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
 from .body_guide import BodyGuide
-from .checking.body_check import odd_limbs
+from .checking.body_check import odd_body
 from .checking.take_check import causes_of_failure, doubts, with_cause
 from .checking.timing import in_step
 from .clicked_points import clicked_depth
@@ -313,6 +313,7 @@ def fit(run: Run, monitor: Monitor) -> None:
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.notes[0].frame) if run.measured else error from error
     states = _told_states(run, body)
+    run.warn(*odd_body(given, body, run.settings["fitting"].click_sigma_px))
     run.finish_stage(
         "fit",
         began,
@@ -333,7 +334,6 @@ def _told_states(run: Run, body: BodyFit) -> dict[str, int]:
     doubtful = ", ".join(f"{n} {word}" for word, n in states.items() if word != "fitted")
     if doubtful:
         run.warn(f"Frames in which the body rests partly on prediction: {doubtful}.")
-    run.warn(*odd_limbs(body.shape))
     if not body.converged:
         run.warn(f"The body has not settled after {body.iterations} steps: look at the pictures, and raise fitting.sequence_steps.")
     return states

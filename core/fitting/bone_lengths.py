@@ -8,7 +8,8 @@ c_k belongs to a chain k of bones whose two ends were clicked: there the length 
 detector, sees it, not where the anatomist does), so it is free by σ_c, as far as two clicks that are off by e tell a length L_k (2); a
 neck is too short for them. Inside a chain (collarbones; pelvis, spine and chest), and where nobody clicked at all (head, hands), bones
 keep the model's proportions: clouds and outlines show no joints there, and what a body differs from its balls (a cap, fingers, loose
-clothes) it differs in all frames alike. However many they are, frames do not outvote σ_d: it counts as often as they do.
+clothes) it differs in all frames alike. However many they are, frames do not outvote σ_d nor σ_g, which count as often as they do: else
+what nobody clicked grows together with all the rest, for chains that were clicked follow by c_k.
 
 j_b ~ N(0, model.length_sigma²) is for a joint that has no place of its own that people agree on, clicked or not. A neck's base is taken
 anywhere between the breastbone and the vertebrae in the middle of the neck, 25 mm up or down. A neck that keeps its proportions above such

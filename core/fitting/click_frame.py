@@ -38,21 +38,22 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     """
     monitor.step(STAGE, 0, 1)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
-    best, best_support = None, -1.0
+    best, best_score = None, -np.inf
     starts = _starts(fit, points, clicked.motion[0], clicked.vector, monitor)
     parts = [monitor.part(STAGE, i, len(starts) + 1) for i in range(len(starts) + 1)]
     for part, motion in zip(parts, starts):
         solution = fit_posture_and_shape(fit, points, motion, clicked.vector, part)
-        support = fit.support(fit.click, points, solution.motion[0], solution.vector)
-        if support > best_support:
-            best, best_support = solution, support
-    if best is None or (best_support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
+        score = fit.score(fit.click, points, solution.motion[0], solution.vector)
+        if score > best_score:
+            best, best_score = solution, score
+    support = fit.support(fit.click, points, best.motion[0], best.vector) if best is not None else 0.0
+    if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
         raise InputError(f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
                          "rig, or click in a frame where the limb was measured.")
-    return _with_lost_limbs(fit, points, best, best_support, parts[-1])
+    return _with_lost_limbs(fit, points, best, best_score, parts[-1])
 
 
-def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_support: float, monitor: Monitor) -> Solution:
+def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> Solution:
     """The solution, or one from where a limb without points explains points that nothing else does.
 
     Clicks from a short base leave a limb's depth open: bent towards the cameras and away from them look alike.
@@ -60,9 +61,9 @@ def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_
     found = found_again(fit, points, best.motion[0], best.vector, _try(monitor, 0))
     for i, start in enumerate(found):
         solution = fit_posture_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
-        support = fit.support(fit.click, points, solution.motion[0], solution.vector)
-        if support > best_support + fit.settings.min_points / 4:
-            best, best_support = solution, support
+        score = fit.score(fit.click, points, solution.motion[0], solution.vector)
+        if score > best_score + fit.settings.min_points / 4:
+            best, best_score = solution, score
     return best
 
 
@@ -79,13 +80,13 @@ def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarr
     best = _to_surface(fit, points, motion, vector, _try(monitor, 0))
     if _plausible(best):
         return best
-    best_support = fit.support(fit.click, points, best.motion[0], best.vector)
+    best_score = fit.score(fit.click, points, best.motion[0], best.vector)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     for i, start in enumerate(_around(fit, clicked.motion[0])):
         solution = _to_surface(fit, points, start, clicked.vector, _try(monitor, i + 1))
-        support = fit.support(fit.click, points, solution.motion[0], solution.vector)
-        if support > best_support:
-            best, best_support = solution, support
+        score = fit.score(fit.click, points, solution.motion[0], solution.vector)
+        if score > best_score:
+            best, best_score = solution, score
         if _plausible(best):
             break
     return best

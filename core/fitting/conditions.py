@@ -17,7 +17,17 @@ from .cloud_points import CloudPoints
 from .empty_views import EmptyViews
 from .joint_tracks import JointTracks
 from .limbs_apart import LimbsApart
-from .observations import ClickedJoints, EqualRadii, Observation, Proportions, ShapePrior, SilhouetteRays, SurfacePoints, Symmetry
+from .observations import (
+    ClickedJoints,
+    EqualRadii,
+    JointLimits,
+    Observation,
+    Proportions,
+    ShapePrior,
+    SilhouetteRays,
+    SurfacePoints,
+    Symmetry,
+)
 from .problem import Problem
 from .robust import robust_weights
 from .segmentation import HeldSegments, segment
@@ -29,6 +39,7 @@ from .state import BodyState, ShapeParameters
 SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
 WEIGHT_SIGMA = 0.3  # of ln w: an isolated ball's weight and radius are seen as one, r = l √(½ ln 2w)
 POINTS_OF_RAY = 3  # a limb of 25 cm shows some 300 points (of one voxel each), and 40 rays a view
+MOST_OFF = 3.0  # sigmas of a click, or beyond a limit, that count
 NO_SHAPE = np.zeros(0, dtype=np.intp)
 
 
@@ -44,9 +55,10 @@ class Conditions:
     click: int  # index of the frame where the fit begins
     located: np.ndarray  # (J,) whether a joint has a place in space of its own, in any frame
     stature_sigma: float  # relative, of a person about the parameters' template
-    frames: int  # for how many a belief of a single bone's length counts
+    frames: int  # for how many a belief of bone lengths counts
     priors: list[Observation]  # of every frame's motion
     clicked: Mapping[int, ClickedJoints]  # by frame index
+    places: Mapping[int, np.ndarray]  # (J, 3) of joints clicked in two views, NaN of others, by frame index
     tracks: JointTracks
     silhouettes: Silhouettes
     empty: EmptyViews
@@ -57,7 +69,7 @@ class Conditions:
         """The same for some of the frames, which count from 0 then; only `click` stays the index in the recording."""
         parts = {name: getattr(self, name).stretch(frames) for name in ("tracks", "silhouettes", "empty")}
         clicked = {i: self.clicked[t] for i, t in enumerate(frames) if t in self.clicked}
-        return replace(self, clicked=clicked, **parts)
+        return replace(self, clicked=clicked, places={i: self.places[frames[i]] for i in clicked}, **parts)
 
     def beliefs(self, state: BodyState) -> list[Observation]:
         """What is known of any posture: limits, beliefs, and that limbs are no ghosts."""
@@ -104,10 +116,10 @@ class Conditions:
 
     @cached_property
     def proportions(self) -> Proportions:
-        """What is believed of the bone lengths; of a single bone, against the error that the model has in all frames alike."""
-        s = self.settings
-        return proportions(self.model, self.parameters.template.lengths_m, self.located, s.length_sigma,
-                           s.proportion_sigma / np.sqrt(self.frames), self.stature_sigma)
+        """What is believed of the bone lengths, against the error that the model has in all frames alike."""
+        s, alike = self.settings, np.sqrt(self.frames)
+        return proportions(self.model, self.parameters.template.lengths_m, self.located, s.length_sigma, s.proportion_sigma / alike,
+                           self.stature_sigma / alike)
 
     def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
         """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the proportions is
@@ -136,6 +148,13 @@ class Conditions:
         state = self.parameters.state(motion, vector)
         found: list[SurfacePoints | SilhouetteRays] = [self.surface(points, state), *self.silhouettes.observe(t, state)]
         return sum(float(robust_weights(o.residual(state) * o.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", 3.0).sum()) for o in found)
+
+    def score(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
+        """The `support`, less what joints known in frame index t and the DOFs' limits are off by: half the squares of it, in sigmas."""
+        state = self.parameters.state(motion, vector)
+        limits = [prior for prior in self.priors if isinstance(prior, JointLimits)]
+        off = np.concatenate([o.residual(state) for o in (*self.joints(t), *limits)])
+        return self.support(t, points, motion, vector) - 0.5 * float(np.minimum(off**2, MOST_OFF**2).sum())
 
 
 def _hard(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float,

@@ -2,7 +2,8 @@
 
 Each frame starts from the prediction 2θ_i − θ_{i−1}, which is also a weak observation; tracked points tie it to its neighbour. A frame
 that explains far less than its neighbour is tried again from the neighbour's posture; one without points, outlines, clicks and keypoints
-keeps the prediction, and the next is tried from both. A limb that nothing shows (hidden behind another) comes to rest in its prediction,
+keeps the prediction, and the next is tried from both. A frame with clicks of its own is tried from where they lead, too, and if that is
+better, so are the frames before it. A limb that nothing shows (hidden behind another) comes to rest in its prediction,
 and is looked for in a wider and wider gate, so that it is found where it comes out.
 """
 
@@ -14,7 +15,7 @@ import numpy as np
 from ..progress import Monitor
 from .cloud_points import CloudPoints
 from .conditions import Conditions
-from .inverse_kinematics import lasting
+from .inverse_kinematics import lasting, posture_as_clicked
 from .lost_limbs import found_again
 from .material_tracks import MaterialTracks
 from .observations import MotionPrior, Observation, StepsFromFixed
@@ -47,7 +48,7 @@ def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, f
         part.step(STAGE, 0, 1)
         if t == fit.click + direction:
             way.support, way.seen, way.unseen = None, [fit.click], at_click
-        _step(fit, way, t, direction, points[t], time_s, first, tracks, part)
+        _step(fit, way, t, direction, points, time_s, first, tracks, part)
         way.done += 1
         if kept is not None and way.done % KEEP_EVERY == 0:
             kept.save("way", way.arrays())
@@ -56,22 +57,39 @@ def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, f
     return way.motion, way.known
 
 
-def _step(fit: Conditions, way: Way, t: int, direction: int, points: CloudPoints, time_s: np.ndarray, first: Solution,
+def _step(fit: Conditions, way: Way, t: int, direction: int, all_points: Sequence[CloudPoints], time_s: np.ndarray, first: Solution,
           tracks: MaterialTracks | None, monitor: Monitor) -> None:
-    """The posture of frame t from that of the frame before."""
-    motion, seen = way.motion, way.seen
+    """The posture of frame t from that of the frame before; those before it too, where a click in t tells that they were wrong."""
+    motion, seen, points = way.motion, way.seen, all_points[t]
     before = fit.parameters.state(motion[t - direction], first.vector)
     moved = _from_neighbour(tracks, t, before, direction) if seen[-1] == t - direction else []
     near = _some(crop(points, before, _reach(fit, before)))
     predictions = _predictions(motion, time_s, seen, t, np.where(_came_out(way.known, seen), 0.0, _slowing(fit, way.unseen)))
     wide = 1 + np.minimum(WIDENING * way.unseen, WIDEST - 1)
     motion[t], found = _next_posture(fit, t, near, moved, predictions, first, way.support, wide, monitor)
+    if t in fit.places:
+        _mend(fit, way, t, direction, all_points, first, monitor)
     way.known[t] = False
     if found is not None:
         way.support = found
         seen.append(t)
         way.unseen = _unseen(fit, t, near, motion[t], first.vector, way.unseen)
         way.known[t] = _slowing(fit, way.unseen) == 1
+
+
+def _mend(fit: Conditions, way: Way, clicked: int, direction: int, points: Sequence[CloudPoints], first: Solution,
+          monitor: Monitor) -> None:
+    """From a clicked frame back over those before it, as long as what comes from there is better than what was found."""
+    motion, wide = way.motion, np.ones(len(fit.model.skeleton.bones))
+    for t in range(clicked - direction, fit.click, -direction):
+        if t in fit.places:
+            return
+        after = fit.parameters.state(motion[t + direction], first.vector)
+        near = _some(crop(points[t], after, _reach(fit, after)))
+        posture, _ = _next_posture(fit, t, near, [], [motion[t + direction]], first, None, wide, monitor)
+        if fit.score(t, near, posture, first.vector) <= fit.score(t, near, motion[t], first.vector) + fit.settings.min_points / 4:
+            return
+        motion[t] = posture
 
 
 def _reach(fit: Conditions, state: BodyState) -> np.ndarray:
@@ -125,9 +143,9 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
     sigma[skeleton.layout.set("base")] = s.prediction_sigma_m
-    best, best_support = predictions[0], -1.0
+    best, best_support, best_score = predictions[0], -1.0, -np.inf
 
-    def adjusted(start: np.ndarray) -> tuple[np.ndarray, float]:
+    def adjusted(start: np.ndarray) -> tuple[np.ndarray, float, float]:
         prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
@@ -135,16 +153,21 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
                     *fit.beliefs(state)]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales, monitor=monitor)
-        return solution.motion[0], fit.support(i, points, solution.motion[0], first.vector)
+        found = solution.motion[0], first.vector
+        return found[0], fit.support(i, points, *found), fit.score(i, points, *found)
 
     for start in predictions:
-        posture, support = adjusted(start)
-        if support > best_support:
-            best, best_support = posture, support
+        posture, support, score = adjusted(start)
+        if score > best_score:
+            best, best_support, best_score = posture, support, score
         if last_support is None or best_support > LOST_SUPPORT * last_support:
             break
+    if i in fit.places:
+        posture, support, score = adjusted(posture_as_clicked(fit.parameters, fit.places[i], best, first.vector))
+        if score > best_score:
+            best, best_support, best_score = posture, support, score
     for start in found_again(fit, points, best, first.vector, monitor):
-        posture, support = adjusted(start)
-        if support > best_support + s.min_points / 4:
-            best, best_support = posture, support
+        posture, support, score = adjusted(start)
+        if score > best_score + s.min_points / 4:
+            best, best_support, best_score = posture, support, score
     return (best, best_support) if best_support >= s.min_points or fit.joints(i) else (predictions[0], None)

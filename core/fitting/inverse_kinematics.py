@@ -78,20 +78,36 @@ def coarse_posture(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
         _turn_trunk(skeleton, lengths, clicks.xyz_m, placed, motion)
     known = placed if turned else np.flatnonzero(clicks.located)[:1].tolist()
     _shift(skeleton, lengths, clicks.xyz_m, known, motion)
+    return _towards(skeleton, lengths, clicks.xyz_m, motion, trunk if turned else [], known)
+
+
+def posture_as_clicked(parameters: ShapeParameters, xyz_m: np.ndarray, motion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """The posture (D,) in which limbs lead to where their joints (J, 3) were clicked, NaN those that were not; the rest as in `motion`
+    (D,) of the shape `vector`."""
+    skeleton = parameters.skeleton
+    return _towards(skeleton, parameters.state(motion, vector).lengths_m, xyz_m, motion, trunk_joints(skeleton), [])
+
+
+def _towards(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, motion: np.ndarray, trunk: list[str], known: list[int],
+             ) -> np.ndarray:
+    """Limb after limb the best on a grid of the DOFs that move its tail towards its place (J, 3); the base brings the joints `known` to
+    theirs."""
+    names, located = list(skeleton.joint_names), np.isfinite(xyz_m).all(axis=1)
     for b, bone in enumerate(skeleton.bones):
-        target = clicks.xyz_m[names.index(bone.tail_joint)]
+        target = xyz_m[names.index(bone.tail_joint)]
         dofs = _movers(skeleton, b)
-        if not np.isfinite(target).all() or not len(dofs) or (turned and bone.tail_joint in trunk):
+        if not np.isfinite(target).all() or not len(dofs) or bone.tail_joint in trunk:
             continue
         grid = np.array(list(product(*(_values(skeleton, d) for d in dofs))))
         trial = np.repeat(motion[None], len(grid), axis=0)
         trial[:, dofs] = grid
         places = joint_positions(skeleton, lengths, trial)
         head = places[bone.head_joint]
-        wanted = target - (clicks.xyz_m[names.index(bone.head_joint)] if clicks.located[names.index(bone.head_joint)] else head)
+        wanted = target - (xyz_m[names.index(bone.head_joint)] if located[names.index(bone.head_joint)] else head)
         angle = _angle(places[bone.tail_joint] - head, wanted)
         motion = trial[np.argmin(angle + 1e-3 * np.abs(grid).sum(axis=1))]
-        _shift(skeleton, lengths, clicks.xyz_m, known, motion)
+        if known:
+            _shift(skeleton, lengths, xyz_m, known, motion)
     return motion
 
 

@@ -222,7 +222,7 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     shape = scaled_shape(shape, stature)
     parameters = ShapeParameters(shape, settings.weights)
     return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,
-                      click=begin, priors=priors, clicked=clicked, tracks=tracks, stature_sigma=stature_sigma,
+                      click=begin, priors=priors, clicked=clicked, places=places, tracks=tracks, stature_sigma=stature_sigma,
                       frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
                       located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
                       silhouettes=Silhouettes(given, model.surface, settings), empty=EmptyViews(given, parameters, settings),
