@@ -1,20 +1,23 @@
 """Where the views show the still background and so no part of the person, for the fit.
 
-A pixel is empty when it shows what it shows when no measured point is near, or most of the time (`images.background`). What stands still
-most of the time may also be the person: of that, nothing is empty near a measured point, nor along the clicked limbs if the pixels there
-have not changed since the click.
+A pixel is empty when it shows what the view's `background` in take.toml shows, or without one what it shows when no measured point is
+near, or most of the time (`images.background`). What stands still most of the time may also be the person: of that, nothing is empty near a
+measured point. Nor is anything along the clicked limbs if the pixels there have not changed since the click.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from .body.model_file import read_model
 from .body.skeleton import Skeleton
+from .errors import InputError
 from .fitting.fit_input import EmptyView, Packed
 from .geometry.camera import Camera
-from .images.background import Background, still_background
+from .images.background import Background, known_background, still_background
+from .person_sources import read_picture
 from .progress import Monitor
 from .surface.cloud import PointCloud
 from .take import Footage, Seeds
@@ -27,46 +30,62 @@ LIMB_M = 0.06  # nothing is empty so near to a measured point or a clicked limb
 
 
 def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor) -> list[EmptyView]:
-    """The empty parts of all views in the frames of the clouds; none if the frames are too few to tell the background.
+    """The empty parts of the views in the frames of the clouds; without those of which nothing tells the background.
 
     Raises:
-        InputError: an image cannot be read.
+        InputError: an image cannot be read, or the background in take.toml is not that of the view.
         Cancelled: the user asked to stop.
     """
     frames = np.array([cloud.frame for cloud in clouds])
-    backgrounds = still_backgrounds(footage, frames, clouds)
-    distances = [Packed() for _ in backgrounds]
-    if any(b is None for b in backgrounds):
+    known = {k: b for k, b in enumerate(still_backgrounds(footage, frames, clouds)) if b is not None}
+    distances = {k: Packed() for k in known}
+    if not known:
         return []
-    known = [b for b in backgrounds if b is not None]
-    persons, bare = _clicked_limbs(footage, known), [_coarse(b.bare) if b.bare is not None else np.False_ for b in known]
+    persons = _clicked_limbs(footage, known)
+    bare = {k: _coarse(b.bare) if b.bare is not None else np.False_ for k, b in known.items()}
     for t, cloud in enumerate(clouds):
         monitor.step("background", t, len(clouds))
-        for k, (camera, image) in enumerate(zip(footage.rig.cameras, footage.read(cloud.frame))):
-            apart = bare[k] | ~_near(camera, cloud.xyz_m, persons[k].shape)
-            empty = _shown(known[k], image) & ~persons[k] & apart
-            far = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) * (STEP_PX / UNIT_PX)
-            distances[k].append(np.minimum(far, 255).astype(np.uint8))
-    return [EmptyView(view=view.name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
-            for view, d in zip(footage.take.views, distances)]
+        images = footage.read(cloud.frame)
+        for k, background in known.items():
+            apart = bare[k] | ~_near(footage.rig.cameras[k], cloud.xyz_m, persons[k].shape)
+            empty = _shown(background, images[k]) & ~persons[k] & apart
+            squares = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # endless where all is empty
+            distances[k].append((np.minimum(squares, 255 * UNIT_PX / STEP_PX) * (STEP_PX / UNIT_PX)).astype(np.uint8))
+    return [EmptyView(view=footage.take.views[k].name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
+            for k, d in distances.items()]
 
 
 def still_backgrounds(footage: Footage, frames: np.ndarray, clouds: Sequence[PointCloud] | None = None) -> list[Background | None]:
-    """The still background of every view, from some of the frames (T,); None where they are too few to tell.
+    """The still background of every view: the image of it in take.toml, or from some of the frames (T,); None where they are too few.
 
     `clouds` (T,): what was measured of the person. A frame in which that is nothing does not tell where the background shows.
 
     Raises:
-        InputError: an image cannot be read.
+        InputError: an image cannot be read, or the one in take.toml is not that of the view.
     """
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int)).tolist()
     persons = [] if clouds is None else [clouds[t].xyz_m for t in chosen]
-    found = []
-    for k, (s, camera) in enumerate(zip(footage.sequences, footage.rig.cameras)):
+    found = list[Background | None]()
+    for k, (s, camera, view) in enumerate(zip(footage.sequences, footage.rig.cameras, footage.take.views)):
         images = [s.read(footage.number(k, int(frames[t]))) for t in chosen]
+        if view.background is not None:
+            found.append(_background_of(footage.take.folder / view.background, view.name, images))
+            continue
         near = [_near_pixels(camera, xyz_m, images[0].shape) for xyz_m in persons] if any(map(len, persons)) else None
         found.append(still_background(images, near))
     return found
+
+
+def _background_of(path: Path, view: str, images: Sequence[np.ndarray]) -> Background:
+    """The background of a view by the user's own image of it.
+
+    Raises:
+        InputError: it cannot be read, is of another size, or none of the images shows it.
+    """
+    known = known_background(read_picture(path, view, (images[0].shape[1], images[0].shape[0])), images)
+    if known is None:
+        raise InputError(f"The background image {path} is nothing like view {view} in any frame; take it with the same camera and light.")
+    return known
 
 
 def _coarse(mask: np.ndarray) -> np.ndarray:
@@ -104,15 +123,16 @@ def _near_pixels(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> n
     return squares.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[: shape[0], : shape[1]]
 
 
-def _clicked_limbs(footage: Footage, backgrounds: Sequence[Background]) -> list[np.ndarray]:
-    """Squares (h, w) of every view along the clicked limbs whose middle looks in the click's frame as it does most of the time."""
+def _clicked_limbs(footage: Footage, backgrounds: Mapping[int, Background]) -> dict[int, np.ndarray]:
+    """Squares (h, w) of every view along the clicked limbs whose middle looks in the click's frame like the background."""
     take = footage.take
-    masks = [np.zeros(_coarse(b.grey > 0).shape, bool) for b in backgrounds]
+    masks = {k: np.zeros(_coarse(b.grey > 0).shape, bool) for k, b in backgrounds.items()}
     skeleton = read_model(str(take.body_model)).skeleton
     for clicked in (take.seeds, *take.keyframes):
         if clicked.joints and clicked.frame in footage.frames:
-            for mask, view, background, image in zip(masks, take.views, backgrounds, footage.read(clicked.frame)):
-                _add_still(mask, _lines(skeleton, clicked, view.name), _shown(background, image))
+            images = footage.read(clicked.frame)
+            for k, background in backgrounds.items():
+                _add_still(masks[k], _lines(skeleton, clicked, take.views[k].name), _shown(background, images[k]))
     return masks
 
 

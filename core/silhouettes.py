@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 
 from .errors import InputError
-from .images.background import WINDOW_PX, empty_view
+from .images.background import OTHER_ROOM, WINDOW_PX, empty_view
 from .images.sequence import open_sequence
 from .matching.foreground import Silhouette
 from .person_sources import PERSON_SOURCES, read_picture
 from .take import Footage
 
 WHITE = 127.0  # brighter pixels of a mask are the person
-OTHER_ROOM = 20.0  # grey values: an image that differs by more from the background does not show it
 HOLE_PX = 15  # in the person's silhouette, where she looks like the background
 
 

@@ -48,6 +48,9 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
             best, best_score = solution, score
     support = fit.support(fit.click, points, best.motion[0], best.vector) if best is not None else 0.0
     if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
+        if not fit.settings.use_surface:
+            raise InputError(f"Frame {points.frame} has no outlines near the clicked joints, and without a measured surface "
+                             "(fitting.use_surface=false) the body rests on them; give outlines with `tricap contour`.")
         raise InputError(f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
                          "rig, or click in a frame where the limb was measured.")
     return _with_lost_limbs(fit, points, best, best_score, parts[-1])

@@ -20,6 +20,7 @@ WINDOW_PX = 7  # side of the window in which two images are compared
 LOOSE = 1.6  # times the noise: a window of 7×7 has a root mean square of 1.0 ± 0.1 times it
 QUANTISED = 0.5  # grey values: what rounding adds
 EMPTY_SHARE = 0.25  # of a picture shows the background, whoever stands before it
+OTHER_ROOM = 20.0  # grey values: an image that differs by more from the background does not show it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -47,6 +48,12 @@ def empty_view(grey: np.ndarray, image: np.ndarray) -> Background:
     difference = image.astype(np.float32) - grey.astype(np.float32)
     square = cv2.blur(difference**2, (WINDOW_PX, WINDOW_PX), borderType=cv2.BORDER_REFLECT_101)
     return Background(grey=grey, noise=float(np.sqrt(np.quantile(square, EMPTY_SHARE))))
+
+
+def known_background(grey: np.ndarray, images: Sequence[np.ndarray]) -> Background | None:
+    """The background of which an image (h, w) was taken, with its noise from those of the `images` that show it; None if none does."""
+    noise = [n for n in (empty_view(grey, image).noise for image in images) if n <= OTHER_ROOM]
+    return Background(grey=grey, noise=float(np.median(noise)), bare=np.ones(grey.shape, dtype=bool)) if noise else None
 
 
 def still_background(images: Sequence[np.ndarray], near: Sequence[np.ndarray] | None = None) -> Background | None:

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..images.sampling import LONGEST_LOOK_UP
 from ..settings import knob
 
 REACH_PX, RHO_PX = 40.0, 15.0  # of (1)
@@ -269,6 +270,8 @@ def outward_normals(xy: np.ndarray) -> np.ndarray:
 
 
 def _sample(image: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    at = np.ascontiguousarray(xy.reshape(-1, 2), dtype=np.float32)
-    values = cv2.remap(image, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return values.reshape(xy.shape[:-1]).astype(np.float64)
+    """Grey values (V, …) of an image (h, w) float32 at places (V, …, 2), each vertex a row of the look-up."""
+    at = np.ascontiguousarray(xy.reshape(len(xy), -1, 2), dtype=np.float32)
+    starts = range(0, len(at), LONGEST_LOOK_UP)
+    parts = [cv2.remap(image, at[i : i + LONGEST_LOOK_UP], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for i in starts]
+    return np.concatenate(parts).reshape(xy.shape[:-1]).astype(np.float64)

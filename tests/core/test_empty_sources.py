@@ -4,9 +4,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
+import pytest
 
 from tricap.core.empty_sources import STEP_PX, find_empty
+from tricap.core.errors import InputError
 from tricap.core.progress import Monitor
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take import open_take, read_take
@@ -28,3 +31,22 @@ def test_nothing_of_a_moving_arm_is_empty(tmp_path: Path) -> None:
             assert (distance[at[:, 1], at[:, 0]] > 0).mean() < 0.01
     assert find_empty(footage, clouds[:4], Monitor()) == []  # too few to tell what stands still
     assert views[0].of_frame(99) is None
+
+
+def test_who_never_moves_is_told_by_the_background_in_take_toml(tmp_path: Path, scenes: Any) -> None:
+    """A board that hangs in the room through all frames is taken for the room where no background is given, and nowhere else."""
+    rig, board = scenes.three_cameras(), scenes.Body(half_m=(0.2, 0.15))
+    take = scenes.write_take(tmp_path, rig, [[board]] * 6, more='[body]\nmodel = "arm.R"')
+    text = (take / "take.toml").read_text().replace('images = "C/*.png"', 'images = "C/*.png"\nbackground = "empty.png"')
+    (take / "take.toml").write_text(text)
+    cv2.imwrite(str(take / "empty.png"), scenes.render(rig["C"], [], noise=1.0, seed=99))
+    clouds: list[Any] = [SimpleNamespace(frame=t, xyz_m=np.zeros((0, 3))) for t in range(6)]
+    board_px = (scenes.render(rig["C"], [board], background=-1.0) >= 0)[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX]
+    empty = {view.view: view.of_frame(3)[: len(board_px)] > 0 for view in find_empty(open_take(read_take(take)), clouds, Monitor())}
+    board_px = board_px[: len(empty["C"])]
+    assert not empty["C"][board_px].any() and empty["C"][~cv2.dilate(board_px.astype(np.uint8), np.ones((5, 5))).astype(bool)].all()
+    assert empty["L"].mean() > 0.95
+    assert [view.view for view in find_empty(open_take(read_take(take)), clouds[:2], Monitor())] == ["C"]  # the others are too few
+    cv2.imwrite(str(take / "empty.png"), scenes.render(rig["C"], [], background=200.0))
+    with pytest.raises(InputError, match="is nothing like view C in any frame"):
+        find_empty(open_take(read_take(take)), clouds, Monitor())

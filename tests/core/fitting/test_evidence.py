@@ -173,8 +173,9 @@ def test_outlines_and_clicks_alone_are_enough(make_scene, other_person) -> None:
     errors = np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2)
     assert set(fit.motion.status) == {"fitted"} and fit.converged and np.isfinite(fit.motion.sigma0).all()
     assert errors.mean() < 3e-3, errors.mean(axis=0)  # three persons: 0.5, 1.5, 0.8 mm
-    with pytest.raises(InputError, match="no measured points"):
-        fit_sequence(_given(scene, clouds=blind), SETTINGS)
+    for use_surface, said in ((True, "no measured points"), (False, "no outlines.*give outlines with `tricap contour`")):
+        with pytest.raises(InputError, match=said):
+            fit_sequence(_given(scene, clouds=blind), replace(SETTINGS, use_surface=use_surface))
 
 
 def test_keypoints_alone_are_enough(make_scene) -> None:
