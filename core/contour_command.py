@@ -34,7 +34,7 @@ from .tracking.contour import (
 )
 from .tracking.point_tables import read_polygon
 
-ALGORITHM = "contours 1"  # part of the checkpoints' keys: raise it when the same input gives other numbers
+ALGORITHM = "contours 2"  # part of the checkpoints' keys: raise it when the same input gives other numbers
 BACKGROUND_SIGMAS, OPENING_PX, CLOSING_PX = 4.0, 1, 3
 SHADOW_PX, SHADOW_SCATTER, DARKEST_SHADOW = 7, 0.06, 0.6  # window, and what a shadow leaves of the light
 CLOSING_CELLS, ONE_PIECE = (2, 3, 4, 6), 0.9
@@ -249,14 +249,17 @@ class _Follower:
 
 
 def _before_background(grey: np.ndarray, background: np.ndarray, settings: ContourSettings) -> np.ndarray:
-    """The outline of what differs from the background, shadows aside: they darken a place by little, and evenly.
+    """The outline of what differs from the background by more than a pixel's shift of the camera explains, shadows aside: they darken a
+    place by little, and evenly.
 
     Raises:
         InputError: the background is of another size.
     """
     if background.shape != grey.shape:
         raise InputError("The background image has another size than the view; take it with the same camera.")
-    difference = cv2.GaussianBlur(np.abs(grey - background).astype(np.float32), (0, 0), 1.5)
+    room, neighbours = background.astype(np.float32), np.ones((3, 3), np.uint8)
+    beyond = np.maximum(grey - cv2.dilate(room, neighbours), cv2.erode(room, neighbours) - grey)
+    difference = cv2.GaussianBlur(np.maximum(beyond, 0.0).astype(np.float32), (0, 0), 1.5)
     limit = max(float(np.median(difference)) * BACKGROUND_SIGMAS, 4.0)
     mask = ((difference > limit) & ~_shadow(grey, background)).astype(np.uint8)
     for operation, radius in ((cv2.MORPH_OPEN, OPENING_PX), (cv2.MORPH_CLOSE, CLOSING_PX)):

@@ -107,6 +107,17 @@ def test_an_outline_is_followed_where_nothing_is_measured(tmp_path: Path, scenes
         recorded.contours(Start(background=background[1:]))
 
 
+def test_a_camera_that_shakes_joins_no_edge_of_the_room_to_the_person(scenes: Any) -> None:
+    """A dark carpet ends behind the person and runs to a bright thing that was not there before; the camera moved by 0.6 px."""
+    camera, body = scenes.three_cameras().cameras[1], scenes.Body(half_m=HALF_M)
+    y = np.arange(150.0)[:, None] * np.ones(200)
+    background, moved = (90 + 60 * np.tanh(y - at) for at in (75.0, 75.6))
+    moved[40:, 180:] = 250.0
+    person, noise = scenes.render(camera, [body], noise=0.0, background=-1.0), scenes.render(camera, [], noise=1.0, background=0.0)
+    contour = _before_background(np.where(person >= 0, person + 100, moved) + noise, background, ContourSettings())
+    assert np.quantile(apart(scenes, contour, body), 0.95) < 4.0
+
+
 def test_a_shadow_is_no_part_of_the_person(scenes: Any) -> None:
     camera, body = scenes.three_cameras().cameras[1], scenes.Body(half_m=HALF_M)
     background = scenes.render(camera, [], noise=1.0, seed=1)
