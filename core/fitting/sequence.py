@@ -155,17 +155,18 @@ def _shape_of_blocks(every: Recording, motion: np.ndarray, vector: np.ndarray, m
 
 def _postures(every: Recording, motion: np.ndarray, shape: FoundShape, monitor: Monitor, kept: Kept | None) -> tuple[Looked, list[Ended]]:
     """The postures from a motion (T, D), with the shape held, stretch after stretch from the click frame on."""
-    done, behind, plan = dict[int, Stretch](), dict[int, Behind](), outwards(len(motion), every.fit.click)
+    done, ends = dict[int, Looked](), list[Ended]()
+    behind, plan = dict[int, Behind](), outwards(len(motion), every.fit.click)
     for k, (own, around, direction) in enumerate(plan):
         stretch = Stretch.loaded(kept, own, around)
         if stretch is None:
             told = monitor.part("adjust the postures", k, len(plan))
             stretch = _stretch(every, (own, around, direction), motion, shape, behind.get(direction, NOTHING_BEHIND), told)
             stretch.save(kept, own, around)
-        done[own.start] = stretch
+        done[own.start] = stretch.looked  # and no longer what it handed over, which takes as much again
+        ends.append(stretch.ended)
         behind.update(stretch.behind)
-    ends = [stretch.ended for stretch in done.values()]
-    return joined([done.pop(start).looked for start in sorted(done)]), ends
+    return joined([done.pop(start) for start in sorted(done)]), ends
 
 
 def _stretch(every: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: FoundShape, behind: Behind,

@@ -1,5 +1,6 @@
 """A fit that was stopped goes on from what it kept, and ends with the same bytes."""
 
+import gc
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core.fitting import frame_to_frame, sequence, stretches
+from tricap.core.fitting.handed_over import HandedOver
 from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
 from tricap.core.progress import Cancelled, Monitor
 from tricap.core.results import KeptFit, Results
@@ -105,3 +107,22 @@ def test_a_fit_in_stretches_goes_on_with_the_next(given: FitInput, tmp_path: Pat
             fit_sequence(given, settings, StoppedStretches(stopped_at), kept)
         assert arrays(fit_sequence(given, settings, again := StoppedStretches(), kept)) == whole
         assert again.begun == monitor.begun[stopped_at:]
+
+
+def test_what_stretches_handed_over_is_let_go(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is as large as a stretch's covariances: a long fit would need twice the memory."""
+    scene, held, adjusted = make_scene(frames=21, click=9), list[int](), sequence._stretch
+    for module in (sequence, stretches):
+        monkeypatch.setattr(module, "AT_ONCE", 3)
+    monkeypatch.setattr(stretches, "MARGIN", 2)
+
+    def counted(*given: object) -> object:
+        gc.collect()
+        held.append(sum(isinstance(thing, HandedOver) for thing in gc.get_objects()))
+        return adjusted(*given)
+
+    monkeypatch.setattr(sequence, "_stretch", counted)
+    given = FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={9: scene.clicks}, click_frame=9, time_s=scene.time_s)
+    fit_sequence(given, replace(SETTINGS, sequence_steps=1))
+    assert len(held) == 7
+    assert max(held) == 4  # the last that was handed over ahead, and the last back: to the adjustment, and to covariances
