@@ -20,8 +20,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent
 TOOLS = ["pytest>=9", "pytest-xdist>=3.8", "ruff", "mypy", "setuptools>=77", "c3d>=0.6", "dask[distributed]>=2024.8"]
 REQUIREMENTS = {
-    (3, 11): ["bpy==4.5.15", "numpy>=1.26,<2", "opencv-python-headless<5", "scipy==1.17.1", *TOOLS],
-    (3, 13): ["bpy==5.2.3", "numpy>=2.2,<3", "opencv-python-headless==5.0.0.93", "scipy==1.18.1", *TOOLS],
+    (3, 11): ["bpy==4.5.15", "numpy>=1.26,<2", "opencv-python-headless<5", "scipy==1.17.1", "threadpoolctl==3.8.0", *TOOLS],
+    (3, 13): ["bpy==5.2.3", "numpy>=2.2,<3", "opencv-python-headless==5.0.0.93", "scipy==1.18.1", "threadpoolctl==3.8.0", *TOOLS],
 }
 BLENDER = {(3, 11): "4.5 LTS", (3, 13): "5.2 LTS"}
 WINDOWS = os.name == "nt"
@@ -30,7 +30,8 @@ LONG_BENCHES = ("resume", "surface", "clip")  # run when they are named only
 # What an extension consists of; everything else in the repository is for developers.
 SHIPPED_FILES = ("blender_manifest.toml", "__init__.py", "__main__.py", "LICENSE")
 SHIPPED_FOLDERS = {"core": (".py", ".toml"), "addon": (".py", ".toml", ".json")}
-PLATFORM_OF_TAG = {"x86_64": "linux-x64", "amd64": "windows-x64", "arm64": "macos-arm64"}  # how a wheel's name ends
+ANY = "any"  # the platform of a wheel in Python alone
+PLATFORM_OF_TAG = {"x86_64": "linux-x64", "amd64": "windows-x64", "arm64": "macos-arm64", ANY: ANY}  # how a wheel's name ends
 
 
 # ---- the environment -------------------------------------------------------------------------------------------------
@@ -217,16 +218,16 @@ def build(platforms: list[str] | None, out: str, with_wheels: bool) -> list[Path
     for platform in platforms or manifest["platforms"]:
         if platform not in manifest["platforms"]:
             sys.exit(f"There is no platform “{platform}” in blender_manifest.toml; choose from {', '.join(manifest['platforms'])}.")
-        wheels = [name for name in manifest["wheels"] if wheel_platform(name) == platform] if with_wheels else []
+        wheels = [name for name in manifest["wheels"] if serves(name, platform)] if with_wheels else []
         for wheel in wheels:
             fetch_wheel(ROOT / wheel)
         zips.append(build_one(manifest, platform, wheels, Path(out).absolute()))
     return zips
 
 
-def wheel_platform(wheel: str) -> str:
-    """The Blender platform of a wheel, from its file name."""
-    return next(platform for tag, platform in PLATFORM_OF_TAG.items() if wheel.endswith(f"{tag}.whl"))
+def serves(wheel: str, platform: str) -> bool:
+    """Whether a wheel is for that Blender platform, from its file name."""
+    return next(of for tag, of in PLATFORM_OF_TAG.items() if wheel.endswith(f"{tag}.whl")) in (platform, ANY)
 
 
 def fetch_wheel(path: Path) -> None:
@@ -240,6 +241,8 @@ def fetch_wheel(path: Path) -> None:
     target = ["--implementation", "cp", "--abi", abi, "--python-version", "311" if abi == "abi3" else python_tag.removeprefix("cp")]
     for tag in platform_tags.split("."):
         target += ["--platform", tag]
+    if platform_tags == ANY:
+        target = []
     if subprocess.run([*pip, *target, "--dest", str(path.parent), f"{name}=={version}"]).returncode or not path.is_file():
         sys.exit(f"pip could not download {path.name} (see above). Check the network, then run this again.")
 
@@ -305,7 +308,7 @@ def blender_extension(command: str, *arguments: object) -> None:
 
 
 def gui_test(out: str, scripts: list[str], install: bool) -> int:
-    """Tricap in a true Blender window (tests/gui). Debian's Blender has Python 3.14 and a scipy of its own; OpenCV's wheel fits any."""
+    """Tricap in a true Blender window (tests/gui). Debian's Blender has Python 3.14 and a scipy of its own; the other wheels fit any."""
     with tempfile.TemporaryDirectory() as folder:
         package = build_for_window(Path(folder))
         said = ["--package", package, "--out", Path(out).absolute(), *(["--install"] if install else []), *scripts]
@@ -317,7 +320,7 @@ def build_for_window(out: Path) -> Path:
     import tomllib
 
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
-    wheels = [name for name in manifest["wheels"] if "-abi3-" in name and wheel_platform(name) == "linux-x64"]
+    wheels = [name for name in manifest["wheels"] if serves(name, "linux-x64") and ("-abi3-" in name or "-none-" in name)]
     for wheel in wheels:
         fetch_wheel(ROOT / wheel)
     return build_one(manifest, "linux-x64", wheels, out)

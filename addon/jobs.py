@@ -22,6 +22,7 @@ import bpy
 
 from ..core.errors import InputError
 from ..core.progress import Cancelled, Monitor
+from ..core.threads import one_thread_in_linear_algebra
 from . import status
 
 log = logging.getLogger(__name__)
@@ -49,7 +50,8 @@ class Job:
     def run(self) -> None:
         """Compute here and now; never raises: look at `error`."""
         try:
-            self.result = self._compute(self.monitor)
+            with one_thread_in_linear_algebra():
+                self.result = self._compute(self.monitor)
         except BaseException as error:  # the edge of the thread: whatever happens is told by the operator
             self.error, self.trace = error, traceback.format_exc()
 

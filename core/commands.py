@@ -26,6 +26,7 @@ from .progress import Cancelled, Monitor
 from .results import check_apart
 from .take import open_take, read_take
 from .take_file import footage_entry, make_take, new_table, take_of_table
+from .threads import one_thread_in_linear_algebra
 
 Adder = Callable[[Any], None]  # adds a sub-command to the parser; the command's `run(args, monitor)` gives the lines to show
 # (and leaves in `args.told_anyway` those that --quiet does not keep back: findings, and what has failed)
@@ -39,7 +40,7 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     _quiet_decoders()
     monitor = Monitor(_progress_line if sys.stderr.isatty() and not args.quiet else None if args.quiet else _plain_progress())
     try:
-        with _interrupts(monitor):
+        with _interrupts(monitor), one_thread_in_linear_algebra():
             lines = args.run(args, monitor)
     except InputError as error:
         _say(f"tricap: {error}", sys.stderr)

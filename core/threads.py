@@ -5,10 +5,21 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+import scipy.linalg  # noqa: F401  so that its library is loaded when it is told
+from threadpoolctl import threadpool_limits
+
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 _SHARE = os.environ.get("TRICAP_THREADS", "")  # `tricap batch` gives each worker its own
 THREADS = int(_SHARE) if _SHARE.isdecimal() and int(_SHARE) > 0 else 2
+
+
+def one_thread_in_linear_algebra() -> threadpool_limits:
+    """A context in which the BLAS and LAPACK of numpy and scipy, in the whole process, use one thread.
+
+    On more threads they add up in another order, which changes the last digits, and wait busily over small matrices beside ours.
+    """
+    return threadpool_limits(1, user_api="blas")
 
 
 def in_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:

@@ -21,7 +21,7 @@ LAYERS = (
     "contour_command points_command check_command fields_command batch batch_command commands"
 ).split()
 SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}
-THIRD_PARTY = {"numpy", "scipy", "cv2"}
+THIRD_PARTY = {"numpy", "scipy", "cv2", "threadpoolctl"}
 OPTIONAL = {"core/batch.py": {"dask", "distributed"}}  # the extra [batch]; imported only when it is used
 NETWORK = {"socket", "ssl", "http", "urllib", "ftplib", "smtplib", "xmlrpc", "requests", "asyncio"}
 SERIALIZERS = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "joblib"}
@@ -68,7 +68,7 @@ def layer_order(name: str, source: str) -> list[str]:
 
 
 def core_is_pure(name: str, source: str) -> list[str]:
-    """Core uses the standard library, numpy, scipy and cv2: no bpy, no mathutils; Dask in one place, which loads without it."""
+    """Core uses the standard library and THIRD_PARTY: no bpy, no mathutils; Dask in one place, which loads without it."""
     known = THIRD_PARTY | set(sys.stdlib_module_names)
     head = {alias.name.split(".")[0] for node in ast.parse(source).body if isinstance(node, ast.Import) for alias in node.names}
     head |= {str(node.module).split(".")[0] for node in ast.parse(source).body if isinstance(node, ast.ImportFrom) and not node.level}

@@ -34,9 +34,9 @@ def test_versions_agree() -> None:
 
 def test_every_platform_and_python_has_its_wheels(dev: ModuleType) -> None:
     for platform in MANIFEST["platforms"]:
-        names = [Path(wheel).name for wheel in MANIFEST["wheels"] if dev.wheel_platform(wheel) == platform]
+        names = [Path(wheel).name for wheel in MANIFEST["wheels"] if dev.serves(wheel, platform)]
         tags = sorted("-".join(name.split("-")[:3]) for name in names)
-        assert tags == ["opencv_python_headless-5.0.0.93-cp37", "scipy-1.17.1-cp311", "scipy-1.18.1-cp313"]
+        assert tags == ["opencv_python_headless-5.0.0.93-cp37", "scipy-1.17.1-cp311", "scipy-1.18.1-cp313", "threadpoolctl-3.8.0-py3"]
 
 
 def test_setup_and_manifest_name_the_same_versions(dev: ModuleType) -> None:
@@ -44,6 +44,8 @@ def test_setup_and_manifest_name_the_same_versions(dev: ModuleType) -> None:
     for (major, minor), requirements in dev.REQUIREMENTS.items():
         scipy = next(line.split("==")[1] for line in requirements if line.startswith("scipy"))
         assert ("scipy", scipy, f"cp{major}{minor}") in shipped
+        threadpoolctl = next(line.split("==")[1] for line in requirements if line.startswith("threadpoolctl"))
+        assert ("threadpoolctl", threadpoolctl, "py3") in shipped
 
 
 def test_packages_of_the_project_are_all_listed() -> None:
@@ -108,7 +110,7 @@ def test_full_zip_holds_the_wheels_of_its_platform(full_extension_zip: Path, dev
         wheels = {name for name in archive.namelist() if name.startswith("wheels/")}
         assert sorted(set(archive.namelist()) - wheels) == sorted(dev.shipped_files())
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
-    assert wheels == {wheel.removeprefix("./") for wheel in MANIFEST["wheels"] if dev.wheel_platform(wheel) == manifest["platforms"][0]}
+    assert wheels == {wheel.removeprefix("./") for wheel in MANIFEST["wheels"] if dev.serves(wheel, manifest["platforms"][0])}
 
 
 @pytest.mark.slow

@@ -46,13 +46,9 @@ def take(killing: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(take: Path, out: Path, python: str = sys.executable, threads: int = 1) -> Path:
-    """A run in a process of its own with so many threads: ours, OpenCV's and the linear algebra's.
-
-    The linear algebra of numpy 1 adds up in another order with more threads; the command gives it one (__main__.py).
-    """
-    blas = threads if int(np.__version__.partition(".")[0]) > 1 else 1
+    """A run in a process of its own with so many threads: ours, OpenCV's and, if the command left it at that, the linear algebra's."""
     code = f"import cv2; from tricap.core import threads; threads.THREADS = {threads}; cv2.setNumThreads({threads}); {COMMAND}"
-    some = {name: str(blas) for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    some = {name: str(threads) for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
     done = subprocess.run([python, "-c", code, "run", str(take), "--out", str(out), "--quiet"], env=os.environ | some,
                           capture_output=True, text=True, check=False)  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -73,7 +69,7 @@ def test_the_button_leaves_the_bytes_of_the_command(killing: ModuleType, take: P
     found = []
     for driver in ("tricap run", "operator"):
         line = [sys.executable, "-c", DRIVER, driver, take, tmp_path / driver, tmp_path / "profile" / driver]
-        some = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+        some = {"OPENBLAS_NUM_THREADS": "4", "PYTHONPATH": str(Path(__file__).parent)}
         done = subprocess.run(line, env=os.environ | some, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         found.append(killing.contents(tmp_path / driver))
