@@ -14,6 +14,7 @@ spreading its narrow quads: a gap of 2 mm would be bridged by 20.
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse import csgraph
 from scipy.sparse.linalg import spsolve
 
 LARGEST_JUMP = np.radians(4.8)
@@ -87,10 +88,17 @@ def faired(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, tied: np.n
             best, least = found.copy(), jumps.max()
         if least <= LARGEST_JUMP:
             break
-        rough[faces[(jumps > LARGEST_JUMP).any(axis=1)]] = True
-        moved = within(near, rough, RINGS + step // WIDER_AFTER)
+        jumping = np.isin(np.arange(len(found)), faces[(jumps > LARGEST_JUMP).any(axis=1)])
+        rough |= jumping
+        moved = _reached_from(near, within(near, rough, RINGS + step // WIDER_AFTER), jumping)
         found[moved] = _plate(found, faces, within(near, np.isin(np.arange(len(found)), moved), 1), moved, WIDTH**-4 * tied[moved])
     return best
+
+
+def _reached_from(near: sparse.csr_matrix, among: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Those `among` the vertices that hang together, by edges between them, with `chosen` (V,) ones."""
+    _, piece = csgraph.connected_components(near[among][:, among], directed=False)
+    return np.asarray(among[np.isin(piece, piece[chosen[among]])])
 
 
 def _troubled(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tricap.core.body import model_file
 from tricap.core.body.ends import person_shape
 from tricap.core.body.model_file import read_model
 from tricap.core.body.one_skin import DETAIL, OneSkin, one_skin
@@ -55,6 +57,24 @@ def test_thighs_that_touch_leave_no_fold_between_them() -> None:
     order = np.lexsort(edges.T)
     pairs = np.tile(np.arange(len(skin.faces)), 4)[order].reshape(-1, 2)  # the two faces of each edge
     assert np.einsum("nk,nk->n", normals[pairs[:, 0]], normals[pairs[:, 1]]).min() > -0.5
+
+
+def test_a_seam_that_is_hard_to_round_off_leaves_the_others_where_they_are(tmp_path: Path) -> None:
+    """Collarbones that reach forwards: at their shoulders it takes many rounds, at the hips one."""
+    model = tmp_path / "forward.toml"
+    text = (Path(model_file.__file__).parent / "models" / "full.toml").read_text(encoding="utf-8")
+    for old, new in (("stature = 0.055\nlength_sigma", "stature = 0.0495\nlength_sigma"),
+                     ("y = [-0.3, 0.0, -1.0]", "y = [-0.32, -0.32, -1.0]"),
+                     ("y = [-1.0, 0.0, -0.24]", "y = [-1.0, 0.13, -0.15]")):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    model.write_text(text, encoding="utf-8")
+    shape = default_shape(read_model(model))
+    skin = one_skin(shape, SkinSettings())
+    off = np.abs(WholeSurface(shape, np.zeros(len(shape.skeleton.dof_names))).distance_m(skin.vertices_m, skin.part))
+    hips = (skin.vertices_m[:, 2] < 0.1) & (skin.vertices_m[:, 2] > -0.2)
+    assert off[~hips].max() > 3e-3, "or nothing was hard"
+    assert off[hips].max() < 0.8e-3  # was 5 mm
 
 
 def test_seams_are_on_the_surface_and_the_parts_skin_is_kept_elsewhere() -> None:
