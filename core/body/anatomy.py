@@ -75,8 +75,8 @@ TABLES: dict[str, tuple[Ball, ...]] = {
         Ball("tibialis anterior", 0.35, -0.25, -0.42, 0.48, 0.28), Ball("peroneus", 0.50, -0.45, 0.0, 0.45, 0.28)),
     "foot": (
         Ball("ankle", 0.12, 0.0, 0.0, 0.85, 0.24), Ball("heel", 0.15, 0.0, 0.40, 0.55, 0.22),
-        Ball("instep", 0.50, 0.25, 0.0, 0.70, 0.26), Ball("outer edge", 0.60, -0.35, 0.10, 0.60, 0.28),
-        Ball("ball of the foot", 0.86, 0.0, 0.0, 0.85, 0.24)),
+        Ball("instep", 0.40, 0.25, 0.0, 0.70, 0.26), Ball("outer edge", 0.50, -0.35, 0.10, 0.60, 0.28),
+        Ball("ball of the foot", 0.70, 0.0, 0.0, 0.85, 0.24), Ball("toes", 0.92, 0.0, 0.0, 0.75, 0.20)),
 }
 RINGS = tuple(Ball(f"{where} {i + 1}", along, aside, ahead, 0.55, 0.26)
               for i, along in enumerate((1 / 6, 1 / 2, 5 / 6))

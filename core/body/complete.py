@@ -6,7 +6,7 @@ the bone's own profile. Then all cross radii are adjusted together until the sur
     √(−½ ln F_complete(X)) = √(−½ ln F_simplified(X)) at points X of the surface and a little outside it,   ln l = its start ± 50 %    (1)
 
 So the refined fit begins with the same body, and departs from it only where the measurement says so. A bone that no table knows (in a
-model of one's own) gets rings of four balls. The whole body has 148 balls.
+model of one's own) gets rings of four balls. The whole body has 150 balls.
 """
 
 from dataclasses import replace

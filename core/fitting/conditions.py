@@ -37,6 +37,7 @@ from .soft_segmentation import soft_segment
 from .state import BodyState, ShapeParameters
 
 SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
+FLESH_UNLIKE = 2.0  # the sigma of radii on the left against the right over that of lengths
 WEIGHT_SIGMA = 0.3  # of ln w: an isolated ball's weight and radius are seen as one, r = l √(½ ln 2w)
 POINTS_OF_RAY = 3  # a limb of 25 cm shows some 300 points (of one voxel each), and 40 rays a view
 MOST_OFF = 3.0  # sigmas of a click, or beyond a limit, that count
@@ -133,7 +134,8 @@ class Conditions:
         found: list[Observation] = [ShapePrior(mean=mean, sigma=sigma), self.proportions,
                                     EqualRadii(sigma=s.roundness_sigma, log_ratio=np.log(radii[:, 0] / radii[:, 2]))]
         left, right = self.parameters.pairs()
-        return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma)] if len(left) else found
+        unlike = np.where(left < self.parameters.n_lengths, 1.0 / np.sqrt(self.frames), FLESH_UNLIKE)
+        return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma * unlike)] if len(left) else found
 
     def problem(self, observe: Callable[[int, BodyState], list[Observation]], free: str | None = None,
                 smoothness: Acceleration | None = None, *, hold_motion: bool = False) -> Problem:

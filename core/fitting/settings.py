@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ..settings import knob
 
-ALGORITHM = "body 2"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 3"  # part of the fit's key: raise it when the same input gives another body
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,7 +45,8 @@ class FitSettings:
     roundness_sigma: float = knob(0.10, "Relative sigma of the difference of a ball's two cross radii.", low=0.001, high=1.0)
     evenness_sigma: float = knob(0.4, "Relative sigma of how much thicker than those beside it a ball is, about the model: rings that "
                                       "nothing proves are evened out after the fit.", low=0.001, high=100.0)
-    symmetry_sigma: float = knob(0.03, "Relative sigma of the difference between left and right.", low=0.001, high=1.0)
+    symmetry_sigma: float = knob(0.015, "Relative sigma of the difference of a bone's lengths on the left and on the right; all frames "
+                                         "count as one. Of radii it is twice that, in each frame.", low=0.001, high=1.0)
     limit_sigma_deg: float = knob(2.0, "How softly joint limits hold.", unit="deg", low=0.1, high=30.0)
     prediction_sigma_deg: float = knob(15.0, "Sigma of an angle predicted from the frames before.", unit="deg", low=0.5, high=90.0)
     prediction_sigma_m: float = knob(0.03, "Sigma of a position predicted from the frames before.", unit="m", low=0.001, high=1.0)

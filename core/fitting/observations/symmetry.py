@@ -1,4 +1,7 @@
-"""Both sides of a body are alike: the logarithms of a length or radius on the left and on the right differ by 0 ± 3 %."""
+"""Both sides of a body are alike: the logarithms of a length or radius on the left and on the right differ by 0 ± sigma.
+
+People's bones do by 1 to 2 % at most (Auerbach & Ruff 2006, J. Hum. Evol. 50: 203-218), their flesh by more.
+"""
 
 from dataclasses import dataclass
 
@@ -13,7 +16,7 @@ class Symmetry:
 
     left: np.ndarray  # (K,) indices in the shape vector
     right: np.ndarray  # (K,)
-    sigma: float
+    sigma: np.ndarray  # (K,)
     kind: str = ""
     crowding: float = 1.0
 

@@ -61,7 +61,7 @@ def _cases(parameters: ShapeParameters, state, rng):
             FootOnFloor(joint=np.arange(joints), height_m=rng.normal(0, 0.1, joints), floor_m=0.1, sigma_m=0.02),
             Keypoints(joint=np.arange(joints), xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=rng.uniform(0.005, 0.02, joints)),
             _apart(state, rng), _empty(camera, joints, rng), _rays(state, near, bone, sigma, rng),
-            Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=0.03)]
+            Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=np.array([0.015, 0.03]))]
 
 
 def _apart(state, rng):

@@ -1,0 +1,51 @@
+"""How alike both sides of a person are believed to be."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.fitting.conditions import Conditions
+from tricap.core.fitting.fit_input import FitInput
+from tricap.core.fitting.observations import Symmetry
+from tricap.core.fitting.sequence import conditions, fit_sequence
+from tricap.core.fitting.settings import FitSettings
+
+from .limb_scene import front_rig, measured_cloud
+
+
+def clicked_person(right_shin: float) -> FitInput:
+    """Clicks of a person one of whose shins is so many times as long, and a few points of one whose shins are alike."""
+    shape, rig = default_shape(read_model("full")), front_rig()
+    rest, names = np.zeros(len(shape.skeleton.dof_names)), [bone.name for bone in shape.skeleton.bones]
+    joints = joint_positions(shape.skeleton, np.where([name == "shin.R" for name in names], right_shin, 1.0) * shape.lengths_m, rest)
+    clicks = {name: {c.name: c.project(at) for c in rig.cameras} for name, at in joints.items()}
+    cloud = measured_cloud(shape, rest, 0, np.random.default_rng(0), points=200, noise=0.001, gross=0.0)
+    return FitInput(rig=rig, model="full", clouds=[cloud], time_s=np.zeros(1), clicks={0: clicks})
+
+
+def symmetry(fit: Conditions) -> Symmetry:
+    (found,) = (x for x in fit.of_shape() if isinstance(x, Symmetry))
+    return found
+
+
+def test_bones_are_more_alike_than_flesh_and_the_more_so_the_more_frames_share_an_error() -> None:
+    fit = conditions(clicked_person(1.0), FitSettings())
+    names = [fit.parameters.layout.names[i] for i in symmetry(fit).left]
+    bones = np.array([name.startswith("length") for name in names])
+    assert 0 < bones.sum() < len(bones)
+    for frames in (1, 16):
+        sigma = symmetry(replace(fit, frames=frames)).sigma
+        assert np.allclose(sigma[bones], 0.015 / np.sqrt(frames)) and np.allclose(sigma[~bones], 0.03)
+
+
+def test_clicks_make_one_shin_longer_only_where_people_may_be_uneven() -> None:
+    longer = []
+    for settings in (FitSettings(symmetry_sigma=1.0), FitSettings()):
+        fit = fit_sequence(clicked_person(1.12), settings)
+        names = [bone.name for bone in fit.shape.skeleton.bones]
+        right, left = (fit.shape.lengths_m[names.index(f"shin.{side}")] for side in "RL")
+        longer.append(right / left - 1)
+    assert longer[0] > 0.03 and abs(longer[1]) < longer[0] / 2
