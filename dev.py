@@ -20,9 +20,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent
 TOOLS = ["pytest>=9", "pytest-xdist>=3.8", "ruff", "mypy", "setuptools>=77", "c3d>=0.6", "dask[distributed]>=2024.8"]
 REQUIREMENTS = {
-    (3, 11): ["bpy==4.5.15", "numpy>=1.26,<2", "opencv-python-headless<5", "scipy==1.17.1", "threadpoolctl==3.8.0", *TOOLS],
-    (3, 13): ["bpy==5.2.3", "numpy>=2.2,<3", "opencv-python-headless==5.0.0.93", "scipy==1.18.1", "threadpoolctl==3.8.0", *TOOLS],
+    (3, 11): ["bpy==4.5.15", "numpy>=1.26,<2", "scipy==1.17.1", "threadpoolctl==3.8.0", *TOOLS],
+    (3, 13): ["bpy==5.2.3", "numpy>=2.2,<3", "scipy==1.18.1", "threadpoolctl==3.8.0", *TOOLS],
 }
+OPENCV = "opencv-python-headless==5.0.0.93"  # as shipped; it asks pip for numpy 2, and works with the numpy 1 of Blender 4.5
 BLENDER = {(3, 11): "4.5 LTS", (3, 13): "5.2 LTS"}
 WINDOWS = os.name == "nt"
 STAMP = "tricap-setup.txt"
@@ -73,7 +74,7 @@ def site_packages() -> Path:
 
 def requirements_digest() -> str:
     """Changes when the environment has to be made or mended: other requirements, a moved folder."""
-    text = "\n".join([str(ROOT), *REQUIREMENTS[python_version()]])
+    text = "\n".join([str(ROOT), *REQUIREMENTS[python_version()], OPENCV])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -103,11 +104,11 @@ def make_venv() -> None:
 
 
 def install_requirements() -> None:
-    """pip install, in one command so that numpy stays the one that Blender was built for."""
+    """pip install, in one command so that numpy stays the one that Blender was built for; OpenCV after it, without asking for another."""
     version = python_version()
     say(f"Installing Blender {BLENDER[version]} (as a Python module, about 400 MB) and the tools into {venv_folder()}; about a minute.")
     pip = [str(venv_program("python")), "-m", "pip", "install", "-q", "--disable-pip-version-check", "--no-input"]
-    if subprocess.run([*pip, *REQUIREMENTS[version]], cwd=ROOT).returncode:
+    if any(subprocess.run([*pip, *what], cwd=ROOT).returncode for what in (REQUIREMENTS[version], ["--no-deps", OPENCV])):
         sys.exit("pip could not install the packages (see above). Check the network and the free space (2 GB), then run this again.")
 
 

@@ -46,6 +46,7 @@ def test_setup_and_manifest_name_the_same_versions(dev: ModuleType) -> None:
         assert ("scipy", scipy, f"cp{major}{minor}") in shipped
         threadpoolctl = next(line.split("==")[1] for line in requirements if line.startswith("threadpoolctl"))
         assert ("threadpoolctl", threadpoolctl, "py3") in shipped
+    assert (*dev.OPENCV.replace("-", "_").split("=="), "cp37") in shipped
 
 
 def test_packages_of_the_project_are_all_listed() -> None:

@@ -3,7 +3,7 @@
 Prepared once per image (`noise` is the standard deviation of its grey values' noise): the exact spline on a grid four times as fine.
 A sample is a bilinear look-up in that grid. On real speckle (DIC Challenge, sample 5) matching has a bias of 0.0009 px with it, 0.0027 px
 with the cubic spline, which takes as long to prepare. OpenCV 4 rounds the place of a look-up to 1/32 of the fine grid, at most 0.0039 px;
-a patch of samples at unlike places averages that away. OpenCV 5 is exact.
+a patch of samples at unlike places averages that away. OpenCV 5, which ships, is exact.
 """
 
 import cv2
