@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
-TOOLS = ["pytest>=9", "pytest-xdist>=3.8", "ruff", "mypy", "setuptools>=77", "c3d>=0.6", "dask[distributed]>=2024.8"]
+TOOLS = ["pytest>=9", "pytest-xdist>=3.8", "ruff==0.17.6", "mypy", "setuptools>=77", "c3d>=0.6", "dask[distributed]>=2024.8"]
 REQUIREMENTS = {
     (3, 11): ["bpy==4.5.15", "numpy>=1.26,<2", "scipy==1.17.1", "threadpoolctl==3.8.0", *TOOLS],
     (3, 13): ["bpy==5.2.3", "numpy>=2.2,<3", "scipy==1.18.1", "threadpoolctl==3.8.0", *TOOLS],
@@ -125,7 +125,7 @@ def link_source() -> None:
     if WINDOWS:
         write_if_changed(venv_folder() / "Scripts" / "tricap.cmd", '@"%~dp0python.exe" -P -m tricap %*\n')
     else:
-        script = f"#!/bin/sh\nexec {shlex.quote(str(venv_program('python')))} -P -m tricap \"$@\"\n"
+        script = f'#!/bin/sh\nexec {shlex.quote(str(venv_program("python")))} -P -m tricap "$@"\n'
         write_if_changed(venv_program("tricap"), script)
         venv_program("tricap").chmod(0o755)
 
@@ -168,9 +168,10 @@ def run(*command: object) -> int:
 
 
 def lint() -> int:
-    """Style of everything, types of the core."""
+    """Style and format of everything, types of the core."""
     python = venv_program("python")
-    return max(run(python, "-m", "ruff", "check", "."), run(python, "-m", "mypy"))
+    checks = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
+    return max(run(python, "-m", *check) for check in checks)
 
 
 def demo(out: str) -> int:

@@ -29,15 +29,30 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--preview", metavar="FILE.png", type=Path, help="also a picture: the body shaded, and over the footage")
     parser.add_argument("--turntable", metavar="FILE.mp4", type=Path, help="also a movie of a turn around the body")
     parser.add_argument("--frame", metavar="N", type=int, help="the frame of preview, turntable, implicit surface (default: middle)")
-    parser.add_argument("--detail", metavar="N", type=int, default=DETAIL, choices=range(1, 9),
-                        help=f"level of detail of the skin, 1 to 8 (default {DETAIL})")
+    parser.add_argument(
+        "--detail",
+        metavar="N",
+        type=int,
+        default=DETAIL,
+        choices=range(1, 9),
+        help=f"level of detail of the skin, 1 to 8 (default {DETAIL})",
+    )
     parser.add_argument("--exact-skin", action="store_true", help="also the run's skin of every frame, as FILE.pc2 beside the .blend")
     parser.add_argument("--implicit", action="store_true", help="also the implicit surface itself in the middle frame, for checking")
-    parser.add_argument("--field", choices=tuple(POTENTIALS), default=EXPONENTIAL.name,
-                        help="the field of that surface's balls, see `tricap fields` (default: the fitted one)")
+    parser.add_argument(
+        "--field",
+        choices=tuple(POTENTIALS),
+        default=EXPONENTIAL.name,
+        help="the field of that surface's balls, see `tricap fields` (default: the fitted one)",
+    )
     parser.add_argument("--rest-pose", choices=("A", "T"), default="A", help="of the armature (default A)")
-    parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0,
-                        help="play a second action with few keys, within this many degrees; the measured one is kept")
+    parser.add_argument(
+        "--simplify",
+        metavar="DEG",
+        type=float,
+        default=0.0,
+        help="play a second action with few keys, within this many degrees; the measured one is kept",
+    )
     parser.add_argument("--colour", choices=("intensity", "sigma", "speed"), default="intensity", help="what colours the cloud")
     parser.add_argument("--arrows", action="store_true", help="velocities as arrows")
     parser.set_defaults(run=scene)
@@ -67,9 +82,17 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
             raise InputError(f"--frame {args.frame} is not among the frames {first} to {last}; choose another.")
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
         look_through()
-        options = SceneOptions(detail=args.detail, exact_skin=args.exact_skin, rest_pose=args.rest_pose,
-                               simplify_deg=args.simplify, colour=args.colour, arrows=args.arrows, implicit=args.implicit,
-                               field=args.field, frame=args.frame)
+        options = SceneOptions(
+            detail=args.detail,
+            exact_skin=args.exact_skin,
+            rest_pose=args.rest_pose,
+            simplify_deg=args.simplify,
+            colour=args.colour,
+            arrows=args.arrows,
+            implicit=args.implicit,
+            field=args.field,
+            frame=args.frame,
+        )
         report = write_scene(contents, args.blend, options, monitor)
         if args.preview is not None:
             preview(contents, args.preview, args.frame)

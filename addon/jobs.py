@@ -135,8 +135,12 @@ class JobState(bpy.types.PropertyGroup):
     """What the panel shows of the running job. Only read: setting a property would draw the whole window again, the 3-D view with it."""
 
     running: bpy.props.BoolProperty(name="Running", get=lambda _: bool(_watched))  # type: ignore[valid-type]
-    progress: bpy.props.FloatProperty(name="Progress", min=0.0, max=1.0,  # type: ignore[valid-type]
-                                      get=lambda _: _watched[0].fraction if _watched else 0.0)
+    progress: bpy.props.FloatProperty(
+        name="Progress",
+        min=0.0,
+        max=1.0,  # type: ignore[valid-type]
+        get=lambda _: _watched[0].fraction if _watched else 0.0,
+    )
     stage: bpy.props.StringProperty(name="Stage", get=lambda _: _watched[0].stage_words if _watched else "")  # type: ignore[valid-type]
     left: bpy.props.StringProperty(name="Time Left", get=lambda _: _watched[0].left_words if _watched else "")  # type: ignore[valid-type]
     step: bpy.props.StringProperty(name="Step", get=lambda _: _watched[0].step if _watched else "")  # type: ignore[valid-type]

@@ -57,8 +57,11 @@ def group_class(name: str, settings: type) -> type:
 
 def touched(group: bpy.types.PropertyGroup, settings: type) -> dict[str, Any]:
     """The knobs that were set in Blender, as a plain table for `core.settings.from_table`."""
-    return {field.name: exact(getattr(group, field.name), field.default)
-            for field in dataclasses.fields(settings) if group.is_property_set(field.name)}
+    return {
+        field.name: exact(getattr(group, field.name), field.default)
+        for field in dataclasses.fields(settings)
+        if group.is_property_set(field.name)
+    }
 
 
 def snapshot(group: bpy.types.PropertyGroup, settings: type) -> Any:
@@ -106,10 +109,20 @@ def register() -> None:
     """Make the classes of all stages and hang them onto the scene as `scene.tricap`."""
     groups = {name: group_class(name, settings) for name, settings in stages().items()}
     annotations: dict[str, Any] = {
-        "take": bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE, update=take_properties.tell_touched,
-                                         description="Folder of the recording; it holds take.toml"),
-        "out": bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE, update=take_properties.tell_touched,
-                                        description="Folder for the results; empty: beside the .blend, or beside the take"),
+        "take": bpy.props.StringProperty(
+            name="Take",
+            subtype="DIR_PATH",
+            options=RELATIVE,
+            update=take_properties.tell_touched,
+            description="Folder of the recording; it holds take.toml",
+        ),
+        "out": bpy.props.StringProperty(
+            name="Output",
+            subtype="DIR_PATH",
+            options=RELATIVE,
+            update=take_properties.tell_touched,
+            description="Folder for the results; empty: beside the .blend, or beside the take",
+        ),
         "last": bpy.props.StringProperty(name="Result", description="What the last run found"),
     }
     annotations |= take_properties.annotations()

@@ -29,7 +29,7 @@ FORMAT, VERSION = "tricap-batch", 1
 TOPIC = "tricap"  # under which workers report
 DONE, MEND, BUG, LOST = "done", "needs mending", "bug", "lost"  # what can become of a take
 WAIT_S, REPORT_S, CONNECT_S = 0.3, 0.5, 10.0
-MISSING = "`tricap batch` needs Dask, which this Python does not have; install it with: pip install \"tricap[batch]\"."
+MISSING = '`tricap batch` needs Dask, which this Python does not have; install it with: pip install "tricap[batch]".'
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -174,8 +174,14 @@ def _client(engine: Engine) -> Iterator[Any]:
     with (
         dask.config.set(quiet),
         LocalCluster(
-            n_workers=engine.workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None, memory_limit=0,
-            silence_logs=50, env=shares(engine.workers, os.cpu_count() or 1),
+            n_workers=engine.workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            memory_limit=0,
+            silence_logs=50,
+            env=shares(engine.workers, os.cpu_count() or 1),
         ) as cluster,
         Client(cluster) as client,
     ):
@@ -189,7 +195,11 @@ def shares(workers: int, cores: int) -> dict[str, str]:
 
 
 def _as_they_end(
-    client: Any, futures: Sequence[Any], takes: Sequence[Path], outs: Sequence[Path], shown: Mapping[str, tuple[str, float, float]],
+    client: Any,
+    futures: Sequence[Any],
+    takes: Sequence[Path],
+    outs: Sequence[Path],
+    shown: Mapping[str, tuple[str, float, float]],
     monitor: Monitor,
 ) -> Iterator[tuple[int, Outcome]]:
     """Number and outcome of each take as soon as it has ended."""

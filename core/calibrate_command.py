@@ -27,16 +27,25 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the rig to write, such as rig.toml")
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
-    parser.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none",
-                        help="which lines to keep of interlaced video; both: as two frames, the odd lines' and the even lines'")
+    parser.add_argument(
+        "--interlaced",
+        choices=(*INTERLACE, BOTH),
+        default="none",
+        help="which lines to keep of interlaced video; both: as two frames, the odd lines' and the even lines'",
+    )
     parser.add_argument("--first-field", choices=("odd", "even"), default="odd", help="of both: which lines were exposed first")
-    parser.add_argument("--mask", type=Path, metavar="PATH",
-                        help="image that is black where no target can be, or a folder of them named like the cameras")
+    parser.add_argument(
+        "--mask", type=Path, metavar="PATH", help="image that is black where no target can be, or a folder of them named like the cameras"
+    )
     parser.add_argument("--target-diameter", type=float, metavar="M", help="diameter of the bar's targets in metres, if known")
     parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar lies on the floor, which becomes z = 0")
     parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar is held level")
-    parser.add_argument("--points", type=Path, metavar="FILE",
-                        help="CSV of point,view,x,y: the pixels of “origin”, “x” and “y”, which become the world's origin and axes")
+    parser.add_argument(
+        "--points",
+        type=Path,
+        metavar="FILE",
+        help="CSV of point,view,x,y: the pixels of “origin”, “x” and “y”, which become the world's origin and axes",
+    )
     parser.add_argument("--like", type=Path, metavar="RIG", help="put the cameras where those of the same names stand in this rig.toml")
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for the report: text, JSON, pictures")
     parser.add_argument("--import", dest="source", type=Path, metavar="FILE", help="read another tool's calibration instead of images")

@@ -149,9 +149,7 @@ def measure_bar(
     return MeasuredBar(tracks=tuple(tracks), observations=observations)
 
 
-def _measure_view(
-    footage: BarFootage, view: int, monitor: Monitor, note: Note | None, diameter: float
-) -> tuple[BarTrack, tuple[int, int]]:
+def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note | None, diameter: float) -> tuple[BarTrack, tuple[int, int]]:
     """The bar's track in one view, and the size of its images; `diameter` of the targets as a part of the bar's length, 0: unknown."""
     name, sequence = footage.names[view], footage.sequences[view]
     mask = footage.masks[view] if footage.masks else None

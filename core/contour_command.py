@@ -172,8 +172,9 @@ def _checkpoints(view: int) -> str:
     return f"contour{view}"
 
 
-def track_contour(job: pipeline.Run, view: int, monitor: Monitor, start: Start,
-                  kept: KeptContours | None = None) -> Iterator[tuple[int, Contour]]:
+def track_contour(
+    job: pipeline.Run, view: int, monitor: Monitor, start: Start, kept: KeptContours | None = None
+) -> Iterator[tuple[int, Contour]]:
     """(frame, contour) of one view; each predicted by the projected trajectories inside the last one that had any, or else by points that
     are followed in the images.
 

@@ -51,8 +51,9 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
             empty = _shown(background, images[k]) & ~persons[k] & apart
             squares = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # endless where all is empty
             distances[k].append((np.minimum(squares, 255 * UNIT_PX / STEP_PX) * (STEP_PX / UNIT_PX)).astype(np.uint8))
-    return [EmptyView(view=footage.take.views[k].name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
-            for k, d in distances.items()]
+    return [
+        EmptyView(view=footage.take.views[k].name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX) for k, d in distances.items()
+    ]
 
 
 def still_backgrounds(footage: Footage, frames: np.ndarray, clouds: Sequence[PointCloud] | None = None) -> list[Background | None]:

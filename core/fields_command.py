@@ -36,12 +36,19 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     second = graphs[1].replace("<svg ", f'<svg y="{2 * HEIGHT}" ', 1)
     head = f'<svg viewBox="0 0 {WIDTH} {4 * HEIGHT}" width="{WIDTH}" height="{4 * HEIGHT}" xmlns="http://www.w3.org/2000/svg">'
     store.write_text(args.out, f"{head}{graphs[0]}{second}</svg>\n")
-    rows = [f"{name:<12} r_t {p.threshold_radius():.4f} l   r_a {p.influence:.4f} l{' (in name: it never ends)' if p.endless else ''}"
-            for name, p in POTENTIALS.items()]
+    rows = [
+        f"{name:<12} r_t {p.threshold_radius():.4f} l   r_a {p.influence:.4f} l{' (in name: it never ends)' if p.endless else ''}"
+        for name, p in POTENTIALS.items()
+    ]
     return [f"{args.out}: {len(rows)} fields, seen where they are w_t = {THRESHOLD:g} of their weight.", *rows]
 
 
 def _graph(title: str, potentials: dict[str, Potential]) -> str:
     radius = np.linspace(0, FARTHEST, 301)
-    return field_graph(title, radius, {name: p.value(radius**2) for name, p in potentials.items()},
-                       {name: (p.threshold_radius(), p.influence) for name, p in potentials.items()}, THRESHOLD)
+    return field_graph(
+        title,
+        radius,
+        {name: p.value(radius**2) for name, p in potentials.items()},
+        {name: (p.threshold_radius(), p.influence) for name, p in potentials.items()},
+        THRESHOLD,
+    )

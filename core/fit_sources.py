@@ -26,14 +26,25 @@ from .surface.cloud import PointCloud
 from .take import JOINTS, Footage, Seeds, Take
 from .tracking.trajectories import Trajectories
 
-OURS = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist", "thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "toe",
-        "clavicle": "clavicle", "hips": "pelvis", "neck": "neck"}  # of the roles that retargeting reads in names
+OURS = {
+    "upper_arm": "shoulder",
+    "forearm": "elbow",
+    "hand": "wrist",
+    "thigh": "hip",
+    "shin": "knee",
+    "foot": "ankle",
+    "toe": "toe",
+    "clavicle": "clavicle",
+    "hips": "pelvis",
+    "neck": "neck",
+}  # of the roles that retargeting reads in names
 LOOSE = {"toe.L": 2.0, "toe.R": 2.0, "neck": 2.0, "pelvis": 2.0}  # where detectors mean another place than we do: times the sigma
 LEAST_CONFIDENCE = 0.2
 
 
-def fit_input(footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results,
-              empty: Sequence[EmptyView] = ()) -> FitInput:
+def fit_input(
+    footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results, empty: Sequence[EmptyView] = ()
+) -> FitInput:
     """All that the fit can use of a run; clicks in other frames than the footage's are left out.
 
     Raises:
@@ -95,8 +106,10 @@ def clicks_left_out(footage: Footage) -> list[str]:
     if not outside or missing_for_fit(footage):
         return []
     begins = "; the fit begins at other clicks or keypoints" if footage.take.seeds.frame in outside else ""
-    return [f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
-            f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."]
+    return [
+        f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
+        f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."
+    ]
 
 
 def _with_joints(take: Take) -> list[Seeds]:
@@ -161,21 +174,31 @@ def _markers(path: Path, axes: str | None) -> Markers:
     return read(path) if axes is None else read(path, axes=axes)
 
 
-def _places(source: KeypointSource, names: Sequence[str], frames: np.ndarray, places: np.ndarray, confidence: np.ndarray,
-            path: Path) -> JointPlaces:
+def _places(
+    source: KeypointSource, names: Sequence[str], frames: np.ndarray, places: np.ndarray, confidence: np.ndarray, path: Path
+) -> JointPlaces:
     """What a file says of joints, one row per place; a point of confidence c has the sigma over √c."""
     for name in source.names:
         if name not in names:
             raise InputError(f"{path} has no point “{name}”.{nearest_name(name, list(names))} Mend `names` under [[keypoints]].")
     joints = [source.names.get(name, joint_named(name)) for name in names]
-    rows = [(t, n) for t in range(len(frames)) for n, joint in enumerate(joints)
-            if joint and confidence[t, n] >= LEAST_CONFIDENCE and np.isfinite(places[t, n]).all()]
+    rows = [
+        (t, n)
+        for t in range(len(frames))
+        for n, joint in enumerate(joints)
+        if joint and confidence[t, n] >= LEAST_CONFIDENCE and np.isfinite(places[t, n]).all()
+    ]
     if not rows:
         raise InputError(f"None of the points in {path} ({', '.join(names[:6])} …) is a joint of ours; say which under `names`.")
     t, n = np.array(rows).T
     loose = np.array([LOOSE.get(joint, 1.0) for joint in joints])
-    return JointPlaces(view=source.view, frame=frames[t], joint=tuple(joints[i] for i in n), place=places[t, n],
-                       sigma=source.sigma * loose[n] / np.sqrt(confidence[t, n]))
+    return JointPlaces(
+        view=source.view,
+        frame=frames[t],
+        joint=tuple(joints[i] for i in n),
+        place=places[t, n],
+        sigma=source.sigma * loose[n] / np.sqrt(confidence[t, n]),
+    )
 
 
 def joint_named(name: str) -> str:

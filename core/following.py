@@ -136,9 +136,7 @@ def _advance(
 
 
 def _relief(view: TrackingView, m: MeasuredFrame) -> Relief:
-    return Relief(
-        field=m.field, cloud=m.cloud, camera=view.cameras[view.reference], reference=view.reference, half_patch=view.half_patch
-    )
+    return Relief(field=m.field, cloud=m.cloud, camera=view.cameras[view.reference], reference=view.reference, half_patch=view.half_patch)
 
 
 def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Tiles:

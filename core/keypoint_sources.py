@@ -25,8 +25,9 @@ class KeypointSource:
     axes: str | None = None  # of a file in space; None: what such files usually have
 
 
-def keypoint_sources(tables: Sequence[Mapping[str, Any]], views: Sequence[str], joints: Sequence[str],
-                     where: str) -> tuple[KeypointSource, ...]:
+def keypoint_sources(
+    tables: Sequence[Mapping[str, Any]], views: Sequence[str], joints: Sequence[str], where: str
+) -> tuple[KeypointSource, ...]:
     """The sources that a take.toml names.
 
     Raises:
@@ -41,7 +42,7 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
             raise InputError(f"A {where} has an unknown key “{key}”.{nearest_name(key, KEYS)}")
     files, view, names = table.get("files"), table.get("view", ""), table.get("names", {})
     if not isinstance(files, str) or Path(files).is_absolute() or ".." in Path(files).parts:
-        raise InputError(f"`files` of a {where} is {files!r}; it must be files inside the take's folder, such as \"kp/C/*.json\".")
+        raise InputError(f'`files` of a {where} is {files!r}; it must be files inside the take\'s folder, such as "kp/C/*.json".')
     kind = Path(files).suffix.lower()
     if kind not in PIXELS + SPACE:
         raise InputError(f"`files` of a {where} is {files!r}; keypoints are read from {', '.join(PIXELS + SPACE)}.")
@@ -49,7 +50,7 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
         need = f"must name its view.{nearest_name(str(view), tuple(views))}" if kind in PIXELS else "is in space and has no view."
         raise InputError(f"The {where} with “{files}” {need}")
     if not isinstance(names, dict):
-        raise InputError(f"`names` of a {where} must be a table, such as {{ RKnee = \"knee.R\" }}.")
+        raise InputError(f'`names` of a {where} must be a table, such as {{ RKnee = "knee.R" }}.')
     for joint in names.values():
         if joint not in joints:
             raise InputError(f"A {where} has the joint {joint!r}, which is none.{nearest_name(str(joint), tuple(joints))}")

@@ -33,9 +33,7 @@ class FrameNote:
 def note_of(m: MeasuredFrame) -> FrameNote:
     """The note of a frame that was measured."""
     residual, sigma = (float(np.median(a)) if len(a) else np.nan for a in (m.cloud.residual_px, m.cloud.sigma_m))
-    return FrameNote(
-        frame=m.frame, key=m.key, points=len(m.cloud.xyz_m), limit_px=m.field.limit_px, residual_px=residual, sigma_m=sigma
-    )
+    return FrameNote(frame=m.frame, key=m.key, points=len(m.cloud.xyz_m), limit_px=m.field.limit_px, residual_px=residual, sigma_m=sigma)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

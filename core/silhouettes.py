@@ -71,9 +71,7 @@ def told_by(footage: Footage) -> str:
     """How the person is told from the background, such as “mask of C”; "" where the user said nothing."""
     views = footage.take.views
     return " and ".join(
-        f"{key} of {', '.join(names)}"
-        for key in PERSON_SOURCES
-        if (names := [v.name for v in views if getattr(v, key) is not None])
+        f"{key} of {', '.join(names)}" for key in PERSON_SOURCES if (names := [v.name for v in views if getattr(v, key) is not None])
     )
 
 

@@ -26,8 +26,23 @@ FORMAT, VERSION = "tricap-take", 1
 MOST_FRAMES = 100_000_000
 SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
 JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
-KEYS = ("format", "version", "fps", "interlaced", "first_field", "rig", "reference_view", "frames", "views", "body", "seeds", "keyframes",
-        "corrections", "keypoints", "settings")
+KEYS = (
+    "format",
+    "version",
+    "fps",
+    "interlaced",
+    "first_field",
+    "rig",
+    "reference_view",
+    "frames",
+    "views",
+    "body",
+    "seeds",
+    "keyframes",
+    "corrections",
+    "keypoints",
+    "settings",
+)
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
@@ -274,7 +289,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     body = table_of(table, "body", where)
     check_keys(body, ("model", "locked", "limits"), f"[body] of {where}")
     if not isinstance(body.get("model", ""), str):
-        raise InputError(f"`model` under [body] of {where} is {body['model']!r}; write the name of a body model, such as \"arm.R\".")
+        raise InputError(f'`model` under [body] of {where} is {body["model"]!r}; write the name of a body model, such as "arm.R".')
     return Take(
         folder=folder,
         fps=float(fps) * instants(interlaced).per_image,
@@ -304,11 +319,11 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         check_keys(entry, ("name", "images", "movie", "offset_frames", *PERSON_SOURCES), label)
         offset = entry.get("offset_frames", 0)
         if not isinstance(entry.get("name"), str) or not entry["name"]:
-            raise InputError(f"A {label} needs a name (text), such as \"L\".")
+            raise InputError(f'A {label} needs a name (text), such as "L".')
         if isinstance(offset, bool) or not isinstance(offset, int) or abs(offset) > MOST_FRAMES:
             raise InputError(f"`offset_frames` of {label} is {str(offset)[:40]}; write a whole number of frames, such as -2.")
         if UNFIT_FOR_NAMES.search(entry["name"]):
-            raise InputError(f"The {label} has a character in its name that file names cannot have; choose a plain name such as \"L\".")
+            raise InputError(f'The {label} has a character in its name that file names cannot have; choose a plain name such as "L".')
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)

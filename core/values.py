@@ -33,5 +33,6 @@ def check_sparse(rows: int, frames: int, names: int, where: object) -> None:
         InputError: next to none of it is known: a file of a megabyte could ask for gigabytes.
     """
     if frames * names > max(LEAST_CELLS, SPARSEST * rows):
-        raise InputError(f"{where} has {rows} rows for {frames} frames and {names} names, so that nearly all is missing; "
-                         "it is damaged, export it again.")
+        raise InputError(
+            f"{where} has {rows} rows for {frames} frames and {names} names, so that nearly all is missing; it is damaged, export it again."
+        )

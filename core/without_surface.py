@@ -26,8 +26,18 @@ def can_do_without(footage: Footage, results: Results) -> bool:
 def empty_clouds(footage: Footage) -> list[PointCloud]:
     """A cloud without points for every frame."""
     none, views = np.zeros((0, 3)), len(footage.take.views)
-    return [PointCloud(frame=frame, xyz_m=none, covariance_m2=np.zeros((0, 3, 3)), normals=none, intensity=np.zeros(0),
-                       xy_px=np.zeros((0, views, 2)), residual_px=np.zeros(0)) for frame in footage.frames]
+    return [
+        PointCloud(
+            frame=frame,
+            xyz_m=none,
+            covariance_m2=np.zeros((0, 3, 3)),
+            normals=none,
+            intensity=np.zeros(0),
+            xy_px=np.zeros((0, views, 2)),
+            residual_px=np.zeros(0),
+        )
+        for frame in footage.frames
+    ]
 
 
 def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[int, np.ndarray]]:
@@ -41,8 +51,9 @@ def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[in
     return {name: found for name, found in polygons.items() if found}
 
 
-def known_silhouettes(footage: Footage, results: Results,
-                      settings: FitSettings) -> tuple[dict[str, Mapping[int, np.ndarray]], dict[str, Background]]:
+def known_silhouettes(
+    footage: Footage, results: Results, settings: FitSettings
+) -> tuple[dict[str, Mapping[int, np.ndarray]], dict[str, Background]]:
     """The outlines, and the still backgrounds of views that have none: what tells the person's silhouette.
 
     Raises:
@@ -63,8 +74,9 @@ def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     return mask.astype(bool)
 
 
-def empty_views(footage: Footage, results: Results, clouds: Sequence[PointCloud], settings: FitSettings,
-                monitor: Monitor) -> list[EmptyView]:
+def empty_views(
+    footage: Footage, results: Results, clouds: Sequence[PointCloud], settings: FitSettings, monitor: Monitor
+) -> list[EmptyView]:
     """Where the views show no part of the person: outside the outline, and in views without one where the still background is seen.
 
     Raises:

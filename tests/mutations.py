@@ -116,6 +116,7 @@ def _all_different(data: bytes, r: random.Random) -> bytes:
     """Many rows like one of a table, each with numbers and names of its own: as many columns as rows, for who makes a table of them."""
     lines = data.split(b"\n")
     i, many = r.randrange(len(lines)), r.choice((300, 30_000))
+
     def renamed(k: int) -> bytes:
         numbered = re.sub(rb"\b\d+\b", b"%d" % k, lines[i], count=r.choice((1, 2)))
         return re.sub(rb"[A-Za-z][A-Za-z_.]*", lambda m: m.group() + b"%d" % k, numbered, count=1)

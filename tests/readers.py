@@ -85,8 +85,18 @@ def unshown() -> str:
     one = np.full((1, 2, 3), 0.25)
     chain = UnshownChain(role="neck", order=(-1,), ends=np.ones(1), along_m=np.ones(3), beside="spine", size=1, turn=one)
     stands = {state: {"L": np.ones(2, dtype=bool)} for state in ("ankle", "toe", "flat")}
-    return to_text(Unshown(frames=np.arange(2.0), held={"foot.L": one}, twisted={}, moved_m=one[0], stands=stands, feet={"mode": "auto"},
-                           level_m=0.1, chains=(chain,)))
+    return to_text(
+        Unshown(
+            frames=np.arange(2.0),
+            held={"foot.L": one},
+            twisted={},
+            moved_m=one[0],
+            stands=stands,
+            feet={"mode": "auto"},
+            level_m=0.1,
+            chains=(chain,),
+        )
+    )
 
 
 def text(name: str, content: str) -> Make:
@@ -190,10 +200,22 @@ def surface(folder: Path) -> list[Path]:
     (folder / "clouds").mkdir(exist_ok=True)
     (folder / "a.ply").rename(folder / "clouds" / "0000.ply")
     xyz = read_ply(folder / "clouds" / "0000.ply").xyz_m
-    results.save_checkpoint("surface", "0000", "k", dict(
-        cloud_xyz_m=xyz, grid=np.array([4, 0, 8, 6]), field_xy=random.uniform(0, 90, (n, k, 2)), field_cell=np.arange(n),
-        field_shape=random.uniform(0, 1, (n, k, 2, 2)), field_residual_px=np.ones(n), field_correlation=np.ones(n),
-        removed_px=random.uniform(0, 90, (5, k, 2)), removed_why=np.ones(5, np.uint8)))
+    results.save_checkpoint(
+        "surface",
+        "0000",
+        "k",
+        dict(
+            cloud_xyz_m=xyz,
+            grid=np.array([4, 0, 8, 6]),
+            field_xy=random.uniform(0, 90, (n, k, 2)),
+            field_cell=np.arange(n),
+            field_shape=random.uniform(0, 1, (n, k, 2, 2)),
+            field_residual_px=np.ones(n),
+            field_correlation=np.ones(n),
+            removed_px=random.uniform(0, 90, (5, k, 2)),
+            removed_why=np.ones(5, np.uint8),
+        ),
+    )
     return [folder / "clouds" / "0000.ply", folder / "cache" / "surface" / "0000.npz"]
 
 

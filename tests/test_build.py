@@ -20,8 +20,22 @@ NOT_SOURCE = shutil.ignore_patterns(".git", ".venv", "wheels", "dist", "out", "b
 def junk_tree(tmp_path: Path) -> Path:
     """A small repository with files that must not be shipped, wherever they lie."""
     wanted = ["blender_manifest.toml", "__init__.py", "__main__.py", "LICENSE", "core/a.py", "core/b/m.toml", "addon/c.py", "addon/p.json"]
-    junk = ["dev.py", "README.md", "notes.txt", "tests/test_a.py", "docs/a.md", ".ci/run", "dist/x.zip", "core/.b.py", "core/clip.mp4",
-            "core/__pycache__/a.cpython-313.py", "core/b/.git/x.py", "addon/old.blend1", "takes/core/a.py", "addon/.cache/x.json"]
+    junk = [
+        "dev.py",
+        "README.md",
+        "notes.txt",
+        "tests/test_a.py",
+        "docs/a.md",
+        ".ci/run",
+        "dist/x.zip",
+        "core/.b.py",
+        "core/clip.mp4",
+        "core/__pycache__/a.cpython-313.py",
+        "core/b/.git/x.py",
+        "addon/old.blend1",
+        "takes/core/a.py",
+        "addon/.cache/x.json",
+    ]
     for name in wanted + junk:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
@@ -66,7 +80,14 @@ def test_type_checkers_find_the_types_of_core() -> None:
 def test_only_what_belongs_in_it_is_shipped(dev: ModuleType, junk_tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dev, "ROOT", junk_tree)
     assert dev.shipped_files() == [
-        "blender_manifest.toml", "__init__.py", "__main__.py", "LICENSE", "core/a.py", "core/b/m.toml", "addon/c.py", "addon/p.json",
+        "blender_manifest.toml",
+        "__init__.py",
+        "__main__.py",
+        "LICENSE",
+        "core/a.py",
+        "core/b/m.toml",
+        "addon/c.py",
+        "addon/p.json",
     ]
 
 

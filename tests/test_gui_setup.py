@@ -39,10 +39,18 @@ def said(gui: ModuleType, root: Path, capsys: pytest.CaptureFixture[str], monkey
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there are no chroots on Windows")
-@pytest.mark.parametrize(("lacking", "why"), [("root", "rights of root"), ("debootstrap", "debootstrap is not installed"),
-                                              ("room", "GB free"), ("network", "could not fetch Debian sid (E: no network)")])
-def test_why_not(gui: ModuleType, lacking: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                 capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("lacking", "why"),
+    [
+        ("root", "rights of root"),
+        ("debootstrap", "debootstrap is not installed"),
+        ("room", "GB free"),
+        ("network", "could not fetch Debian sid (E: no network)"),
+    ],
+)
+def test_why_not(
+    gui: ModuleType, lacking: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     if lacking == "root":
         monkeypatch.setattr(os, "geteuid", lambda: 1000, raising=False)
     elif lacking == "debootstrap":
@@ -57,8 +65,9 @@ def test_why_not(gui: ModuleType, lacking: str, why: str, tmp_path: Path, monkey
 
 @pytest.mark.skipif(os.name == "nt", reason="there are no chroots on Windows")
 @pytest.mark.parametrize("asked", [False, True])
-def test_debootstrap_is_installed_only_when_asked(gui: ModuleType, asked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                                  capsys: pytest.CaptureFixture[str]) -> None:
+def test_debootstrap_is_installed_only_when_asked(
+    gui: ModuleType, asked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     ran: list[list[str]] = []
 
     def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:

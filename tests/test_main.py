@@ -10,8 +10,17 @@ import tricap
 from tricap.__main__ import main
 
 PATIENCE_S = 900
-PROMISED = ("run.json", "clouds/0000.ply", "trajectories.npz", "joints.csv", "motion.csv", "body.toml", "skin/0000.ply",
-            "report/report.html", "body.blend")
+PROMISED = (
+    "run.json",
+    "clouds/0000.ply",
+    "trajectories.npz",
+    "joints.csv",
+    "motion.csv",
+    "body.toml",
+    "skin/0000.ply",
+    "report/report.html",
+    "body.blend",
+)
 
 
 def test_the_parser_joins_the_commands_of_core_and_addon(capsys: pytest.CaptureFixture[str]) -> None:
@@ -29,8 +38,12 @@ def test_the_commands_of_core_do_not_start_blender(tmp_path: Path) -> None:
 
 
 def test_it_runs_as_a_module_and_faults_of_the_input_end_with_2(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-m", "tricap", "run", str(tmp_path / "none"), "--out", str(tmp_path / "out")],
-                          capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-m", "tricap", "run", str(tmp_path / "none"), "--out", str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
     assert done.returncode == 2 and done.stderr.startswith("tricap: ") and done.stderr.count("\n") == 1, done.stderr
     assert not (tmp_path / "out").exists()
 
@@ -47,8 +60,9 @@ def test_modules_in_a_stranger_s_folder_are_not_loaded(tmp_path: Path) -> None:
 def test_the_demo_ends_and_leaves_every_promised_file(tmp_path: Path) -> None:
     pytest.importorskip("bpy")
     out = tmp_path / "demo"
-    done = subprocess.run([sys.executable, "-m", "tricap", "demo", "--out", str(out)],
-                          capture_output=True, text=True, cwd=tmp_path, timeout=PATIENCE_S)
+    done = subprocess.run(
+        [sys.executable, "-m", "tricap", "demo", "--out", str(out)], capture_output=True, text=True, cwd=tmp_path, timeout=PATIENCE_S
+    )
     assert done.returncode == 0, done.stderr
     assert "truth" in done.stdout and "body.blend" in done.stdout
     missing = [name for name in PROMISED if not (out / name).is_file()]
@@ -61,7 +75,10 @@ def test_a_wrong_command_ends_with_2(tmp_path: Path) -> None:
 
 
 def test_importing_the_package_loads_nothing_of_blender() -> None:
-    done = subprocess.run([sys.executable, "-c", "import sys, tricap; print([m for m in ('bpy', 'tricap.addon') if m in sys.modules])"],
-                          capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys, tricap; print([m for m in ('bpy', 'tricap.addon') if m in sys.modules])"],
+        capture_output=True,
+        text=True,
+    )
     assert done.stdout.strip() == "[]", done.stderr
     assert callable(tricap.register) and callable(tricap.unregister)

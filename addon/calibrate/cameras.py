@@ -21,8 +21,13 @@ EXACT = "tricap_exact"
 SAME = 2e-6  # relative: what single precision leaves of a number
 
 
-def build_cameras(scene: bpy.types.Scene, rig: Rig, files: dict[str, list[Path]], tracks: dict[str, np.ndarray],
-                  bar: tuple[np.ndarray, np.ndarray] | None = None) -> list[bpy.types.Object]:
+def build_cameras(
+    scene: bpy.types.Scene,
+    rig: Rig,
+    files: dict[str, list[Path]],
+    tracks: dict[str, np.ndarray],
+    bar: tuple[np.ndarray, np.ndarray] | None = None,
+) -> list[bpy.types.Object]:
     """Cameras in a collection of their own, with their footage behind them and the measured targets as tracks over it.
 
     `bar`: frames (T,) and ends (T, 2, 3) [m] of the reference bar, which is shown as well.

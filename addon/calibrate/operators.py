@@ -56,12 +56,25 @@ class Calibrate(JobOperator, bpy.types.Operator):
     step = "cameras"
     last_words = "No camera was changed."
 
-    bar: bpy.props.StringProperty(name="Bar Footage", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Folder with a folder of images, or a movie, per camera; empty: the panel's")
-    length_m: bpy.props.FloatProperty(name="Bar Length", min=0.0, unit="LENGTH", precision=4,  # type: ignore[valid-type]
-                                      description="Distance between the middles of the bar's targets; 0: the panel's")
-    out: bpy.props.StringProperty(name="Rig", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="File for the rig; empty: rig.toml beside the bar's footage")
+    bar: bpy.props.StringProperty(
+        name="Bar Footage",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder with a folder of images, or a movie, per camera; empty: the panel's",
+    )
+    length_m: bpy.props.FloatProperty(
+        name="Bar Length",
+        min=0.0,
+        unit="LENGTH",
+        precision=4,  # type: ignore[valid-type]
+        description="Distance between the middles of the bar's targets; 0: the panel's",
+    )
+    out: bpy.props.StringProperty(
+        name="Rig",
+        subtype="FILE_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="File for the rig; empty: rig.toml beside the bar's footage",
+    )
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Done]:
         """Folder, length and switches as they are now."""
@@ -98,8 +111,11 @@ class Calibrate(JobOperator, bpy.types.Operator):
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)
         if strangers:
-            self.report({"WARNING"}, f"The project keeps its cameras, for its view {strangers[0]} has no footage of that name in "
-                        f"{result.footage.folder}; rename the view or the footage, and load {result.written}.")
+            self.report(
+                {"WARNING"},
+                f"The project keeps its cameras, for its view {strangers[0]} has no footage of that name in "
+                f"{result.footage.folder}; rename the view or the footage, and load {result.written}.",
+            )
         return {"FINISHED"}
 
 
@@ -151,8 +167,11 @@ class ExportRig(ExportHelper, bpy.types.Operator):
 
     filename_ext = ".toml"
     check_extension = None
-    layout_name: bpy.props.EnumProperty(name="Format", default="tricap",  # type: ignore[valid-type]
-                                        items=[(name, name, "") for name in ("tricap", *sorted(FORMATS))])
+    layout_name: bpy.props.EnumProperty(
+        name="Format",
+        default="tricap",  # type: ignore[valid-type]
+        items=[(name, name, "") for name in ("tricap", *sorted(FORMATS))],
+    )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Read the scene and write the file."""

@@ -31,8 +31,11 @@ def figure() -> Figure:
     outline = np.concatenate([_limb(a, b, r) for a, b, r in limbs if np.isfinite(r).all()])
     low, high = outline.reshape(-1, 2).min(axis=0), outline.reshape(-1, 2).max(axis=0)
     size = high[1] - low[1]
-    return Figure(triangles=(outline - low) / size, joints={name: (p - low) / size for name, p in places.items()},
-                  width=float((high[0] - low[0]) / size))
+    return Figure(
+        triangles=(outline - low) / size,
+        joints={name: (p - low) / size for name, p in places.items()},
+        width=float((high[0] - low[0]) / size),
+    )
 
 
 def _limb(a: np.ndarray, b: np.ndarray, radii: np.ndarray) -> np.ndarray:

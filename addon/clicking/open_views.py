@@ -10,8 +10,12 @@ from ..overlay import canvas
 
 NAME = "Tricap Clicks"
 FROM_KEY = "tricap_from"  # of the workspace: the one from which it was opened
-SHOWN = (("nothing", "Nothing", "The footage alone"), ("points", "Points", "The matched points, coloured by sigma"),
-         ("tracks", "Trajectories", "What was followed, and what the filters took out"), ("body", "Body", "The fitted body's outline"))
+SHOWN = (
+    ("nothing", "Nothing", "The footage alone"),
+    ("points", "Points", "The matched points, coloured by sigma"),
+    ("tracks", "Trajectories", "What was followed, and what the filters took out"),
+    ("body", "Body", "The fitted body's outline"),
+)
 MOST_VIEWS = 9
 SOON_S, TRIES = 0.05, 40  # a workspace is shown only after the event that asked for it
 CLOSED = ("OUTLINER", "PROPERTIES")

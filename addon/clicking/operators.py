@@ -173,7 +173,8 @@ class ClickJoints(ClickOperator, bpy.types.Operator):
 
     only: bpy.props.StringProperty(name="Only", description="Click this joint alone; empty: all of the model")  # type: ignore[valid-type]
     hidden: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Ask for Hidden Joints", description="Ask also for chest, spine and collarbones, which hardly anyone can see from outside")
+        name="Ask for Hidden Joints", description="Ask also for chest, spine and collarbones, which hardly anyone can see from outside"
+    )
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
         """The joints of the chosen model."""
@@ -227,7 +228,7 @@ class ClickSeeds(ClickOperator, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Clicking needs a window."""
-        self.report({"ERROR"}, "Clicking needs Blender's window; scripts use bpy.ops.tricap.click(name=\"seed 1\", view=…, x=…, y=…).")
+        self.report({"ERROR"}, 'Clicking needs Blender\'s window; scripts use bpy.ops.tricap.click(name="seed 1", view=…, x=…, y=…).')
         return {"CANCELLED"}
 
 

@@ -38,8 +38,14 @@ class ClickSession:
     `depths_m` says how deep a joint lies below the skin; what is not in it lies on the surface.
     """
 
-    def __init__(self, clips: Mapping[str, bpy.types.MovieClip], names: Sequence[str], frame: int, finder: Finder | None,
-                 depths_m: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        clips: Mapping[str, bpy.types.MovieClip],
+        names: Sequence[str],
+        frame: int,
+        finder: Finder | None,
+        depths_m: Mapping[str, float] | None = None,
+    ) -> None:
         if not names:
             raise InputError("There is nothing to click: choose a body model first.")
         self._clip_names = {view: clip.name for view, clip in clips.items()}  # undo makes other objects of them
@@ -246,6 +252,9 @@ def joints_of(model_joints: Sequence[str], *, hidden: bool = False) -> list[str]
 
 def free_seed_names(clips: Mapping[str, bpy.types.MovieClip], frame: int, count: int = 200) -> list[str]:
     """Names for surface seeds: those half clicked in this frame, then new ones."""
-    taken = {name for name in (f"seed {i}" for i in range(1, count))
-             if sum(seeds.click(clip, name, frame) is not None for clip in clips.values()) > 1}
+    taken = {
+        name
+        for name in (f"seed {i}" for i in range(1, count))
+        if sum(seeds.click(clip, name, frame) is not None for clip in clips.values()) > 1
+    }
     return [name for name in (f"seed {i}" for i in range(1, count)) if name not in taken]

@@ -13,9 +13,13 @@ class TricapCorner(bpy.types.PropertyGroup):
 class TricapCorrection(bpy.types.PropertyGroup):
     """A trajectory to remove (one corner, in frame `first`), or a region to leave out (three corners or more, `first` to `last`)."""
 
-    kind: bpy.props.EnumProperty(name="Kind", items=[  # type: ignore[valid-type]
-        ("trajectory", "Trajectory", "The trajectory nearest to a pixel is removed"),
-        ("region", "Region", "What is measured inside a polygon is left out")])
+    kind: bpy.props.EnumProperty(
+        name="Kind",
+        items=[  # type: ignore[valid-type]
+            ("trajectory", "Trajectory", "The trajectory nearest to a pixel is removed"),
+            ("region", "Region", "What is measured inside a polygon is left out"),
+        ],
+    )
     view: bpy.props.StringProperty(name="View")  # type: ignore[valid-type]
     first: bpy.props.IntProperty(name="From", min=0, description="First frame")  # type: ignore[valid-type]
     last: bpy.props.IntProperty(name="To", min=0, description="Last frame")  # type: ignore[valid-type]
@@ -40,8 +44,13 @@ class TricapCorrecting(bpy.types.PropertyGroup):
     active_dof: bpy.props.IntProperty(name="Degree of Freedom")  # type: ignore[valid-type]
     dofs_model: bpy.props.StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
     region_frames: bpy.props.EnumProperty(  # type: ignore[valid-type]
-        name="In", default="all", items=[("all", "All Frames", "The region is left out in the whole recording"),
-                                         ("one", "This Frame", "Only in the present frame; extend it in the list")])
+        name="In",
+        default="all",
+        items=[
+            ("all", "All Frames", "The region is left out in the whole recording"),
+            ("one", "This Frame", "Only in the present frame; extend it in the list"),
+        ],
+    )
 
 
 CLASSES = (TricapCorner, TricapCorrection, TricapDof, TricapCorrecting)

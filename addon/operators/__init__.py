@@ -5,8 +5,16 @@ import bpy
 from .. import jobs
 from . import build_scene, cancel, import_tracks, load_sample, run, stages
 
-CLASSES = (load_sample.LoadSample, stages.Measure, stages.Track, stages.Fit, run.Run, build_scene.BuildScene, import_tracks.ImportTracks2d,
-           cancel.Cancel)
+CLASSES = (
+    load_sample.LoadSample,
+    stages.Measure,
+    stages.Track,
+    stages.Fit,
+    run.Run,
+    build_scene.BuildScene,
+    import_tracks.ImportTracks2d,
+    cancel.Cancel,
+)
 
 
 def register() -> None:

@@ -30,23 +30,54 @@ class BuildScene(JobOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     step = "rig"
 
-    out: bpy.props.StringProperty(name="Contents", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Folder of a run; empty: the panel's output folder")
-    blend: bpy.props.StringProperty(name="Save As", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                    description="Also save a copy of the file under this name; empty: do not save")
+    out: bpy.props.StringProperty(
+        name="Contents",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder of a run; empty: the panel's output folder",
+    )
+    blend: bpy.props.StringProperty(
+        name="Save As",
+        subtype="FILE_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Also save a copy of the file under this name; empty: do not save",
+    )
 
-    rest_pose: bpy.props.EnumProperty(name="Rest Pose", items=[(pose, f"{pose}-pose", "") for pose in POSES],  # type: ignore[valid-type]
-                                      description="In A-pose every channel is a number of motion.csv")
-    detail: bpy.props.IntProperty(name="Skin Detail", default=DEFAULTS.detail, min=1, max=8,  # type: ignore[valid-type]
-                                  description="Pieces of each edge of the skin")
-    exact_skin: bpy.props.BoolProperty(name="Exact Skin", default=False,  # type: ignore[valid-type]
-                                       description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file")
-    implicit: bpy.props.BoolProperty(name="Implicit Surface", default=False,  # type: ignore[valid-type]
-                                     description="Also the surface of the exact field in the middle frame, to check skins against")
-    field: bpy.props.EnumProperty(name="Field", items=[(name, name.capitalize(), "") for name in POTENTIALS],  # type: ignore[valid-type]
-                                  description="The field of the implicit surface's balls; the exponential is the fitted one")
-    simplify: bpy.props.FloatProperty(name="Simplify", default=0.0, min=0.0, max=math.radians(10), subtype="ANGLE",  # type: ignore[valid-type]
-                                      description="Play an action with few keys within this angle; the measured one is kept. 0: measured")
+    rest_pose: bpy.props.EnumProperty(
+        name="Rest Pose",
+        items=[(pose, f"{pose}-pose", "") for pose in POSES],  # type: ignore[valid-type]
+        description="In A-pose every channel is a number of motion.csv",
+    )
+    detail: bpy.props.IntProperty(
+        name="Skin Detail",
+        default=DEFAULTS.detail,
+        min=1,
+        max=8,  # type: ignore[valid-type]
+        description="Pieces of each edge of the skin",
+    )
+    exact_skin: bpy.props.BoolProperty(
+        name="Exact Skin",
+        default=False,  # type: ignore[valid-type]
+        description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file",
+    )
+    implicit: bpy.props.BoolProperty(
+        name="Implicit Surface",
+        default=False,  # type: ignore[valid-type]
+        description="Also the surface of the exact field in the middle frame, to check skins against",
+    )
+    field: bpy.props.EnumProperty(
+        name="Field",
+        items=[(name, name.capitalize(), "") for name in POTENTIALS],  # type: ignore[valid-type]
+        description="The field of the implicit surface's balls; the exponential is the fitted one",
+    )
+    simplify: bpy.props.FloatProperty(
+        name="Simplify",
+        default=0.0,
+        min=0.0,
+        max=math.radians(10),
+        subtype="ANGLE",  # type: ignore[valid-type]
+        description="Play an action with few keys within this angle; the measured one is kept. 0: measured",
+    )
     colour: bpy.props.EnumProperty(name="Cloud Colour", items=[(c, c.capitalize(), "") for c in COLOURS])  # type: ignore[valid-type]
     arrows: bpy.props.BoolProperty(name="Velocity Arrows", default=False)  # type: ignore[valid-type]
 
@@ -57,15 +88,27 @@ class BuildScene(JobOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, result: Contents) -> set[str]:
         """Build the scene from what was read."""
-        options = SceneOptions(rest_pose=self.rest_pose, detail=self.detail, exact_skin=self.exact_skin, colour=self.colour,
-                               simplify_deg=math.degrees(self.simplify), arrows=self.arrows, implicit=self.implicit,
-                               field=self.field)
+        options = SceneOptions(
+            rest_pose=self.rest_pose,
+            detail=self.detail,
+            exact_skin=self.exact_skin,
+            colour=self.colour,
+            simplify_deg=math.degrees(self.simplify),
+            arrows=self.arrows,
+            implicit=self.implicit,
+            field=self.field,
+        )
         put_into_scene(self, context, result, Path(bpy.path.abspath(self.blend)) if self.blend else None, options)
         return {"FINISHED"}
 
 
-def put_into_scene(operator: bpy.types.Operator, context: bpy.types.Context, contents: Contents, blend: Path | None = None,
-                   options: SceneOptions = DEFAULTS) -> None:
+def put_into_scene(
+    operator: bpy.types.Operator,
+    context: bpy.types.Context,
+    contents: Contents,
+    blend: Path | None = None,
+    options: SceneOptions = DEFAULTS,
+) -> None:
     """Build the scene and tell what it has; the first time, turn the 3-D views to the body."""
     first = scene_build.COLLECTION not in bpy.data.collections
     tell(operator, write_scene(contents, blend, options))

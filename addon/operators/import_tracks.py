@@ -24,9 +24,11 @@ class ImportTracks2d(bpy.types.Operator):
     filepath: bpy.props.StringProperty(subtype="FILE_PATH", options=RELATIVE)  # type: ignore[valid-type]
     filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})  # type: ignore[valid-type]
     points: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="Points", options=RELATIVE, description="The table of the chosen points, whose joined_to says what is joined; empty: nothing")
+        name="Points", options=RELATIVE, description="The table of the chosen points, whose joined_to says what is joined; empty: nothing"
+    )
     footage: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="Footage", options=RELATIVE, description="The movie or the folder of images that they were followed in; empty: none is shown")
+        name="Footage", options=RELATIVE, description="The movie or the folder of images that they were followed in; empty: none is shown"
+    )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask for the file."""

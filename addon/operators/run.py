@@ -22,12 +22,23 @@ class Run(StageOperator, bpy.types.Operator):
     bl_options = {"UNDO"}
     step, stages = "surface", ("measure", "track", "fit", "report")
 
-    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                   description="Folder with take.toml; empty: the panel's")
-    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Folder for the results; empty: the panel's")
-    build: bpy.props.BoolProperty(name="Build Scene", default=True,  # type: ignore[valid-type]
-                                  description="Put the results into this scene afterwards")
+    take: bpy.props.StringProperty(
+        name="Take",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder with take.toml; empty: the panel's",
+    )
+    out: bpy.props.StringProperty(
+        name="Output",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder for the results; empty: the panel's",
+    )
+    build: bpy.props.BoolProperty(
+        name="Build Scene",
+        default=True,  # type: ignore[valid-type]
+        description="Put the results into this scene afterwards",
+    )
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Any, Contents | None]]:
         """Folders and settings as they are now."""

@@ -13,9 +13,15 @@ from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE
 
-STEP_WORDS = {"surface": "surface", "seeds": "surface", "matching": "surface", "tracks": "tracks", "filters": "tracks",
-              **dict.fromkeys(("thin", "background", "fit", "adjust", "refine", "sigmas", "skin", "silhouettes", "report"), "body"),
-              **dict.fromkeys(("reading", "preparing"), "rig")}  # the first word of what a stage says of itself -> its step
+STEP_WORDS = {
+    "surface": "surface",
+    "seeds": "surface",
+    "matching": "surface",
+    "tracks": "tracks",
+    "filters": "tracks",
+    **dict.fromkeys(("thin", "background", "fit", "adjust", "refine", "sigmas", "skin", "silhouettes", "report"), "body"),
+    **dict.fromkeys(("reading", "preparing"), "rig"),
+}  # the first word of what a stage says of itself -> its step
 
 
 class StageOperator(JobOperator):
@@ -60,10 +66,18 @@ class Measure(StageOperator, bpy.types.Operator):
     bl_options = {"UNDO"}
     step, stages = "surface", ("measure",)
 
-    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                   description="Folder with take.toml; empty: this file's project")
-    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Folder for the results; empty: the project's")
+    take: bpy.props.StringProperty(
+        name="Take",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder with take.toml; empty: this file's project",
+    )
+    out: bpy.props.StringProperty(
+        name="Output",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder for the results; empty: the project's",
+    )
 
 
 class Track(StageOperator, bpy.types.Operator):
@@ -74,10 +88,18 @@ class Track(StageOperator, bpy.types.Operator):
     bl_options = {"UNDO"}
     step, stages = "tracks", ("measure", "track")
 
-    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                   description="Folder with take.toml; empty: this file's project")
-    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Folder for the results; empty: the project's")
+    take: bpy.props.StringProperty(
+        name="Take",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder with take.toml; empty: this file's project",
+    )
+    out: bpy.props.StringProperty(
+        name="Output",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder for the results; empty: the project's",
+    )
 
 
 class Fit(StageOperator, bpy.types.Operator):
@@ -88,7 +110,15 @@ class Fit(StageOperator, bpy.types.Operator):
     bl_options = {"UNDO"}
     step, stages = "body", ("measure", "track", "fit", "report")
 
-    take: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                   description="Folder with take.toml; empty: this file's project")
-    out: bpy.props.StringProperty(name="Output", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Folder for the results; empty: the project's")
+    take: bpy.props.StringProperty(
+        name="Take",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder with take.toml; empty: this file's project",
+    )
+    out: bpy.props.StringProperty(
+        name="Output",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder for the results; empty: the project's",
+    )

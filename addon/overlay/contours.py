@@ -24,7 +24,8 @@ class FollowContours(JobOperator, bpy.types.Operator):
 
     view: bpy.props.StringProperty(name="View", description="Name of the view; empty: all of them")  # type: ignore[valid-type]
     from_body: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="From the Fitted Body", description="Begin with the outline of the fitted body, not with that of the measured surface")
+        name="From the Fitted Body", description="Begin with the outline of the fitted body, not with that of the measured surface"
+    )
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], list[str]]:
         """Folders and settings as they are now; the project's take.toml is written."""
@@ -42,9 +43,7 @@ class FollowContours(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def follow(
-    take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], view: str, monitor: Monitor, start: Start
-) -> list[str]:
+def follow(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], view: str, monitor: Monitor, start: Start) -> list[str]:
     """The computation, free of bpy: what was found in every view."""
     with pipeline.open_run(take, out, overrides, contours_aside=True) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]

@@ -69,9 +69,7 @@ def removed_points(recording: "Recording", view: str, frame: int, by: str = ALL)
     return seen[np.isfinite(seen).all(axis=1)], [(words, count) for words, count in counts if count]
 
 
-def tails(
-    recording: "Recording", view: str, frame: int, length: int, which: str, by: str = ALL
-) -> tuple[np.ndarray, np.ndarray]:
+def tails(recording: "Recording", view: str, frame: int, length: int, which: str, by: str = ALL) -> tuple[np.ndarray, np.ndarray]:
     """Segments (M, 2, 2) of the trajectories and their colours (M, 4); the older the paler. `by`: as if there were only that filter."""
     history = recording.tracks()
     if history is None:
@@ -120,8 +118,9 @@ def look(recording: "Recording", view: str, frame: int, xy_px: np.ndarray, reach
         places = dict(zip(views, points.xy_px[row]))
         if np.isfinite(points.residual_px[row]):
             words.append(f"rays miss by {points.residual_px[row]:.2f} px, correlation {points.correlation[row]:.2f}")
-            begun, end = patch_boxes(points, row, list(recording.cameras.values()), recording.reference,
-                                     recording.rows_at(frame), recording.patch_px)
+            begun, end = patch_boxes(
+                points, row, list(recording.cameras.values()), recording.reference, recording.rows_at(frame), recording.patch_px
+            )
             start, found = dict(zip(views, begun)), dict(zip(views, end))
         else:
             words.append("its patches are not known: the cache was deleted, run again to see them")

@@ -98,8 +98,9 @@ class TRICAP_PT_frames(ClipPanel, bpy.types.Panel):
             row = column.row(align=True)
             residual, sigma = (table.values[name][i] for name in ("residual_px", "sigma_mm"))
             text = f"{frame}: {why[i] or 'fine'}"
-            row.operator("tricap.go_to_frame", text=text, depress=frame == context.scene.frame_current,
-                         icon="ERROR" if why[i] else "CHECKMARK").frame = frame
+            row.operator(
+                "tricap.go_to_frame", text=text, depress=frame == context.scene.frame_current, icon="ERROR" if why[i] else "CHECKMARK"
+            ).frame = frame
             row.label(text=f"{residual:.2f} px  {sigma:.2f} mm" if np.isfinite(residual) else "no points")
 
 

@@ -136,5 +136,4 @@ def _open(scene: bpy.types.Scene) -> Recording:
     matching = run.get("settings", {}).get("matching", {})
     patch = from_table(MatchingSettings, {name: v for name, v in matching.items() if name == "patch_px"}, "[matching] of run.json")
     cameras = {view.name: camera for view, camera in zip(footage.take.views, footage.rig.cameras)}
-    return Recording(out=out, cameras=cameras, reference=footage.take.reference, rows_at=footage.take.rows_at,
-                     patch_px=patch.patch_px)
+    return Recording(out=out, cameras=cameras, reference=footage.take.reference, rows_at=footage.take.rows_at, patch_px=patch.patch_px)

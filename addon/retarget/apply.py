@@ -84,14 +84,22 @@ def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:
     return replace(edited, steering=steering and steering.of_controls(edited.bones, edited.twist))
 
 
-def transfer(source: Motion, source_map: RigMap, target: Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor
-             ) -> Retargeted:
+def transfer(
+    source: Motion, source_map: RigMap, target: Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor
+) -> Retargeted:
     """The computation alone; any thread."""
     return retarget(source, source_map, target.rig, target.rig_map, settings, feet, monitor, target.floor_m)
 
 
-def apply(armature_object: bpy.types.Object, source: Motion, source_map: RigMap, target: Target, result: Retargeted, name: str,
-          tolerance_deg: float = 0.0) -> Outcome:
+def apply(
+    armature_object: bpy.types.Object,
+    source: Motion,
+    source_map: RigMap,
+    target: Target,
+    result: Retargeted,
+    name: str,
+    tolerance_deg: float = 0.0,
+) -> Outcome:
     """Write the action and play some frames of it. Main thread."""
     steering = target.rig_map.steering
     written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg, properties=steering.properties if steering else {})

@@ -42,13 +42,31 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
     basis, driven = channels(rig, motion.R), np.ones(len(rig.names), dtype=bool)
     first = int(roots[0])
     shift_m = motion.head_m[:, first] - rig.head_m[first]
-    write_action(armature_object, Retargeted(motion=motion, basis=basis, shift_m=shift_m, carrier=first, loose_m={}, driven=driven,
-                                             scale=1.0, roles=(), contacts=None, notes=(), kept_back_m=0.0 * shift_m), name)
+    write_action(
+        armature_object,
+        Retargeted(
+            motion=motion,
+            basis=basis,
+            shift_m=shift_m,
+            carrier=first,
+            loose_m={},
+            driven=driven,
+            scale=1.0,
+            roles=(),
+            contacts=None,
+            notes=(),
+            kept_back_m=0.0 * shift_m,
+        ),
+        name,
+    )
     return armature_object
 
 
 def loose_bones(motion: Motion) -> list[str]:
     """Bones whose heads move against their parents, by more than 0.1 mm: an armature built here would not show that."""
     rig = motion.rig
-    return [name for b, name in enumerate(rig.names) if rig.parents[b] >= 0
-            and float(np.abs(head_of(rig, motion.R, motion.head_m, b) - motion.head_m[:, b]).max()) > SHORTEST_M]
+    return [
+        name
+        for b, name in enumerate(rig.names)
+        if rig.parents[b] >= 0 and float(np.abs(head_of(rig, motion.R, motion.head_m, b) - motion.head_m[:, b]).max()) > SHORTEST_M
+    ]

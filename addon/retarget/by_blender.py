@@ -124,33 +124,69 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
 
 def _fbx(path: str, program: Program) -> None:
     axes = program.axes or "Y up"
-    bpy.ops.export_scene.fbx(filepath=path, object_types={"ARMATURE", "MESH"}, axis_forward=FORWARD[axes], axis_up=UP[axes],
-                             apply_unit_scale=True, apply_scale_options="FBX_SCALE_UNITS", add_leaf_bones=False, primary_bone_axis="Y",
-                             secondary_bone_axis="X", bake_anim=True, bake_anim_use_all_bones=True, bake_anim_use_nla_strips=False,
-                             bake_anim_use_all_actions=False, bake_anim_force_startend_keying=True, bake_anim_step=1.0,
-                             bake_anim_simplify_factor=0.0)
+    bpy.ops.export_scene.fbx(
+        filepath=path,
+        object_types={"ARMATURE", "MESH"},
+        axis_forward=FORWARD[axes],
+        axis_up=UP[axes],
+        apply_unit_scale=True,
+        apply_scale_options="FBX_SCALE_UNITS",
+        add_leaf_bones=False,
+        primary_bone_axis="Y",
+        secondary_bone_axis="X",
+        bake_anim=True,
+        bake_anim_use_all_bones=True,
+        bake_anim_use_nla_strips=False,
+        bake_anim_use_all_actions=False,
+        bake_anim_force_startend_keying=True,
+        bake_anim_step=1.0,
+        bake_anim_simplify_factor=0.0,
+    )
 
 
 def _glb(path: str, program: Program) -> None:
-    bpy.ops.export_scene.gltf(filepath=path, export_format="GLB", use_active_scene=True, export_yup=True, export_animations=True,
-                              export_animation_mode="ACTIVE_ACTIONS", export_nla_strips_merged_animation_name="Motion",
-                              export_force_sampling=True, export_frame_range=True,
-                              export_optimize_animation_size=False, export_rest_position_armature=True, export_def_bones=False,
-                              export_apply=False)
+    bpy.ops.export_scene.gltf(
+        filepath=path,
+        export_format="GLB",
+        use_active_scene=True,
+        export_yup=True,
+        export_animations=True,
+        export_animation_mode="ACTIVE_ACTIONS",
+        export_nla_strips_merged_animation_name="Motion",
+        export_force_sampling=True,
+        export_frame_range=True,
+        export_optimize_animation_size=False,
+        export_rest_position_armature=True,
+        export_def_bones=False,
+        export_apply=False,
+    )
 
 
 def _usd(path: str, program: Program) -> None:
     axes = program.axes or "Z up"
     unit = {"cm": "CENTIMETERS"}.get(program.unit, "METERS")
-    bpy.ops.wm.usd_export(filepath=path, export_animation=True, export_armatures=True, export_meshes=True, only_deform_bones=False,
-                          convert_orientation=axes != "Z up", export_global_forward_selection=FORWARD[axes].replace("-", "NEGATIVE_"),
-                          export_global_up_selection=UP[axes], convert_scene_units=unit)
+    bpy.ops.wm.usd_export(
+        filepath=path,
+        export_animation=True,
+        export_armatures=True,
+        export_meshes=True,
+        only_deform_bones=False,
+        convert_orientation=axes != "Z up",
+        export_global_forward_selection=FORWARD[axes].replace("-", "NEGATIVE_"),
+        export_global_up_selection=UP[axes],
+        convert_scene_units=unit,
+    )
 
 
 def _abc(path: str, program: Program) -> None:
     scene = bpy.context.scene
-    bpy.ops.wm.alembic_export(filepath=path, as_background_job=False, start=scene.frame_start, end=scene.frame_end,
-                              global_scale=1.0 / metres_per(program.unit or "m", "the preset"))
+    bpy.ops.wm.alembic_export(
+        filepath=path,
+        as_background_job=False,
+        start=scene.frame_start,
+        end=scene.frame_end,
+        global_scale=1.0 / metres_per(program.unit or "m", "the preset"),
+    )
 
 
 EXPORTERS: dict[str, Callable[[str, Program], None]] = {"fbx": _fbx, "glb": _glb, "usd": _usd, "abc": _abc}

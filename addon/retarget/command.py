@@ -30,10 +30,18 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("--armature", metavar="NAME", default="", help="which armature, if the rig's file has several")
     parser.add_argument("--root", choices=("travel", "in place", "still"), default="travel", help="how the body moves through the room")
     parser.add_argument("--feet", choices=("off", "auto", "always"), default="auto", help="when feet are held on the floor")
-    parser.add_argument("--hands", choices=("free", "keep"), default="free",
-                        help="keep: hands keep their distance from each other, head, hips and thighs where they are near")
-    parser.add_argument("--twist", choices=("off", "bones", "forearms"), default="bones",
-                        help="spread twist over twist bones, or half of a hand's also over a forearm that has none")
+    parser.add_argument(
+        "--hands",
+        choices=("free", "keep"),
+        default="free",
+        help="keep: hands keep their distance from each other, head, hips and thighs where they are near",
+    )
+    parser.add_argument(
+        "--twist",
+        choices=("off", "bones", "forearms"),
+        default="bones",
+        help="spread twist over twist bones, or half of a hand's also over a forearm that has none",
+    )
     parser.add_argument("--scale", metavar="F", type=float, default=0.0, help="size of the steps against the source's; default: the legs'")
     _add_axes(parser)
     parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0, help="leave out keys within this tolerance")
@@ -45,14 +53,14 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--out", dest="file", metavar="FILE", type=Path, required=True, help="the file to write (for ply: a folder)")
-    parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain",
-                        help="names, units and axes for a program")
+    parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain", help="names, units and axes for a program")
     _add_axes(parser)
     parser.set_defaults(run=_clean(export))
 
 
 def _clean(run: Callable[[argparse.Namespace, Monitor], list[str]]) -> Callable[[argparse.Namespace, Monitor], list[str]]:
     """A command on whose standard output nothing of Blender's own is written."""
+
     def kept_clean(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         with standard_output_kept_clean(args):
             return run(args, monitor)
@@ -107,11 +115,13 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     table = source.account(outcome, motion_map, target.rig_map)
     if args.report:
         from .picture import draw
+
         draw(args.blend.with_suffix(".png"), motion, motion_map, armature_object, result.motion, target.rig_map)
         store.write_json(args.blend.with_suffix(".json"), table)
     save_blend(args.blend)
     if args.json:
         import json
+
         return [json.dumps(table, indent=1, ensure_ascii=False)]
     return [f"{args.blend}: {outcome.figures}", *(f"Note: {note}" for note in outcome.notes)]
 

@@ -42,11 +42,19 @@ class Retarget(JobOperator, bpy.types.Operator):
     bl_options = {"UNDO"}
 
     source: bpy.props.StringProperty(name="Source", description="Armature that moves; empty: the panel's")  # type: ignore[valid-type]
-    file: bpy.props.StringProperty(name="Motion", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                   description="A run's folder, BVH, TRC, C3D or CSV instead of an armature; empty: the panel's")
+    file: bpy.props.StringProperty(
+        name="Motion",
+        subtype="FILE_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="A run's folder, BVH, TRC, C3D or CSV instead of an armature; empty: the panel's",
+    )
     target: bpy.props.StringProperty(name="Target", description="Armature that shall move; empty: the panel's")  # type: ignore[valid-type]
-    map: bpy.props.StringProperty(name="Mapping", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Mapping of the target (JSON); empty: the panel's, or found")
+    map: bpy.props.StringProperty(
+        name="Mapping",
+        subtype="FILE_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Mapping of the target (JSON); empty: the panel's, or found",
+    )
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Made]:
         """Read both rigs and, from an armature, its motion."""

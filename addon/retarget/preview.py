@@ -22,8 +22,7 @@ NAME = "Tricap preview"
 KEPT = "tricap_before_preview"  # of the target: the properties that steer its controls, as they were
 
 
-def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, target: bpy.types.Object, rig: Rig, rig_map: RigMap
-                ) -> int:
+def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, target: bpy.types.Object, rig: Rig, rig_map: RigMap) -> int:
     """Constrain the target to the source; the number of bones that follow.
 
     Raises:
@@ -45,8 +44,14 @@ def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, t
             _follow(target.pose.bones[bone], _empty(collection, source, follows, K, f"{NAME} {bone}"))
             count += 1
     if "hips" in aligned:
-        _carry(collection, source, source_map.bones["hips"][0], target, rig_map.bones["hips"][0],
-               leg_ratio(source_rig, source_map, rig, rig_map))
+        _carry(
+            collection,
+            source,
+            source_map.bones["hips"][0],
+            target,
+            rig_map.bones["hips"][0],
+            leg_ratio(source_rig, source_map, rig, rig_map),
+        )
     _steer(target, rig_map)
     collection.hide_viewport = collection.hide_render = True
     return count
@@ -98,8 +103,9 @@ def _follow(bone: bpy.types.PoseBone, empty: bpy.types.Object) -> None:
     constraint.target_space = constraint.owner_space = "WORLD"
 
 
-def _carry(collection: bpy.types.Collection, source: bpy.types.Object, source_hips: str, target: bpy.types.Object, hips: str,
-           scale: float) -> None:
+def _carry(
+    collection: bpy.types.Collection, source: bpy.types.Object, source_hips: str, target: bpy.types.Object, hips: str, scale: float
+) -> None:
     """The hips' place: the source's, times the ratio of the legs, by drivers."""
     empty = bpy.data.objects.new(f"{NAME} place", None)
     collection.objects.link(empty)

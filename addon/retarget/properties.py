@@ -47,18 +47,41 @@ Feet: type = group_class("retarget_feet", FeetSettings)
 class Retargeting(bpy.types.PropertyGroup):
     """Source, target, settings and the mapping that is being edited."""
 
-    source: bpy.props.PointerProperty(type=bpy.types.Object, name="Source", poll=_is_armature,  # type: ignore[valid-type]
-                                      description="The armature that moves")
-    file: bpy.props.StringProperty(name="Motion", subtype="FILE_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                   description="Instead of an armature: a run's folder, BVH, TRC, C3D or CSV")
-    up: bpy.props.EnumProperty(name="Up", items=_with_usual(("Y", "Z")),  # type: ignore[valid-type]
-                               description="The axis that is up in the file, if the body lies down otherwise")
-    unit: bpy.props.EnumProperty(name="Unit", items=_with_usual(UNITS_M),  # type: ignore[valid-type]
-                                 description="The unit of the file, if it is not the one that it says")
-    target: bpy.props.PointerProperty(type=bpy.types.Object, name="Target", poll=_is_armature,  # type: ignore[valid-type]
-                                      description="The armature that shall move")
-    tolerance_deg: bpy.props.FloatProperty(name="Simplify [°]", min=0.0, max=10.0, default=0.0,  # type: ignore[valid-type]
-                                           description="Leave out keys as long as no rotation is off by more; 0: a key in every frame")
+    source: bpy.props.PointerProperty(
+        type=bpy.types.Object,
+        name="Source",
+        poll=_is_armature,  # type: ignore[valid-type]
+        description="The armature that moves",
+    )
+    file: bpy.props.StringProperty(
+        name="Motion",
+        subtype="FILE_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Instead of an armature: a run's folder, BVH, TRC, C3D or CSV",
+    )
+    up: bpy.props.EnumProperty(
+        name="Up",
+        items=_with_usual(("Y", "Z")),  # type: ignore[valid-type]
+        description="The axis that is up in the file, if the body lies down otherwise",
+    )
+    unit: bpy.props.EnumProperty(
+        name="Unit",
+        items=_with_usual(UNITS_M),  # type: ignore[valid-type]
+        description="The unit of the file, if it is not the one that it says",
+    )
+    target: bpy.props.PointerProperty(
+        type=bpy.types.Object,
+        name="Target",
+        poll=_is_armature,  # type: ignore[valid-type]
+        description="The armature that shall move",
+    )
+    tolerance_deg: bpy.props.FloatProperty(
+        name="Simplify [°]",
+        min=0.0,
+        max=10.0,
+        default=0.0,  # type: ignore[valid-type]
+        description="Leave out keys as long as no rotation is off by more; 0: a key in every frame",
+    )
     strip: bpy.props.BoolProperty(name="As NLA Strip", description="Put the action into a strip, to layer corrections over it")  # type: ignore[valid-type]
     settings: bpy.props.PointerProperty(type=Settings)  # type: ignore[valid-type]
     feet: bpy.props.PointerProperty(type=Feet)  # type: ignore[valid-type]
@@ -87,6 +110,7 @@ def edited_map(props: Any, target: bpy.types.Object | None) -> RigMap | None:
     Raises:
         InputError: a part has two lines.
     """
+
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
 

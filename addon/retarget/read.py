@@ -33,11 +33,17 @@ def read_rig(armature_object: bpy.types.Object) -> Rig:
     scale_of(armature_object)
     rest = np.array([bone.matrix_local for bone in bones])
     index = {bone.name: i for i, bone in enumerate(bones)}
-    return Rig(names=tuple(index), parents=np.array([index[b.parent.name] if b.parent else -1 for b in bones]),
-               R_rest=orthonormal(world[:3, :3] @ rest[:, :3, :3]), head_m=_moved(world, [b.head_local for b in bones]),
-               tail_m=_moved(world, [b.tail_local for b in bones]), connected=np.array([b.use_connect for b in bones]),
-               inherits_rotation=np.array([b.use_inherit_rotation for b in bones]), roles=humanoid_roles(armature_object),
-               sole_m={})
+    return Rig(
+        names=tuple(index),
+        parents=np.array([index[b.parent.name] if b.parent else -1 for b in bones]),
+        R_rest=orthonormal(world[:3, :3] @ rest[:, :3, :3]),
+        head_m=_moved(world, [b.head_local for b in bones]),
+        tail_m=_moved(world, [b.tail_local for b in bones]),
+        connected=np.array([b.use_connect for b in bones]),
+        inherits_rotation=np.array([b.use_inherit_rotation for b in bones]),
+        roles=humanoid_roles(armature_object),
+        sole_m={},
+    )
 
 
 def in_order(armature_object: bpy.types.Object) -> list[bpy.types.Bone]:
@@ -108,9 +114,19 @@ def _vrm0(extension: object) -> dict[str, str]:
 
 
 VRM = {"hips": "hips", "head": "head"} | {
-    f"{role}.{side}": f"{word}_{part}" for side, word in (("L", "left"), ("R", "right")) for role, part in (
-        ("clavicle", "shoulder"), ("upper_arm", "upper_arm"), ("forearm", "lower_arm"), ("hand", "hand"), ("thigh", "upper_leg"),
-        ("shin", "lower_leg"), ("foot", "foot"), ("toe", "toes"))}
+    f"{role}.{side}": f"{word}_{part}"
+    for side, word in (("L", "left"), ("R", "right"))
+    for role, part in (
+        ("clavicle", "shoulder"),
+        ("upper_arm", "upper_arm"),
+        ("forearm", "lower_arm"),
+        ("hand", "hand"),
+        ("thigh", "upper_leg"),
+        ("shin", "lower_leg"),
+        ("foot", "foot"),
+        ("toe", "toes"),
+    )
+}
 
 
 def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> Rig:
@@ -168,8 +184,13 @@ def read_motion(armature_object: bpy.types.Object, rig: Rig, frames: Sequence[in
     finally:
         scene.frame_set(now)
     placed = world[:, None] @ pose
-    return Motion(rig=rig, fps=scene.render.fps / scene.render.fps_base, frames=np.asarray(frames, dtype=float),
-                  R=orthonormal(placed[..., :3, :3]), head_m=placed[..., :3, 3])
+    return Motion(
+        rig=rig,
+        fps=scene.render.fps / scene.render.fps_base,
+        frames=np.asarray(frames, dtype=float),
+        R=orthonormal(placed[..., :3, :3]),
+        head_m=placed[..., :3, 3],
+    )
 
 
 def action_frames(armature_object: bpy.types.Object) -> range:

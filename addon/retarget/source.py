@@ -35,10 +35,21 @@ def account(outcome: Any, source_map: RigMap, target_map: RigMap) -> dict[str, A
     """The outcome as a table for JSON."""
     figures, result = outcome.figures, outcome.result
     return {
-        "format": "tricap-retarget", "version": 1, "frames": figures.frames, "keys": outcome.written.keys, "scale": result.scale,
-        "direction_rms_deg": figures.direction_rms_deg, "direction_worst_deg": figures.direction_worst_deg,
-        "by_part_deg": figures.by_part_deg, "slide_mm": figures.slide_mm, "penetration_mm": figures.penetration_mm,
-        "float_mm": figures.float_mm, "largest_step_deg": figures.largest_step_deg, "contacts": figures.contacts,
-        "notes": list(outcome.notes), "source": {role: list(chain) for role, chain in source_map.bones.items()},
-        "target": {role: list(chain) for role, chain in target_map.bones.items()}, "mapped_by": target_map.origin,
+        "format": "tricap-retarget",
+        "version": 1,
+        "frames": figures.frames,
+        "keys": outcome.written.keys,
+        "scale": result.scale,
+        "direction_rms_deg": figures.direction_rms_deg,
+        "direction_worst_deg": figures.direction_worst_deg,
+        "by_part_deg": figures.by_part_deg,
+        "slide_mm": figures.slide_mm,
+        "penetration_mm": figures.penetration_mm,
+        "float_mm": figures.float_mm,
+        "largest_step_deg": figures.largest_step_deg,
+        "contacts": figures.contacts,
+        "notes": list(outcome.notes),
+        "source": {role: list(chain) for role, chain in source_map.bones.items()},
+        "target": {role: list(chain) for role, chain in target_map.bones.items()},
+        "mapped_by": target_map.origin,
     }

@@ -12,8 +12,13 @@ from ...core.motion.retarget.turns import continuous, euler_from_matrix, quatern
 from .read import scale_of, world_matrix
 
 CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_axis_angle", 4)}
-REST = {"rotation_quaternion": (1, 0, 0, 0), "rotation_axis_angle": (0, 0, 1, 0), "rotation_euler": (0, 0, 0), "location": (0, 0, 0),
-        "scale": (1, 1, 1)}
+REST = {
+    "rotation_quaternion": (1, 0, 0, 0),
+    "rotation_axis_angle": (0, 0, 1, 0),
+    "rotation_euler": (0, 0, 0),
+    "location": (0, 0, 0),
+    "scale": (1, 1, 1),
+}
 
 Resting = tuple[str, str, np.ndarray]  # bone, path and values of a channel at rest
 
@@ -29,8 +34,14 @@ class Written:
     muted: tuple[str, ...]
 
 
-def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tolerance_deg: float = 0.0,
-                 properties: Mapping[str, Mapping[str, float]] | None = None) -> Written:
+def write_action(
+    target: bpy.types.Object,
+    result: Retargeted,
+    name: str,
+    *,
+    tolerance_deg: float = 0.0,
+    properties: Mapping[str, Mapping[str, float]] | None = None,
+) -> Written:
     """Give the target a new action with the motion; its former one is kept in the file. Main thread only.
 
     `tolerance_deg`: leave out keys as long as no rotation is off by more, and keep an action with all of them, too; 0 keys every frame.
@@ -48,8 +59,14 @@ def write_action(target: bpy.types.Object, result: Retargeted, name: str, *, tol
     return Written(action=action, raw=raw, keys=keys, muted=_mute(target, result))
 
 
-def _filled(target: bpy.types.Object, result: Retargeted, name: str, tolerance_deg: float, resting: Sequence[Resting],
-            properties: Mapping[str, Mapping[str, float]]) -> tuple[bpy.types.Action, int]:
+def _filled(
+    target: bpy.types.Object,
+    result: Retargeted,
+    name: str,
+    tolerance_deg: float,
+    resting: Sequence[Resting],
+    properties: Mapping[str, Mapping[str, float]],
+) -> tuple[bpy.types.Action, int]:
     """A new action of the target with the motion, and its number of keys."""
     action = bpy.data.actions.new(name)
     target.animation_data.action = action
@@ -123,8 +140,9 @@ def _put_to_rest(target: bpy.types.Object, result: Retargeted) -> list[Resting]:
     return resting
 
 
-def _set_properties(action: bpy.types.Action, target: bpy.types.Object, properties: Mapping[str, Mapping[str, float]],
-                    at: np.ndarray) -> int:
+def _set_properties(
+    action: bpy.types.Action, target: bpy.types.Object, properties: Mapping[str, Mapping[str, float]], at: np.ndarray
+) -> int:
     """One key for each custom property that the rig has."""
     keys = 0
     for name, values in properties.items():

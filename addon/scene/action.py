@@ -21,8 +21,9 @@ METRES_PER_RADIAN = 0.2  # of the tolerance: 1° of an angle counts like 3.5 mm 
 LIMITS_TOLERANCE_RAD = 1e-6
 
 
-def add_action(armature_object: bpy.types.Object, shape: BodyShape, frames: np.ndarray, dof_names: Sequence[str],
-               values: np.ndarray, sigma: np.ndarray) -> bpy.types.Action:
+def add_action(
+    armature_object: bpy.types.Object, shape: BodyShape, frames: np.ndarray, dof_names: Sequence[str], values: np.ndarray, sigma: np.ndarray
+) -> bpy.types.Action:
     """Key the armature with the motion: frames (T,), values and sigma (T, D) in rad and metres. NaN gives no key."""
     action = bpy.data.actions.new(NAME)
     armature_object.animation_data_create().action = action
@@ -40,8 +41,14 @@ def add_action(armature_object: bpy.types.Object, shape: BodyShape, frames: np.n
     return action
 
 
-def add_simplified(armature_object: bpy.types.Object, shape: BodyShape, frames: np.ndarray, dof_names: Sequence[str], values: np.ndarray,
-                   tolerance_deg: float) -> bpy.types.Action:
+def add_simplified(
+    armature_object: bpy.types.Object,
+    shape: BodyShape,
+    frames: np.ndarray,
+    dof_names: Sequence[str],
+    values: np.ndarray,
+    tolerance_deg: float,
+) -> bpy.types.Action:
     """A second action with few keys, every angle of `values` (T, D) within `tolerance_deg`; it becomes the armature's.
 
     The measured motion stays in the file, in its own action. Places count `METRES_PER_RADIAN`.
@@ -60,8 +67,15 @@ def add_simplified(armature_object: bpy.types.Object, shape: BodyShape, frames: 
     return action
 
 
-def key(action: bpy.types.Action, owner: bpy.types.Object, path: str, index: int, frames: np.ndarray, values: np.ndarray,
-        interpolation: str = "LINEAR") -> None:
+def key(
+    action: bpy.types.Action,
+    owner: bpy.types.Object,
+    path: str,
+    index: int,
+    frames: np.ndarray,
+    values: np.ndarray,
+    interpolation: str = "LINEAR",
+) -> None:
     """Key one channel of an object in these frames; NaN gives no key."""
     known = np.isfinite(values)
     curve = action.fcurve_ensure_for_datablock(owner, path, index=index)

@@ -80,8 +80,13 @@ def lens(camera: Camera) -> Lens:
     fx, fy = camera.matrix[0, 0] * (1.0 + camera.affinity[0]), camera.matrix[1, 1]
     u, v = uv_from_pixel(camera.matrix[:2, 2], camera.size_px)
     aspect = fx / fy
-    return Lens(lens_mm=fx * SENSOR_WIDTH_MM / w, sensor_width_mm=SENSOR_WIDTH_MM, shift_x=0.5 - u,
-                shift_y=(0.5 - v) * h / w * aspect, pixel_aspect_y=aspect)
+    return Lens(
+        lens_mm=fx * SENSOR_WIDTH_MM / w,
+        sensor_width_mm=SENSOR_WIDTH_MM,
+        shift_x=0.5 - u,
+        shift_y=(0.5 - v) * h / w * aspect,
+        pixel_aspect_y=aspect,
+    )
 
 
 def principal_point_bottom_up_px(camera: Camera) -> tuple[float, float]:

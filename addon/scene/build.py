@@ -1,6 +1,6 @@
 """Building the scene of a run: everything that was measured, in one collection, in the take's own frame numbers.
 
-    read_contents (any thread) → write_scene (main thread) → save_blend
+read_contents (any thread) → write_scene (main thread) → save_blend
 """
 
 import math
@@ -75,8 +75,9 @@ def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = 
     return write_scene(read_contents(Path(out), monitor, skins=options.exact_skin), blend, options, monitor)
 
 
-def write_scene(contents: Contents, blend: Path | None = None, options: SceneOptions = DEFAULTS,
-                monitor: Monitor | None = None) -> SceneReport:
+def write_scene(
+    contents: Contents, blend: Path | None = None, options: SceneOptions = DEFAULTS, monitor: Monitor | None = None
+) -> SceneReport:
     """The second half of `build_scene`: main thread only. What can fail is done before anything of an earlier build is removed."""
     if options.exact_skin and blend is None:
         raise InputError("The exact skin is kept in a file beside the Blender file; give the Blender file a name.")
@@ -239,12 +240,20 @@ def _cloud_points(frame: int, ply: Ply, every: int, contents: Contents) -> Cloud
     names = ("sigma", "nx", "ny", "nz", "intensity")
     column = {name: ply.vertex[name][::every] if name in ply.vertex else np.zeros(len(xyz)) for name in names}
     normals = np.stack([column[name] for name in ("nx", "ny", "nz")], axis=-1)
-    return CloudPoints(frame=frame, xyz_m=xyz, sigma_m=column["sigma"], normals=normals, intensity=column["intensity"],
-                       velocity_m_s=ready.velocity_m_s[frame][::every], segment=ready.segment[frame][::every])
+    return CloudPoints(
+        frame=frame,
+        xyz_m=xyz,
+        sigma_m=column["sigma"],
+        normals=normals,
+        intensity=column["intensity"],
+        velocity_m_s=ready.velocity_m_s[frame][::every],
+        segment=ready.segment[frame][::every],
+    )
 
 
-def _add_trajectories(collection: bpy.types.Collection, contents: Contents, arrays: Mapping[str, np.ndarray], options: SceneOptions,
-                      warnings: list[str]) -> int:
+def _add_trajectories(
+    collection: bpy.types.Collection, contents: Contents, arrays: Mapping[str, np.ndarray], options: SceneOptions, warnings: list[str]
+) -> int:
     assert contents.ready.track_segment is not None
     shown, every = sparser({**arrays, "segment": contents.ready.track_segment}, options.most_points)
     if every > 1:
@@ -261,8 +270,9 @@ def _name_segments(thing: bpy.types.Object, contents: Contents) -> None:
         thing[SEGMENTS_KEY] = list(contents.ready.bones)
 
 
-def _implicit_surface(contents: Contents, options: SceneOptions, monitor: Monitor | None
-                      ) -> tuple[tuple[np.ndarray, np.ndarray], int] | None:
+def _implicit_surface(
+    contents: Contents, options: SceneOptions, monitor: Monitor | None
+) -> tuple[tuple[np.ndarray, np.ndarray], int] | None:
     """The implicit surface in the chosen or the middle frame, and which that is; None without a posture there.
 
     Raises:
@@ -278,8 +288,9 @@ def _implicit_surface(contents: Contents, options: SceneOptions, monitor: Monito
     return (implicit.implicit_surface(shape, posture, monitor, potential), frame) if np.isfinite(posture).all() else None
 
 
-def _add_body(collection: bpy.types.Collection, contents: Contents, warnings: list[str], options: SceneOptions, blend: Path | None
-              ) -> dict[str, int]:
+def _add_body(
+    collection: bpy.types.Collection, contents: Contents, warnings: list[str], options: SceneOptions, blend: Path | None
+) -> dict[str, int]:
     shape, motion = contents.shape, contents.motion
     if shape is None:
         return {}

@@ -44,8 +44,10 @@ def frame_faults(rig: Rig, reference: Camera) -> list[str]:
     w, h = reference.size_px
     for camera in rig.cameras:
         if camera.size_px[0] * h != camera.size_px[1] * w:
-            faults.append(f"Camera {camera.name} has pictures of another shape than {reference.name};"
-                          " set the scene's resolution to its own to look through it.")
+            faults.append(
+                f"Camera {camera.name} has pictures of another shape than {reference.name};"
+                " set the scene's resolution to its own to look through it."
+            )
             continue
         off_px = abs(axes.lens(camera).pixel_aspect_y / axes.lens(reference).pixel_aspect_y - 1.0) * camera.size_px[1] / 2
         if off_px > ASPECT_TOLERANCE_PX:

@@ -91,11 +91,15 @@ def clip_faults(clip: bpy.types.MovieClip, camera: Camera, files: Collection[Pat
     """What keeps Blender from showing the footage as Tricap reads it, in sentences."""
     faults = []
     if tuple(clip.size) != camera.size_px:
-        faults.append(f"Blender reads the footage of {label} as {clip.size[0]}×{clip.size[1]}, the camera has "
-                      f"{camera.size_px[0]}×{camera.size_px[1]}; convert it to PNG to see it behind the camera.")
+        faults.append(
+            f"Blender reads the footage of {label} as {clip.size[0]}×{clip.size[1]}, the camera has "
+            f"{camera.size_px[0]}×{camera.size_px[1]}; convert it to PNG to see it behind the camera."
+        )
     if files and clip.frame_duration < len(files):
-        faults.append(f"Blender shows only {clip.frame_duration} of the {len(files)} images of {label}: their names are not numbered"
-                      " without a gap; rename them to see all of them behind the camera.")
+        faults.append(
+            f"Blender shows only {clip.frame_duration} of the {len(files)} images of {label}: their names are not numbered"
+            " without a gap; rename them to see all of them behind the camera."
+        )
     return faults
 
 

@@ -91,9 +91,20 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     person = None if shape is None else shape_for_skin(shape, settings)
     ready = find_ready(clouds, trajectories, person, motion, settings, monitor)
-    return Contents(out=out, run=run, footage=footage, clouds=clouds, trajectories=trajectories, shape=person, motion=motion,
-                   skin_settings=settings, ready=ready, skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
-                   bar=_bar(footage, warnings), warnings=tuple(warnings))
+    return Contents(
+        out=out,
+        run=run,
+        footage=footage,
+        clouds=clouds,
+        trajectories=trajectories,
+        shape=person,
+        motion=motion,
+        skin_settings=settings,
+        ready=ready,
+        skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
+        bar=_bar(footage, warnings),
+        warnings=tuple(warnings),
+    )
 
 
 def _bar(footage: Footage | None, warnings: list[str]) -> tuple[np.ndarray, np.ndarray] | None:

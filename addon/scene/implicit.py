@@ -13,8 +13,9 @@ from ...core.progress import Monitor
 SPACING_M = 0.005
 
 
-def implicit_surface(shape: BodyShape, motion: np.ndarray, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL,
-                     spacing_m: float = SPACING_M) -> tuple[np.ndarray, np.ndarray]:
+def implicit_surface(
+    shape: BodyShape, motion: np.ndarray, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL, spacing_m: float = SPACING_M
+) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) and quads (K, 4) of the surface F = ½ of the body in one posture, `motion` (D,) rad and metres.
 
     To 0.4 mm, from a grid of 5 mm.
@@ -31,8 +32,9 @@ def implicit_surface(shape: BodyShape, motion: np.ndarray, monitor: Monitor | No
     return sampled.origin_m + spacing_m * points, quads
 
 
-def add_implicit(collection: bpy.types.Collection, surface: tuple[np.ndarray, np.ndarray], frame: int, potential: Potential = EXPONENTIAL
-                 ) -> bpy.types.Object:
+def add_implicit(
+    collection: bpy.types.Collection, surface: tuple[np.ndarray, np.ndarray], frame: int, potential: Potential = EXPONENTIAL
+) -> bpy.types.Object:
     """The surface as an object whose name tells the frame, and the field where it is not the fitted one."""
     points, quads = surface
     mesh = bpy.data.meshes.new(f"Implicit surface {frame:04d}" + (f" {potential.name}" if potential.name != EXPONENTIAL.name else ""))
@@ -51,6 +53,8 @@ def _openvdb():  # type: ignore[no-untyped-def]
     try:
         import openvdb
     except ImportError as error:
-        raise InputError("This Blender was built without OpenVDB for Python, which the implicit surface is made with; "
-                         "use the Blender from blender.org, or leave it out.") from error
+        raise InputError(
+            "This Blender was built without OpenVDB for Python, which the implicit surface is made with; "
+            "use the Blender from blender.org, or leave it out."
+        ) from error
     return openvdb

@@ -92,8 +92,14 @@ def _point(
     return point
 
 
-def _line(collection: bpy.types.Collection, picture: bpy.types.Object, a: bpy.types.Object, b: bpy.types.Object, frames: np.ndarray,
-          seen: np.ndarray) -> None:
+def _line(
+    collection: bpy.types.Collection,
+    picture: bpy.types.Object,
+    a: bpy.types.Object,
+    b: bpy.types.Object,
+    frames: np.ndarray,
+    seen: np.ndarray,
+) -> None:
     data = bpy.data.curves.new(f"{a.name} – {b.name}", "CURVE")
     data.dimensions, data.bevel_depth = "3D", LINE_M
     data.splines.new("POLY").points.add(1)  # it begins with one; both at the origin, which the hooks take to their empties

@@ -127,8 +127,14 @@ def _turning_camera(scene: bpy.types.Scene) -> Iterator:
 def _extent(scene: bpy.types.Scene) -> tuple[Vector, float]:
     """Centre and radius of the posed armatures."""
     graph = bpy.context.evaluated_depsgraph_get()
-    ends = [o.matrix_world @ end for o in scene.objects if o.type == "ARMATURE"
-            for bone in o.evaluated_get(graph).pose.bones if bone.bone.use_deform for end in (bone.head, bone.tail)]
+    ends = [
+        o.matrix_world @ end
+        for o in scene.objects
+        if o.type == "ARMATURE"
+        for bone in o.evaluated_get(graph).pose.bones
+        if bone.bone.use_deform
+        for end in (bone.head, bone.tail)
+    ]
     if not ends:
         raise InputError("There is nothing to turn around: the scene has no body; run the fit first.")
     low, high = (Vector(pick(p[i] for p in ends) for i in range(3)) for pick in (min, max))

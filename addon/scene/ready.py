@@ -37,8 +37,14 @@ class Ready:
     skin: OneSkin | None = None  # None: the body has no metaballs
 
 
-def find_ready(clouds: Mapping[int, Ply], trajectories: Mapping[str, np.ndarray] | None, shape: BodyShape | None,
-               motion: MotionTable | None, settings: SkinSettings, monitor: Monitor) -> Ready:
+def find_ready(
+    clouds: Mapping[int, Ply],
+    trajectories: Mapping[str, np.ndarray] | None,
+    shape: BodyShape | None,
+    motion: MotionTable | None,
+    settings: SkinSettings,
+    monitor: Monitor,
+) -> Ready:
     """All of it.
 
     Raises:
@@ -55,8 +61,13 @@ def find_ready(clouds: Mapping[int, Ply], trajectories: Mapping[str, np.ndarray]
     for frame in sorted(tracks.rows.keys() - clouds.keys()):
         tracks.keep(frame, segments.of(frame, tracks.of(frame)))
     monitor.step(STAGE, len(clouds), len(clouds) + 1)
-    return Ready(bones=segments.names, velocity_m_s=velocity, segment=owner, skin=_rest_skin(shape, settings),
-                 track_segment=None if trajectories is None else tracks.segment)
+    return Ready(
+        bones=segments.names,
+        velocity_m_s=velocity,
+        segment=owner,
+        skin=_rest_skin(shape, settings),
+        track_segment=None if trajectories is None else tracks.segment,
+    )
 
 
 def velocity_nearby(frame: int, xyz_m: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:

@@ -32,8 +32,10 @@ def at_rest(shape: BodyShape, values: np.ndarray, sigma: np.ndarray, pose: str) 
     for b, parent in enumerate(skeleton.parents):
         rest = skeleton.bones[b].R_rest
         turn[b] = swing(rest[:, 1], LEVEL[skeleton.bones[b].name[-2:]]) if b in turned else turn[parent] if parent >= 0 else np.eye(3)
-    bones = tuple(dataclasses.replace(bone, R_rest=Q @ bone.R_rest, dofs=tuple(map(_unlimited, bone.dofs)) if b in turned else bone.dofs)
-                  for b, (bone, Q) in enumerate(zip(skeleton.bones, turn)))
+    bones = tuple(
+        dataclasses.replace(bone, R_rest=Q @ bone.R_rest, dofs=tuple(map(_unlimited, bone.dofs)) if b in turned else bone.dofs)
+        for b, (bone, Q) in enumerate(zip(skeleton.bones, turn))
+    )
     other = dataclasses.replace(shape, skeleton=dataclasses.replace(skeleton, bones=bones))
     known = np.isfinite(values).all(axis=1)
     new_values, new_sigma = values.copy(), sigma.copy()
@@ -58,8 +60,9 @@ def _recounted(shape: BodyShape, other: BodyShape, values: np.ndarray, turned: l
     return new
 
 
-def _carried_sigma(shape: BodyShape, other: BodyShape, values: np.ndarray, new: np.ndarray, sigma: np.ndarray,
-                   turned: list[int]) -> np.ndarray:
+def _carried_sigma(
+    shape: BodyShape, other: BodyShape, values: np.ndarray, new: np.ndarray, sigma: np.ndarray, turned: list[int]
+) -> np.ndarray:
     """Both sets of angles turn the same bone: A θ̇ = A' θ̇' with the axes A in the world, so θ̇' = A'⁻¹ A θ̇."""
     before, after = (frames_and_axes(s.skeleton, s.lengths_m, v)[2] for s, v in ((shape, values), (other, new)))
     carried = sigma.copy()

@@ -28,8 +28,14 @@ STEPS = 2000  # a weight is written in so many steps: coarser ones fold the insi
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
 
-def add_skin(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape, detail: int = 1,
-             settings: SkinSettings = SkinSettings(), found: OneSkin | None = None) -> bpy.types.Object:  # noqa: B008  frozen
+def add_skin(
+    collection: bpy.types.Collection,
+    armature_object: bpy.types.Object,
+    shape: BodyShape,
+    detail: int = 1,
+    settings: SkinSettings = SkinSettings(),  # noqa: B008  frozen
+    found: OneSkin | None = None,
+) -> bpy.types.Object:
     """The skin of the rest pose as one closed mesh, bound to the armature, sampled as the run's settings say; `detail` cuts it finer.
     It may have been found before.
 
@@ -50,8 +56,9 @@ def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: Fr
     """
     rest = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), skins.settings)
     if rest.vertices_m.shape != skins.vertices_m.shape[1:]:
-        raise InputError(f"The run's skins have {skins.vertices_m.shape[1]} points, that of body.toml {len(rest.vertices_m)}; "
-                         "run the fit again.")
+        raise InputError(
+            f"The run's skins have {skins.vertices_m.shape[1]} points, that of body.toml {len(rest.vertices_m)}; run the fit again."
+        )
     first, last = int(skins.frames[0]), int(skins.frames[-1])
     held = np.searchsorted(skins.frames, np.arange(first, last + 1), side="right") - 1
     head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(rest.vertices_m), float(first), 1.0, len(held))
@@ -65,8 +72,9 @@ def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: Fr
     return skin_object
 
 
-def _mesh_object(collection: bpy.types.Collection, name: str, vertices_m: np.ndarray, faces: np.ndarray, uv: np.ndarray
-                 ) -> bpy.types.Object:
+def _mesh_object(
+    collection: bpy.types.Collection, name: str, vertices_m: np.ndarray, faces: np.ndarray, uv: np.ndarray
+) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(vertices_m.tolist(), [], faces.tolist())
     mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))

@@ -102,10 +102,15 @@ def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy
     thread = nodes.add(group, "GeometryNodeCurveToMesh")
     paint_node = nodes.add(group, "GeometryNodeSetMaterial")
     paint_node.inputs["Material"].default_value = material
-    chain = ((group_input.outputs[0], keep.inputs["Geometry"]), (both.outputs[0], keep.inputs["Selection"]),
-             (keep.outputs["Selection"], curve.inputs["Mesh"]), (curve.outputs["Curve"], thread.inputs["Curve"]),
-             (profile.outputs["Curve"], thread.inputs["Profile Curve"]), (thread.outputs["Mesh"], paint_node.inputs["Geometry"]),
-             (paint_node.outputs["Geometry"], group_output.inputs[0]))
+    chain = (
+        (group_input.outputs[0], keep.inputs["Geometry"]),
+        (both.outputs[0], keep.inputs["Selection"]),
+        (keep.outputs["Selection"], curve.inputs["Mesh"]),
+        (curve.outputs["Curve"], thread.inputs["Curve"]),
+        (profile.outputs["Curve"], thread.inputs["Profile Curve"]),
+        (thread.outputs["Mesh"], paint_node.inputs["Geometry"]),
+        (paint_node.outputs["Geometry"], group_output.inputs[0]),
+    )
     for source, target in chain:
         group.links.new(source, target)
     nodes.arrange(group)

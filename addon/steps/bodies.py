@@ -187,8 +187,16 @@ def retarget(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bo
     row.operator_menu_enum("tricap.export", "kind", text="Export the Motion", icon="EXPORT")
 
 
-DRAW = {"footage": footage, "cameras": cameras, "seeds": _seeds, "surface": surface, "tracks": tracks, "body": body, "rig": rig,
-        "retarget": retarget}
+DRAW = {
+    "footage": footage,
+    "cameras": cameras,
+    "seeds": _seeds,
+    "surface": surface,
+    "tracks": tracks,
+    "body": body,
+    "rig": rig,
+    "retarget": retarget,
+}
 
 
 def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:

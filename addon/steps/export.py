@@ -16,15 +16,17 @@ from ..retarget.export import BY_BLENDER, export_file, named_for
 from ..retarget.programs import PROGRAMS
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
-KINDS = (("bvh", "BVH", "The skeleton's motion, for nearly every animation program"),
-         ("trc", "TRC", "The joints as points, for OpenSim"),
-         ("c3d", "C3D", "The joints as points, for biomechanics"),
-         ("csv", "CSV", "The joints as a table with their sigmas"),
-         ("fbx", "FBX", "The skeleton with the skin, for game engines and animation programs"),
-         ("glb", "glTF", "The skeleton with the skin, for game engines and the web"),
-         ("usd", "USD", "The skeleton with the skin, for film pipelines"),
-         ("abc", "Alembic", "The moving skin alone"),
-         ("ply", "PLY", "The skin of every frame, into a folder"))
+KINDS = (
+    ("bvh", "BVH", "The skeleton's motion, for nearly every animation program"),
+    ("trc", "TRC", "The joints as points, for OpenSim"),
+    ("c3d", "C3D", "The joints as points, for biomechanics"),
+    ("csv", "CSV", "The joints as a table with their sigmas"),
+    ("fbx", "FBX", "The skeleton with the skin, for game engines and animation programs"),
+    ("glb", "glTF", "The skeleton with the skin, for game engines and the web"),
+    ("usd", "USD", "The skeleton with the skin, for film pipelines"),
+    ("abc", "Alembic", "The moving skin alone"),
+    ("ply", "PLY", "The skin of every frame, into a folder"),
+)
 
 
 class Export(JobOperator, bpy.types.Operator):
@@ -36,11 +38,18 @@ class Export(JobOperator, bpy.types.Operator):
     last_words = "No file was written."
 
     kind: bpy.props.EnumProperty(name="Format", items=KINDS, default="bvh")  # type: ignore[valid-type]
-    preset: bpy.props.EnumProperty(name="For", items=[(name, name.capitalize(), "") for name in PROGRAMS],  # type: ignore[valid-type]
-                                   description="Names, units and axes as a program wants them")
+    preset: bpy.props.EnumProperty(
+        name="For",
+        items=[(name, name.capitalize(), "") for name in PROGRAMS],  # type: ignore[valid-type]
+        description="Names, units and axes as a program wants them",
+    )
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH")  # type: ignore[valid-type]
-    out: bpy.props.StringProperty(name="Results", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                  description="Folder of a run; empty: the project's")
+    out: bpy.props.StringProperty(
+        name="Results",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder of a run; empty: the project's",
+    )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask for the file; what follows is quick enough to wait for."""

@@ -53,8 +53,14 @@ class AddFootage(Told, bpy.types.Operator):
     directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=RELATIVE)  # type: ignore[valid-type]
     files: bpy.props.CollectionProperty(type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
     filename: bpy.props.StringProperty(subtype="FILE_NAME", options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
-    fps: bpy.props.FloatProperty(name="Images a Second", default=0.0, min=0.0, max=10000.0, options={"SKIP_SAVE"},  # type: ignore[valid-type]
-                                 description="Images do not tell it, movies do. 0: as in step 1")
+    fps: bpy.props.FloatProperty(
+        name="Images a Second",
+        default=0.0,
+        min=0.0,
+        max=10000.0,
+        options={"SKIP_SAVE"},  # type: ignore[valid-type]
+        description="Images do not tell it, movies do. 0: as in step 1",
+    )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
@@ -111,8 +117,12 @@ class OpenTake(Told, bpy.types.Operator):
     bl_label = "Open Take"
     bl_options = {"UNDO"}
 
-    directory: bpy.props.StringProperty(name="Take", subtype="DIR_PATH", options=RELATIVE,  # type: ignore[valid-type]
-                                        description="Folder with take.toml; empty: the panel's")
+    directory: bpy.props.StringProperty(
+        name="Take",
+        subtype="DIR_PATH",
+        options=RELATIVE,  # type: ignore[valid-type]
+        description="Folder with take.toml; empty: the panel's",
+    )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

@@ -11,10 +11,12 @@ from .. import folders, project
 from .footage import Told
 
 FOUND = "none"
-KINDS = ((FOUND, "Found by Itself", "The person is found by clicks, depth and motion"),
-         ("mask", "One Mask", "An image of the view's size, white where the person is, for all frames"),
-         ("masks", "A Mask for Every Image", "A folder of such images, one for every image of the view; choose one of them"),
-         ("background", "The Empty Background", "An image that the same camera took without the person"))
+KINDS = (
+    (FOUND, "Found by Itself", "The person is found by clicks, depth and motion"),
+    ("mask", "One Mask", "An image of the view's size, white where the person is, for all frames"),
+    ("masks", "A Mask for Every Image", "A folder of such images, one for every image of the view; choose one of them"),
+    ("background", "The Empty Background", "An image that the same camera took without the person"),
+)
 
 
 class PersonFrom(Told, bpy.types.Operator):
@@ -25,8 +27,11 @@ class PersonFrom(Told, bpy.types.Operator):
     bl_options = {"UNDO"}
 
     kind: bpy.props.EnumProperty(name="From", items=KINDS)  # type: ignore[valid-type]
-    view: bpy.props.StringProperty(name="View", description="Name of the view; empty: the one chosen in the list",  # type: ignore[valid-type]
-                                   options={"SKIP_SAVE"})
+    view: bpy.props.StringProperty(
+        name="View",
+        description="Name of the view; empty: the one chosen in the list",  # type: ignore[valid-type]
+        options={"SKIP_SAVE"},
+    )
     filepath: bpy.props.StringProperty(name="Image", subtype="FILE_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]

@@ -145,8 +145,10 @@ def _cameras(scene: bpy.types.Scene, found: _Found) -> State:
     for view in scene.tricap.views:
         size = rig[view.name].size_px
         if tuple(view.clip.size) != size:
-            raise InputError(f"Camera {view.name} was calibrated with pictures of {size[0]}×{size[1]} pixels, its footage has "
-                             f"{view.clip.size[0]}×{view.clip.size[1]}; use the footage as it was calibrated.")
+            raise InputError(
+                f"Camera {view.name} was calibrated with pictures of {size[0]}×{size[1]} pixels, its footage has "
+                f"{view.clip.size[0]}×{view.clip.size[1]}; use the footage as it was calibrated."
+            )
     found.footage = open_take(found.take, found.sequences)
     return State(word="done", why=f"{len(found.footage.rig.cameras)} cameras, one for each view.")
 
@@ -221,9 +223,11 @@ def _stage(step: str, states: Mapping[str, State], found: _Found) -> State:
     return State(word="done", why=_figures(step, entry))
 
 
-_READY = {"surface": "Measure the surface of the body in every frame.",
-          "tracks": "Follow the surface's points from frame to frame.",
-          "body": "Fit the skeleton and its flesh to surface and tracks."}
+_READY = {
+    "surface": "Measure the surface of the body in every frame.",
+    "tracks": "Follow the surface's points from frame to frame.",
+    "body": "Fit the skeleton and its flesh to surface and tracks.",
+}
 
 
 def _figures(step: str, entry: Mapping[str, Any]) -> str:

@@ -38,8 +38,18 @@ def complete_shape(shape: BodyShape) -> BodyShape:
     X, bone = np.concatenate(list(places.values())), np.repeat(list(places), 2 * ALONG * AROUND)
     F = np.maximum(field(simple, lengths, R, head, X, counted[bone][:, simple.bone_index]), LEAST_F)
     weight = np.tile(np.repeat([1.0, OUTSIDE_WEIGHT], ALONG * AROUND), len(places))
-    balls = with_radii_for(start, np.arange(len(start.weight)), lengths, R, head, X, counted[bone][:, start.bone_index],
-                           np.sqrt(np.maximum(-0.5 * np.log(np.minimum(F, 0.99)), 0.03)), weight, FREE)
+    balls = with_radii_for(
+        start,
+        np.arange(len(start.weight)),
+        lengths,
+        R,
+        head,
+        X,
+        counted[bone][:, start.bone_index],
+        np.sqrt(np.maximum(-0.5 * np.log(np.minimum(F, 0.99)), 0.03)),
+        weight,
+        FREE,
+    )
     return replace(shape, metaballs=balls, radius_sigma_m=np.full(balls.radii_m.shape, np.nan), weight_sigma=None)
 
 

@@ -62,24 +62,54 @@ class End:
 
 # Head: z forwards. Hand: x to the thumb, z to the palm. Foot: x to the other foot, y level ahead, z down.
 TABLES: dict[str, End] = {
-    "head": End((1, 2, 3, 4), (0, 1, 2, 3), (
-        Ellipsoid("cranium", 0, 0.56, -0.02, 0.48, 0.53, 0.61), Ellipsoid("nape", 0, 0.20, -0.18, 0.22, 0.17, 0.19),
-        Ellipsoid("face", 0, 0.16, 0.26, 0.31, 0.28, 0.27), Ellipsoid("jaw", 0, -0.02, 0.28, 0.21, 0.14, 0.20),
-        Ellipsoid("chin", 0, -0.17, 0.44, 0.13, 0.09, 0.12), Ellipsoid("nose", 0, 0.15, 0.59, 0.075, 0.13, 0.11))),
-    "hand": End((1, 2, 3), (0, 2), (
-        Ellipsoid("wrist", 0, 0.05, 0, 0.22, 0.20, 0.15), Ellipsoid("palm", -0.02, 0.42, 0, 0.33, 0.31, 0.13),
-        Ellipsoid("knuckles", -0.03, 0.82, 0, 0.37, 0.26, 0.12), Ellipsoid("thenar", 0.26, 0.34, 0.07, 0.12, 0.24, 0.10),
-        Ellipsoid("thumb", 0.43, 0.64, 0.09, 0.10, 0.22, 0.095), Ellipsoid("thumb's tip", 0.49, 0.88, 0.10, 0.075, 0.13, 0.075),
-        Ellipsoid("fingers 1", -0.04, 1.15, 0.01, 0.34, 0.22, 0.10), Ellipsoid("fingers 2", -0.03, 1.42, 0.03, 0.31, 0.20, 0.09),
-        Ellipsoid("fingers 3", -0.01, 1.66, 0.05, 0.26, 0.15, 0.08))),
-    "foot": End((1, 2, 3), (0, 2, 3), (
-        Ellipsoid("ankle", 0, -0.01, 0.06, 0.17, 0.18, 0.18), Ellipsoid("heel", 0, -0.16, 0.33, 0.19, 0.18, 0.19),
-        Ellipsoid("tendon", 0, -0.17, 0.08, 0.10, 0.11, 0.13), Ellipsoid("instep", 0.05, 0.25, 0.25, 0.21, 0.29, 0.19),
-        Ellipsoid("arch", 0.06, 0.52, 0.34, 0.23, 0.27, 0.155), Ellipsoid("outer edge", -0.12, 0.36, 0.44, 0.15, 0.22, 0.11),
-        Ellipsoid("sole", -0.06, 0.08, 0.43, 0.17, 0.18, 0.12), Ellipsoid("ball", 0.13, 0.86, 0.43, 0.17, 0.20, 0.12),
-        Ellipsoid("ball, outer", -0.13, 0.76, 0.45, 0.16, 0.19, 0.10), Ellipsoid("great toe", 0.15, 1.10, 0.47, 0.11, 0.16, 0.08),
-        Ellipsoid("great toe's tip", 0.13, 1.30, 0.49, 0.095, 0.13, 0.07), Ellipsoid("toes", -0.07, 1.02, 0.48, 0.20, 0.15, 0.075),
-        Ellipsoid("toes' tips", -0.03, 1.19, 0.50, 0.17, 0.11, 0.065)), tip=1.40, drop=0.447),
+    "head": End(
+        (1, 2, 3, 4),
+        (0, 1, 2, 3),
+        (
+            Ellipsoid("cranium", 0, 0.56, -0.02, 0.48, 0.53, 0.61),
+            Ellipsoid("nape", 0, 0.20, -0.18, 0.22, 0.17, 0.19),
+            Ellipsoid("face", 0, 0.16, 0.26, 0.31, 0.28, 0.27),
+            Ellipsoid("jaw", 0, -0.02, 0.28, 0.21, 0.14, 0.20),
+            Ellipsoid("chin", 0, -0.17, 0.44, 0.13, 0.09, 0.12),
+            Ellipsoid("nose", 0, 0.15, 0.59, 0.075, 0.13, 0.11),
+        ),
+    ),
+    "hand": End(
+        (1, 2, 3),
+        (0, 2),
+        (
+            Ellipsoid("wrist", 0, 0.05, 0, 0.22, 0.20, 0.15),
+            Ellipsoid("palm", -0.02, 0.42, 0, 0.33, 0.31, 0.13),
+            Ellipsoid("knuckles", -0.03, 0.82, 0, 0.37, 0.26, 0.12),
+            Ellipsoid("thenar", 0.26, 0.34, 0.07, 0.12, 0.24, 0.10),
+            Ellipsoid("thumb", 0.43, 0.64, 0.09, 0.10, 0.22, 0.095),
+            Ellipsoid("thumb's tip", 0.49, 0.88, 0.10, 0.075, 0.13, 0.075),
+            Ellipsoid("fingers 1", -0.04, 1.15, 0.01, 0.34, 0.22, 0.10),
+            Ellipsoid("fingers 2", -0.03, 1.42, 0.03, 0.31, 0.20, 0.09),
+            Ellipsoid("fingers 3", -0.01, 1.66, 0.05, 0.26, 0.15, 0.08),
+        ),
+    ),
+    "foot": End(
+        (1, 2, 3),
+        (0, 2, 3),
+        (
+            Ellipsoid("ankle", 0, -0.01, 0.06, 0.17, 0.18, 0.18),
+            Ellipsoid("heel", 0, -0.16, 0.33, 0.19, 0.18, 0.19),
+            Ellipsoid("tendon", 0, -0.17, 0.08, 0.10, 0.11, 0.13),
+            Ellipsoid("instep", 0.05, 0.25, 0.25, 0.21, 0.29, 0.19),
+            Ellipsoid("arch", 0.06, 0.52, 0.34, 0.23, 0.27, 0.155),
+            Ellipsoid("outer edge", -0.12, 0.36, 0.44, 0.15, 0.22, 0.11),
+            Ellipsoid("sole", -0.06, 0.08, 0.43, 0.17, 0.18, 0.12),
+            Ellipsoid("ball", 0.13, 0.86, 0.43, 0.17, 0.20, 0.12),
+            Ellipsoid("ball, outer", -0.13, 0.76, 0.45, 0.16, 0.19, 0.10),
+            Ellipsoid("great toe", 0.15, 1.10, 0.47, 0.11, 0.16, 0.08),
+            Ellipsoid("great toe's tip", 0.13, 1.30, 0.49, 0.095, 0.13, 0.07),
+            Ellipsoid("toes", -0.07, 1.02, 0.48, 0.20, 0.15, 0.075),
+            Ellipsoid("toes' tips", -0.03, 1.19, 0.50, 0.17, 0.11, 0.065),
+        ),
+        tip=1.40,
+        drop=0.447,
+    ),
 }
 
 
@@ -90,16 +120,23 @@ def person_shape(shape: BodyShape) -> BodyShape:
     the width that it has below.
     """
     counts = np.bincount(shape.metaballs.bone_index, minlength=len(shape.skeleton.bones))
-    ends = {b: TABLES[kind] for b, bone in enumerate(shape.skeleton.bones)
-            if counts[b] == SIMPLE and (kind := bone.name.removesuffix(".R").removesuffix(".L")) in TABLES}
+    ends = {
+        b: TABLES[kind]
+        for b, bone in enumerate(shape.skeleton.bones)
+        if counts[b] == SIMPLE and (kind := bone.name.removesuffix(".R").removesuffix(".L")) in TABLES
+    }
     if not ends:
         return shape
     profiles = bone_profiles(shape.skeleton, shape.lengths_m, shape.metaballs, chain_neighbours(shape))
     made = [_placed(shape, b, end, _fitted(shape, b, end, profiles[b])) for b, end in ends.items()]
     kept = ~np.isin(shape.metaballs.bone_index, list(ends))
     slender = _slender_neck(shape)
-    balls = Metaballs(**{name: np.concatenate([getattr(slender, name)[kept], *(getattr(m, name) for m in made)])
-                         for name in ("bone_index", "centre", "radii_m", "weight")})
+    balls = Metaballs(
+        **{
+            name: np.concatenate([getattr(slender, name)[kept], *(getattr(m, name) for m in made)])
+            for name in ("bone_index", "centre", "radii_m", "weight")
+        }
+    )
     sigma = np.concatenate([shape.radius_sigma_m[kept], np.full((len(balls.weight) - kept.sum(), 3), np.nan)])
     return replace(shape, metaballs=balls, radius_sigma_m=sigma, weight_sigma=None)
 

@@ -73,8 +73,13 @@ def _solved(f: np.ndarray, slope: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 def _family(balls: Metaballs, order: np.ndarray, weights: np.ndarray) -> Metaballs:
     used = order[weights[order] > LEAST]
-    return replace(balls, bone_index=balls.bone_index[used], centre=balls.centre[used], radii_m=balls.radii_m[used],
-                   weight=balls.weight[used] * weights[used])
+    return replace(
+        balls,
+        bone_index=balls.bone_index[used],
+        centre=balls.centre[used],
+        radii_m=balls.radii_m[used],
+        weight=balls.weight[used] * weights[used],
+    )
 
 
 def _samples(shape: BodyShape, parts: tuple[Part, ...]) -> tuple[np.ndarray, np.ndarray]:

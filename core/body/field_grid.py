@@ -25,8 +25,9 @@ class FieldGrid:
         object.__setattr__(self, "origin_m", frozen(self.origin_m, (3,), name="origin_m"))
 
 
-def field_grid(shape: BodyShape, motion: np.ndarray, spacing_m: float = 0.005, monitor: Monitor | None = None,
-               potential: Potential = EXPONENTIAL) -> FieldGrid:
+def field_grid(
+    shape: BodyShape, motion: np.ndarray, spacing_m: float = 0.005, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL
+) -> FieldGrid:
     """The field of a body in one posture, `motion` (D,) rad and metres, around everything that it reaches.
 
     The balls of a part (`skin_parts`: an arm, a leg, the trunk) add, and of the parts' fields the largest counts: the surface is the

@@ -95,13 +95,17 @@ def _quadric_slope(d: np.ndarray) -> np.ndarray:
 
 
 EXPONENTIAL = Potential(name="exponential", of=lambda d: np.exp(-2 * d), slope_of=lambda d: -2 * np.exp(-2 * d), endless=True)
-POTENTIALS = {p.name: p for p in (
-    EXPONENTIAL,
-    Potential(name="Blinn", of=lambda d: np.exp(-BLINN * d), slope_of=lambda d: -BLINN * np.exp(-BLINN * d), endless=True),
-    Potential(name="Wyvill", of=_wyvill, slope_of=_wyvill_slope),
-    Potential(name="quadric", of=_quadric, slope_of=_quadric_slope),
-    Potential(name="Blender", of=lambda d: (1 - d) ** 3, slope_of=lambda d: -3 * (1 - d) ** 2),
-    Potential(name="Shen", of=lambda d: 1 - d, slope_of=lambda d: np.full_like(d, -1.0)))}
+POTENTIALS = {
+    p.name: p
+    for p in (
+        EXPONENTIAL,
+        Potential(name="Blinn", of=lambda d: np.exp(-BLINN * d), slope_of=lambda d: -BLINN * np.exp(-BLINN * d), endless=True),
+        Potential(name="Wyvill", of=_wyvill, slope_of=_wyvill_slope),
+        Potential(name="quadric", of=_quadric, slope_of=_quadric_slope),
+        Potential(name="Blender", of=lambda d: (1 - d) ** 3, slope_of=lambda d: -3 * (1 - d) ** 2),
+        Potential(name="Shen", of=lambda d: 1 - d, slope_of=lambda d: np.full_like(d, -1.0)),
+    )
+}
 
 
 def potential_named(name: str) -> Potential:

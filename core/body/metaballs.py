@@ -16,8 +16,18 @@ import numpy as np
 from ..values import frozen
 from .fields import EXPONENTIAL, THRESHOLD, VISIBLE, Potential
 
-__all__ = ["ALONG", "STATIONS", "THRESHOLD", "VISIBLE", "Metaballs", "active_balls", "field", "field_and_derivatives", "local_points",
-           "three_balls"]
+__all__ = [
+    "ALONG",
+    "STATIONS",
+    "THRESHOLD",
+    "VISIBLE",
+    "Metaballs",
+    "active_balls",
+    "field",
+    "field_and_derivatives",
+    "local_points",
+    "three_balls",
+]
 
 STATIONS = (1 / 6, 1 / 2, 5 / 6)  # centres of a segment's three balls, as fractions of the bone
 ALONG = 0.30  # l along the bone, as a fraction of its length
@@ -55,8 +65,15 @@ def squared_distances(balls: Metaballs, lengths_m: np.ndarray, local: np.ndarray
     return q, np.einsum("nmi,nmi->nm", q, q)
 
 
-def field(balls: Metaballs, lengths_m: np.ndarray, R: np.ndarray, head_m: np.ndarray, xyz_m: np.ndarray,
-          active: np.ndarray | None = None, potential: Potential = EXPONENTIAL) -> np.ndarray:
+def field(
+    balls: Metaballs,
+    lengths_m: np.ndarray,
+    R: np.ndarray,
+    head_m: np.ndarray,
+    xyz_m: np.ndarray,
+    active: np.ndarray | None = None,
+    potential: Potential = EXPONENTIAL,
+) -> np.ndarray:
     """F (N,) at world points (N, 3). `active`: bool (M,) or (N, M), the balls that count; default all.  (8)
 
     Arguments: bone lengths (B,), frames R (B, 3, 3) and heads (B, 3) of ONE posture (`skeleton.bone_frames`).
@@ -65,9 +82,15 @@ def field(balls: Metaballs, lengths_m: np.ndarray, R: np.ndarray, head_m: np.nda
     return np.asarray((terms if active is None else np.where(active, terms, 0.0)).sum(axis=1))
 
 
-def field_and_derivatives(balls: Metaballs, lengths_m: np.ndarray, R: np.ndarray, head_m: np.ndarray, xyz_m: np.ndarray,
-                          active: np.ndarray | None = None, potential: Potential = EXPONENTIAL,
-                          ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def field_and_derivatives(
+    balls: Metaballs,
+    lengths_m: np.ndarray,
+    R: np.ndarray,
+    head_m: np.ndarray,
+    xyz_m: np.ndarray,
+    active: np.ndarray | None = None,
+    potential: Potential = EXPONENTIAL,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """F (N,), its gradient in space (N, 3), and its derivatives to ln l (N, M, 3) and to the weights w (N, M).
 
     Arguments as in `field`. ∇F = 2 Σ w f'(d) q/l in the world's axes; ∂F/∂ln l = −2 q² w f'(d); ∂F/∂w = f(d).
@@ -85,8 +108,9 @@ def active_balls(balls: Metaballs, neighbours: np.ndarray, bone: int) -> np.ndar
     return neighbours[bone, balls.bone_index]
 
 
-def three_balls(bone_index: np.ndarray, lengths_m: np.ndarray, visible_radii_m: np.ndarray,
-                stations: np.ndarray | None = None) -> Metaballs:
+def three_balls(
+    bone_index: np.ndarray, lengths_m: np.ndarray, visible_radii_m: np.ndarray, stations: np.ndarray | None = None
+) -> Metaballs:
     """Three balls for each of the bones (K,) whose surface has the wanted cross radii (K, 3 stations, 2) [m] in x and z at the stations.
 
     `stations` (K, 3) are fractions of the bones, as a rule `STATIONS`. Balls of bones that are short for their thickness reach further

@@ -92,7 +92,7 @@ def _sources(name: str | Path) -> list[tuple[Path, dict[str, Any]]]:
 
 def _path(name: Any, folder: Path) -> Path:
     if not isinstance(name, str | Path):
-        raise InputError(f"A body model in {folder} is made from {name!r}; write the name of a model, such as \"arm.R\", or a .toml file.")
+        raise InputError(f'A body model in {folder} is made from {name!r}; write the name of a model, such as "arm.R", or a .toml file.')
     if str(name).endswith(".toml"):
         return folder / name
     if name not in model_names():
@@ -131,8 +131,15 @@ def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
             gone.add(bone.name)
     rows = [i for i, left in enumerate(names) if left not in gone]
     skeleton = Skeleton(name=name, bones=tuple(model.skeleton.bones[i] for i in rows), base_dofs=model.skeleton.base_dofs)
-    return BodyModel(name=name, skeleton=skeleton, visible_radii_m=model.visible_radii_m[rows], surface=model.surface[rows],
-                     stations=model.stations[rows], aside=model.aside[rows], length_sigma=model.length_sigma[rows])
+    return BodyModel(
+        name=name,
+        skeleton=skeleton,
+        visible_radii_m=model.visible_radii_m[rows],
+        surface=model.surface[rows],
+        stations=model.stations[rows],
+        aside=model.aside[rows],
+        length_sigma=model.length_sigma[rows],
+    )
 
 
 def with_limits(model: BodyModel, limits: Mapping[str, tuple[float, float]], locked: Sequence[str]) -> BodyModel:
@@ -162,9 +169,15 @@ def mirrored(model: BodyModel, name: str) -> BodyModel:
     old = model.skeleton
     bones = tuple(_mirrored_bone(bone) for bone in old.bones)
     base = tuple(Dof(name=other_side(d.name), axis=d.axis, limits=d.limits, prior_sigma=d.prior_sigma) for d in old.base_dofs)
-    return BodyModel(name=name, skeleton=Skeleton(name=name, bones=bones, base_dofs=base),
-                     visible_radii_m=model.visible_radii_m, surface=model.surface, stations=model.stations,
-                     aside=model.aside * MIRROR[[0, 2]], length_sigma=model.length_sigma)
+    return BodyModel(
+        name=name,
+        skeleton=Skeleton(name=name, bones=bones, base_dofs=base),
+        visible_radii_m=model.visible_radii_m,
+        surface=model.surface,
+        stations=model.stations,
+        aside=model.aside * MIRROR[[0, 2]],
+        length_sigma=model.length_sigma,
+    )
 
 
 def other_side(name: str) -> str:
@@ -178,12 +191,20 @@ def _mirrored_bone(bone: Bone) -> Bone:
     for d in bone.dofs:
         sign = 1.0 if d.axis == "x" else -1.0
         low, high = sorted((sign * d.limits[0], sign * d.limits[1]))
-        dofs.append(Dof(name=other_side(d.name), axis=d.axis, limits=(low, high),
-                        prior_mean=sign * d.prior_mean, prior_sigma=d.prior_sigma))
+        dofs.append(
+            Dof(name=other_side(d.name), axis=d.axis, limits=(low, high), prior_mean=sign * d.prior_mean, prior_sigma=d.prior_sigma)
+        )
     R = MIRROR[:, None] * bone.R_rest * MIRROR  # x changes sign twice: the frame stays right-handed
-    return Bone(name=other_side(bone.name), parent=None if bone.parent is None else other_side(bone.parent),
-                head_joint=other_side(bone.head_joint), tail_joint=other_side(bone.tail_joint),
-                nominal_length_m=bone.nominal_length_m, R_rest=R, rotation_mode=bone.rotation_mode, dofs=tuple(dofs))
+    return Bone(
+        name=other_side(bone.name),
+        parent=None if bone.parent is None else other_side(bone.parent),
+        head_joint=other_side(bone.head_joint),
+        tail_joint=other_side(bone.tail_joint),
+        nominal_length_m=bone.nominal_length_m,
+        R_rest=R,
+        rotation_mode=bone.rotation_mode,
+        dofs=tuple(dofs),
+    )
 
 
 def rest_frame(y: Any, z: Any) -> np.ndarray:
@@ -198,8 +219,13 @@ def rest_frame(y: Any, z: Any) -> np.ndarray:
 def dof_from_table(table: Mapping[str, Any]) -> Dof:
     """A rotational DOF from its table in a model or body file."""
     low, high = table.get("limits_deg", (-inf, inf))
-    return Dof(name=str(table["name"]), axis=str(table["axis"]), limits=(radians(low), radians(high)),
-               prior_mean=radians(table.get("prior_deg", 0.0)), prior_sigma=radians(table.get("prior_sigma_deg", inf)))
+    return Dof(
+        name=str(table["name"]),
+        axis=str(table["axis"]),
+        limits=(radians(low), radians(high)),
+        prior_mean=radians(table.get("prior_deg", 0.0)),
+        prior_sigma=radians(table.get("prior_sigma_deg", inf)),
+    )
 
 
 def base_dofs(joint: str) -> tuple[Dof, Dof, Dof]:
@@ -210,7 +236,7 @@ def base_dofs(joint: str) -> tuple[Dof, Dof, Dof]:
 
 def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
     if table.get("format") != "tricap-model" or table.get("version") != 1:
-        raise InputError(f"{path} is no body model of this version of Tricap; begin it with format = \"tricap-model\" and version = 1.")
+        raise InputError(f'{path} is no body model of this version of Tricap; begin it with format = "tricap-model" and version = 1.')
     try:
         stature = float(table["stature_m"])
         rows = list(table["bones"])
@@ -226,13 +252,27 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
             columns: tuple[list[Any], ...] = (radii, surface, stations, open_lengths)
             radii, surface, stations, open_lengths = ([*column, *(column[i] for i in right)] for column in columns)
         skeleton = Skeleton(name=str(table["name"]), bones=tuple(bones), base_dofs=base_dofs(str(table["base"])))
-        return BodyModel(name=skeleton.name, skeleton=skeleton, visible_radii_m=np.array(radii), surface=np.array(surface),
-                         stations=np.array(stations), aside=np.array(aside), length_sigma=np.array(open_lengths))
+        return BodyModel(
+            name=skeleton.name,
+            skeleton=skeleton,
+            visible_radii_m=np.array(radii),
+            surface=np.array(surface),
+            stations=np.array(stations),
+            aside=np.array(aside),
+            length_sigma=np.array(open_lengths),
+        )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The body model {path} lacks something or holds a wrong value: {error}.") from error
 
 
 def _bone(t: Mapping[str, Any], stature: float) -> Bone:
-    return Bone(name=str(t["name"]), parent=t.get("parent"), head_joint=str(t["head"]), tail_joint=str(t["tail"]),
-                nominal_length_m=stature * float(t["length_per_stature"]), R_rest=rest_frame(t["y"], t["z"]),
-                rotation_mode=str(t.get("rotation_mode", "YZX")), dofs=tuple(map(dof_from_table, t.get("dofs", ()))))
+    return Bone(
+        name=str(t["name"]),
+        parent=t.get("parent"),
+        head_joint=str(t["head"]),
+        tail_joint=str(t["tail"]),
+        nominal_length_m=stature * float(t["length_per_stature"]),
+        R_rest=rest_frame(t["y"], t["z"]),
+        rotation_mode=str(t.get("rotation_mode", "YZX")),
+        dofs=tuple(map(dof_from_table, t.get("dofs", ()))),
+    )

@@ -94,8 +94,14 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
 def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneSkin:
     skin = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), settings)
     skin = refined(skin, detail) if detail > 1 else skin
-    return OneSkin(vertices_m=skin.vertices_m, faces=skin.faces, uv=corner_uv(skin), weights=skin.weights, bone_names=skin.bone_names,
-                   part=np.zeros(len(skin.vertices_m), dtype=np.int64))
+    return OneSkin(
+        vertices_m=skin.vertices_m,
+        faces=skin.faces,
+        uv=corner_uv(skin),
+        weights=skin.weights,
+        bone_names=skin.bone_names,
+        part=np.zeros(len(skin.vertices_m), dtype=np.int64),
+    )
 
 
 def _sparse(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, surface: WholeSurface) -> np.ndarray:
@@ -109,8 +115,9 @@ def _sparse(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, surface: 
     return found
 
 
-def _evened(vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, sewn: np.ndarray, part: np.ndarray,
-            surface: WholeSurface) -> np.ndarray:
+def _evened(
+    vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, sewn: np.ndarray, part: np.ndarray, surface: WholeSurface
+) -> np.ndarray:
     """Vertices (V, 3), the free ones evened out on the surface; those about a seam first in all directions."""
     found, part = vertices.copy(), part[free]
     along, towards = np.flatnonzero(~np.isin(free, sewn)), np.arange(len(free))
@@ -124,9 +131,7 @@ def _evened(vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, sew
     return found
 
 
-def _unfolded(
-    vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _unfolded(vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) of which the free ones leave the surface where it folds, and how far (V,), 0 to 1, each belongs to such a place."""
     found, may = vertices.copy(), np.isin(np.arange(len(vertices)), free)
     loose = np.zeros(len(vertices))

@@ -47,8 +47,14 @@ def default_shape(model: BodyModel) -> BodyShape:
     chain = stout_chain(model.skeleton, lengths, model.visible_radii_m)
     if chain:
         balls = smoothed(balls, model.skeleton, lengths, chain, model.visible_radii_m, model.stations)
-    return BodyShape(model=model.name, skeleton=model.skeleton, lengths_m=lengths, metaballs=balls,
-                     length_sigma_m=np.full(len(lengths), np.nan), radius_sigma_m=np.full((len(balls.weight), 3), np.nan))
+    return BodyShape(
+        model=model.name,
+        skeleton=model.skeleton,
+        lengths_m=lengths,
+        metaballs=balls,
+        length_sigma_m=np.full(len(lengths), np.nan),
+        radius_sigma_m=np.full((len(balls.weight), 3), np.nan),
+    )
 
 
 def one_ball_shape(shape: BodyShape) -> BodyShape:
@@ -77,18 +83,32 @@ def write_body(path: Path, shape: BodyShape) -> None:
     skeleton = shape.skeleton
     lines = ['format = "tricap-body"', "version = 1", f"model = {_text(shape.model)}", f"base = {_text(skeleton.bones[0].head_joint)}", ""]
     for bone, length, sigma in zip(skeleton.bones, shape.lengths_m, shape.length_sigma_m):
-        lines += ["[[bones]]", f"name = {_text(bone.name)}", *([f"parent = {_text(bone.parent)}"] if bone.parent else []),
-                  f"head = {_text(bone.head_joint)}", f"tail = {_text(bone.tail_joint)}", f"length_m = {float(length)!r}",
-                  f"sigma_m = {float(sigma)!r}", f"nominal_length_m = {bone.nominal_length_m!r}",
-                  f"rest = {bone.R_rest.tolist()!r}  # rows; the columns are the bone's axes in the world at rest",
-                  f"rotation_mode = {_text(bone.rotation_mode)}", f"dofs = [{', '.join(map(_dof, bone.dofs))}]", ""]
+        lines += [
+            "[[bones]]",
+            f"name = {_text(bone.name)}",
+            *([f"parent = {_text(bone.parent)}"] if bone.parent else []),
+            f"head = {_text(bone.head_joint)}",
+            f"tail = {_text(bone.tail_joint)}",
+            f"length_m = {float(length)!r}",
+            f"sigma_m = {float(sigma)!r}",
+            f"nominal_length_m = {bone.nominal_length_m!r}",
+            f"rest = {bone.R_rest.tolist()!r}  # rows; the columns are the bone's axes in the world at rest",
+            f"rotation_mode = {_text(bone.rotation_mode)}",
+            f"dofs = [{', '.join(map(_dof, bone.dofs))}]",
+            "",
+        ]
     balls = shape.metaballs
     for i, bone_index in enumerate(balls.bone_index):
-        lines += ["[[metaballs]]", f"bone = {_text(skeleton.bones[bone_index].name)}",
-                  f"centre = {balls.centre[i].tolist()!r}  # in bone lengths, in the bone's axes",
-                  f"radii_m = {balls.radii_m[i].tolist()!r}  # l of the field exp(-2 d), not the visible radius",
-                  f"sigma_m = {shape.radius_sigma_m[i].tolist()!r}", f"weight = {float(balls.weight[i])!r}",
-                  *([f"weight_sigma = {float(shape.weight_sigma[i])!r}"] if shape.weight_sigma is not None else []), ""]
+        lines += [
+            "[[metaballs]]",
+            f"bone = {_text(skeleton.bones[bone_index].name)}",
+            f"centre = {balls.centre[i].tolist()!r}  # in bone lengths, in the bone's axes",
+            f"radii_m = {balls.radii_m[i].tolist()!r}  # l of the field exp(-2 d), not the visible radius",
+            f"sigma_m = {shape.radius_sigma_m[i].tolist()!r}",
+            f"weight = {float(balls.weight[i])!r}",
+            *([f"weight_sigma = {float(shape.weight_sigma[i])!r}"] if shape.weight_sigma is not None else []),
+            "",
+        ]
     store.write_text(Path(path), "\n".join(lines))
 
 
@@ -113,19 +133,36 @@ def read_body(path: Path) -> BodyShape:
 
 def _shape(table: dict[str, Any]) -> BodyShape:
     rows = table["bones"]
-    bones = tuple(Bone(name=str(t["name"]), parent=t.get("parent"), head_joint=str(t["head"]), tail_joint=str(t["tail"]),
-                       nominal_length_m=float(t["nominal_length_m"]), R_rest=np.array(t["rest"], dtype=float),
-                       rotation_mode=str(t["rotation_mode"]), dofs=tuple(map(dof_from_table, t["dofs"]))) for t in rows)
+    bones = tuple(
+        Bone(
+            name=str(t["name"]),
+            parent=t.get("parent"),
+            head_joint=str(t["head"]),
+            tail_joint=str(t["tail"]),
+            nominal_length_m=float(t["nominal_length_m"]),
+            R_rest=np.array(t["rest"], dtype=float),
+            rotation_mode=str(t["rotation_mode"]),
+            dofs=tuple(map(dof_from_table, t["dofs"])),
+        )
+        for t in rows
+    )
     skeleton = Skeleton(name=str(table["model"]), bones=bones, base_dofs=base_dofs(str(table["base"])))
     names, balls = [bone.name for bone in bones], table.get("metaballs", [])
-    metaballs = Metaballs(bone_index=np.array([names.index(t["bone"]) for t in balls], dtype=np.intp),
-                          centre=np.array([t["centre"] for t in balls], dtype=float).reshape(-1, 3),
-                          radii_m=np.array([t["radii_m"] for t in balls], dtype=float).reshape(-1, 3),
-                          weight=np.array([t["weight"] for t in balls], dtype=float))
-    return BodyShape(model=str(table["model"]), skeleton=skeleton, lengths_m=np.array([t["length_m"] for t in rows], dtype=float),
-                     metaballs=metaballs, length_sigma_m=np.array([t["sigma_m"] for t in rows], dtype=float),
-                     radius_sigma_m=np.array([t["sigma_m"] for t in balls], dtype=float).reshape(-1, 3),
-                     weight_sigma=np.array([t["weight_sigma"] for t in balls], dtype=float) if _has_weight_sigmas(balls) else None)
+    metaballs = Metaballs(
+        bone_index=np.array([names.index(t["bone"]) for t in balls], dtype=np.intp),
+        centre=np.array([t["centre"] for t in balls], dtype=float).reshape(-1, 3),
+        radii_m=np.array([t["radii_m"] for t in balls], dtype=float).reshape(-1, 3),
+        weight=np.array([t["weight"] for t in balls], dtype=float),
+    )
+    return BodyShape(
+        model=str(table["model"]),
+        skeleton=skeleton,
+        lengths_m=np.array([t["length_m"] for t in rows], dtype=float),
+        metaballs=metaballs,
+        length_sigma_m=np.array([t["sigma_m"] for t in rows], dtype=float),
+        radius_sigma_m=np.array([t["sigma_m"] for t in balls], dtype=float).reshape(-1, 3),
+        weight_sigma=np.array([t["weight_sigma"] for t in balls], dtype=float) if _has_weight_sigmas(balls) else None,
+    )
 
 
 def _has_weight_sigmas(balls: list[dict[str, Any]]) -> bool:

@@ -56,8 +56,10 @@ class Bone:
         object.__setattr__(self, "R_rest", frozen(self.R_rest, (3, 3), name="R_rest"))
         axes = [dof.axis for dof in self.dofs]
         if self.rotation_mode not in ROTATION_MODES or len(set(axes)) < len(axes) or not set(axes) <= set("xyz"):
-            raise InputError(f"Bone “{self.name}” has rotation mode “{self.rotation_mode}” and axes {axes}; "
-                             f"use a mode of {', '.join(ROTATION_MODES)} and every axis at most once.")
+            raise InputError(
+                f"Bone “{self.name}” has rotation mode “{self.rotation_mode}” and axes {axes}; "
+                f"use a mode of {', '.join(ROTATION_MODES)} and every axis at most once."
+            )
         if not np.allclose(self.R_rest.T @ self.R_rest, np.eye(3), atol=1e-6) or np.linalg.det(self.R_rest) < 0:
             raise InputError(f"The rest frame of bone “{self.name}” is no rotation; give orthogonal y and z axes.")
 
@@ -122,8 +124,9 @@ class Skeleton:
     def layout(self) -> Layout:
         """The owner of the order of the motion vector."""
         n = len(self.base_dofs)
-        sets: dict[str, list[int]] = dict(motion=list(range(len(self.dofs))), base=list(range(n)),
-                                          rotation=list(range(n, len(self.dofs))), twist=[])
+        sets: dict[str, list[int]] = dict(
+            motion=list(range(len(self.dofs))), base=list(range(n)), rotation=list(range(n, len(self.dofs))), twist=[]
+        )
         for i, dof in enumerate(self.dofs[n:], n):
             sets.setdefault(dof.name.rpartition(" ")[0], []).append(i)
             if dof.axis == "y":

@@ -66,14 +66,21 @@ def body_skin(shape: BodyShape, motion: np.ndarray, settings: SkinSettings | Non
         local = np.einsum("vi,vij->vj", found - head[rays.bone], R[rays.bone])
         weights.append(chain_weights(shape, segments, rays, local))
         first += len(rays.bone)
-    skin = Skin(vertices_m=np.concatenate(vertices), faces=np.concatenate(faces), weights=np.concatenate(weights),
-                bone_names=tuple(bone.name for bone in shape.skeleton.bones), part_sizes=tuple(map(len, vertices)),
-                normals=np.concatenate(normals), rays=settings.rays)
+    skin = Skin(
+        vertices_m=np.concatenate(vertices),
+        faces=np.concatenate(faces),
+        weights=np.concatenate(weights),
+        bone_names=tuple(bone.name for bone in shape.skeleton.bones),
+        part_sizes=tuple(map(len, vertices)),
+        normals=np.concatenate(normals),
+        rays=settings.rays,
+    )
     return skin if settings.detail == 1 and settings.patches == INTERPOLATING else refined(skin, settings.detail, settings.patches)
 
 
-def _surface(shape: BodyShape, parts: tuple[Part, ...], index: int, R: np.ndarray, head: np.ndarray,
-             rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+def _surface(
+    shape: BodyShape, parts: tuple[Part, ...], index: int, R: np.ndarray, head: np.ndarray, rays: Rays
+) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and normals (V, 3) of one part."""
     if len(parts) > 1:
         rho, normals = part_root(shape, parts, index, R, head, rays)

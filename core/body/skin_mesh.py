@@ -18,10 +18,14 @@ class SkinSettings:
     rays: int = knob(32, "Points on each contour (an even number).", low=8, high=400)
     cap_contours: int = knob(5, "Contours that close each end of the limb.", low=2, high=100)
     detail: int = knob(1, "Pieces of each mesh between contours and points, by B-spline patches; 1: the points alone.", low=1, high=16)
-    patches: str = knob(INTERPOLATING, "B-spline patches go through the points, or approximate them and shrink a little.",
-                        choices=(INTERPOLATING, APPROXIMATING))
-    anatomy: bool = knob(True, "Heads, hands and feet as people have them, with jaw, fingers, heel and toes, not the three balls that "
-                               "were fitted.")
+    patches: str = knob(
+        INTERPOLATING,
+        "B-spline patches go through the points, or approximate them and shrink a little.",
+        choices=(INTERPOLATING, APPROXIMATING),
+    )
+    anatomy: bool = knob(
+        True, "Heads, hands and feet as people have them, with jaw, fingers, heel and toes, not the three balls that were fitted."
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -38,8 +38,14 @@ def body_parts(shape: BodyShape) -> tuple[Part, ...]:
         attachment = int(skeleton.parents[first])
         while attachment >= 0 and attachment not in owner:
             attachment = int(skeleton.parents[attachment])
-        parts.append(Part(bones=tuple(chain), junction=_junction(shape, chain), parent=owner.get(attachment),
-                          attachment=attachment if attachment >= 0 else None))
+        parts.append(
+            Part(
+                bones=tuple(chain),
+                junction=_junction(shape, chain),
+                parent=owner.get(attachment),
+                attachment=attachment if attachment >= 0 else None,
+            )
+        )
         owner |= {bone: len(parts) - 1 for bone in chain}
     return tuple(parts)
 

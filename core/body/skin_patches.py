@@ -39,8 +39,15 @@ def refined(skin: Skin, detail: int, mode: str = INTERPOLATING) -> Skin:
         faces.append(first + chain_faces(len(points), skin.rays * detail))
         sizes.append(len(points))
         begin, first = begin + size, first + len(points)
-    return Skin(vertices_m=np.concatenate(vertices), normals=np.concatenate(normals), weights=np.concatenate(weights),
-                faces=np.concatenate(faces), bone_names=skin.bone_names, part_sizes=tuple(sizes), rays=skin.rays * detail)
+    return Skin(
+        vertices_m=np.concatenate(vertices),
+        normals=np.concatenate(normals),
+        weights=np.concatenate(weights),
+        faces=np.concatenate(faces),
+        bone_names=skin.bone_names,
+        part_sizes=tuple(sizes),
+        rays=skin.rays * detail,
+    )
 
 
 def control_net(net: np.ndarray, mode: str = INTERPOLATING) -> np.ndarray:

@@ -58,8 +58,9 @@ def _net_uv(net: Net) -> np.ndarray:
     return np.concatenate([ends[0], sides, ends[1]])
 
 
-def cut(vertices: np.ndarray, weights: np.ndarray, part: np.ndarray, faces: np.ndarray, uv: np.ndarray, detail: int
-        ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def cut(
+    vertices: np.ndarray, weights: np.ndarray, part: np.ndarray, faces: np.ndarray, uv: np.ndarray, detail: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Every quad in detail × detail: values linear between its corners, part (V,) of the nearest.
 
     Vertices (V, 3), weights (V, B), faces (F, 4), uv (F, 4, 2).

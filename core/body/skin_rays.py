@@ -89,12 +89,24 @@ def segments_of(shape: BodyShape, chain: Sequence[int], R: np.ndarray, head: np.
         widest = balls.radii_m[balls.bone_index == b][:, [0, 2]].max()
         ahead = chain[i + 1] if i + 1 < len(chain) else None
         beyond, aside = _tips(shape, b) if ahead is None else (0.0, np.zeros(3))
-        segments.append(Segment(
-            bone=b, head=head[b], y=y, e1=R[b] @ across, length=float(shape.lengths_m[b]), radius=RADIUS_OF_L * widest,
-            reach=reach, delta=delta,
-            k_head=_bend(y, R[chain[i - 1], :, 1], -1) if i else np.zeros(3),
-            k_tail=_bend(y, R[ahead, :, 1], 1) if ahead is not None else np.zeros(3), first=i == 0, last=ahead is None,
-            beyond=beyond, aside=R[b] @ aside))
+        segments.append(
+            Segment(
+                bone=b,
+                head=head[b],
+                y=y,
+                e1=R[b] @ across,
+                length=float(shape.lengths_m[b]),
+                radius=RADIUS_OF_L * widest,
+                reach=reach,
+                delta=delta,
+                k_head=_bend(y, R[chain[i - 1], :, 1], -1) if i else np.zeros(3),
+                k_tail=_bend(y, R[ahead, :, 1], 1) if ahead is not None else np.zeros(3),
+                first=i == 0,
+                last=ahead is None,
+                beyond=beyond,
+                aside=R[b] @ aside,
+            )
+        )
     return segments
 
 
@@ -134,7 +146,7 @@ def cast(segments: list[Segment], settings: SkinSettings) -> Rays:
         inset = min(CAP_START * segment.radius / segment.length, DEEPEST_CAP)
         start, stop = inset if segment.first else 0.0, 1 - inset if segment.last else 1.0
         stop = segment.beyond if segment.beyond > 1 else stop
-        fraction = np.linspace(start, stop, settings.contours + 1)[0 if segment.first else 1:]
+        fraction = np.linspace(start, stop, settings.contours + 1)[0 if segment.first else 1 :]
         if segment.first:
             rise = _cap_angles(segment, settings)
             parts.append(_contours(segment, np.full(len(rise), start), -rise[::-1], settings))
@@ -167,8 +179,13 @@ def _contours(segment: Segment, fraction: np.ndarray, rise: np.ndarray, settings
     reach = np.where(rise[:, None] == 0, reach, np.maximum(reach, CAP_START * segment.radius + segment.length / 2))
     bent = np.maximum(fraction - BENT_FROM, 0.0) / (segment.beyond - BENT_FROM) if segment.beyond > 1 else 0 * fraction
     origin = segment.head + a[:, None, None] * segment.y + bent[:, None, None] * segment.aside + 0 * u
-    return Rays(origin=origin.reshape(-1, 3), direction=u.reshape(-1, 3), reach=reach.ravel(), bone=np.full(u[..., 0].size, segment.bone),
-                 station=np.repeat(a, settings.rays))
+    return Rays(
+        origin=origin.reshape(-1, 3),
+        direction=u.reshape(-1, 3),
+        reach=reach.ravel(),
+        bone=np.full(u[..., 0].size, segment.bone),
+        station=np.repeat(a, settings.rays),
+    )
 
 
 def smooth(v: np.ndarray) -> np.ndarray:

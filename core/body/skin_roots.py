@@ -57,8 +57,9 @@ def limb_normals(shape: BodyShape, R: np.ndarray, head: np.ndarray, rays: Rays, 
     return _unit(-field_and_derivatives(shape.metaballs, shape.lengths_m, R, head, vertices_m, active)[1])
 
 
-def part_root(shape: BodyShape, parts: tuple[Part, ...], index: int, R: np.ndarray, head: np.ndarray,
-              rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+def part_root(
+    shape: BodyShape, parts: tuple[Part, ...], index: int, R: np.ndarray, head: np.ndarray, rays: Rays
+) -> tuple[np.ndarray, np.ndarray]:
     """ρ (V,) of (2) on the rays of part `index`, and the outward normals of (1) there (V, 3); bone after bone."""
     rho, normals = np.empty(len(rays.bone)), np.empty((len(rays.bone), 3))
     for bone in parts[index].bones:
@@ -197,22 +198,31 @@ def _log(F: np.ndarray) -> np.ndarray:
     return np.asarray(np.log(np.maximum(F, NOTHING) / THRESHOLD))
 
 
-def _joined_field(shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays,
-                  own: np.ndarray) -> _JoinedField:
+def _joined_field(
+    shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays, own: np.ndarray
+) -> _JoinedField:
     neighbours, balls, part = shape.skeleton.neighbours, shape.metaballs, parts[index]
     k = part.bones.index(bone)
-    chains = [part.bones[max(k - 1, 0):k + 2], *_adjacent(parts, index, bone)]
+    chains = [part.bones[max(k - 1, 0) : k + 2], *_adjacent(parts, index, bone)]
     masks = [np.stack([active_balls(balls, neighbours, b) for b in chain]) for chain in chains]
     used = np.flatnonzero(np.concatenate(masks).any(axis=0))
-    own_chain, *others = [(Chain.of(chain, shape.lengths_m, R, head), mask[:, used].astype(np.float64))
-                          for chain, mask in zip(chains, masks)]
+    own_chain, *others = [
+        (Chain.of(chain, shape.lengths_m, R, head), mask[:, used].astype(np.float64)) for chain, mask in zip(chains, masks)
+    ]
     of, radii = balls.bone_index[used], balls.radii_m[used]
     frame = R[of] / radii[:, None, :]
     return _JoinedField(
-        origin=rays.origin[own], direction=rays.direction[own], fade=_fade(part, bone, rays, own, shape.lengths_m, head),
-        weight=balls.weight[used], frame=frame, of_part=np.isin(of, part.bones).astype(np.float64),
+        origin=rays.origin[own],
+        direction=rays.direction[own],
+        fade=_fade(part, bone, rays, own, shape.lengths_m, head),
+        weight=balls.weight[used],
+        frame=frame,
+        of_part=np.isin(of, part.bones).astype(np.float64),
         shift=np.einsum("mi,mij->mj", head[of], frame) + balls.centres_m(shape.lengths_m)[used] / radii,
-        own=own_chain[0], chosen=own_chain[1], others=tuple(others))
+        own=own_chain[0],
+        chosen=own_chain[1],
+        others=tuple(others),
+    )
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -29,8 +29,9 @@ def stout_chain(skeleton: Skeleton, lengths_m: np.ndarray, visible_radii_m: np.n
     return chain if stout[0] and len(chain) > 1 else []
 
 
-def smoothed(balls: Metaballs, skeleton: Skeleton, lengths_m: np.ndarray, chain: list[int], visible_radii_m: np.ndarray,
-             stations: np.ndarray) -> Metaballs:
+def smoothed(
+    balls: Metaballs, skeleton: Skeleton, lengths_m: np.ndarray, chain: list[int], visible_radii_m: np.ndarray, stations: np.ndarray
+) -> Metaballs:
     """The balls with the cross radii of the chain's balls adjusted to its outline. Arguments of all bones, as in `BodyModel`."""
     R, head = bone_frames(skeleton, lengths_m, np.zeros(len(skeleton.dofs)))
     X, bone = _outline(R, head, lengths_m, chain, visible_radii_m, stations)
@@ -39,8 +40,18 @@ def smoothed(balls: Metaballs, skeleton: Skeleton, lengths_m: np.ndarray, chain:
     return with_radii_for(balls, mine, lengths_m, R, head, X, active, np.full(len(X), VISIBLE), np.ones(len(X)))
 
 
-def with_radii_for(balls: Metaballs, mine: np.ndarray, lengths_m: np.ndarray, R: np.ndarray, head: np.ndarray, xyz_m: np.ndarray,
-                   active: np.ndarray, root: np.ndarray, weight: np.ndarray, free: float = FREE) -> Metaballs:
+def with_radii_for(
+    balls: Metaballs,
+    mine: np.ndarray,
+    lengths_m: np.ndarray,
+    R: np.ndarray,
+    head: np.ndarray,
+    xyz_m: np.ndarray,
+    active: np.ndarray,
+    root: np.ndarray,
+    weight: np.ndarray,
+    free: float = FREE,
+) -> Metaballs:
     """The balls with the cross radii of `mine` (K,) such that √(−½ ln F) is `root` (N,) at points (N, 3), with weights (N,).
 
     `active` (N, M) as in `metaballs.field`. ln l keeps its value ± `free`; Gauss-Newton steps of 0.2 at most.
@@ -61,8 +72,9 @@ def with_radii_for(balls: Metaballs, mine: np.ndarray, lengths_m: np.ndarray, R:
     return balls
 
 
-def _outline(R: np.ndarray, head: np.ndarray, lengths_m: np.ndarray, chain: list[int], visible_radii_m: np.ndarray,
-             stations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _outline(
+    R: np.ndarray, head: np.ndarray, lengths_m: np.ndarray, chain: list[int], visible_radii_m: np.ndarray, stations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) of the outline in front, behind and at the sides at rest, and their bones (N,)."""
     axis, base = R[chain[0]][:, 1], head[chain[0]]
     first = [(head[b] - base) @ axis for b in chain]

@@ -90,7 +90,7 @@ def welded(skin: Skin, parts: tuple[Part, ...], surface: WholeSurface) -> Welded
                 nets[trunk], loops[i] = _block_out(sewing, nets[trunk], nets[i], of_others[i, nets[trunk].rings] < 1)
         for i, loop in loops.items():
             nets[i], ring = _sewn_on(sewing, nets[i], loop, of_others[i])
-            sewing.settle(surface, ring[len(loop):-len(loop)], i)
+            sewing.settle(surface, ring[len(loop) : -len(loop)], i)
             joined.append(ring)
     return _compact(sewing, parts, nets, np.concatenate([np.zeros(0, dtype=np.int64), *joined]), len(skin.vertices_m))
 
@@ -148,8 +148,10 @@ def _crotch(sewing: _Sewing, net: Net, level: int, ends: tuple[int, int]) -> np.
     half = net.rings.shape[1] // 2
     at = np.linspace(0, run[-1], half + 1)[1:-1]
     shares = sewing.shares(path)
-    return sewing.added(np.stack([np.interp(at, run, places[:, k]) for k in range(3)], axis=1),
-                        np.stack([np.interp(at, run, shares[:, b]) for b in range(shares.shape[1])], axis=1))
+    return sewing.added(
+        np.stack([np.interp(at, run, places[:, k]) for k in range(3)], axis=1),
+        np.stack([np.interp(at, run, shares[:, b]) for b in range(shares.shape[1])], axis=1),
+    )
 
 
 def _block_out(sewing: _Sewing, net: Net, limb: Net, inside: np.ndarray) -> tuple[Net, np.ndarray]:
@@ -167,8 +169,12 @@ def _block_out(sewing: _Sewing, net: Net, limb: Net, inside: np.ndarray) -> tupl
     across, along = (column + np.arange(a + 1)) % rays, row + np.arange(b + 1)
     kept = net.kept.copy()
     kept[np.ix_(along[:-1], across[:-1])] = False
-    border = [net.rings[row, across[:-1]], net.rings[along[:-1], across[-1]], net.rings[row + b, across[:0:-1]],
-              net.rings[along[:0:-1], across[0]]]
+    border = [
+        net.rings[row, across[:-1]],
+        net.rings[along[:-1], across[-1]],
+        net.rings[row + b, across[:0:-1]],
+        net.rings[along[:0:-1], across[0]],
+    ]
     return Net(rings=net.rings, poles=net.poles, kept=kept), np.concatenate(border)
 
 
@@ -201,16 +207,27 @@ def _compact(sewing: _Sewing, parts: tuple[Part, ...], nets: list[Net], sewn: np
     number = np.cumsum(used) - 1
     made = np.zeros(sewing.count, dtype=bool)
     made[sewn] = made[before:] = True
-    renumbered = tuple(Net(rings=np.where(used[net.rings], number[net.rings], -1), kept=net.kept,
-                           poles=(_of(number, net.poles[0]), _of(number, net.poles[1]))) for net in nets)
+    renumbered = tuple(
+        Net(
+            rings=np.where(used[net.rings], number[net.rings], -1),
+            kept=net.kept,
+            poles=(_of(number, net.poles[0]), _of(number, net.poles[1])),
+        )
+        for net in nets
+    )
     part = np.zeros(sewing.count, dtype=np.int64)
     for p in reversed(range(len(nets))):  # trunks last: a limb's first ring is theirs
         part[nets[p].rings] = p
         trunk = parts[p].parent
         part[nets[p].rings[0]] = p if trunk is None else trunk
         part[[pole for pole in nets[p].poles if pole is not None]] = p
-    return Welded(vertices_m=np.concatenate(sewing.places)[used], weights=np.concatenate(sewing.weights)[used], nets=renumbered,
-                  part=part[used], sewn=made[used])
+    return Welded(
+        vertices_m=np.concatenate(sewing.places)[used],
+        weights=np.concatenate(sewing.weights)[used],
+        nets=renumbered,
+        part=part[used],
+        sewn=made[used],
+    )
 
 
 def _of(number: np.ndarray, pole: int | None) -> int | None:

@@ -41,7 +41,7 @@ class WholeSurface:
 
     def of_others(self, points: np.ndarray) -> np.ndarray:
         """At points (N, 3), for each part (N, P): the field there of what it grows out of, without its own balls, over that of its own."""
-        return np.concatenate([self._of_others(points[i:i + CHUNK]) for i in range(0, len(points), CHUNK)])
+        return np.concatenate([self._of_others(points[i : i + CHUNK]) for i in range(0, len(points), CHUNK)])
 
     def _of_others(self, points: np.ndarray) -> np.ndarray:
         terms = self._terms(points)[1]
@@ -110,8 +110,9 @@ class WholeSurface:
         own = np.einsum("nm,nm->n", terms, own_factors)
         return own + fade * (G - own), own_factors + fade[:, None] * (factors - own_factors)
 
-    def _together(self, trunk: int, limbs: Sequence[tuple[int, ...]], points: np.ndarray, terms: np.ndarray
-                  ) -> tuple[np.ndarray, np.ndarray]:
+    def _together(
+        self, trunk: int, limbs: Sequence[tuple[int, ...]], points: np.ndarray, terms: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(1) for a trunk and the bones of its limbs."""
         counted = self._factors(self._parts[trunk].bones, points)
         M = np.maximum(np.einsum("nm,nm->n", terms, counted), NOTHING)
@@ -122,8 +123,12 @@ class WholeSurface:
             limb = self._factors(bones, points)
             both = np.minimum(counted, limb)
             C = np.einsum("nm,nm->n", terms, both)[:, None]
-            found, balls = joined(terms, s[:, None] * both + C * slope, s[:, None] * (counted - both) + (M[:, None] - C) * slope,
-                                  limb - s[:, None] * both - C * slope)
+            found, balls = joined(
+                terms,
+                s[:, None] * both + C * slope,
+                s[:, None] * (counted - both) + (M[:, None] - C) * slope,
+                limb - s[:, None] * both - C * slope,
+            )
             excess[i], of_excess[i] = np.maximum(found - G, NOTHING), balls - factors
         E = (excess**TOGETHER).sum(axis=0) ** (1 / TOGETHER) if len(limbs) else np.zeros(len(points))
         return G + E, factors + np.einsum("ln,lnm->nm", (excess / np.maximum(E, NOTHING)) ** (TOGETHER - 1), of_excess)

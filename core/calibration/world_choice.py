@@ -76,6 +76,8 @@ def frame_of_clicks(cameras: Sequence[Camera], points: Mapping[str, Mapping[str,
     found = forward_intersection(cameras, xy, np.broadcast_to(CLICK_PX**2 * np.eye(2), (3, len(cameras), 2, 2)))
     for point, miss in zip(POINTS, found.rms_residual_px):
         if not miss < 2 * CLICK_PX:
-            raise InputError(f"The clicks of the point “{point}” of the world's frame miss each other by {miss:.0f} px; click the same "
-                             "point in every view.")
+            raise InputError(
+                f"The clicks of the point “{point}” of the world's frame miss each other by {miss:.0f} px; click the same "
+                "point in every view."
+            )
     return frame_of_points(*found.xyz_m)

@@ -55,8 +55,10 @@ def clicks_not_kept(given: FitInput, motion: BodyMotion, sigma_px: float) -> lis
         return []
     told = ", ".join(sentence for _, sentence in sorted(found, reverse=True)[:MOST_TOLD])
     more = f" and {len(found) - MOST_TOLD} more" if len(found) > MOST_TOLD else ""
-    return [f"The body does not lie where it was clicked: {told}{more}. Look at those clicks and at the pictures of the body; clicks in "
-            "frames between help."]
+    return [
+        f"The body does not lie where it was clicked: {told}{more}. Look at those clicks and at the pictures of the body; clicks in "
+        "frames between help."
+    ]
 
 
 def limits_not_kept(given: FitInput, motion: BodyMotion) -> list[str]:
@@ -67,10 +69,15 @@ def limits_not_kept(given: FitInput, motion: BodyMotion) -> list[str]:
     beyond = np.maximum(values - high, low - values)
     beyond[:, skeleton.layout.set("base")] = 0.0  # a place, no angle
     worst = np.argsort(-beyond.max(axis=0), kind="stable")
-    told = [f"{skeleton.dofs[d].name} by up to {beyond[:, d].max():.0f}° (frame {motion.frames[int(beyond[:, d].argmax())]})"
-            for d in worst if beyond[:, d].max() > BEYOND_LIMIT_DEG]
+    told = [
+        f"{skeleton.dofs[d].name} by up to {beyond[:, d].max():.0f}° (frame {motion.frames[int(beyond[:, d].argmax())]})"
+        for d in worst
+        if beyond[:, d].max() > BEYOND_LIMIT_DEG
+    ]
     if not told:
         return []
     more = f" and {len(told) - MOST_TOLD} more" if len(told) > MOST_TOLD else ""
-    return [f"Joints are bent further than they can: {', '.join(told[:MOST_TOLD])}{more}. The limb may have been taken for another way "
-            "round: click its joints in such a frame, or widen the angle under [body.limits]."]
+    return [
+        f"Joints are bent further than they can: {', '.join(told[:MOST_TOLD])}{more}. The limb may have been taken for another way "
+        "round: click its joints in such a frame, or widen the angle under [body.limits]."
+    ]

@@ -1,6 +1,6 @@
 """Weak smoothness over time: every DOF's acceleration is zero within a sigma.
 
-    a_t = 2/(h1 + h2) · ((θ_{t+1} − θ_t)/h2 − (θ_t − θ_{t−1})/h1) = 0 ± σ ,   h1, h2: the times between the three frames
+a_t = 2/(h1 + h2) · ((θ_{t+1} − θ_t)/h2 − (θ_t − θ_{t−1})/h1) = 0 ± σ ,   h1, h2: the times between the three frames
 """
 
 from dataclasses import dataclass

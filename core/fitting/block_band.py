@@ -28,9 +28,15 @@ class NormalEquations:
     def empty(frames: int, motion: int, shape: int) -> "NormalEquations":
         """All zeros."""
         D, S = motion, shape
-        return NormalEquations(diagonal=np.zeros((frames, D, D)), next1=np.zeros((max(frames - 1, 0), D, D)),
-                               next2=np.zeros((max(frames - 2, 0), D, D)), border=np.zeros((frames, D, S)), corner=np.zeros((S, S)),
-                               g=np.zeros((frames, D)), h=np.zeros(S))
+        return NormalEquations(
+            diagonal=np.zeros((frames, D, D)),
+            next1=np.zeros((max(frames - 1, 0), D, D)),
+            next2=np.zeros((max(frames - 2, 0), D, D)),
+            border=np.zeros((frames, D, S)),
+            corner=np.zeros((S, S)),
+            g=np.zeros((frames, D)),
+            h=np.zeros(S),
+        )
 
     def hold(self, motion: np.ndarray) -> None:
         """Take some of the D unknowns (K,) out of every frame: they keep their values. Their variance in the inverse is 1."""
@@ -71,8 +77,15 @@ class NormalEquations:
 def reversed_in_time(equations: NormalEquations) -> NormalEquations:
     """The same equations with the last frame first."""
     e = equations
-    return NormalEquations(diagonal=e.diagonal[::-1], next1=e.next1[::-1].transpose(0, 2, 1), next2=e.next2[::-1].transpose(0, 2, 1),
-                           border=e.border[::-1], corner=e.corner, g=e.g[::-1], h=e.h)
+    return NormalEquations(
+        diagonal=e.diagonal[::-1],
+        next1=e.next1[::-1].transpose(0, 2, 1),
+        next2=e.next2[::-1].transpose(0, 2, 1),
+        border=e.border[::-1],
+        corner=e.corner,
+        g=e.g[::-1],
+        h=e.h,
+    )
 
 
 def eliminated(equations: NormalEquations, frames: int) -> NormalEquations:
@@ -92,8 +105,9 @@ def eliminated(equations: NormalEquations, frames: int) -> NormalEquations:
         g[t + 1 : t + 3] -= (below @ free).reshape(2, D)
         corner -= border[t].T @ shape
         h -= border[t].T @ free
-    return NormalEquations(diagonal=A[frames:], next1=C[frames:], next2=e.next2[frames:], border=border[frames:], corner=corner,
-                           g=g[frames:], h=h)
+    return NormalEquations(
+        diagonal=A[frames:], next1=C[frames:], next2=e.next2[frames:], border=border[frames:], corner=corner, g=g[frames:], h=h
+    )
 
 
 class Factor:

@@ -28,8 +28,14 @@ STATURE_SIGMA = 0.07  # relative, of a person about the model
 CLICKS_OFF_M = 0.02  # of both ends of a length together
 
 
-def proportions(model: BodyModel, lengths_m: np.ndarray, located: np.ndarray, clicked_sigma: float, own_sigma: float,
-                stature_sigma: float = STATURE_SIGMA) -> Proportions:
+def proportions(
+    model: BodyModel,
+    lengths_m: np.ndarray,
+    located: np.ndarray,
+    clicked_sigma: float,
+    own_sigma: float,
+    stature_sigma: float = STATURE_SIGMA,
+) -> Proportions:
     """(1) about the lengths (B,) of a model, when some joints (J,) have places: σ_c, σ_d and σ_g. Lengths that are known fix the size."""
     stature = min(stature_sigma, clicked_sigma)
     of_joints = np.minimum(model.length_sigma, 2 * clicked_sigma)

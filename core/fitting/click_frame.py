@@ -49,10 +49,14 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     support = fit.support(fit.click, points, best.motion[0], best.vector) if best is not None else 0.0
     if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
         if not fit.settings.use_surface:
-            raise InputError(f"Frame {points.frame} has no outlines near the clicked joints, and without a measured surface "
-                             "(fitting.use_surface=false) the body rests on them; give outlines with `tricap contour`.")
-        raise InputError(f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
-                         "rig, or click in a frame where the limb was measured.")
+            raise InputError(
+                f"Frame {points.frame} has no outlines near the clicked joints, and without a measured surface "
+                "(fitting.use_surface=false) the body rests on them; give outlines with `tricap contour`."
+            )
+        raise InputError(
+            f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
+            "rig, or click in a frame where the limb was measured."
+        )
     return _with_lost_limbs(fit, points, best, best_score, parts[-1])
 
 
@@ -70,8 +74,9 @@ def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_
     return best
 
 
-def fit_posture_and_shape(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray,
-                          monitor: Monitor | None = None) -> Solution:
+def fit_posture_and_shape(
+    fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
+) -> Solution:
     """From a motion (D,) and shape (S,) to the points and outlines.
 
     When the residuals stay suspiciously large, again from the posture of the clicks and from others around it; the best supported is kept.

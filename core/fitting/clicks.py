@@ -49,8 +49,9 @@ def read_clicks(rig: Rig, joint_names: Sequence[str], joints: ClickedAt, sigma_p
         cameras += seen
         index += [j] * len(seen)
         xy += list(views.values())
-    found = ClickedJoints(cameras=tuple(cameras), joint=np.array(index, dtype=np.intp), xy_px=np.array(xy).reshape(-1, 2),
-                          sigma_px=sigma_px)
+    found = ClickedJoints(
+        cameras=tuple(cameras), joint=np.array(index, dtype=np.intp), xy_px=np.array(xy).reshape(-1, 2), sigma_px=sigma_px
+    )
     return found, places
 
 
@@ -62,9 +63,11 @@ def enough(xyz_m: np.ndarray, joint_names: Sequence[str], observations: Sequence
     """
     located = [name for name, place in zip(joint_names, xyz_m) if np.isfinite(place).all()]
     if len(located) < 2:
-        raise InputError(f"The body needs at least two of the joints {', '.join(joint_names)} clicked in two views each, "
-                         f"but has {', '.join(located) or 'none'}; click more of them under [seeds.joints], or choose the model under "
-                         "[body] that has those that you clicked.")
+        raise InputError(
+            f"The body needs at least two of the joints {', '.join(joint_names)} clicked in two views each, "
+            f"but has {', '.join(located) or 'none'}; click more of them under [seeds.joints], or choose the model under "
+            "[body] that has those that you clicked."
+        )
     return Clicks(observations=tuple(observations), xyz_m=xyz_m)
 
 
@@ -93,8 +96,10 @@ def _check_agreement(name: str, cameras: Sequence[Camera], xy_px: np.ndarray, X:
     if np.isfinite(error).all() and error.max() < CONTRADICTION * sigma_px:
         return
     worst = _odd_one_out(cameras, xy_px) if len(cameras) > 2 else int(np.argmax(np.nan_to_num(error, nan=np.inf)))
-    raise InputError(f"The clicks on “{name}” contradict each other by up to {np.nan_to_num(error, nan=np.inf).max():.0f} px; "
-                     f"check view {cameras[worst].name} first and click the joint again.")
+    raise InputError(
+        f"The clicks on “{name}” contradict each other by up to {np.nan_to_num(error, nan=np.inf).max():.0f} px; "
+        f"check view {cameras[worst].name} first and click the joint again."
+    )
 
 
 def _odd_one_out(cameras: Sequence[Camera], xy_px: np.ndarray) -> int:

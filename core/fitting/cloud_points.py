@@ -55,8 +55,9 @@ def thinned(cloud: Cloud, voxel_m: float) -> CloudPoints:
         return CloudPoints(frame=int(cloud.frame), xyz_m=xyz, normals=normals, sigma_m=sigma)
     _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     which = which.ravel()
-    mean = [np.stack([np.bincount(which, column) for column in table.T], axis=1) / count[:, None]
-            for table in (xyz, normals, sigma[:, None])]
+    mean = [
+        np.stack([np.bincount(which, column) for column in table.T], axis=1) / count[:, None] for table in (xyz, normals, sigma[:, None])
+    ]
     length = np.linalg.norm(mean[1], axis=1, keepdims=True)
     normals = mean[1] / np.where(length > 0.3, length, np.inf)
     return CloudPoints(frame=int(cloud.frame), xyz_m=mean[0], normals=normals, sigma_m=mean[2][:, 0])

@@ -80,8 +80,13 @@ class Conditions:
         """What is known of the joints in frame index `t`: clicks and keypoints."""
         return [*([self.clicked[t]] if t in self.clicked else []), *self.tracks.observe(t)]
 
-    def surface(self, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0, held: HeldSegments | None = None,
-                ) -> SurfacePoints:
+    def surface(
+        self,
+        points: CloudPoints,
+        state: BodyState,
+        wide: np.ndarray | float = 1.0,
+        held: HeldSegments | None = None,
+    ) -> SurfacePoints:
         """The points near a body's surface, as observations of it; `wide` (B,) or for all multiplies the gate.
 
         Points within one patch share the model's error: the weight of their common part is divided among them (`crowding`).
@@ -99,11 +104,17 @@ class Conditions:
         s = self.settings
         own, model = points.sigma_m[rows] ** 2 + 1e-12, s.model_sigma_m**2
         share = max(1.0, (s.model_patch_m / s.voxel_m) ** 2)
-        return SurfacePoints(xyz_m=points.xyz_m[rows], bone=bone, sigma_m=np.sqrt(own + model),
-                             crowding=(own + share * model) / (own + model) / part, form=s.residual)
+        return SurfacePoints(
+            xyz_m=points.xyz_m[rows],
+            bone=bone,
+            sigma_m=np.sqrt(own + model),
+            crowding=(own + share * model) / (own + model) / part,
+            form=s.residual,
+        )
 
-    def seen_surface(self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0,
-                     held: HeldSegments | None = None) -> list[Observation]:
+    def seen_surface(
+        self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0, held: HeldSegments | None = None
+    ) -> list[Observation]:
         """What the views show of the body's surface in frame index `t`: measured points, and outlines."""
         return [self.surface(points, state, wide, held), *self.silhouettes.observe(t, state, held, wide)]
 
@@ -119,8 +130,14 @@ class Conditions:
     def proportions(self) -> Proportions:
         """What is believed of the bone lengths, against the error that the model has in all frames alike."""
         s, alike = self.settings, np.sqrt(self.frames)
-        return proportions(self.model, self.parameters.template.lengths_m, self.located, s.length_sigma, s.proportion_sigma / alike,
-                           self.stature_sigma / alike)
+        return proportions(
+            self.model,
+            self.parameters.template.lengths_m,
+            self.located,
+            s.length_sigma,
+            s.proportion_sigma / alike,
+            self.stature_sigma / alike,
+        )
 
     def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
         """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the proportions is
@@ -131,19 +148,37 @@ class Conditions:
         of_lengths = self.parameters.layout.set("lengths")
         mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], np.inf)
         radii = self.parameters.template.metaballs.radii_m
-        found: list[Observation] = [ShapePrior(mean=mean, sigma=sigma), self.proportions,
-                                    EqualRadii(sigma=s.roundness_sigma, log_ratio=np.log(radii[:, 0] / radii[:, 2]))]
+        found: list[Observation] = [
+            ShapePrior(mean=mean, sigma=sigma),
+            self.proportions,
+            EqualRadii(sigma=s.roundness_sigma, log_ratio=np.log(radii[:, 0] / radii[:, 2])),
+        ]
         left, right = self.parameters.pairs()
         unlike = np.where(left < self.parameters.n_lengths, 1.0 / np.sqrt(self.frames), FLESH_UNLIKE)
         return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma * unlike)] if len(left) else found
 
-    def problem(self, observe: Callable[[int, BodyState], list[Observation]], free: str | None = None,
-                smoothness: Acceleration | None = None, *, hold_motion: bool = False) -> Problem:
+    def problem(
+        self,
+        observe: Callable[[int, BodyState], list[Observation]],
+        free: str | None = None,
+        smoothness: Acceleration | None = None,
+        *,
+        hold_motion: bool = False,
+    ) -> Problem:
         """An adjustment in which the shape parameters of the set `free` may change, and the motion unless it is held."""
         shape = self.parameters.layout.set(free) if free else NO_SHAPE
         held = np.arange(len(self.model.skeleton.dofs)) if hold_motion else self.model.skeleton.held
-        return Problem(parameters=self.parameters, observe=observe, of_shape=self.of_shape(), free_shape=shape, smoothness=smoothness,
-                       held=held, robust=self.settings.robust, robust_width=self.settings.robust_width, monitor=self.monitor)
+        return Problem(
+            parameters=self.parameters,
+            observe=observe,
+            of_shape=self.of_shape(),
+            free_shape=shape,
+            smoothness=smoothness,
+            held=held,
+            robust=self.settings.robust,
+            robust_width=self.settings.robust_width,
+            monitor=self.monitor,
+        )
 
     def support(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
         """How many points and rays of frame index `t` a body explains: the sum of their weights at a fixed width."""
@@ -159,8 +194,12 @@ class Conditions:
         return self.support(t, points, motion, vector) - 0.5 * float(np.minimum(off**2, MOST_OFF**2).sum())
 
 
-def _hard(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float,
-          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _hard(
+    points: CloudPoints,
+    state: BodyState,
+    surface: np.ndarray,
+    gate_m: np.ndarray | float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `soft_segment`: every point is wholly one limb's."""
     rows, bone = segment(points, state, surface, gate_m)
     return rows, bone, np.ones(len(rows))

@@ -44,8 +44,11 @@ class EmptyViews:
 
     def observe(self, t: int) -> list[EmptySpace]:
         """What is empty in frame index `t`; nothing where that is not known."""
-        views = [Distances(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
-                 for v in self._given if (d := v.of_frame(self._frames[t])) is not None]
+        views = [
+            Distances(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
+            for v in self._given
+            if (d := v.of_frame(self._frames[t])) is not None
+        ]
         if not views:
             return []
         return [EmptySpace(views=views, head=self._head, tail=self._tail, fraction=self._fraction, sigma_px=self._sigma_px)]

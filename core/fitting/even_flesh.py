@@ -36,10 +36,14 @@ def _second_differences(shape: BodyShape) -> np.ndarray:
     balls = shape.metaballs
     if not set(np.bincount(balls.bone_index).tolist()) <= {0, SIMPLE}:
         return np.zeros((0, 2 * len(balls.weight)))
-    places = [(p, part.bones.index(b), balls.centre[m, 1], m) for p, part in enumerate(body_parts(shape))
-              for m, b in enumerate(balls.bone_index.tolist()) if b in part.bones]
+    places = [
+        (p, part.bones.index(b), balls.centre[m, 1], m)
+        for p, part in enumerate(body_parts(shape))
+        for m, b in enumerate(balls.bone_index.tolist())
+        if b in part.bones
+    ]
     line = sorted(places)
-    threes = [[m for *_, m in line[i:i + 3]] for i in range(len(line) - 2) if line[i][0] == line[i + 2][0]]
+    threes = [[m for *_, m in line[i : i + 3]] for i in range(len(line) - 2) if line[i][0] == line[i + 2][0]]
     A = np.zeros((len(threes), 2, len(balls.weight), 2))
     for k, three in enumerate(threes):
         for axis in (0, 1):

@@ -97,8 +97,11 @@ class Stretch:
         found = kept.load(_name(own)) if kept is not None else None
         if found is None or found["around"].tolist() != [around.start, around.stop]:
             return None
-        behind = {way: Behind(known=_handed_over(found, f"{word}.known", way), honest=_handed_over(found, f"{word}.honest", way))
-                  for way, word in WAYS.items() if f"{word}.known.motion" in found}
+        behind = {
+            way: Behind(known=_handed_over(found, f"{word}.known", way), honest=_handed_over(found, f"{word}.honest", way))
+            for way, word in WAYS.items()
+            if f"{word}.known.motion" in found
+        }
         return Stretch(looked=_value(Looked, "looked", found), ended=Ended.loaded(found), behind=behind)
 
 

@@ -155,8 +155,9 @@ class FitInput:
     def __post_init__(self) -> None:
         times = np.asarray(self.time_s, dtype=np.float64)
         if times.shape != (len(self.clouds),) or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise InputError(f"The fit needs a growing time for each of the {len(self.clouds)} frames; "
-                             "check the frame rate and the frames of the take.")
+            raise InputError(
+                f"The fit needs a growing time for each of the {len(self.clouds)} frames; check the frame rate and the frames of the take."
+            )
         object.__setattr__(self, "time_s", frozen(times, times.shape))
         object.__setattr__(self, "frames", [int(f) for f in self.frames or (cloud.frame for cloud in self.clouds)])
         for frame in self.clicks:

@@ -33,8 +33,15 @@ STAGE = "fit frame after frame"
 WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per frame, and at most
 
 
-def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, first: Solution, tracks: MaterialTracks | None,
-           monitor: Monitor, kept: Kept | None = None) -> tuple[np.ndarray, np.ndarray]:
+def follow(
+    fit: Conditions,
+    points: Sequence[CloudPoints],
+    time_s: np.ndarray,
+    first: Solution,
+    tracks: MaterialTracks | None,
+    monitor: Monitor,
+    kept: Kept | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Motion (T, D) of all frames, and where each DOF (T, D) was seen."""
     fit, T = replace(fit, priors=lasting(fit.priors, time_s)), len(points)  # the frame before has said them already
     motion = np.full((T, first.motion.shape[1]), np.nan)
@@ -57,8 +64,17 @@ def follow(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, f
     return way.motion, way.known
 
 
-def _step(fit: Conditions, way: Way, t: int, direction: int, all_points: Sequence[CloudPoints], time_s: np.ndarray, first: Solution,
-          tracks: MaterialTracks | None, monitor: Monitor) -> None:
+def _step(
+    fit: Conditions,
+    way: Way,
+    t: int,
+    direction: int,
+    all_points: Sequence[CloudPoints],
+    time_s: np.ndarray,
+    first: Solution,
+    tracks: MaterialTracks | None,
+    monitor: Monitor,
+) -> None:
     """The posture of frame t from that of the frame before; those before it too, where a click in t tells that they were wrong."""
     motion, seen, points = way.motion, way.seen, all_points[t]
     before = fit.parameters.state(motion[t - direction], first.vector)
@@ -77,8 +93,9 @@ def _step(fit: Conditions, way: Way, t: int, direction: int, all_points: Sequenc
         way.known[t] = _slowing(fit, way.unseen) == 1
 
 
-def _mend(fit: Conditions, way: Way, clicked: int, direction: int, points: Sequence[CloudPoints], first: Solution,
-          monitor: Monitor) -> None:
+def _mend(
+    fit: Conditions, way: Way, clicked: int, direction: int, points: Sequence[CloudPoints], first: Solution, monitor: Monitor
+) -> None:
     """From a clicked frame back over those before it, as long as what comes from there is better than what was found."""
     motion, wide = way.motion, np.ones(len(fit.model.skeleton.bones))
     for t in range(clicked - direction, fit.click, -direction):
@@ -137,8 +154,17 @@ def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, di
     return [] if steps is None else [StepsFromFixed(steps=steps, other=before, backwards=direction < 0)]
 
 
-def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[StepsFromFixed], predictions: list[np.ndarray], first: Solution,
-                  last_support: float | None, wide: np.ndarray, monitor: Monitor) -> tuple[np.ndarray, float | None]:
+def _next_posture(
+    fit: Conditions,
+    i: int,
+    points: CloudPoints,
+    moved: list[StepsFromFixed],
+    predictions: list[np.ndarray],
+    first: Solution,
+    last_support: float | None,
+    wide: np.ndarray,
+    monitor: Monitor,
+) -> tuple[np.ndarray, float | None]:
     """The posture (D,) of frame index `i` and its support; None if the frame shows too little, and the posture is the prediction."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
@@ -149,8 +175,14 @@ def _next_posture(fit: Conditions, i: int, points: CloudPoints, moved: list[Step
         prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
 
         def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
-            return [*fit.seen_surface(i, points, state, wide, held), *fit.joints(i), *fit.empty.observe(i), *moved, prior,
-                    *fit.beliefs(state)]
+            return [
+                *fit.seen_surface(i, points, state, wide, held),
+                *fit.joints(i),
+                *fit.empty.observe(i),
+                *moved,
+                prior,
+                *fit.beliefs(state),
+            ]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales, monitor=monitor)
         found = solution.motion[0], first.vector

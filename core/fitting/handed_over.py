@@ -70,8 +70,17 @@ class Tied:
             self.beside.add_to(equations, motion)
 
 
-def hand_over(problem: Problem, solution: Solution, own: range, beside: HandedOver | None, time_s: np.ndarray, sigma: np.ndarray, *,
-              ahead: bool, understated: Scales | None = None) -> HandedOver:
+def hand_over(
+    problem: Problem,
+    solution: Solution,
+    own: range,
+    beside: HandedOver | None,
+    time_s: np.ndarray,
+    sigma: np.ndarray,
+    *,
+    ahead: bool,
+    understated: Scales | None = None,
+) -> HandedOver:
     """What the `own` frames of an adjusted stretch, and those `beside` it, say of the two frames ahead of them or before them.
 
     `time_s` (T,) are the times of the stretch's frames, `sigma` (D,) those of accelerations, `understated` as in `linearise`.

@@ -33,9 +33,13 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
     """
     vector = parameters.vector()
     start = coarse_posture(parameters, clicks)
-    problem = Problem(parameters=parameters, observe=lambda t, state: [*clicks.observations, *priors],
-                      of_shape=[lengths], free_shape=parameters.layout.set("lengths"),
-                      held=parameters.skeleton.held)
+    problem = Problem(
+        parameters=parameters,
+        observe=lambda t, state: [*clicks.observations, *priors],
+        of_shape=[lengths],
+        free_shape=parameters.layout.set("lengths"),
+        held=parameters.skeleton.held,
+    )
     return solve(problem, start[None], vector, steps=STEPS)
 
 
@@ -59,8 +63,10 @@ def clicked_stature(parameters: ShapeParameters, clicks: Clicks, priors: list[Ob
 
 def trunk_joints(skeleton: Skeleton) -> list[str]:
     """The joints that keep their places in the trunk: those of the first bone and of the bones on it that turn by little."""
-    stiff = [not b or max((abs(limit) for dof in bone.dofs for limit in dof.limits), default=0.0) <= LITTLE
-             for b, bone in enumerate(skeleton.bones)]
+    stiff = [
+        not b or max((abs(limit) for dof in bone.dofs for limit in dof.limits), default=0.0) <= LITTLE
+        for b, bone in enumerate(skeleton.bones)
+    ]
     for b, p in enumerate(skeleton.parents):
         stiff[b] = stiff[b] and (p < 0 or stiff[p])
     return list(dict.fromkeys(j for bone, s in zip(skeleton.bones, stiff) if s for j in (bone.head_joint, bone.tail_joint)))
@@ -88,8 +94,14 @@ def posture_as_clicked(parameters: ShapeParameters, xyz_m: np.ndarray, motion: n
     return _towards(skeleton, parameters.state(motion, vector).lengths_m, xyz_m, motion, trunk_joints(skeleton), [])
 
 
-def _towards(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, motion: np.ndarray, trunk: list[str], known: list[int],
-             ) -> np.ndarray:
+def _towards(
+    skeleton: Skeleton,
+    lengths: np.ndarray,
+    xyz_m: np.ndarray,
+    motion: np.ndarray,
+    trunk: list[str],
+    known: list[int],
+) -> np.ndarray:
     """Limb after limb the best on a grid of the DOFs that move its tail towards its place (J, 3); the base brings the joints `known` to
     theirs."""
     names, located = list(skeleton.joint_names), np.isfinite(xyz_m).all(axis=1)
@@ -169,16 +181,22 @@ def lasting(priors: list[Observation], time_s: np.ndarray) -> list[Observation]:
     """
     step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else LASTS_S
     frames = min(max(1.0, LASTS_S / step), float(len(time_s)))
-    return [replace(p, sigma=np.where(p.sigma <= FIRM, p.sigma, p.sigma * np.sqrt(frames))) if isinstance(p, MotionPrior) else p
-            for p in priors]
+    return [
+        replace(p, sigma=np.where(p.sigma <= FIRM, p.sigma, p.sigma * np.sqrt(frames))) if isinstance(p, MotionPrior) else p for p in priors
+    ]
 
 
 def _movers(skeleton: Skeleton, bone: int) -> np.ndarray:
     """DOFs that move a bone's tail but not its head: its own across the bone, and its parent's twist."""
     n = len(skeleton.base_dofs)
-    return np.array([i for i, dof in enumerate(skeleton.dofs[n:], n)
-                     if (skeleton.dof_bone[i] == bone and dof.axis != "y")
-                     or (skeleton.dof_bone[i] == skeleton.parents[bone] and dof.axis == "y")], dtype=np.intp)
+    return np.array(
+        [
+            i
+            for i, dof in enumerate(skeleton.dofs[n:], n)
+            if (skeleton.dof_bone[i] == bone and dof.axis != "y") or (skeleton.dof_bone[i] == skeleton.parents[bone] and dof.axis == "y")
+        ],
+        dtype=np.intp,
+    )
 
 
 def _values(skeleton: Skeleton, dof: int) -> np.ndarray:

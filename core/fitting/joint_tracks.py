@@ -25,8 +25,10 @@ class JointTracks:
         self._frames, self._rig = given.frames, given.rig
         step = float(np.median(np.diff(given.time_s))) if len(given.time_s) > 1 else LASTS_S
         self._crowding = max(1.0, LASTS_S / step)
-        self._tables = [(table, np.array([self._names.index(j) if j in self._names else -1 for j in table.joint], dtype=np.intp))
-                        for table in given.keypoints]
+        self._tables = [
+            (table, np.array([self._names.index(j) if j in self._names else -1 for j in table.joint], dtype=np.intp))
+            for table in given.keypoints
+        ]
 
     def stretch(self, frames: Sequence[int]) -> "JointTracks":
         """Those of some of the frames."""
@@ -46,11 +48,22 @@ class JointTracks:
                 xy.append(table.place[rows])
                 sigma.append(table.sigma[rows])
             else:
-                found.append(Keypoints(joint=joint[rows], xyz_m=table.place[rows], sigma_m=table.sigma[rows], kind="keypoints",
-                                       crowding=self._crowding))
+                found.append(
+                    Keypoints(
+                        joint=joint[rows], xyz_m=table.place[rows], sigma_m=table.sigma[rows], kind="keypoints", crowding=self._crowding
+                    )
+                )
         if cameras:
-            found.append(ClickedJoints(cameras=tuple(cameras), joint=np.concatenate(index), xy_px=np.concatenate(xy),
-                                       sigma_px=np.concatenate(sigma), kind="keypoints", crowding=self._crowding))
+            found.append(
+                ClickedJoints(
+                    cameras=tuple(cameras),
+                    joint=np.concatenate(index),
+                    xy_px=np.concatenate(xy),
+                    sigma_px=np.concatenate(sigma),
+                    kind="keypoints",
+                    crowding=self._crowding,
+                )
+            )
         return found
 
     def located(self, t: int) -> np.ndarray:
@@ -77,6 +90,8 @@ class JointTracks:
         return int(np.argmax([np.isfinite(self.located(t)).all(axis=1).sum() for t in range(len(self._frames))]))
 
     def _rows(self, t: int) -> list[tuple[JointPlaces, np.ndarray, np.ndarray]]:
-        rows = [(table, joint, np.flatnonzero((table.frame == self._frames[t]) & (joint >= 0) & np.isfinite(table.place).all(axis=1)))
-                for table, joint in self._tables]
+        rows = [
+            (table, joint, np.flatnonzero((table.frame == self._frames[t]) & (joint >= 0) & np.isfinite(table.place).all(axis=1)))
+            for table, joint in self._tables
+        ]
         return [row for row in rows if len(row[2])]

@@ -36,8 +36,9 @@ class LimbsApart:
         near = np.flatnonzero(away < radius[bone].min(axis=1) + radius[other].max(axis=1) + NEAR_M)
         if not len(near):
             return []
-        found = Apart(bone=bone[near], fraction=fraction[near], other=other[near], radius_m=SOFT * radius[bone[near]].min(axis=1),
-                      sigma_m=SIGMA_M)
+        found = Apart(
+            bone=bone[near], fraction=fraction[near], other=other[near], radius_m=SOFT * radius[bone[near]].min(axis=1), sigma_m=SIGMA_M
+        )
         return [found.scaled(state)]
 
 

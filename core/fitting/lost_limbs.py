@@ -30,8 +30,9 @@ def lost_limbs(fit: Conditions, counts: np.ndarray) -> list[np.ndarray]:
     return [outer[b] for b in lost if int(fit.model.skeleton.parents[b]) not in lost]
 
 
-def found_again(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray,
-                monitor: Monitor | None = None) -> list[np.ndarray]:
+def found_again(
+    fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
+) -> list[np.ndarray]:
     """Postures (D,) in which limbs explain points that nothing else does; none where there are too few such points.
 
     At most one for each limb; each includes those before it. First the limbs without points; then, from the hands and feet inwards, those
@@ -58,8 +59,9 @@ def found_again(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector
     return found
 
 
-def _found(fit: Conditions, points: CloudPoints, rows: np.ndarray, limb: np.ndarray, now: np.ndarray, vector: np.ndarray,
-           monitor: Monitor) -> np.ndarray | None:
+def _found(
+    fit: Conditions, points: CloudPoints, rows: np.ndarray, limb: np.ndarray, now: np.ndarray, vector: np.ndarray, monitor: Monitor
+) -> np.ndarray | None:
     """The posture (D,) in which a limb explains most of these points; None if it explains too few."""
     kept = now[None]
     for k, (count, spread, width, best) in enumerate(ROUNDS):

@@ -55,15 +55,23 @@ class MaterialTracks:
     def steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
         """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`; None: not yet known)."""
         rows, sigma = self._pairs[t]
-        found = [self._held.get((t, i), state, partial(self._limbs, i, rows, sigma, state))
-                 for i, state in ((t, a), (t + 1, b)) if state is not None]
+        found = [
+            self._held.get((t, i), state, partial(self._limbs, i, rows, sigma, state))
+            for i, state in ((t, a), (t + 1, b))
+            if state is not None
+        ]
         keep = np.flatnonzero((found[0] >= 0) & (found[0] == found[-1]))
         if not len(keep):
             return None
         own, skin = sigma[keep] ** 2 + 1e-12, self._settings.track_sigma_m**2
         share = max(1.0, (self._settings.model_patch_m / SPACING_M) ** 2)
-        return MaterialSteps(from_m=self._xyz[t][rows[keep]], to_m=self._xyz[t + 1][rows[keep]], bone=found[0][keep],
-                             sigma_m=np.sqrt(own + skin), crowding=np.repeat((own + share * skin) / (own + skin), 3))
+        return MaterialSteps(
+            from_m=self._xyz[t][rows[keep]],
+            to_m=self._xyz[t + 1][rows[keep]],
+            bone=found[0][keep],
+            sigma_m=np.sqrt(own + skin),
+            crowding=np.repeat((own + share * skin) / (own + skin), 3),
+        )
 
     def forget(self) -> None:
         """Ask anew whose each point is: what comes next shall not depend on what was asked before."""

@@ -141,8 +141,14 @@ def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarr
 
 def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scales:
     """By how much the weights understate variances (`robust.variance_factor`)."""
-    return Scales(**{kind: variance_factor(np.concatenate(r) / scales.of(kind), problem.robust, problem.robust_width)
-                     * max(1.0, scales.of(kind) / LARGEST_SCALE.get(kind, np.inf)) ** 2 for kind, r in lin.residuals.items() if r})
+    return Scales(
+        **{
+            kind: variance_factor(np.concatenate(r) / scales.of(kind), problem.robust, problem.robust_width)
+            * max(1.0, scales.of(kind) / LARGEST_SCALE.get(kind, np.inf)) ** 2
+            for kind, r in lin.residuals.items()
+            if r
+        }
+    )
 
 
 def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, before: Scales) -> Scales:
@@ -221,8 +227,9 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
         e.h[s] -= g[S]
 
 
-def _free_columns(problem: Problem, motion: int, w: np.ndarray | float, rows: np.ndarray, columns: np.ndarray,
-                  J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _free_columns(
+    problem: Problem, motion: int, w: np.ndarray | float, rows: np.ndarray, columns: np.ndarray, J: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted transpose (c, n), columns (c,) and J (n, c) of a block without the shape parameters that are held."""
     if len(columns) and columns[-1] >= motion and len(problem.free_shape) < len(problem.place_of_shape):
         place = np.where(columns < motion, columns, motion + problem.place_of_shape[np.maximum(columns - motion, 0)])

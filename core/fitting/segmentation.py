@@ -52,7 +52,6 @@ class HeldSegments:
             self._held[key] = (now, find())
         return self._held[key][1]
 
-
     def made(self, key: Hashable, found: Any) -> Any:
         """What was kept for `key` as made of just this `found`; None if that has changed."""
         known = self._made.get(key)

@@ -86,9 +86,16 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
         tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
     motion, known = follow(fit, points, given.time_s, first, tracks, monitor, kept)
     sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
-    every = Recording(fit=fit, frames=given.frames, points=points, time_s=given.time_s, sigma=sigma, tracks=tracks,
-                      lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
-                      feet=_standing(fit, motion, first.vector, given.time_s))
+    every = Recording(
+        fit=fit,
+        frames=given.frames,
+        points=points,
+        time_s=given.time_s,
+        sigma=sigma,
+        tracks=tracks,
+        lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
+        feet=_standing(fit, motion, first.vector, given.time_s),
+    )
     if len(points) <= AT_ONCE:
         return _at_once(every, motion, first.vector, monitor)
     return _in_stretches(every, motion, first.vector, monitor, kept)
@@ -123,8 +130,17 @@ def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: 
     if part.fit.settings.balls == "complete":
         part = replace(part, fit=_completed(part.fit, solutions[0].vector))
         problem = _whole_sequence(part)
-        solutions.append(solve(problem, solutions[0].motion, part.fit.parameters.vector(), steps=steps, scales=solutions[0].scales,
-                               monitor=monitor, stage="refine the complete model"))
+        solutions.append(
+            solve(
+                problem,
+                solutions[0].motion,
+                part.fit.parameters.vector(),
+                steps=steps,
+                scales=solutions[0].scales,
+                monitor=monitor,
+                stage="refine the complete model",
+            )
+        )
     return part, problem, solutions
 
 
@@ -169,8 +185,9 @@ def _postures(every: Recording, motion: np.ndarray, shape: FoundShape, monitor: 
     return joined([done.pop(start) for start in sorted(done)]), ends
 
 
-def _stretch(every: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: FoundShape, behind: Behind,
-             monitor: Monitor) -> Stretch:
+def _stretch(
+    every: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: FoundShape, behind: Behind, monitor: Monitor
+) -> Stretch:
     """One of `outwards`, from a motion (T, D) of all frames, with what the stretches behind handed over."""
     own, around, direction = place
     part = every.stretch(around, motion, shape.vector)
@@ -182,9 +199,16 @@ def _stretch(every: Recording, place: tuple[range, range, int], motion: np.ndarr
     covariance = _covariance(_whole_sequence(part, behind.honest), solution, factors, shape.covariance)
     told = partial(hand_over, problem, solution, local, time_s=part.time_s, sigma=part.sigma)
     ways = [way for way in ({1, -1} if direction == 0 else {direction}) if (own.stop < len(motion) if way > 0 else own.start > 0)]
-    return Stretch(looked=_looked(part, solution, covariance, local), ended=Ended.of(solution),
-                   behind={way: Behind(known=told(beside=behind.known, ahead=way > 0),
-                                       honest=told(beside=behind.honest, ahead=way > 0, understated=factors)) for way in ways})
+    return Stretch(
+        looked=_looked(part, solution, covariance, local),
+        ended=Ended.of(solution),
+        behind={
+            way: Behind(
+                known=told(beside=behind.known, ahead=way > 0), honest=told(beside=behind.honest, ahead=way > 0, understated=factors)
+            )
+            for way in ways
+        },
+    )
 
 
 def _standing(fit: Conditions, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
@@ -222,12 +246,24 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
     shape = scaled_shape(shape, stature)
     parameters = ShapeParameters(shape, settings.weights)
-    return Conditions(cameras=given.rig.cameras, model=model, parameters=parameters, settings=settings, clicks=clicks,
-                      click=begin, priors=priors, clicked=clicked, places=places, tracks=tracks, stature_sigma=stature_sigma,
-                      frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
-                      located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
-                      silhouettes=Silhouettes(given, model.surface, settings), empty=EmptyViews(given, parameters, settings),
-                      limbs=LimbsApart(model.skeleton, shape.metaballs.bone_index))
+    return Conditions(
+        cameras=given.rig.cameras,
+        model=model,
+        parameters=parameters,
+        settings=settings,
+        clicks=clicks,
+        click=begin,
+        priors=priors,
+        clicked=clicked,
+        places=places,
+        tracks=tracks,
+        stature_sigma=stature_sigma,
+        frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
+        located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
+        silhouettes=Silhouettes(given, model.surface, settings),
+        empty=EmptyViews(given, parameters, settings),
+        limbs=LimbsApart(model.skeleton, shape.metaballs.bone_index),
+    )
 
 
 def _best_known(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
@@ -251,14 +287,24 @@ def _whole_sequence(every: Recording, beside: HandedOver | None = None) -> Probl
     held = HeldSegments()
 
     def observe(t: int, state: BodyState) -> list[Observation]:
-        return [*fit.seen_surface(t, points[t], state, held=held), *fit.joints(t), *fit.empty.observe(t), *priors,
-                *fit.limbs.observe(state), *(feet.observe(t) if feet is not None else [])]
+        return [
+            *fit.seen_surface(t, points[t], state, held=held),
+            *fit.joints(t),
+            *fit.empty.observe(t),
+            *priors,
+            *fit.limbs.observe(state),
+            *(feet.observe(t) if feet is not None else []),
+        ]
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=every.time_s, sigma=every.sigma))
     if beside is not None:
         problem = replace(problem, smoothness=Tied(acceleration=Acceleration(time_s=every.time_s, sigma=every.sigma), beside=beside))
-    return replace(problem, of_shape=fit.of_shape(every.lengths), of_shape_weight=_shared_weight(points, fit.settings),
-                   observe_step=None if every.tracks is None else every.tracks.steps)
+    return replace(
+        problem,
+        of_shape=fit.of_shape(every.lengths),
+        of_shape_weight=_shared_weight(points, fit.settings),
+        observe_step=None if every.tracks is None else every.tracks.steps,
+    )
 
 
 def _shared_weight(points: Sequence[CloudPoints], settings: FitSettings) -> float:
@@ -271,8 +317,9 @@ def _shared_weight(points: Sequence[CloudPoints], settings: FitSettings) -> floa
     return (own + frames * model) / (own + model)
 
 
-def _begun_anew(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem,
-                monitor: Monitor) -> Solution:
+def _begun_anew(
+    fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem, monitor: Monitor
+) -> Solution:
     """The solution, or that from where frames with suspicious residuals stand between the others, if it explains more of those frames."""
     sigma0 = np.array([_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
     strange = np.flatnonzero(_strange(sigma0))
@@ -281,10 +328,19 @@ def _begun_anew(fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarr
         return solution
     start = solution.motion.copy()
     start[strange] = np.stack([np.interp(time_s[strange], time_s[good], column) for column in start[good].T], axis=1)
-    again = solve(problem, start, solution.vector, steps=fit.settings.sequence_steps, scales=solution.scales, monitor=monitor,
-                  stage="adjust the sequence")
-    more = sum(fit.support(t, points[t], again.motion[t], again.vector) - fit.support(t, points[t], solution.motion[t], solution.vector)
-               for t in strange.tolist())
+    again = solve(
+        problem,
+        start,
+        solution.vector,
+        steps=fit.settings.sequence_steps,
+        scales=solution.scales,
+        monitor=monitor,
+        stage="adjust the sequence",
+    )
+    more = sum(
+        fit.support(t, points[t], again.motion[t], again.vector) - fit.support(t, points[t], solution.motion[t], solution.vector)
+        for t in strange.tolist()
+    )
     return again if more > 0 else solution
 
 
@@ -318,24 +374,47 @@ def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, n
         counts[0, i] = np.bincount(fit.surface(points[t], state).bone, minlength=B)
         counts[1, i] = fit.evidence(t, points[t], state)
         outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
-    return Looked(values=solution.motion[frames], covariance=pose[frames], joints_m=joints, joint_sigma_m=joint_sigma, sigma0=sigma0,
-                  points=counts[0], evidence=counts[1], outline_m=np.concatenate(outline))
+    return Looked(
+        values=solution.motion[frames],
+        covariance=pose[frames],
+        joints_m=joints,
+        joint_sigma_m=joint_sigma,
+        sigma0=sigma0,
+        points=counts[0],
+        evidence=counts[1],
+        outline_m=np.concatenate(outline),
+    )
 
 
 def _result(every: Recording, looked: Looked, vector: np.ndarray, covariance: np.ndarray, ends: Sequence[Ended]) -> BodyFit:
     """The body of all frames, with the shape vector (S,) of a covariance (S, S), and how the adjustments ended."""
     fit, skeleton = every.fit, every.fit.model.skeleton
     vector, covariance = evened(fit.parameters, vector, covariance, fit.settings.evenness_sigma)
-    motion = BodyMotion(frames=np.array(every.frames), time_s=every.time_s, dof_names=skeleton.dof_names, values=looked.values,
-                        covariance=looked.covariance, joint_names=skeleton.joint_names, joints_m=looked.joints_m,
-                        joint_sigma_m=looked.joint_sigma_m, status=_statuses(fit, looked.evidence, looked.sigma0), sigma0=looked.sigma0)
-    return BodyFit(shape=fit.parameters.shape(vector, np.sqrt(np.diag(covariance))), motion=motion,
-                   iterations=max(end.iterations for end in ends), converged=all(end.converged for end in ends), points=looked.points,
-                   outline_m=looked.outline_m)
+    motion = BodyMotion(
+        frames=np.array(every.frames),
+        time_s=every.time_s,
+        dof_names=skeleton.dof_names,
+        values=looked.values,
+        covariance=looked.covariance,
+        joint_names=skeleton.joint_names,
+        joints_m=looked.joints_m,
+        joint_sigma_m=looked.joint_sigma_m,
+        status=_statuses(fit, looked.evidence, looked.sigma0),
+        sigma0=looked.sigma0,
+    )
+    return BodyFit(
+        shape=fit.parameters.shape(vector, np.sqrt(np.diag(covariance))),
+        motion=motion,
+        iterations=max(end.iterations for end in ends),
+        converged=all(end.converged for end in ends),
+        points=looked.points,
+        outline_m=looked.outline_m,
+    )
 
 
-def _covariance(problem: Problem, solution: Solution, understated: Scales,
-                shape: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _covariance(
+    problem: Problem, solution: Solution, understated: Scales, shape: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Blocks of the covariance: pose (T, D, D), pose with shape (T, D, S), shape (S, S); the last may be given."""
     lin = linearise(problem, solution.motion, solution.vector, solution.scales, understated)
     pose, mixed, shape = lin.equations.covariance(shape)

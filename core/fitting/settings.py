@@ -12,10 +12,14 @@ class FitSettings:
     """How the body is fitted to clouds and clicks."""
 
     method: str = knob("joint", "At the click frame: pose and radii together, or in turns as published.", choices=("joint", "alternating"))
-    residual: str = knob("metric", "Surface residual: metric (root of the logarithm) or the paper's field difference.",
-                         choices=("metric", "paper"))
-    balls: str = knob("three", "Metaballs of a bone: three; one, to compare; complete: three, then refined in an anatomical arrangement.",
-                      choices=("three", "one", "complete"))
+    residual: str = knob(
+        "metric", "Surface residual: metric (root of the logarithm) or the paper's field difference.", choices=("metric", "paper")
+    )
+    balls: str = knob(
+        "three",
+        "Metaballs of a bone: three; one, to compare; complete: three, then refined in an anatomical arrangement.",
+        choices=("three", "one", "complete"),
+    )
     segmentation: str = knob("hard", "A point belongs to its nearest limb, or in parts to several.", choices=("hard", "soft"))
     weights: bool = knob(False, "The balls' weights are parameters of the fit too: edges can be sharper or rounder.")
     robust: str = knob("geman-mcclure", "How gross points lose their weight.", choices=("geman-mcclure", "huber"))
@@ -23,13 +27,16 @@ class FitSettings:
     voxel_m: float = knob(0.008, "Points are averaged in voxels of this size.", unit="m", low=0.001, high=0.1)
     model_sigma_m: float = knob(0.004, "What a real body differs from its metaballs.", unit="m", low=0.0, high=0.05)
     model_patch_m: float = knob(0.06, "Points within a patch of this size share the model's error.", unit="m", low=0.0, high=0.5)
-    use_surface: bool = knob(True, "Let measured points attract the body; without them the fit rests on outlines and keypoints alone, and "
-                                   "nothing is measured for it.")
+    use_surface: bool = knob(
+        True,
+        "Let measured points attract the body; without them the fit rests on outlines and keypoints alone, and nothing is measured for it.",
+    )
     use_trajectories: bool = knob(True, "Let tracked points hold their places in the limbs: twist, sliding, centres of the joints.")
     track_again: bool = knob(False, "Track once more with the fitted body, which says where and when lost points reappear.")
     track_sigma_m: float = knob(0.001, "How far a tracked point moves on its limb from frame to frame.", unit="m", low=0.0, high=0.05)
-    shared_frames: float = knob(1.0, "Over how many frames the model errs alike; beliefs of the shape weigh as much more (balls=one: all).",
-                                low=1.0, high=1e5)
+    shared_frames: float = knob(
+        1.0, "Over how many frames the model errs alike; beliefs of the shape weigh as much more (balls=one: all).", low=1.0, high=1e5
+    )
     use_contours: bool = knob(True, "Let the views' outlines (tricap contour) be touched by the body.")
     use_background: bool = knob(True, "Keep limbs out of pixels that show the still background (cameras and background must stand still).")
     empty_sigma_px: float = knob(4.0, "How exactly the person's outline is known from the background.", unit="px", low=0.5, high=50.0)
@@ -37,21 +44,34 @@ class FitSettings:
     outline_gate_m: float = knob(0.10, "A ray of an outline further than this from every limb touches none.", unit="m", low=0.005, high=1.0)
     floor: bool = knob(False, "A foot that stands keeps the height that feet have when they stand (world: Z up, a level floor).")
     click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)
-    length_sigma: float = knob(0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.",
-                               low=0.001, high=1.0)
-    proportion_sigma: float = knob(0.04, "Relative sigma of one bone about other people's of that size; all frames count as one.",
-                                   low=0.001, high=1.0)
+    length_sigma: float = knob(
+        0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.", low=0.001, high=1.0
+    )
+    proportion_sigma: float = knob(
+        0.04, "Relative sigma of one bone about other people's of that size; all frames count as one.", low=0.001, high=1.0
+    )
     radius_sigma: float = knob(0.2, "Relative sigma of the model's radii.", low=0.001, high=1.0)
     roundness_sigma: float = knob(0.10, "Relative sigma of the difference of a ball's two cross radii.", low=0.001, high=1.0)
-    evenness_sigma: float = knob(0.4, "Relative sigma of how much thicker than those beside it a ball is, about the model: rings that "
-                                      "nothing proves are evened out after the fit.", low=0.001, high=100.0)
-    symmetry_sigma: float = knob(0.015, "Relative sigma of the difference of a bone's lengths on the left and on the right; all frames "
-                                         "count as one. Of radii it is twice that, in each frame.", low=0.001, high=1.0)
+    evenness_sigma: float = knob(
+        0.4,
+        "Relative sigma of how much thicker than those beside it a ball is, about the model: rings that "
+        "nothing proves are evened out after the fit.",
+        low=0.001,
+        high=100.0,
+    )
+    symmetry_sigma: float = knob(
+        0.015,
+        "Relative sigma of the difference of a bone's lengths on the left and on the right; all frames "
+        "count as one. Of radii it is twice that, in each frame.",
+        low=0.001,
+        high=1.0,
+    )
     limit_sigma_deg: float = knob(2.0, "How softly joint limits hold.", unit="deg", low=0.1, high=30.0)
     prediction_sigma_deg: float = knob(15.0, "Sigma of an angle predicted from the frames before.", unit="deg", low=0.5, high=90.0)
     prediction_sigma_m: float = knob(0.03, "Sigma of a position predicted from the frames before.", unit="m", low=0.001, high=1.0)
-    acceleration_deg_s2: float = knob(6000.0, "Typical angular acceleration, for the adjustment over time.", unit="deg/s²",
-                                      low=1.0, high=1e6)
+    acceleration_deg_s2: float = knob(
+        6000.0, "Typical angular acceleration, for the adjustment over time.", unit="deg/s²", low=1.0, high=1e6
+    )
     acceleration_m_s2: float = knob(5.0, "Typical acceleration of the base, for the adjustment over time.", unit="m/s²", low=0.01, high=1e4)
     frame_steps: int = knob(6, "Most steps of the adjustment of one frame.", low=1, high=100)
     sequence_steps: int = knob(30, "Most steps of the adjustment over the whole sequence.", low=0, high=200)

@@ -52,8 +52,7 @@ class Silhouettes:
         part._frames, part._rays = [self._frames[t] for t in frames], {}
         return part
 
-    def observe(self, t: int, state: BodyState, held: HeldSegments | None = None,
-                wide: np.ndarray | float = 1.0) -> list[SilhouetteRays]:
+    def observe(self, t: int, state: BodyState, held: HeldSegments | None = None, wide: np.ndarray | float = 1.0) -> list[SilhouetteRays]:
         """The rays of frame index `t` that touch a limb of the body near its state; `wide` (B,) or for all multiplies the gate."""
         if t not in self._rays:
             self._rays[t] = self._of_frame(t, state)
@@ -72,31 +71,44 @@ class Silhouettes:
         away = np.linalg.norm(state.head_m[bone] - rays.origin_m[rows], axis=1)
         own, model = (rays.angle[rows] * away) ** 2 + 1e-12, self._settings.model_sigma_m**2
         share = np.maximum(1.0, rays.alike[rows] * OUTLINE_PATCHES * self._settings.model_patch_m / SPACING_M)
-        found = SilhouetteRays(origin_m=rays.origin_m[rows], direction=rays.direction[rows], bone=bone, sigma_m=np.sqrt(own + model),
-                               crowding=(own + share * model) / (own + model))
+        found = SilhouetteRays(
+            origin_m=rays.origin_m[rows],
+            direction=rays.direction[rows],
+            bone=bone,
+            sigma_m=np.sqrt(own + model),
+            crowding=(own + share * model) / (own + model),
+        )
         return [found.scaled(state)]
 
     def _of_frame(self, t: int, state: BodyState) -> Rays | None:
         ahead = np.array([camera.R_cam_world[2] for camera, _ in self._tables]).reshape(-1, 3)
-        parts = [_view_rays(camera, *outline, state.head_m.mean(axis=0), int((ahead @ camera.R_cam_world[2] > ALIKE).sum()))
-                 for camera, table in self._tables if (outline := table.of_frame(self._frames[t])) is not None]
+        parts = [
+            _view_rays(camera, *outline, state.head_m.mean(axis=0), int((ahead @ camera.R_cam_world[2] > ALIKE).sum()))
+            for camera, table in self._tables
+            if (outline := table.of_frame(self._frames[t])) is not None
+        ]
         if not parts:
             return None
-        columns: Mapping[str, np.ndarray] = {name: np.concatenate([getattr(p, name) for p in parts])
-                                             for name in ("origin_m", "direction", "outward", "angle", "alike")}
+        columns: Mapping[str, np.ndarray] = {
+            name: np.concatenate([getattr(p, name) for p in parts]) for name in ("origin_m", "direction", "outward", "angle", "alike")
+        }
         return Rays(**columns)
 
 
-def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: np.ndarray, about_m: np.ndarray,
-               alike: int) -> Rays:
+def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: np.ndarray, about_m: np.ndarray, alike: int) -> Rays:
     """The rays of one view, thinned to `SPACING_M` at a place (3,) of the body; `alike` views show about the same."""
     pixel_m = np.linalg.norm(about_m - camera.centre_m) / camera.focal_px
     gap = np.median(np.linalg.norm(np.diff(xy_px, axis=0), axis=1)) * pixel_m if len(xy_px) > 1 else SPACING_M
     keep = np.arange(0, len(xy_px), max(1, round(SPACING_M / max(gap, 1e-9))))
     direction, beside = (_unit(camera.rays(xy)) for xy in (xy_px[keep], xy_px[keep] + normal[keep]))
     outward = _unit(beside - np.einsum("ni,ni->n", beside, direction)[:, None] * direction)
-    return Rays(origin_m=np.broadcast_to(camera.centre_m, direction.shape), direction=direction, outward=outward,
-                angle=sigma_px[keep] / camera.focal_px, alike=np.full(len(keep), alike))
+    return Rays(
+        origin_m=np.broadcast_to(camera.centre_m, direction.shape),
+        direction=direction,
+        outward=outward,
+        angle=sigma_px[keep] / camera.focal_px,
+        alike=np.full(len(keep), alike),
+    )
 
 
 def _closed(surface: np.ndarray) -> np.ndarray:

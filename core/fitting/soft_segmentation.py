@@ -21,8 +21,9 @@ OUTLIERS = (0.05, 0.5)  # π_0 at the start, and at most
 LEAST_SHARE = 0.05  # what a point gives to a limb; less is not worth its equation
 
 
-def soft_segment(points: CloudPoints, state: BodyState, surface: np.ndarray,
-                 gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def soft_segment(
+    points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of the points (K,), a limb's bone (K,), and which share of the point is the limb's (K,). A row may come several times.
 
     Arguments as in `segmentation.segment`.

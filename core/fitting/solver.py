@@ -37,8 +37,17 @@ class Solution:
     converged: bool
 
 
-def solve(problem: Problem, motion: np.ndarray, vector: np.ndarray, *, steps: int, scales: Scales | None = None,
-          monitor: Monitor | None = None, stage: str = "fit", furthest: float = np.inf) -> Solution:
+def solve(
+    problem: Problem,
+    motion: np.ndarray,
+    vector: np.ndarray,
+    *,
+    steps: int,
+    scales: Scales | None = None,
+    monitor: Monitor | None = None,
+    stage: str = "fit",
+    furthest: float = np.inf,
+) -> Solution:
     """Minimise the problem's cost from a motion (T, D) and a shape vector (S,). Time and memory are linear in frames.
 
     `furthest` [rad, m]: no DOF goes further in one step; `FURTHEST` from a start that may be far off.
@@ -79,8 +88,9 @@ def _at_minimum(lin: Linearised) -> bool:
     return bool(np.isfinite(lin.cost)) and (size < STEP_DONE or gain < COST_DONE * lin.cost)
 
 
-def _accepted_step(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarray,
-                   damping: float, furthest: float) -> tuple[tuple[np.ndarray, np.ndarray, float] | None, float]:
+def _accepted_step(
+    problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarray, damping: float, furthest: float
+) -> tuple[tuple[np.ndarray, np.ndarray, float] | None, float]:
     """The first damped step that does not raise the cost: new motion, new vector, new cost; None if there is none."""
     while damping < LARGEST_DAMPING:
         try:

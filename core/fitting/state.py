@@ -23,7 +23,6 @@ __all__ = ["CROSS", "FIRM", "BodyState", "ShapeParameters", "free_bones", "shape
 FIRM = float(np.radians(20.5))  # a DOF with a prior of a smaller sigma is believed firmly
 
 
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyState:
     """A body in one posture."""
@@ -179,9 +178,21 @@ class ShapeParameters:
     def _states(self, motion: np.ndarray, vector: np.ndarray) -> list[BodyState]:
         lengths, balls = self.body(vector)
         forward = frames_and_axes(self.skeleton, lengths, motion)
-        return [BodyState(skeleton=self.skeleton, lengths_m=lengths, balls=balls, motion=m, parts=self.parts, R=R, head_m=head, axes=axes,
-                          weights=self.weights, find_profiles=partial(self.profiles, vector))
-                for m, R, head, axes in zip(motion, *forward)]
+        return [
+            BodyState(
+                skeleton=self.skeleton,
+                lengths_m=lengths,
+                balls=balls,
+                motion=m,
+                parts=self.parts,
+                R=R,
+                head_m=head,
+                axes=axes,
+                weights=self.weights,
+                find_profiles=partial(self.profiles, vector),
+            )
+            for m, R, head, axes in zip(motion, *forward)
+        ]
 
     def shape(self, vector: np.ndarray, sigma: np.ndarray) -> BodyShape:
         """The body's shape with sigmas, from the vector (S,) and the sigma of its logarithms (S,)."""
@@ -190,9 +201,15 @@ class ShapeParameters:
         length_sigma, radius_sigma = sigma[:n] * lengths, np.empty_like(balls.radii_m)
         radius_sigma[:, CROSS] = sigma[self.layout.set("radii")].reshape(-1, 2) * balls.radii_m[:, CROSS]
         radius_sigma[:, 1] = sigma[balls.bone_index] * balls.radii_m[:, 1]
-        return BodyShape(model=self.template.model, skeleton=self.skeleton, lengths_m=lengths, metaballs=balls,
-                         length_sigma_m=length_sigma, radius_sigma_m=radius_sigma,
-                         weight_sigma=sigma[self.layout.set("weights")] * balls.weight if self.weights else None)
+        return BodyShape(
+            model=self.template.model,
+            skeleton=self.skeleton,
+            lengths_m=lengths,
+            metaballs=balls,
+            length_sigma_m=length_sigma,
+            radius_sigma_m=radius_sigma,
+            weight_sigma=sigma[self.layout.set("weights")] * balls.weight if self.weights else None,
+        )
 
 
 def _names(shape: BodyShape, weights: bool) -> list[str]:
@@ -206,5 +223,6 @@ def _names(shape: BodyShape, weights: bool) -> list[str]:
 
 def _sets(n_lengths: int, n_balls: int, weights: bool) -> dict[str, range]:
     n, last = n_lengths + 2 * n_balls, n_lengths + (3 if weights else 2) * n_balls
-    return dict(lengths=range(n_lengths), radii=range(n_lengths, n), weights=range(n, last), flesh=range(n_lengths, last),
-                shape=range(last))
+    return dict(
+        lengths=range(n_lengths), radii=range(n_lengths, n), weights=range(n, last), flesh=range(n_lengths, last), shape=range(last)
+    )

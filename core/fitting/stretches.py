@@ -41,8 +41,15 @@ class Recording:
         points = [near(self.points[t], state) for t, state in zip(frames, states)]
         if len(frames) == len(self.frames):
             return replace(self, points=points)
-        return replace(self, fit=self.fit.stretch(frames), frames=[self.frames[t] for t in frames], time_s=self.time_s[frames],
-                       points=points, tracks=self.tracks and self.tracks.stretch(frames), feet=self.feet and self.feet.stretch(frames))
+        return replace(
+            self,
+            fit=self.fit.stretch(frames),
+            frames=[self.frames[t] for t in frames],
+            time_s=self.time_s[frames],
+            points=points,
+            tracks=self.tracks and self.tracks.stretch(frames),
+            feet=self.feet and self.feet.stretch(frames),
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,5 +107,8 @@ def outwards(frames: int, click: int) -> list[tuple[range, range, int]]:
     def wide(span: range, before: int, after: int) -> range:
         return range(max(0, span.start - before), min(frames, span.stop + after))
 
-    return [(every[first], wide(every[first], MARGIN, MARGIN), 0), *((span, wide(span, 0, MARGIN), 1) for span in every[first + 1 :]),
-            *((span, wide(span, MARGIN, 0), -1) for span in every[:first][::-1])]
+    return [
+        (every[first], wide(every[first], MARGIN, MARGIN), 0),
+        *((span, wide(span, 0, MARGIN), 1) for span in every[first + 1 :]),
+        *((span, wide(span, MARGIN, 0), -1) for span in every[:first][::-1]),
+    ]

@@ -33,8 +33,14 @@ class Way:
     def arrays(self) -> dict[str, np.ndarray]:
         """As arrays to be kept; unknown support is NaN."""
         support = np.nan if self.support is None else self.support
-        return {"motion": self.motion, "known": self.known, "unseen": self.unseen, "seen": np.array(self.seen, dtype=np.int64),
-                "support": np.array([support]), "done": np.array([self.done])}
+        return {
+            "motion": self.motion,
+            "known": self.known,
+            "unseen": self.unseen,
+            "seen": np.array(self.seen, dtype=np.int64),
+            "support": np.array([support]),
+            "done": np.array([self.done]),
+        }
 
     def goes_on(self, kept: Mapping[str, np.ndarray] | None) -> "Way":
         """What was kept, if it is of these frames, else this."""
@@ -42,5 +48,11 @@ class Way:
         if kept is None or mine != other:
             return self
         support = float(kept["support"][0])
-        return Way(motion=kept["motion"].copy(), known=kept["known"].copy(), unseen=kept["unseen"].copy(), seen=kept["seen"].tolist(),
-                   support=None if np.isnan(support) else support, done=int(kept["done"][0]))
+        return Way(
+            motion=kept["motion"].copy(),
+            known=kept["known"].copy(),
+            unseen=kept["unseen"].copy(),
+            seen=kept["seen"].tolist(),
+            support=None if np.isnan(support) else support,
+            done=int(kept["done"][0]),
+        )

@@ -35,8 +35,13 @@ class Pieces:
 
     def __post_init__(self) -> None:
         m = len(self.source)
-        for name, shape, kind in (("xy_px", (m, 3, 2), np.float64), ("inverse_z", (m, 3), np.float64), ("source", (m,), np.int64),
-                                  ("cut", (m,), np.bool_), ("corner_weights", (m, 3, 3), np.float64)):
+        for name, shape, kind in (
+            ("xy_px", (m, 3, 2), np.float64),
+            ("inverse_z", (m, 3), np.float64),
+            ("source", (m,), np.int64),
+            ("cut", (m,), np.bool_),
+            ("corner_weights", (m, 3, 3), np.float64),
+        ):
             object.__setattr__(self, name, frozen(getattr(self, name), shape, kind, name))
 
     def weights(self, piece: np.ndarray, xy_px: np.ndarray) -> np.ndarray:
@@ -64,8 +69,13 @@ class Raster:
 
     def __post_init__(self) -> None:
         n = len(self.sample)
-        for name, shape, kind in (("x_px", (None,), np.float64), ("y_px", (None,), np.float64), ("sample", (n,), np.int64),
-                                  ("piece", (n,), np.int64), ("depth_m", (n,), np.float64)):
+        for name, shape, kind in (
+            ("x_px", (None,), np.float64),
+            ("y_px", (None,), np.float64),
+            ("sample", (n,), np.int64),
+            ("piece", (n,), np.int64),
+            ("depth_m", (n,), np.float64),
+        ):
             object.__setattr__(self, name, frozen(getattr(self, name), shape, kind, name))
 
     @property
@@ -101,8 +111,15 @@ class Raster:
         return picture
 
 
-def rasterize(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, *, rows: np.ndarray | None = None, factor: int = 1,
-              back_faces: bool = False) -> Raster:
+def rasterize(
+    camera: Camera,
+    vertices_m: np.ndarray,
+    triangles: np.ndarray,
+    *,
+    rows: np.ndarray | None = None,
+    factor: int = 1,
+    back_faces: bool = False,
+) -> Raster:
     """Find the triangle that each sample of the picture shows.
 
     `vertices_m` (V, 3) world, `triangles` (F, 3) counter-clockwise seen from outside. `rows`: increasing full-frame rows to
@@ -204,12 +221,21 @@ def _expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return run, np.arange(len(run)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
-def _nearest(column: np.ndarray, pieces: Pieces, line: np.ndarray, part: np.ndarray, start: np.ndarray, stop: np.ndarray,
-             y_px: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _nearest(
+    column: np.ndarray,
+    pieces: Pieces,
+    line: np.ndarray,
+    part: np.ndarray,
+    start: np.ndarray,
+    stop: np.ndarray,
+    y_px: np.ndarray,
+    width: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The z-buffer: flat sample indices (N,), increasing, with their triangle and depth."""
     along_x, along_y = _depth_slopes(column, pieces)
-    at_start = (pieces.inverse_z[part, 0] + (start - column[part, 0]) * along_x[part]
-                + (y_px[line] - pieces.xy_px[part, 0, 1]) * along_y[part])
+    at_start = (
+        pieces.inverse_z[part, 0] + (start - column[part, 0]) * along_x[part] + (y_px[line] - pieces.xy_px[part, 0, 1]) * along_y[part]
+    )
     span, at = _expand(start, stop - start)
     sample = line[span] * width + at
     inverse_z = at_start[span] + (at - start[span]) * along_x[part[span]]

@@ -99,11 +99,7 @@ def write_rig(path: Path, rig: Rig) -> None:
             lines.append(f"sigma = {{ {', '.join(f'{_key(k)} = {_number(v)}' for k, v in rig.sigmas[camera.name].items())} }}")
         lines.append("")
     lines += ["[metadata]", 'unit = "m"']
-    lines += [
-        f"{_key(k)} = {_value(v)}"
-        for k, v in rig.metadata.items()
-        if k != "unit" and isinstance(v, (str, int, float))
-    ]
+    lines += [f"{_key(k)} = {_value(v)}" for k, v in rig.metadata.items() if k != "unit" and isinstance(v, (str, int, float))]
     store.write_text(Path(path), "\n".join(lines) + "\n")
 
 

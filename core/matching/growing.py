@@ -220,9 +220,7 @@ def _with_seeds(state: "_State", seeds: Front, front: Front) -> Front:
     return cells, start, shape, depth
 
 
-def _front_from(
-    state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts: int, camera: Camera
-) -> Front:
+def _front_from(state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts: int, camera: Camera) -> Front:
     """The next cells to try, their starts and shapes in every view, and the depth that they should continue."""
     cells, parents = _next_front(state, fresh, grid, attempts)
     step = grid.xy(cells) - grid.xy(parents)

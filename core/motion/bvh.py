@@ -138,7 +138,7 @@ def _values(body: str, columns: int, path: Path) -> tuple[np.ndarray, float]:
         values = np.zeros(0)
     if len(values) < frames * columns:
         raise InputError(f"{path} promises {frames} frames of {columns} values but holds {len(values)} good values; export it again.")
-    table = values[:frames * columns].reshape(frames, columns)
+    table = values[: frames * columns].reshape(frames, columns)
     if not np.isfinite(table).all():
         raise InputError(f"{path} holds values that are no finite numbers; export it again.")
     return table, 1.0 / frame_time
@@ -165,8 +165,15 @@ def _motion(joints: list[_Joint], values: np.ndarray, fps: float, unit_m: float 
     scale = unit_m or _unit(np.concatenate([head, tail]) @ turn.T)
     head, tail, place = scale * head @ turn.T, scale * tail @ turn.T, scale * place @ turn.T
     R_rest = shortest(np.array([0.0, 1.0, 0.0]), tail - head)
-    rig = Rig(names=_distinct([joint.name for joint in joints]), parents=parents, R_rest=R_rest, head_m=head, tail_m=tail,
-              connected=np.array([p >= 0 and not _moves(j) for j, p in zip(joints, parents)]), inherits_rotation=np.ones(n, dtype=bool))
+    rig = Rig(
+        names=_distinct([joint.name for joint in joints]),
+        parents=parents,
+        R_rest=R_rest,
+        head_m=head,
+        tail_m=tail,
+        connected=np.array([p >= 0 and not _moves(j) for j, p in zip(joints, parents)]),
+        inherits_rotation=np.ones(n, dtype=bool),
+    )
     return Motion(rig=rig, fps=fps, frames=np.arange(t), R=turn @ R @ turn.T @ R_rest, head_m=place)
 
 
@@ -238,9 +245,14 @@ def write_bvh(path: Path, motion: Motion, *, unit_m: float = 1.0, order: str = "
         offset = head_rest[b] - (head_rest[p] if p >= 0 else 0.0)
         moves = p < 0 or free[b]
         channels = ["Xposition Yposition Zposition"] if moves else []
-        lines.extend([f"{pad}{'JOINT' if depth else 'ROOT'} {(names or {}).get(rig.names[b], rig.names[b]).replace(' ', '_')}", f"{pad}{{",
-                      f"{pad}\tOFFSET {_text(offset)}",
-                      f"{pad}\tCHANNELS {6 if moves else 3} {' '.join([*channels, *(f'{axis}rotation' for axis in order)])}"])
+        lines.extend(
+            [
+                f"{pad}{'JOINT' if depth else 'ROOT'} {(names or {}).get(rig.names[b], rig.names[b]).replace(' ', '_')}",
+                f"{pad}{{",
+                f"{pad}\tOFFSET {_text(offset)}",
+                f"{pad}\tCHANNELS {6 if moves else 3} {' '.join([*channels, *(f'{axis}rotation' for axis in order)])}",
+            ]
+        )
         local = since_rest[:, b] if p < 0 else np.swapaxes(since_rest[:, p], 1, 2) @ since_rest[:, b]
         if moves:
             parent = place[:, b] if p < 0 else np.einsum("tji,tj->ti", since_rest[:, p], place[:, b] - place[:, p])

@@ -62,8 +62,10 @@ def without_gaps(markers: Markers, where: object) -> Markers:
         return markers
     t, n = int(markers.frames[-1] - markers.frames[0]) + 1, len(markers.names)
     if (steps < 1).any() or t * n * 4 > MOST_VALUES:
-        raise InputError(f"{where} cannot be written: C3D needs every frame from the first to the last, and these ({markers.frames[0]} … "
-                         f"{markers.frames[-1]}) do not rise or are too far apart; mend the frame numbers.")
+        raise InputError(
+            f"{where} cannot be written: C3D needs every frame from the first to the last, and these ({markers.frames[0]} … "
+            f"{markers.frames[-1]}) do not rise or are too far apart; mend the frame numbers."
+        )
     xyz, sigma = np.full((t, n, 3), np.nan), np.full((t, n), np.nan)
     rows = markers.frames - markers.frames[0]
     xyz[rows], sigma[rows] = markers.xyz_m, markers.sigma_m
@@ -75,14 +77,22 @@ def _padded(data: bytes) -> bytes:
 
 
 def _parameters(markers: Markers, t: int, n: int, scale: float, unit: str, first: int, last: int, start: int = 0) -> bytes:
-    point: list[tuple[str, Any]] = [("USED", np.uint16(n)), ("FRAMES", np.uint16(min(t, MOST_WORD))), ("DATA_START", np.uint16(start)),
-                                    ("SCALE", np.float32(-scale)), ("RATE", np.float32(markers.fps)), ("UNITS", unit)]
+    point: list[tuple[str, Any]] = [
+        ("USED", np.uint16(n)),
+        ("FRAMES", np.uint16(min(t, MOST_WORD))),
+        ("DATA_START", np.uint16(start)),
+        ("SCALE", np.float32(-scale)),
+        ("RATE", np.float32(markers.fps)),
+        ("UNITS", unit),
+    ]
     for k in range(0, n, BATCH):
         number = "" if k == 0 else str(k // BATCH + 1)
-        point.append((f"LABELS{number}", markers.names[k:k + BATCH]))
-        point.append((f"DESCRIPTIONS{number}", tuple("" for _ in markers.names[k:k + BATCH])))
-    trial: list[tuple[str, Any]] = [("ACTUAL_START_FIELD", np.array([first & 0xFFFF, first >> 16], dtype=np.uint16)),
-             ("ACTUAL_END_FIELD", np.array([last & 0xFFFF, last >> 16], dtype=np.uint16))]
+        point.append((f"LABELS{number}", markers.names[k : k + BATCH]))
+        point.append((f"DESCRIPTIONS{number}", tuple("" for _ in markers.names[k : k + BATCH])))
+    trial: list[tuple[str, Any]] = [
+        ("ACTUAL_START_FIELD", np.array([first & 0xFFFF, first >> 16], dtype=np.uint16)),
+        ("ACTUAL_END_FIELD", np.array([last & 0xFFFF, last >> 16], dtype=np.uint16)),
+    ]
     groups = [("POINT", point), ("ANALOG", [("USED", np.uint16(0))]), ("TRIAL", trial)]
     offset = (int(markers.frames[0]) - first) & 0xFFFFFFFF
     if offset:
@@ -165,7 +175,7 @@ def _read(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Markers:
     begin = (start - 1) * BLOCK
     if begin < BLOCK or begin + t * stride > len(data):
         raise InputError(f"{path} promises {t} frames of {n} points but is too short for them; export it again.")
-    rows = np.frombuffer(data, np.uint8, t * stride, begin).reshape(t, stride)[:, :size * 4 * n].tobytes()
+    rows = np.frombuffer(data, np.uint8, t * stride, begin).reshape(t, stride)[:, : size * 4 * n].tobytes()
     raw = (number.floats(rows) if scale < 0 else np.frombuffer(rows, f"{number.order}i2")).astype(np.float64).reshape(t, n, 4)
     per_unit = metres_per(unit or table.get(("POINT", "UNITS"), "mm") or "mm", path)
     xyz = raw[..., :3] * (1.0 if scale < 0 else scale) * per_unit
@@ -213,9 +223,9 @@ def _read_parameters(data: bytes, at: int, number: _Number, path: Path) -> dict[
         length = abs(length)
         if length == 0 or group == 0:
             break
-        name = data[position + 2:position + 2 + length].decode("ascii", errors="replace").strip().upper()
+        name = data[position + 2 : position + 2 + length].decode("ascii", errors="replace").strip().upper()
         pointer = position + 2 + length
-        step = int(number.words(data[pointer:pointer + 2])[0])
+        step = int(number.words(data[pointer : pointer + 2])[0])
         if group < 0:
             groups[-group] = name
         else:
@@ -223,23 +233,26 @@ def _read_parameters(data: bytes, at: int, number: _Number, path: Path) -> dict[
         if step == 0:
             break
         position = pointer + step
-    return {(groups.get(group, ""), name): value for group, name, where in rows
-            if (value := _read_value(data, where, number, path)) is not None}
+    return {
+        (groups.get(group, ""), name): value for group, name, where in rows if (value := _read_value(data, where, number, path)) is not None
+    }
 
 
 def _read_value(data: bytes, where: int, number: _Number, path: Path) -> Any:
     kind, count = struct.unpack_from("<bB", data, where)
-    shape = list(data[where + 2:where + 2 + count])
+    shape = list(data[where + 2 : where + 2 + count])
     size = int(np.prod(shape)) if shape else 1
     begin = where + 2 + count
     if kind not in (-1, 1, 2, 4) or begin + abs(kind) * size > len(data):
         raise InputError(f"{path} has a parameter that runs over its end; it is damaged, export it again.")
-    raw = data[begin:begin + abs(kind) * size]
+    raw = data[begin : begin + abs(kind) * size]
     if kind == -1:
         if count < 2:
             return raw.decode("utf-8", errors="replace").strip(" \0")
         width = shape[0]
-        return [raw[i * width:(i + 1) * width].decode("utf-8", errors="replace").strip(" \0") for i in range(size // width if width else 0)]
+        return [
+            raw[i * width : (i + 1) * width].decode("utf-8", errors="replace").strip(" \0") for i in range(size // width if width else 0)
+        ]
     if kind == 1:
         return None
     values = number.words(raw) if kind == 2 else number.floats(raw)

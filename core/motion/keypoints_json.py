@@ -17,8 +17,25 @@ import numpy as np
 from ..errors import InputError
 from ..values import check_sparse, frozen
 
-COCO = ("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow",
-        "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
+COCO = (
+    "nose",
+    "left_eye",
+    "right_eye",
+    "left_ear",
+    "right_ear",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_ankle",
+    "right_ankle",
+)
 ARMS = ("Nose", "Neck", "RShoulder", "RElbow", "RWrist", "LShoulder", "LElbow", "LWrist")
 LEGS = ("RHip", "RKnee", "RAnkle", "LHip", "LKnee", "LAnkle")
 FACE, FEET = ("REye", "LEye", "REar", "LEar"), ("LBigToe", "LSmallToe", "LHeel", "RBigToe", "RSmallToe", "RHeel")
@@ -65,8 +82,10 @@ def read_keypoints(paths: Sequence[Path]) -> ImagePoints:
             names = names or given
     counts = {len(person) for _, those in people for person in those if len(person)}
     if len(counts) != 1:
-        raise InputError(f"{paths[0]} and the files beside it hold {'nobody' if not counts else 'people of different kinds'}; "
-                         "give the keypoints of one detector.")
+        raise InputError(
+            f"{paths[0]} and the files beside it hold {'nobody' if not counts else 'people of different kinds'}; "
+            "give the keypoints of one detector."
+        )
     return _followed(people, names or _layout(counts.pop(), paths[0]))
 
 
@@ -89,8 +108,12 @@ def _followed(people: list[tuple[int, list[Person]]], names: tuple[str, ...]) ->
             continue
         best = max(those, key=_size) if before is None else min(those, key=partial(_distance, before=before))
         row[:] = before = np.where(best[:, 2:] > 0, best, np.nan)
-    return ImagePoints(names=names, number=np.array([n for n, _ in people]), xy_px=table[..., :2],
-                       confidence=np.clip(np.nan_to_num(table[..., 2]), 0.0, 1.0))
+    return ImagePoints(
+        names=names,
+        number=np.array([n for n, _ in people]),
+        xy_px=table[..., :2],
+        confidence=np.clip(np.nan_to_num(table[..., 2]), 0.0, 1.0),
+    )
 
 
 def _size(person: Person) -> float:

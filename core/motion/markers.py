@@ -89,7 +89,13 @@ def filled(markers: Markers) -> Markers:
     keep = np.flatnonzero(known.any(axis=0))
     if not len(keep):
         raise InputError("None of the points is ever known; choose a file with points.")
-    xyz = np.stack([np.stack([np.interp(markers.frames, markers.frames[known[:, n]], markers.xyz_m[known[:, n], n, i]) for i in range(3)],
-                             axis=1) for n in keep], axis=1)
-    return Markers(names=tuple(markers.names[n] for n in keep), fps=markers.fps, frames=markers.frames, xyz_m=xyz,
-                   sigma_m=markers.sigma_m[:, keep])
+    xyz = np.stack(
+        [
+            np.stack([np.interp(markers.frames, markers.frames[known[:, n]], markers.xyz_m[known[:, n], n, i]) for i in range(3)], axis=1)
+            for n in keep
+        ],
+        axis=1,
+    )
+    return Markers(
+        names=tuple(markers.names[n] for n in keep), fps=markers.fps, frames=markers.frames, xyz_m=xyz, sigma_m=markers.sigma_m[:, keep]
+    )

@@ -14,8 +14,24 @@ import numpy as np
 from .. import store
 from ..errors import InputError
 
-KINDS = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-         "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+KINDS = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
 LONGEST_HEADER = 65536
 END = b"end_header\n"
 
@@ -151,19 +167,29 @@ def _declare(words: list[str], elements: list[_Element], path: Path) -> None:
     kinds = [KINDS[t] for t in types if t != "list"]
     if types[0] != "list" and len(kinds) == 1 and element.index_list is None:
         element.scalars.append((words[-1], kinds[0]))
-    elif types[0] == "list" and len(kinds) == 2 and element.name == "face" and not element.scalars and element.index_list is None \
-            and all(k[-2] in "iu" for k in kinds):
+    elif (
+        types[0] == "list"
+        and len(kinds) == 2
+        and element.name == "face"
+        and not element.scalars
+        and element.index_list is None
+        and all(k[-2] in "iu" for k in kinds)
+    ):
         element.index_list = (kinds[0], kinds[1])
     else:
-        raise InputError(f"{path} has the property “{words[-1]}” of “{element.name}”, which is not supported;"
-                         " export vertices with plain properties and faces with one list of indices.")
+        raise InputError(
+            f"{path} has the property “{words[-1]}” of “{element.name}”, which is not supported;"
+            " export vertices with plain properties and faces with one list of indices."
+        )
 
 
 def _take(data: bytes, position: int, kind: np.dtype, element: _Element, path: Path) -> tuple[np.ndarray, int]:
     size = element.count * kind.itemsize
     if position + size > len(data):
-        raise InputError(f"{path} ends too early: its header promises {element.count} of “{element.name}”, which do not fit in"
-                         f" {len(data)} bytes; copy or export it again.")
+        raise InputError(
+            f"{path} ends too early: its header promises {element.count} of “{element.name}”, which do not fit in"
+            f" {len(data)} bytes; copy or export it again."
+        )
     return (np.frombuffer(data, kind, element.count, position) if kind.itemsize else np.zeros(element.count, kind)), position + size
 
 
@@ -201,5 +227,5 @@ def _read_mixed_faces(data: bytes, position: int, element: _Element, path: Path)
         position += corners * index_kind.itemsize
     table = np.full((len(faces), max(map(len, faces))), -1, dtype=np.int64)
     for row, face in zip(table, faces, strict=True):
-        row[:len(face)] = face
+        row[: len(face)] = face
     return table, position

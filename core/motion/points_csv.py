@@ -30,8 +30,10 @@ def write_points_csv(path: Path, markers: Markers, *, axes: str = "Z up", unit: 
             if np.isfinite(X).all():
                 text = io.StringIO()
                 csv.writer(text, lineterminator="").writerow([name])
-                rows.append(f"{frame},{frame / markers.fps:.6f},{text.getvalue()},{X[0]:.6f},{X[1]:.6f},{X[2]:.6f},"
-                            f"{'nan' if np.isnan(sigma) else format(sigma, '.6f')}")
+                rows.append(
+                    f"{frame},{frame / markers.fps:.6f},{text.getvalue()},{X[0]:.6f},{X[1]:.6f},{X[2]:.6f},"
+                    f"{'nan' if np.isnan(sigma) else format(sigma, '.6f')}"
+                )
     store.write_text(Path(path), "\n".join(rows) + "\n")
 
 

@@ -62,7 +62,7 @@ def from_run(out: Path) -> Motion:
     if not known.any():
         raise InputError(f"{out / 'motion.csv'} has no frame that was solved; run the fit again.")
     first, last = np.flatnonzero(known)[[0, -1]]
-    frames = table.frames[first:last + 1]
+    frames = table.frames[first : last + 1]
     values = np.stack([np.interp(frames, table.frames[known], column) for column in table.values[known].T], axis=1)
     return body_motion(shape, values, frames, rate(table.frames, table.time_s))
 
@@ -73,6 +73,14 @@ def body_motion(shape: BodyShape, values: np.ndarray, frames: np.ndarray, fps: f
     R_rest, head = bone_frames(skeleton, shape.lengths_m, np.zeros(len(skeleton.dof_names)))
     R, places = bone_frames(skeleton, shape.lengths_m, values)
     names = tuple(bone.name for bone in skeleton.bones)
-    rig = Rig(names=names, parents=skeleton.parents, R_rest=R_rest, head_m=head, tail_m=head + shape.lengths_m[:, None] * R_rest[..., 1],
-              connected=skeleton.starts_at_tail, inherits_rotation=np.ones(len(names), dtype=bool), roles=model_roles(names))
+    rig = Rig(
+        names=names,
+        parents=skeleton.parents,
+        R_rest=R_rest,
+        head_m=head,
+        tail_m=head + shape.lengths_m[:, None] * R_rest[..., 1],
+        connected=skeleton.starts_at_tail,
+        inherits_rotation=np.ones(len(names), dtype=bool),
+        roles=model_roles(names),
+    )
     return Motion(rig=rig, fps=fps, frames=frames, R=R, head_m=places)

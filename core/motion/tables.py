@@ -56,9 +56,11 @@ def write_joints(path: Path, motion: BodyMotion) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    rows = [[frame, f"{time:.6f}", joint, *(f"{c:.6f}" for c in X), f"{sigma:.6f}"]
-            for frame, time, places, sigmas in zip(motion.frames, motion.time_s, motion.joints_m, motion.joint_sigma_m)
-            for joint, X, sigma in zip(motion.joint_names, places, sigmas)]
+    rows = [
+        [frame, f"{time:.6f}", joint, *(f"{c:.6f}" for c in X), f"{sigma:.6f}"]
+        for frame, time, places, sigmas in zip(motion.frames, motion.time_s, motion.joints_m, motion.joint_sigma_m)
+        for joint, X, sigma in zip(motion.joint_names, places, sigmas)
+    ]
     _write(path, JOINT_COLUMNS, rows)
 
 
@@ -70,8 +72,10 @@ def write_motion(path: Path, motion: BodyMotion, skeleton: Skeleton) -> None:
     """
     factor = _to_file(skeleton, motion.dof_names)
     names = ["frame", "time_s", *motion.dof_names, *(f"sigma {name}" for name in motion.dof_names)]
-    rows = [[frame, f"{time:.6f}", *(f"{v:.6f}" for v in np.concatenate([values * factor, sigma * factor]))]
-            for frame, time, values, sigma in zip(motion.frames, motion.time_s, motion.values, motion.sigma)]
+    rows = [
+        [frame, f"{time:.6f}", *(f"{v:.6f}" for v in np.concatenate([values * factor, sigma * factor]))]
+        for frame, time, values, sigma in zip(motion.frames, motion.time_s, motion.values, motion.sigma)
+    ]
     _write(path, names, rows)
 
 
@@ -86,8 +90,9 @@ def read_motion(path: Path, skeleton: Skeleton) -> MotionTable:
     columns = [_column(header, name, path) for name in ("frame", "time_s", *names, *(f"sigma {name}" for name in names))]
     table = np.array([[_number(row[c], path, line) for c in columns] for line, row in enumerate(rows, 2)]).reshape(-1, len(columns))
     d, factor = len(names), _to_file(skeleton, names)
-    return MotionTable(frames=table[:, 0], time_s=table[:, 1], dof_names=names, values=table[:, 2 : 2 + d] / factor,
-                       sigma=table[:, 2 + d :] / factor)
+    return MotionTable(
+        frames=table[:, 0], time_s=table[:, 1], dof_names=names, values=table[:, 2 : 2 + d] / factor, sigma=table[:, 2 + d :] / factor
+    )
 
 
 def read_joints(path: Path) -> JointTable:
@@ -107,8 +112,12 @@ def read_joints(path: Path) -> JointTable:
     frames = sorted(times)
     check_sparse(len(rows), len(frames), len(found), path)
     tables = {joint: np.array([places.get(f, [np.nan] * 4) for f in frames]) for joint, places in found.items()}
-    return JointTable(frames=np.array(frames, dtype=np.int64), time_s=np.array([times[f] for f in frames]),
-                      joints_m={joint: t[:, :3] for joint, t in tables.items()}, sigma_m={joint: t[:, 3] for joint, t in tables.items()})
+    return JointTable(
+        frames=np.array(frames, dtype=np.int64),
+        time_s=np.array([times[f] for f in frames]),
+        joints_m={joint: t[:, :3] for joint, t in tables.items()},
+        sigma_m={joint: t[:, 3] for joint, t in tables.items()},
+    )
 
 
 def _to_file(skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:

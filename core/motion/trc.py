@@ -21,10 +21,14 @@ def write_trc(path: Path, markers: Markers, *, axes: str = "OpenSim", unit: str 
     xyz = markers.xyz_m @ axes_of(axes).T / metres_per(unit, path)
     t, n = xyz.shape[:2]
     rate = f"{markers.fps:.9g}"
-    lines = [f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}", "\t".join(HEADINGS),
-             "\t".join([rate, rate, str(t), str(n), unit, rate, str(markers.frames[0]), str(t)]),
-             "Frame#\tTime\t" + "\t\t\t".join(markers.names) + "\t\t",
-             "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, n + 1) for axis in "XYZ"), ""]
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",
+        "\t".join(HEADINGS),
+        "\t".join([rate, rate, str(t), str(n), unit, rate, str(markers.frames[0]), str(t)]),
+        "Frame#\tTime\t" + "\t\t\t".join(markers.names) + "\t\t",
+        "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, n + 1) for axis in "XYZ"),
+        "",
+    ]
     time = (markers.frames - markers.frames[0]) / markers.fps
     for frame, second, row in zip(markers.frames, time, xyz.reshape(t, -1)):
         lines.append("\t".join([str(frame), f"{second:.6f}", *("" if np.isnan(v) else f"{v:.6f}" for v in row)]))
@@ -82,7 +86,7 @@ def _rate(text: str, path: Path) -> float:
 
 def _row(row: list[str], n: int, path: Path) -> list[float]:
     """Frame number and 3 n coordinates; empty fields are unknown points."""
-    fields = [row[0], *row[2:2 + 3 * n]]
+    fields = [row[0], *row[2 : 2 + 3 * n]]
     fields += [""] * (1 + 3 * n - len(fields))
     try:
         values = [float(text) if text.strip() else np.nan for text in fields]

@@ -42,8 +42,10 @@ def _of_silhouettes(fits: Sequence[SilhouetteFit]) -> list[Row]:
     rows = []
     for view, person in dict.fromkeys((f.view, f.person) for f in fits):
         mine = [f for f in fits if (f.view, f.person) == (view, person)]
-        for name, unit, values in ((f"silhouette of view {view}, IoU with the person's {person}", "", [f.iou for f in mine]),
-                                   (f"outline of view {view} from the body's", "px", [f.distance_px for f in mine])):
+        for name, unit, values in (
+            (f"silhouette of view {view}, IoU with the person's {person}", "", [f.iou for f in mine]),
+            (f"outline of view {view} from the body's", "px", [f.distance_px for f in mine]),
+        ):
             known = [v for v in values if np.isfinite(v)]
             rows += [_row(name, float(np.median(known)), float(np.std(known)), unit, FRAME_TO_FRAME)] if known else []
     return rows

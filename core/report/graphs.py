@@ -50,8 +50,9 @@ def curve_graph(title: str, unit: str, frames: np.ndarray, curves: Mapping[str, 
     return "".join(parts) + "</svg>"
 
 
-def field_graph(title: str, radius: np.ndarray, curves: Mapping[str, np.ndarray], marks: Mapping[str, tuple[float, float]],
-                threshold: float) -> str:
+def field_graph(
+    title: str, radius: np.ndarray, curves: Mapping[str, np.ndarray], marks: Mapping[str, tuple[float, float]], threshold: float
+) -> str:
     """Fields (values 0 to 1) over the radius (N,) from 0, with the threshold w_t as a line, and of each curve in `marks` r_t as a dot on it
     and r_a as a stroke on the axis."""
     high = 2 * HEIGHT
@@ -63,20 +64,26 @@ def field_graph(title: str, radius: np.ndarray, curves: Mapping[str, np.ndarray]
         return TOP + (high - TOP - BOTTOM) * (1 - np.asarray(value))
 
     line = '<line x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}" stroke="{}"/>'
-    parts = [f'<svg viewBox="0 0 {WIDTH} {high}" width="{WIDTH}" height="{high}" xmlns="http://www.w3.org/2000/svg" '
-             'font-family="sans-serif" font-size="11">', f'<text x="{LEFT}" y="15" font-size="13">{html.escape(title)}</text>',
-             line.format(LEFT, WIDTH - 10, y(0), y(0), "#888"), line.format(LEFT, LEFT, y(0), y(1), "#888"),
-             line.format(LEFT, WIDTH - 10, y(threshold), y(threshold), "#bbb"),
-             f'<text x="{LEFT - 6}" y="{y(threshold) + 4:.1f}" text-anchor="end">w_t = {threshold:g}</text>',
-             f'<text x="{WIDTH - 10}" y="{high - 8}" text-anchor="end">r / l</text>']
+    parts = [
+        f'<svg viewBox="0 0 {WIDTH} {high}" width="{WIDTH}" height="{high}" xmlns="http://www.w3.org/2000/svg" '
+        'font-family="sans-serif" font-size="11">',
+        f'<text x="{LEFT}" y="15" font-size="13">{html.escape(title)}</text>',
+        line.format(LEFT, WIDTH - 10, y(0), y(0), "#888"),
+        line.format(LEFT, LEFT, y(0), y(1), "#888"),
+        line.format(LEFT, WIDTH - 10, y(threshold), y(threshold), "#bbb"),
+        f'<text x="{LEFT - 6}" y="{y(threshold) + 4:.1f}" text-anchor="end">w_t = {threshold:g}</text>',
+        f'<text x="{WIDTH - 10}" y="{high - 8}" text-anchor="end">r / l</text>',
+    ]
     parts += [f'<text x="{x(r):.1f}" y="{high - 8}" text-anchor="middle">{r:g}</text>' for r in np.arange(0, radius[-1], 0.25)]
     for i, ((name, curve), stroke) in enumerate(zip(curves.items(), COLOURS)):
         seen, ends = marks[name]
         row = f"{name}: r_t {seen:.3f}, r_a {ends:.3f}"
-        parts += [f'<polyline points="{_points(x(radius), y(curve))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>',
-                  f'<circle cx="{x(seen):.1f}" cy="{y(threshold):.1f}" r="3.5" fill="{stroke}"/>',
-                  line.format(x(ends), x(ends), y(0) - 7, y(0) + 5, stroke),
-                  f'<text x="{WIDTH - 14}" y="{TOP + 14 * (i + 1)}" text-anchor="end" fill="{stroke}">{html.escape(row)}</text>']
+        parts += [
+            f'<polyline points="{_points(x(radius), y(curve))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>',
+            f'<circle cx="{x(seen):.1f}" cy="{y(threshold):.1f}" r="3.5" fill="{stroke}"/>',
+            line.format(x(ends), x(ends), y(0) - 7, y(0) + 5, stroke),
+            f'<text x="{WIDTH - 14}" y="{TOP + 14 * (i + 1)}" text-anchor="end" fill="{stroke}">{html.escape(row)}</text>',
+        ]
     return "".join(parts) + "</svg>"
 
 

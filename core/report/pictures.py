@@ -23,8 +23,9 @@ PANEL_PX = 480
 TAIL_FRAMES = 10
 
 
-def body_over_footage(grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings,
-                      person_px: np.ndarray | None = None) -> np.ndarray:
+def body_over_footage(
+    grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings, person_px: np.ndarray | None = None
+) -> np.ndarray:
     """The skin of one posture, shaded, with its bones and outline, over one view (h, w, 3) uint8. `values` (D,) are the posture's DOFs.
 
     `person_px` (V, 2): the outline of the person in the footage, drawn as well.

@@ -48,8 +48,14 @@ class Silhouettes:
     outlines: Mapping[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
 
 
-def silhouettes_of(footage: Footage, body: BodyFit, settings: SkinSettings, outlines: Mapping[str, Mapping[int, np.ndarray]],
-                   backgrounds: Mapping[str, Background], monitor: Monitor) -> Silhouettes:
+def silhouettes_of(
+    footage: Footage,
+    body: BodyFit,
+    settings: SkinSettings,
+    outlines: Mapping[str, Mapping[int, np.ndarray]],
+    backgrounds: Mapping[str, Background],
+    monitor: Monitor,
+) -> Silhouettes:
     """The agreement of the body with the outlines, and in views without one with what hides the still background.
 
     Raises:
@@ -82,8 +88,12 @@ def by_view(fits: Sequence[SilhouetteFit]) -> dict[str, dict[str, float]]:
     for view in dict.fromkeys(f.view for f in known):
         mine = [f for f in known if f.view == view]
         iou, distance = [f.iou for f in mine], [f.distance_px for f in mine]
-        table[view] = {"iou": round(float(np.median(iou)), 4), "least_iou": round(min(iou), 4),
-                       "distance_px": round(float(np.median(distance)), 3), "frames": len(mine)}
+        table[view] = {
+            "iou": round(float(np.median(iou)), 4),
+            "least_iou": round(min(iou), 4),
+            "distance_px": round(float(np.median(distance)), 3),
+            "frames": len(mine),
+        }
     return table
 
 
@@ -123,8 +133,9 @@ def _agreement(view: str, frame: int, body: np.ndarray, person: np.ndarray, sour
         far = cv2.distanceTransform(edge, cv2.DIST_L2, cv2.DIST_MASK_5)
         largest = max(seen, key=len)
         distance = float(np.median(far[largest[:, 1], largest[:, 0]]))
-    return SilhouetteFit(view=view, frame=frame, iou=float((body & person).sum() / union) if union else np.nan, distance_px=distance,
-                         person=source)
+    return SilhouetteFit(
+        view=view, frame=frame, iou=float((body & person).sum() / union) if union else np.nan, distance_px=distance, person=source
+    )
 
 
 def _filled_holes(mask: np.ndarray) -> np.ndarray:

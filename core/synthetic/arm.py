@@ -113,16 +113,28 @@ def _made_here(folder: Path) -> bool:
 
 def _studio(settings: ArmTakeSettings) -> _Studio:
     rig, shape, noise = arm_rig(settings.width_px), arm_shape(), solid_noise(settings.seed)
-    return _Studio(settings=settings, rig=rig, shape=shape, noise=noise, at_rest=arm_parts(shape, np.zeros(len(shape.skeleton.dof_names))),
-                   backdrops=tuple(paint(camera, [wall(WALL_Y_M)], noise) for camera in rig.cameras))
+    return _Studio(
+        settings=settings,
+        rig=rig,
+        shape=shape,
+        noise=noise,
+        at_rest=arm_parts(shape, np.zeros(len(shape.skeleton.dof_names))),
+        backdrops=tuple(paint(camera, [wall(WALL_Y_M)], noise) for camera in rig.cameras),
+    )
 
 
 def arm_shape() -> BodyShape:
     """The person's true arm."""
     model = read_model("arm.R")
     balls = three_balls(np.array([0, 1]), LENGTHS_M, SEEN_RADII_M)
-    return BodyShape(model=model.name, skeleton=model.skeleton, lengths_m=LENGTHS_M, metaballs=balls, length_sigma_m=np.zeros(2),
-                     radius_sigma_m=np.zeros((len(balls.weight), 3)))
+    return BodyShape(
+        model=model.name,
+        skeleton=model.skeleton,
+        lengths_m=LENGTHS_M,
+        metaballs=balls,
+        length_sigma_m=np.zeros(2),
+        radius_sigma_m=np.zeros((len(balls.weight), 3)),
+    )
 
 
 def arm_motion(time_s: np.ndarray | float) -> np.ndarray:
@@ -130,11 +142,16 @@ def arm_motion(time_s: np.ndarray | float) -> np.ndarray:
     time = np.asarray(time_s, dtype=np.float64)
     swing = 0.5 - 0.5 * np.cos(2 * np.pi * time / SWING_S)  # 0 … 1 … 0
     late = 0.5 - 0.5 * np.cos(2 * np.pi * (time - 0.10) / SWING_S)
-    columns = {"shoulder.R x": SHOULDER_M[0] - 0.010 * swing, "shoulder.R y": SHOULDER_M[1] - 0.008 * late,
-               "shoulder.R z": SHOULDER_M[2] + 0.012 * swing,
-               "shoulder.R flexion": np.radians(14 + 18 * swing), "shoulder.R abduction": np.radians(-14 - 12 * late),
-               "shoulder.R twist": np.radians(34 + 10 * late), "elbow.R flexion": np.radians(24 + 56 * swing),
-               "elbow.R twist": np.radians(-10 + 20 * late)}
+    columns = {
+        "shoulder.R x": SHOULDER_M[0] - 0.010 * swing,
+        "shoulder.R y": SHOULDER_M[1] - 0.008 * late,
+        "shoulder.R z": SHOULDER_M[2] + 0.012 * swing,
+        "shoulder.R flexion": np.radians(14 + 18 * swing),
+        "shoulder.R abduction": np.radians(-14 - 12 * late),
+        "shoulder.R twist": np.radians(34 + 10 * late),
+        "elbow.R flexion": np.radians(24 + 56 * swing),
+        "elbow.R twist": np.radians(-10 + 20 * late),
+    }
     return np.stack([columns[name] + 0 * time for name in arm_shape().skeleton.dof_names], axis=-1)
 
 
@@ -143,17 +160,26 @@ def arm_rig(width_px: int) -> Rig:
     scale = width_px / 768
     cameras = []
     for name, x, y, z, roll, focal, cx, cy, k1, p1, p2 in (
-            ("L", -0.352, 0.035, 0.012, 0.012, 1503.2, 386.1, 284.9, -0.112, 5e-4, -3e-4),
-            ("C", 0.0, 0.0, 0.025, -0.006, 1498.7, 381.7, 290.3, -0.118, 4e-4, -4e-4),
-            ("R", 0.345, 0.028, 0.004, 0.009, 1507.9, 384.6, 282.2, -0.107, 6e-4, -2e-4)):
+        ("L", -0.352, 0.035, 0.012, 0.012, 1503.2, 386.1, 284.9, -0.112, 5e-4, -3e-4),
+        ("C", 0.0, 0.0, 0.025, -0.006, 1498.7, 381.7, 290.3, -0.118, 4e-4, -4e-4),
+        ("R", 0.345, 0.028, 0.004, 0.009, 1507.9, 384.6, 282.2, -0.107, 6e-4, -2e-4),
+    ):
         centre = TARGET_M + np.array([x, y - 1.9, z])
         ahead = (TARGET_M - centre) / np.linalg.norm(TARGET_M - centre)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         R = axis_rotation("z", roll) @ np.stack([right, np.cross(ahead, right), ahead])
         matrix = np.array([[focal * scale, 0, (cx + 0.5) * scale - 0.5], [0, focal * scale, (cy + 0.5) * scale - 0.5], [0, 0, 1]])
-        cameras.append(Camera(name=name, size_px=(width_px, width_px * 3 // 4), matrix=matrix,
-                              distortions=np.array([k1, 0.05, p1, p2, 0.0]), R_cam_world=R, t_cam_world_m=-R @ centre))
+        cameras.append(
+            Camera(
+                name=name,
+                size_px=(width_px, width_px * 3 // 4),
+                matrix=matrix,
+                distortions=np.array([k1, 0.05, p1, p2, 0.0]),
+                R_cam_world=R,
+                t_cam_world_m=-R @ centre,
+            )
+        )
     return Rig(cameras=tuple(cameras), metadata=dict(source=MARK))
 
 
@@ -187,7 +213,7 @@ def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> 
             row &= seen_vertices(camera, scene.vertices_m, scene.normals, layer)
         picture = expose(layers[0], sensor)
         if kept.step == 2:
-            picture[1 - kept.offset::2] = expose(layers[1], sensor)[1 - kept.offset::2]
+            picture[1 - kept.offset :: 2] = expose(layers[1], sensor)[1 - kept.offset :: 2]
         rng = np.random.default_rng([settings.seed, frame, i])
         _write_png(folder / camera.name / f"{frame:04d}.png", digitize(picture, sensor, settings.noise, rng))
     return seen
@@ -206,11 +232,18 @@ def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
     arrays = dict(
         vertices_m=np.array([np.concatenate([p.vertices_m for p in body]) for body in bodies], dtype=np.float32),
         triangles=joined(bodies[0]).triangles.astype(np.int32),
-        textured=textured, visible=np.packbits(visible, axis=1), joints_m=np.stack([joints[name] for name in JOINTS], axis=1),
-        joint_names=np.array([motion_capture_name(name) for name in JOINTS]), time_s=time, motion_values=motion,
+        textured=textured,
+        visible=np.packbits(visible, axis=1),
+        joints_m=np.stack([joints[name] for name in JOINTS], axis=1),
+        joint_names=np.array([motion_capture_name(name) for name in JOINTS]),
+        time_s=time,
+        motion_values=motion,
         dof_names=np.array(shape.skeleton.dof_names),
-        bone_names=np.array([bone.name for bone in shape.skeleton.bones]), lengths_m=shape.lengths_m,
-        radii_m=shape.metaballs.radii_m, ball_bone=shape.metaballs.bone_index)
+        bone_names=np.array([bone.name for bone in shape.skeleton.bones]),
+        lengths_m=shape.lengths_m,
+        radii_m=shape.metaballs.radii_m,
+        ball_bone=shape.metaballs.bone_index,
+    )
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
@@ -220,8 +253,14 @@ def _take_toml(studio: _Studio) -> str:
     settings, rig, shape = studio.settings, studio.rig, studio.shape
     rng = np.random.default_rng([settings.seed, 77])
     joints = joint_positions(shape.skeleton, shape.lengths_m, arm_motion(0.0))
-    lines = ['format = "tricap-take"', "version = 1", f"fps = {settings.fps!r}", f'interlaced = "{settings.interlaced}"',
-             'rig = "rig.toml"', ""]
+    lines = [
+        'format = "tricap-take"',
+        "version = 1",
+        f"fps = {settings.fps!r}",
+        f'interlaced = "{settings.interlaced}"',
+        'rig = "rig.toml"',
+        "",
+    ]
     for camera in rig.cameras:
         lines += ["[[views]]", f'name = "{camera.name}"', f'images = "{camera.name}/*.png"', ""]
     lines += ["[body]", f'model = "{shape.model}"', "", "[seeds]", "frame = 0", "[seeds.joints]"]

@@ -59,16 +59,20 @@ def arm_parts(shape: BodyShape, motion: np.ndarray, rest: Sequence["Part"] | Non
     R, head = bone_frames(shape.skeleton, shape.lengths_m, motion)
     hand = head[-1] + hand @ R[-1].T
     rest_m = (skin.vertices_m, hand) if rest is None else tuple(part.vertices_m for part in rest)
-    return (Part(vertices_m=skin.vertices_m, triangles=skin.triangles, rest_m=rest_m[0], material=CLOTH),
-            Part(vertices_m=hand, triangles=hand_triangles, rest_m=rest_m[1], material=BARE_SKIN))
+    return (
+        Part(vertices_m=skin.vertices_m, triangles=skin.triangles, rest_m=rest_m[0], material=CLOTH),
+        Part(vertices_m=hand, triangles=hand_triangles, rest_m=rest_m[1], material=BARE_SKIN),
+    )
 
 
 def torso_parts(shoulder_m: np.ndarray) -> tuple[Part, ...]:
     """Torso, neck and head of a person whose right shoulder is at `shoulder_m` (3,); they sway with it."""
     parts = []
     for centre, semi_axes, power, n, material in (
-            ((0.150, 0.01, -0.26), (0.225, 0.125, 0.335), 2.5, 96, CLOTH), ((0.150, 0.0, 0.10), (0.058, 0.062, 0.11), 2.0, 32, BARE_SKIN),
-            ((0.150, -0.015, 0.26), (0.075, 0.095, 0.120), 2.0, 40, BARE_SKIN)):
+        ((0.150, 0.01, -0.26), (0.225, 0.125, 0.335), 2.5, 96, CLOTH),
+        ((0.150, 0.0, 0.10), (0.058, 0.062, 0.11), 2.0, 32, BARE_SKIN),
+        ((0.150, -0.015, 0.26), (0.075, 0.095, 0.120), 2.0, 40, BARE_SKIN),
+    ):
         vertices, triangles = superellipsoid(shoulder_m + np.array(centre), np.array(semi_axes), power, n, n)
         parts.append(Part(vertices_m=vertices, triangles=triangles, rest_m=vertices - shoulder_m, material=material))
     return tuple(parts)
@@ -114,8 +118,11 @@ class Scene:
 def joined(parts: Sequence[Part]) -> Scene:
     """All parts as one mesh, each with normals of its own."""
     start = np.cumsum([0, *(len(p.vertices_m) for p in parts)])
-    return Scene(vertices_m=np.concatenate([p.vertices_m for p in parts]),
-                 triangles=np.concatenate([p.triangles + first for p, first in zip(parts, start)]),
-                 normals=np.concatenate([vertex_normals(p.vertices_m, p.triangles) for p in parts]),
-                 rest_m=np.concatenate([p.rest_m for p in parts]), materials=tuple(p.material for p in parts),
-                 owner=np.repeat(np.arange(len(parts)), [len(p.triangles) for p in parts]))
+    return Scene(
+        vertices_m=np.concatenate([p.vertices_m for p in parts]),
+        triangles=np.concatenate([p.triangles + first for p, first in zip(parts, start)]),
+        normals=np.concatenate([vertex_normals(p.vertices_m, p.triangles) for p in parts]),
+        rest_m=np.concatenate([p.rest_m for p in parts]),
+        materials=tuple(p.material for p in parts),
+        owner=np.repeat(np.arange(len(parts)), [len(p.triangles) for p in parts]),
+    )

@@ -1,8 +1,8 @@
 """Filming a scene: what each camera's sensor would have stored, frame after frame, with optics, interlace and noise.
 
-    L = (m + s · noise(X_rest)) · (ambient + (1 − ambient) max(0, n·l))          grey value on the surface, Lambert        (1)
-    μ = offset + gain · (PSF ∗ L)                                              the camera's own gain and offset           (2)
-    σ² = σ_dark² + K μ + 1/12                                                  EMVA 1288's linear model, in grey values   (3)
+L = (m + s · noise(X_rest)) · (ambient + (1 − ambient) max(0, n·l))          grey value on the surface, Lambert        (1)
+μ = offset + gain · (PSF ∗ L)                                              the camera's own gain and offset           (2)
+σ² = σ_dark² + K μ + 1/12                                                  EMVA 1288's linear model, in grey values   (3)
 """
 
 from collections.abc import Sequence

@@ -37,8 +37,10 @@ class CloudScore:
     coverage: float  # share of the textured surface seen by all cameras that has a point within 12 mm
 
     def __str__(self) -> str:
-        return (f"{self.frames} frames of {self.points_per_frame:,.0f} points: median {self.median_mm:.2f} mm, 95 % {self.p95_mm:.2f} mm, "
-                f"≥ 10 mm {self.gross_fraction:.1%}, coverage {self.coverage:.0%}")
+        return (
+            f"{self.frames} frames of {self.points_per_frame:,.0f} points: median {self.median_mm:.2f} mm, 95 % {self.p95_mm:.2f} mm, "
+            f"≥ 10 mm {self.gross_fraction:.1%}, coverage {self.coverage:.0%}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -52,8 +54,10 @@ class TrajectoryScore:
     false_fraction: float  # share of the positions after the first that are 10 mm or more off
 
     def __str__(self) -> str:
-        return (f"{self.trajectories:,} of {self.mean_length_frames:.1f} frames: median {self.median_mm:.2f} mm, 95 % {self.p95_mm:.2f} "
-                f"mm, ≥ 10 mm {self.false_fraction:.1%}")
+        return (
+            f"{self.trajectories:,} of {self.mean_length_frames:.1f} frames: median {self.median_mm:.2f} mm, 95 % {self.p95_mm:.2f} "
+            f"mm, ≥ 10 mm {self.false_fraction:.1%}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,8 +69,11 @@ class JointScore:
     joints_mm: dict[str, float]
 
     def __str__(self) -> str:
-        return (f"mean error {self.mpjpe_mm:.1f} mm, motion {self.motion_rms_mm:.1f} mm rms ("
-                + ", ".join(f"{name} {value:.1f}" for name, value in self.joints_mm.items()) + ")")
+        return (
+            f"mean error {self.mpjpe_mm:.1f} mm, motion {self.motion_rms_mm:.1f} mm rms ("
+            + ", ".join(f"{name} {value:.1f}" for name, value in self.joints_mm.items())
+            + ")"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -136,9 +143,15 @@ def score_run(take: Path, out: Path, monitor: Monitor | None = None) -> Score:
     """
     truth, out, monitor = read_truth(Path(take)), Path(out), monitor or Monitor()
     joints = _read_joints(out / "joints.csv", truth)
-    return Score(clouds=_score_clouds(truth, out, monitor), trajectories=_score_trajectories(truth, out / "trajectories.npz", monitor),
-                 joints=_score_joints(truth, joints), hinges=_score_hinges(truth, joints), angles=_score_angles(truth, out / "motion.csv"),
-                 shape=_score_shape(truth, out / "body.toml"), skin=_score_skin(truth, out, monitor))
+    return Score(
+        clouds=_score_clouds(truth, out, monitor),
+        trajectories=_score_trajectories(truth, out / "trajectories.npz", monitor),
+        joints=_score_joints(truth, joints),
+        hinges=_score_hinges(truth, joints),
+        angles=_score_angles(truth, out / "motion.csv"),
+        shape=_score_shape(truth, out / "body.toml"),
+        skin=_score_skin(truth, out, monitor),
+    )
 
 
 def _meshes(folder: Path, truth: Truth, monitor: Monitor) -> list[tuple[int, Ply]]:
@@ -165,9 +178,14 @@ def _score_clouds(truth: Truth, out: Path, monitor: Monitor) -> CloudScore | Non
         return None
     fine = np.concatenate([d[d < GROSS_MM] for d in distances] + [np.zeros(0)])
     median, p95 = np.percentile(fine, [50, 95]) if len(fine) else (np.nan, np.nan)
-    return CloudScore(frames=len(distances), points_per_frame=float(np.mean([len(d) for d in distances])), median_mm=float(median),
-                      p95_mm=float(p95), gross_fraction=float(np.mean([np.mean(d >= GROSS_MM) for d in distances])),
-                      coverage=float(np.mean(coverage)))
+    return CloudScore(
+        frames=len(distances),
+        points_per_frame=float(np.mean([len(d) for d in distances])),
+        median_mm=float(median),
+        p95_mm=float(p95),
+        gross_fraction=float(np.mean([np.mean(d >= GROSS_MM) for d in distances])),
+        coverage=float(np.mean(coverage)),
+    )
 
 
 def _score_trajectories(truth: Truth, path: Path, monitor: Monitor) -> TrajectoryScore | None:
@@ -190,8 +208,13 @@ def _score_trajectories(truth: Truth, path: Path, monitor: Monitor) -> Trajector
     later = seen & (np.arange(len(frames))[:, None] > seen.argmax(axis=0))
     off = np.linalg.norm((xyz - expected)[later], axis=1) * 1e3
     median, p95 = np.percentile(off, [50, 95]) if len(off) else (np.nan, np.nan)
-    return TrajectoryScore(trajectories=seen.shape[1], mean_length_frames=float(seen.sum(axis=0).mean()), median_mm=float(median),
-                           p95_mm=float(p95), false_fraction=float(np.mean(off > GROSS_MM)) if len(off) else 0.0)
+    return TrajectoryScore(
+        trajectories=seen.shape[1],
+        mean_length_frames=float(seen.sum(axis=0).mean()),
+        median_mm=float(median),
+        p95_mm=float(p95),
+        false_fraction=float(np.mean(off > GROSS_MM)) if len(off) else 0.0,
+    )
 
 
 def _true_paths(truth: Truth, frames: np.ndarray, xyz: np.ndarray, first: np.ndarray, monitor: Monitor) -> np.ndarray:
@@ -291,8 +314,11 @@ def _score_shape(truth: Truth, path: Path) -> ShapeScore | None:
     if truth.radii_m is None or truth.lengths_m is None or not path.exists():
         return None
     shape = read_body(path)
-    lengths = {bone.name: float(length - truth.lengths_m[bone.name]) * 1e3
-               for bone, length in zip(shape.skeleton.bones, shape.lengths_m) if bone.name in truth.lengths_m}
+    lengths = {
+        bone.name: float(length - truth.lengths_m[bone.name]) * 1e3
+        for bone, length in zip(shape.skeleton.bones, shape.lengths_m)
+        if bone.name in truth.lengths_m
+    }
     if shape.metaballs.radii_m.shape != truth.radii_m.shape:
         return ShapeScore(lengths_mm=lengths, radius_bias=float("nan"), radius_rms=float("nan"))
     ratio = (shape.metaballs.radii_m / truth.radii_m)[:, [0, 2]] - 1
@@ -307,5 +333,6 @@ def _score_skin(truth: Truth, out: Path, monitor: Monitor) -> SkinScore | None:
     d = np.concatenate(distances) if distances else np.zeros(0)
     if not len(d):
         return None
-    return SkinScore(frames=len(distances), median_mm=float(np.median(d)), rms_mm=float(np.sqrt(np.mean(d**2))),
-                     p95_mm=float(np.percentile(d, 95)))
+    return SkinScore(
+        frames=len(distances), median_mm=float(np.median(d)), rms_mm=float(np.sqrt(np.mean(d**2))), p95_mm=float(np.percentile(d, 95))
+    )

@@ -1,7 +1,7 @@
 """truth.npz, the truth beside a recording, and distances from it.
 
-    vertices_m (T, V, 3), triangles (F, 3), textured (V,), visible (T, ⌈V/8⌉) packed bits, joints_m (T, J, 3), joint_names, time_s (T,)
-    and, where a body model made the recording: dof_names, motion_values (T, D), bone_names, lengths_m (B,), radii_m (M, 3)
+vertices_m (T, V, 3), triangles (F, 3), textured (V,), visible (T, ⌈V/8⌉) packed bits, joints_m (T, J, 3), joint_names, time_s (T,)
+and, where a body model made the recording: dof_names, motion_values (T, D), bone_names, lengths_m (B,), radii_m (M, 3)
 """
 
 import zipfile
@@ -64,12 +64,15 @@ def read_truth(take: Path) -> Truth:
         raise InputError(f"{path} lacks {', '.join(missing)}; make the recording again.")
     count = data["vertices_m"].shape[1]
     return Truth(
-        vertices_m=data["vertices_m"].astype(np.float64), triangles=data["triangles"].astype(np.int64),
-        textured=data["textured"].astype(bool), visible=np.unpackbits(data["visible"], axis=1)[:, :count].astype(bool),
+        vertices_m=data["vertices_m"].astype(np.float64),
+        triangles=data["triangles"].astype(np.int64),
+        textured=data["textured"].astype(bool),
+        visible=np.unpackbits(data["visible"], axis=1)[:, :count].astype(bool),
         joints_m={str(name): data["joints_m"][:, i].astype(np.float64) for i, name in enumerate(data["joint_names"])},
         motion=dict(zip(data["dof_names"].tolist(), data["motion_values"].T)) if "dof_names" in data else None,
         lengths_m=dict(zip(data["bone_names"].tolist(), data["lengths_m"].tolist())) if "bone_names" in data else None,
-        radii_m=data.get("radii_m"))
+        radii_m=data.get("radii_m"),
+    )
 
 
 def closest_on_mesh(vertices_m: np.ndarray, triangles: np.ndarray, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -189,9 +189,7 @@ def _parting(grey: np.ndarray, xy: np.ndarray, normal: np.ndarray, search_px: fl
 def _stiffness(n: int, settings: ContourSettings) -> np.ndarray:
     """α D2 + β D4 + γ I (n, n) of a closed contour, rows (β, −α − 4 β, 2 α + 6 β + 1, −α − 4 β, β)."""
     a, b, eye = settings.alpha, settings.beta, np.eye(n)
-    return (2 * a + 6 * b + 1) * eye + sum(
-        c * np.roll(eye, s, axis=1) for c, s in ((-a - 4 * b, 1), (-a - 4 * b, -1), (b, 2), (b, -2))
-    )  # type: ignore[no-any-return]
+    return (2 * a + 6 * b + 1) * eye + sum(c * np.roll(eye, s, axis=1) for c, s in ((-a - 4 * b, 1), (-a - 4 * b, -1), (b, 2), (b, -2)))  # type: ignore[no-any-return]
 
 
 def _gradient(grey: np.ndarray, blur_px: float) -> tuple[np.ndarray, np.ndarray]:

@@ -126,9 +126,7 @@ class _Lost:
         keep = ~np.isin(points.identity, tracked.identity) & (abs(tracked.frame - last) < wait_frames)
         return _Lost(points=points.select(keep), velocity_m=velocity[keep], last=last[keep])
 
-    def retaken(
-        self, view: TrackingView, templates: Templates, grey: Sequence[np.ndarray], spline: Sequence[SplineImage]
-    ) -> TrackedFrame:
+    def retaken(self, view: TrackingView, templates: Templates, grey: Sequence[np.ndarray], spline: Sequence[SplineImage]) -> TrackedFrame:
         """Those that are seen again in the frame of the view, about where their motion takes them."""
         ahead = np.abs(view.frame - self.last)[:, None]
         p, ref = replace(self.points, xyz_m=self.points.xyz_m + ahead * self.velocity_m), view.reference
@@ -202,9 +200,7 @@ def _meeting(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
     return met.without(miss > max(view.limit_px, MISFITS * usual), TrackStatus.RAYS_MISS)
 
 
-def _first(
-    grey: Sequence[np.ndarray], spline: Sequence[SplineImage], clicks: np.ndarray, frame: int, view: TrackingView
-) -> TrackedFrame:
+def _first(grey: Sequence[np.ndarray], spline: Sequence[SplineImage], clicks: np.ndarray, frame: int, view: TrackingView) -> TrackedFrame:
     """The points in the frame of the clicks: matched from the reference view in the others, as far as clicks are wrong.
 
     Nothing is known of the surface's slope, so several are tried; the one with the best correlation counts.

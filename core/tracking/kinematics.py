@@ -43,9 +43,7 @@ def differences(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float) -> Kinematics
         sigma_v = np.where(both & np.isfinite(sigma_m), np.hypot(after, before) / (2 * dt), one_sided)
         velocity[np.isnan(sigma_m)] = np.nan
         sigma_a = np.sqrt(after**2 + 4 * sigma_m**2 + before**2) / dt**2
-    return Kinematics(
-        velocity_m_s=velocity, acceleration_m_s2=acceleration, sigma_velocity_m_s=sigma_v, sigma_acceleration_m_s2=sigma_a
-    )
+    return Kinematics(velocity_m_s=velocity, acceleration_m_s2=acceleration, sigma_velocity_m_s=sigma_v, sigma_acceleration_m_s2=sigma_a)
 
 
 def smoothed(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float, frames: int) -> Kinematics:

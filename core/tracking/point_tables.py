@@ -116,9 +116,7 @@ def read_planar(path: Path) -> PlanarTable:
     return PlanarTable(frames=np.array(frames), names=names, xy_px=np.where(np.isfinite(xy).all(axis=2, keepdims=True), xy, np.nan))
 
 
-def write_key_points(
-    space: Path, images: Path, names: tuple[str, ...], views: tuple[str, ...], fps: float, points: KeyPoints
-) -> None:
+def write_key_points(space: Path, images: Path, names: tuple[str, ...], views: tuple[str, ...], fps: float, points: KeyPoints) -> None:
     """Two CSVs: frame, time_s, point, x, y, z, sigma, status (metres, world); and frame, view, point, x, y (full-frame pixels).
 
     A point that is not seen has empty cells and says why. In a view that does not show it, it has no row.

@@ -151,9 +151,7 @@ def _with_the_others(
     lost = np.flatnonzero(~found)
     rows, there = nearest_neighbours(current.xyz_m[lost], current.xyz_m[found], settings.neighbourhood_m)
     if there.any():
-        moved = common_motion(
-            current.xyz_m[lost], current.xyz_m[found][rows], result.xyz_m[found][rows], there.astype(float), HARMLESS_M
-        )
+        moved = common_motion(current.xyz_m[lost], current.xyz_m[found][rows], result.xyz_m[found][rows], there.astype(float), HARMLESS_M)
         usable = np.isfinite(moved.xyz_m).all(axis=1)
         goal[lost[usable]], known[lost[usable]] = moved.xyz_m[usable], True
     return goal, known
@@ -199,8 +197,14 @@ def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray
     for k in range(len(view.cameras)):
         begin = np.where((status[:, k] == TrackStatus.MEASURED)[:, None], start[:, k], np.nan)
         m = match_patches(
-            images.spline[k], points.xy[:, k], [images.next_spline[k]], [begin], [eye], view.matching, row_step=view.rows.step,
-            of_texture=False
+            images.spline[k],
+            points.xy[:, k],
+            [images.next_spline[k]],
+            [begin],
+            [eye],
+            view.matching,
+            row_step=view.rows.step,
+            of_texture=False,
         )[0]
         mark(status[:, k], ~m.ok, TrackStatus.NOT_MATCHED)
         matches.append(m)

@@ -99,9 +99,7 @@ def _coverage(field: TripletField, xy: np.ndarray, depth: np.ndarray, view: Trac
 
 def _born(field: TripletField, cloud: PointCloud, rows: np.ndarray, first: int, view: TrackingView) -> TrackedFrame:
     identity = np.arange(first, first + len(rows))
-    return _with_relief(
-        born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows]), view
-    )
+    return _with_relief(born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows]), view)
 
 
 def _with_relief(points: TrackedFrame, view: TrackingView) -> TrackedFrame:

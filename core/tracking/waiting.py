@@ -59,9 +59,7 @@ class Waiting:
     own_m: np.ndarray  # (N, 3) in the bone's frame
     by_body: np.ndarray  # (N,) whether it is the body that says where it is now
 
-    def after(
-        self, current: TrackedFrame, tracked: TrackedFrame, settings: TrackingSettings, guide: Guide | None = None
-    ) -> "Waiting":
+    def after(self, current: TrackedFrame, tracked: TrackedFrame, settings: TrackingSettings, guide: Guide | None = None) -> "Waiting":
         """Those that wait when `current` has become `tracked`: with the newly lost, without the regained and those that waited too long."""
         lost = np.isin(current.identity, tracked.ended[tracked.reason != TrackStatus.LEFT_IMAGE])
         still = ~np.isin(self.points.identity, tracked.identity)
@@ -76,9 +74,7 @@ class Waiting:
         waiting = Waiting(points=points, frames=since, bone=bone, own_m=own, by_body=np.zeros(n, dtype=bool))
         return waiting.carried(current, tracked, settings, guide)
 
-    def carried(
-        self, current: TrackedFrame, tracked: TrackedFrame, settings: TrackingSettings, guide: Guide | None = None
-    ) -> "Waiting":
+    def carried(self, current: TrackedFrame, tracked: TrackedFrame, settings: TrackingSettings, guide: Guide | None = None) -> "Waiting":
         """Moved with the points tracked from one frame to the other, or with the body; without those that nobody carries or that waited
         too long."""
         since = self.frames + abs(tracked.frame - current.frame)

@@ -55,8 +55,16 @@ def small_rig() -> Rig:
         matrix = np.array([[390.0, 0, 97.3 + 10 * x], [0, 390.0, 68.9], [0, 0, 1]])
         R = rotation_from_vector(np.array([0.0, 0.15 * x / 0.4, 0.0])) @ rotation_from_vector(np.array([np.pi / 2, 0, 0]))
         centre = np.array([x - 0.2, -2.2, 0.0])
-        cameras.append(Camera(name=name, size_px=SIZE, matrix=matrix, distortions=np.array([-0.12, 0.05, 6e-4, -4e-4, 0.01]),
-                              R_cam_world=R, t_cam_world_m=-R @ centre))
+        cameras.append(
+            Camera(
+                name=name,
+                size_px=SIZE,
+                matrix=matrix,
+                distortions=np.array([-0.12, 0.05, 6e-4, -4e-4, 0.01]),
+                R_cam_world=R,
+                t_cam_world_m=-R @ centre,
+            )
+        )
     return Rig(cameras=tuple(cameras), metadata={"floor": True})
 
 
@@ -100,13 +108,28 @@ def small_run(tmp_path: Path) -> SmallRun:
     for i, frame in enumerate(FRAMES):
         n = 40 + i
         xyz = joints["elbow.R"][i] + random.normal(0, 0.03, (n, 3))
-        write_cloud(out / "clouds" / f"{frame:04d}.ply", xyz_m=xyz, sigma_m=np.full(n, 1e-3), normals=np.tile([0.0, -1.0, 0.0], (n, 1)),
-                    intensity=random.uniform(0, 255, n))
+        write_cloud(
+            out / "clouds" / f"{frame:04d}.ply",
+            xyz_m=xyz,
+            sigma_m=np.full(n, 1e-3),
+            normals=np.tile([0.0, -1.0, 0.0], (n, 1)),
+            intensity=random.uniform(0, 255, n),
+        )
     xyz = np.stack([joints["elbow.R"], joints["wrist.R"]], axis=1)
     xyz[0, 1] = np.nan
-    store.save(out / "trajectories.npz", dict(
-        frames=np.array(FRAMES), time_s=np.array(FRAMES) / FPS, xyz_m=xyz, velocity_m_s=np.gradient(xyz, axis=0) * FPS,
-        acceleration_m_s2=np.zeros_like(xyz), sigma_m=np.full(xyz.shape[:2], 1e-3), status=np.zeros(xyz.shape[:2], dtype=np.int8)), {})
+    store.save(
+        out / "trajectories.npz",
+        dict(
+            frames=np.array(FRAMES),
+            time_s=np.array(FRAMES) / FPS,
+            xyz_m=xyz,
+            velocity_m_s=np.gradient(xyz, axis=0) * FPS,
+            acceleration_m_s2=np.zeros_like(xyz),
+            sigma_m=np.full(xyz.shape[:2], 1e-3),
+            status=np.zeros(xyz.shape[:2], dtype=np.int8),
+        ),
+        {},
+    )
     return SmallRun(out=out, take=take, rig=rig, shape=shape, motion=motion, sigma=sigma, joints_m=joints)
 
 
@@ -115,10 +138,17 @@ def write_result(out: Path, shape: BodyShape, frames: np.ndarray, motion: np.nda
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     write_body(out / "body.toml", shape)
     fit = BodyMotion(
-        frames=frames, time_s=frames / FPS, dof_names=shape.skeleton.dof_names, values=motion,
-        covariance=np.eye(motion.shape[1]) * sigma[..., None] ** 2, joint_names=tuple(joints),
-        joints_m=np.stack(list(joints.values()), axis=1), joint_sigma_m=np.full((len(frames), len(joints)), 1e-3),
-        status=("fitted",) * len(frames), sigma0=np.ones(len(frames)))
+        frames=frames,
+        time_s=frames / FPS,
+        dof_names=shape.skeleton.dof_names,
+        values=motion,
+        covariance=np.eye(motion.shape[1]) * sigma[..., None] ** 2,
+        joint_names=tuple(joints),
+        joints_m=np.stack(list(joints.values()), axis=1),
+        joint_sigma_m=np.full((len(frames), len(joints)), 1e-3),
+        status=("fitted",) * len(frames),
+        sigma0=np.ones(len(frames)),
+    )
     write_joints(out / "joints.csv", fit)
     write_motion(out / "motion.csv", fit, shape.skeleton)
 

@@ -105,8 +105,15 @@ def reloaded(before: dict[str, list[str]], package: str) -> list[dict[str, objec
             bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True, overwrite=True)
         jobs, watch = (importlib.import_module(f"{EXTENSION}.addon.{name}") for name in ("jobs", "steps.watch"))
         states = watch.refresh(bpy.context.scene).states
-        found.append({"way": way, "added": counts(difference(traces(), before)), "classes": registered_classes(),
-                      "listeners": len(jobs.ENDED), "footage": states["footage"].word})
+        found.append(
+            {
+                "way": way,
+                "added": counts(difference(traces(), before)),
+                "classes": registered_classes(),
+                "listeners": len(jobs.ENDED),
+                "footage": states["footage"].word,
+            }
+        )
     return found
 
 

@@ -244,8 +244,10 @@ def test_undo_takes_calibrated_and_imported_cameras_away(blender, empty, bar: Pa
         return sum(o.type == "CAMERA" for o in empty.context.scene.objects)
 
     write_rig(tmp_path / "rig.toml", small_rig())
-    for name, run in (("calibrate", lambda: empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)),
-                      ("import", lambda: empty.ops.tricap.import_rig(filepath=str(tmp_path / "rig.toml")))):
+    for name, run in (
+        ("calibrate", lambda: empty.ops.tricap.calibrate(bar=str(bar), length_m=0.5)),
+        ("import", lambda: empty.ops.tricap.import_rig(filepath=str(tmp_path / "rig.toml"))),
+    ):
         empty.ops.ed.undo_push(message=f"before {name}")
         assert run() == {"FINISHED"} and cameras() == 3
         empty.ops.ed.undo_push(message=f"after {name}")

@@ -36,9 +36,13 @@ def imported(bpy: ModuleType, file: Path, fps: float) -> None:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     scene.render.fps, scene.render.fps_base = 30, 30 / fps
-    {".fbx": lambda f: bpy.ops.import_scene.fbx(filepath=f), ".glb": lambda f: bpy.ops.import_scene.gltf(filepath=f),
-     ".usd": lambda f: bpy.ops.wm.usd_import(filepath=f), ".usda": lambda f: bpy.ops.wm.usd_import(filepath=f),
-     ".abc": lambda f: bpy.ops.wm.alembic_import(filepath=f, as_background_job=False)}[file.suffix](str(file))
+    {
+        ".fbx": lambda f: bpy.ops.import_scene.fbx(filepath=f),
+        ".glb": lambda f: bpy.ops.import_scene.gltf(filepath=f),
+        ".usd": lambda f: bpy.ops.wm.usd_import(filepath=f),
+        ".usda": lambda f: bpy.ops.wm.usd_import(filepath=f),
+        ".abc": lambda f: bpy.ops.wm.alembic_import(filepath=f, as_background_job=False),
+    }[file.suffix](str(file))
 
 
 def skinned(bpy: ModuleType) -> tuple[Any, Any]:
@@ -80,8 +84,9 @@ def test_fbx_by_preset(empty: ModuleType, small_run: SmallRun, tmp_path: Path, p
     assert 0.1 < height < 1.5, "the skin is as large as the arm"
 
 
-@pytest.mark.parametrize(("preset", "hand"), [("plain", "forearm.R"), ("mixamo", "mixamorig:RightForeArm"), ("unreal", "lowerarm_r"),
-                                              ("maya", "RightForeArm")])
+@pytest.mark.parametrize(
+    ("preset", "hand"), [("plain", "forearm.R"), ("mixamo", "mixamorig:RightForeArm"), ("unreal", "lowerarm_r"), ("maya", "RightForeArm")]
+)
 def test_glb_keeps_its_skin_under_other_names(empty: ModuleType, small_run: SmallRun, tmp_path: Path, preset: str, hand: str) -> None:
     source = from_run(small_run.out)
     export_file(small_run.out, "glb", tmp_path / "a.glb", preset, Monitor())
@@ -127,9 +132,15 @@ def extent(bpy: ModuleType, frame: int) -> np.ndarray:
     return np.array([places.min(axis=0), places.max(axis=0)])
 
 
-@pytest.mark.parametrize(("preset", "unit", "axes", "elbow"), [
-    ("unreal", "cm", "Z up", "lowerarm_r"), ("maya", "cm", "Y up", "RightForeArm"), ("unity", "m", "Y up", "RightLowerArm"),
-    ("opensim", "", "OpenSim", "elbow.R")])
+@pytest.mark.parametrize(
+    ("preset", "unit", "axes", "elbow"),
+    [
+        ("unreal", "cm", "Z up", "lowerarm_r"),
+        ("maya", "cm", "Y up", "RightForeArm"),
+        ("unity", "m", "Y up", "RightLowerArm"),
+        ("opensim", "", "OpenSim", "elbow.R"),
+    ],
+)
 def test_points_by_preset(small_run: SmallRun, tmp_path: Path, preset: str, unit: str, axes: str, elbow: str) -> None:
     wanted = points_of(small_run.out)
     for kind, own, read in (("trc", "m", read_trc), ("c3d", "mm", read_c3d), ("csv", "m", read_points_csv)):
@@ -204,6 +215,7 @@ def test_a_folder_that_cannot_be_written_is_told_before_blender_tries(
     empty: ModuleType, small_run: SmallRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
 ) -> None:
     """Its exporters print a traceback there."""
+
     def refused(path: Path, *args: object, **more: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
 

@@ -80,8 +80,12 @@ def test_undo_and_what_is_refused(blender: ModuleType, empty: ModuleType, files:
     assert objects() == 0 and not empty.data.collections
     (tmp_path / "other.csv").write_text("point,x,y,joined_to\nnose,1,1,\near,2,2,nose\n")
     (tmp_path / "none.csv").write_text("frame,point,x,y\n1,a,b,c\n")
-    for changed, said in (({"points": str(tmp_path / "other.csv")}, "“ear”"), ({"filepath": str(tmp_path / "none.csv")}, "no table of 2-D"),
-                          ({"filepath": str(tmp_path / "gone.csv")}, "Cannot read"), ({"footage": str(tmp_path / "gone.mp4")}, "missing")):
+    for changed, said in (
+        ({"points": str(tmp_path / "other.csv")}, "“ear”"),
+        ({"filepath": str(tmp_path / "none.csv")}, "no table of 2-D"),
+        ({"filepath": str(tmp_path / "gone.csv")}, "Cannot read"),
+        ({"footage": str(tmp_path / "gone.mp4")}, "missing"),
+    ):
         with pytest.raises(RuntimeError, match=said):
             empty.ops.tricap.import_tracks2d(**files | changed)
         assert objects() == 0

@@ -207,8 +207,11 @@ def test_it_is_drawn_where_it_is(drawn: Any, run: Any, small_run: SmallRun) -> N
     picture = drawn(points=True, most_sigma_mm=2.0)
     for xy in small_run.rig["C"].project(run.points(3).xyz_m)[:10]:
         assert lit(picture, xy)[1] > 0.8
-    store.save(small_run.out / "cache" / "surface" / "0003.npz",
-               dict(removed_px=np.array([[[10, 9], [12, 9], [14, 9]]], np.float32), removed_why=np.ones(1, np.uint8)), {})
+    store.save(
+        small_run.out / "cache" / "surface" / "0003.npz",
+        dict(removed_px=np.array([[[10, 9], [12, 9], [14, 9]]], np.float32), removed_why=np.ones(1, np.uint8)),
+        {},
+    )
     assert lit(drawn(), [12, 9]).max() == 0.0
     assert lit(drawn(which_points="both"), [12, 9])[0] > 0.9 and lit(drawn(which_points="before"), [12, 9])[2] > 0.9
     picture = drawn(which_points="removed")
@@ -246,7 +249,6 @@ def test_the_clicks_are_drawn_where_they_are(blender: ModuleType, drawn: Any, sc
     inside = curve[(curve > 8).all(axis=1) & (curve < np.array(SIZE) - 8).all(axis=1)]
     assert len(inside) > 5 and all(lit(picture, xy)[2] > 0.5 for xy in inside)
     assert lit(picture, np.array([100.0 + 11 / 3, 50.0]))[1] > 0.8, "the ring of the proposal"
-
 
 
 @pytest.mark.slow

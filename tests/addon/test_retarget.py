@@ -35,8 +35,14 @@ from ..core.motion.test_retarget import recorded
 from .conftest import SmallRun
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
-RIGS = ("cryptovoxels.vrm", "gdquest_mannequiny.glb", "kaykit_knight.glb", "mpfb_female_mixamo-names.glb", "mpfb_male_cmu_mb-names.glb",
-        "mpfb_male_game_engine_UE-names.glb")
+RIGS = (
+    "cryptovoxels.vrm",
+    "gdquest_mannequiny.glb",
+    "kaykit_knight.glb",
+    "mpfb_female_mixamo-names.glb",
+    "mpfb_male_cmu_mb-names.glb",
+    "mpfb_male_game_engine_UE-names.glb",
+)
 MOTIONS = ("02_01_walk", "02_04_jump_balance")
 PLAYED_DEG = 0.02  # single precision of pose matrices; measured 2e-3
 PROMISED = {"direction_rms_deg": 1.0, "slide_mm": 5.0, "penetration_mm": 5.0, "largest_step_deg": 90.0}
@@ -192,6 +198,7 @@ def test_the_operator_undoes_in_one_step_and_leaves_the_source(blender: ModuleTy
 
 def the_step_is_undone(bpy: ModuleType, former: str) -> None:
     """One undo takes the new action, its keys and what the panel says of them back."""
+
     def state() -> Any:
         target = bpy.data.objects["Target"]
         return target.animation_data.action.name, sorted(bpy.data.actions.keys()), bpy.context.scene.tricap_retarget.last
@@ -221,9 +228,16 @@ def test_the_preview_points_alike_and_goes_away(empty: ModuleType) -> None:
 
 def test_bad_rigs_are_said_and_the_scene_is_unchanged(empty: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_bvh(tmp_path / "move.bvh", squat(person(), frames=6))
-    made = {"none.blend": lambda: None, "two.blend": lambda: (armature(person(), "A"), armature(person(), "B")),
-            "names.blend": lambda: build_armature(flail(person(names={role: f"b{i}" for i, role in enumerate(person().names)},
-                                                               without=("thigh", "shin", "foot", "toe")), frames=3), "C")}
+    made = {
+        "none.blend": lambda: None,
+        "two.blend": lambda: (armature(person(), "A"), armature(person(), "B")),
+        "names.blend": lambda: build_armature(
+            flail(
+                person(names={role: f"b{i}" for i, role in enumerate(person().names)}, without=("thigh", "shin", "foot", "toe")), frames=3
+            ),
+            "C",
+        ),
+    }
     for name, make in made.items():
         empty.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
         make()
@@ -232,9 +246,17 @@ def test_bad_rigs_are_said_and_the_scene_is_unchanged(empty: ModuleType, tmp_pat
     (tmp_path / "huge.glb").write_bytes(b"glTF\x02\0\0\0\xff\xff\xff\xbf\xff\xff\xff\xbfJSON{}")
     (tmp_path / "broken.fbx").write_bytes(b"Kaydara FBX Binary  \0\x1a\0" + b"\x01" * 90)
     (tmp_path / "broken.blend").write_bytes(b"BLENDER-v405" + b"\0" * 50)
-    for name, word in (("none.blend", "no armature"), ("two.blend", "2 armatures"), ("names.blend", "recognised"),
-                       ("broken.glb", "export it"), ("huge.glb", "export it"), ("broken.fbx", "export it"),
-                       ("broken.blend", "export it"), ("nothing.glb", "no file"), ("move.txt", "no file")):
+    for name, word in (
+        ("none.blend", "no armature"),
+        ("two.blend", "2 armatures"),
+        ("names.blend", "recognised"),
+        ("broken.glb", "export it"),
+        ("huge.glb", "export it"),
+        ("broken.fbx", "export it"),
+        ("broken.blend", "export it"),
+        ("nothing.glb", "no file"),
+        ("move.txt", "no file"),
+    ):
         capsys.readouterr()
         out = tmp_path / "out.blend"
         assert main(["retarget", str(tmp_path / "move.bvh"), "--rig", str(tmp_path / name), "--out", str(out), "--quiet"]) == 2, name
@@ -265,8 +287,27 @@ def test_the_command_with_a_run_a_map_and_a_report(empty: ModuleType, small_run:
     empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
     (tmp_path / "map.json").write_text(json.dumps({"name": "mine", "bones": {"upper_arm.R": "upper_arm.R", "forearm.R": ["forearm.R"]}}))
     out = tmp_path / "out.blend"
-    assert main(["retarget", str(small_run.out), "--rig", str(tmp_path / "rig.blend"), "--out", str(out),
-                 "--map", str(tmp_path / "map.json"), "--report", "--quiet", "--twist", "off", "--scale", "2"]) == 0
+    assert (
+        main(
+            [
+                "retarget",
+                str(small_run.out),
+                "--rig",
+                str(tmp_path / "rig.blend"),
+                "--out",
+                str(out),
+                "--map",
+                str(tmp_path / "map.json"),
+                "--report",
+                "--quiet",
+                "--twist",
+                "off",
+                "--scale",
+                "2",
+            ]
+        )
+        == 0
+    )
     table = json.loads((tmp_path / "out.json").read_text())
     assert table["scale"] == 2.0 and table["direction_worst_deg"] < 0.01
     assert table["mapped_by"] == "mapping “mine”" and (tmp_path / "out.png").stat().st_size > 1000
@@ -323,9 +364,9 @@ def without_actions(file: Path, copy: Path) -> None:
     """A binary glTF file without its animations, of which one has 76 that take longer to read than all the rest."""
     data = file.read_bytes()
     size = int.from_bytes(data[12:16], "little")
-    table = json.loads(data[20:20 + size])
+    table = json.loads(data[20 : 20 + size])
     table.pop("animations", None)
     text = json.dumps(table).encode()
     text += b" " * (-len(text) % 4)
-    whole = len(text).to_bytes(4, "little") + data[16:20] + text + data[20 + size:]
+    whole = len(text).to_bytes(4, "little") + data[16:20] + text + data[20 + size :]
     copy.write_bytes(data[:8] + (12 + len(whole)).to_bytes(4, "little") + whole)

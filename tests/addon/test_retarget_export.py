@@ -23,9 +23,15 @@ def wave() -> Motion:
     """A trunk and two limbs that turn about all their axes while they travel."""
     head = np.array([[0.1, 0.0, 0.9], [0.1, 0.02, 1.1], [0.3, 0.0, 1.4], [0.6, 0.0, 1.4], [-0.1, 0.0, 0.85]])
     tail = np.array([[0.1, 0.02, 1.1], [0.1, 0.0, 1.45], [0.6, 0.0, 1.4], [0.85, -0.05, 1.4], [-0.12, 0.05, 0.4]])
-    rig = Rig(names=("hips", "spine", "upper_arm.L", "forearm.L", "thigh.R"), parents=np.array([-1, 0, 1, 2, 0]),
-              R_rest=shortest(np.array([0.0, 1.0, 0.0]), tail - head), head_m=head, tail_m=tail, connected=np.zeros(5, dtype=bool),
-              inherits_rotation=np.ones(5, dtype=bool))
+    rig = Rig(
+        names=("hips", "spine", "upper_arm.L", "forearm.L", "thigh.R"),
+        parents=np.array([-1, 0, 1, 2, 0]),
+        R_rest=shortest(np.array([0.0, 1.0, 0.0]), tail - head),
+        head_m=head,
+        tail_m=tail,
+        connected=np.zeros(5, dtype=bool),
+        inherits_rotation=np.ones(5, dtype=bool),
+    )
     phase = np.linspace(0, 2 * np.pi, 30)[:, None]
     k = np.arange(5)
     angles = np.stack([np.sin(phase + k), 0.8 * np.cos(phase * 2 + k), 1.2 * np.sin(phase + 2 * k)], axis=-1)

@@ -35,8 +35,11 @@ def steered() -> dict[str, Any]:
     """A mapping of a person whose bones are controls that follow each other."""
     rig = person()
     follows = {name: rig.names[p] for name, p in zip(rig.names, rig.parents) if p >= 0}
-    return {"name": "controls", "bones": {name: name for name in rig.names},
-            "steering": {"follows": follows, "properties": {"hips": {"IK_FK": 1.0}}, "skin": {"foot.L": "foot.R"}}}
+    return {
+        "name": "controls",
+        "bones": {name: name for name in rig.names},
+        "steering": {"follows": follows, "properties": {"hips": {"IK_FK": 1.0}}, "skin": {"foot.L": "foot.R"}},
+    }
 
 
 def test_notes_of_the_same_are_told_in_one_sentence() -> None:

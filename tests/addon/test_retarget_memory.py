@@ -66,8 +66,22 @@ def test_a_file_and_a_strip_remember(empty: ModuleType, tmp_path: Path) -> None:
     empty.data.objects.remove(empty.data.objects["Few"])
     empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "full.blend"), copy=True)
     for source, rig, out in (("full", "few", "there"), ("there", "full", "back")):
-        assert main(["retarget", str(tmp_path / f"{source}.blend"), "--rig", str(tmp_path / f"{rig}.blend"), "--out",
-                     str(tmp_path / f"{out}.blend"), "--feet", "off", "--quiet"]) == 0
+        assert (
+            main(
+                [
+                    "retarget",
+                    str(tmp_path / f"{source}.blend"),
+                    "--rig",
+                    str(tmp_path / f"{rig}.blend"),
+                    "--out",
+                    str(tmp_path / f"{out}.blend"),
+                    "--feet",
+                    "off",
+                    "--quiet",
+                ]
+            )
+            == 0
+        )
     assert off_deg(wanted, played(empty.data.objects["Full"])) < BACK_DEG
     empty.ops.wm.open_mainfile(filepath=str(tmp_path / "there.blend"))
     few = empty.data.objects["Few"]

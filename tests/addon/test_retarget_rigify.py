@@ -77,10 +77,15 @@ def the_preview_gives_back_what_it_set(generated: Any) -> None:
     assert remove_preview(generated) > 15 and generated.pose.bones["thigh_parent.L"]["IK_FK"] == 0.25
 
 
-@pytest.mark.parametrize("steering, said", [
-    ("3", "says nothing of how controls follow"), ('{"follows": {"a": "b", "b": "a"}}', "lets “a” follow itself"),
-    ('{"follows": {"a": 3}}', "something else than names"), ('{"follows": {}, "properties": {"a": {"IK": "x"}}}', "needs numbers by name"),
-])
+@pytest.mark.parametrize(
+    "steering, said",
+    [
+        ("3", "says nothing of how controls follow"),
+        ('{"follows": {"a": "b", "b": "a"}}', "lets “a” follow itself"),
+        ('{"follows": {"a": 3}}', "something else than names"),
+        ('{"follows": {}, "properties": {"a": {"IK": "x"}}}', "needs numbers by name"),
+    ],
+)
 def test_damaged_steering(tmp_path: Path, steering: str, said: str) -> None:
     (tmp_path / "map.json").write_text(f'{{"bones": {{"hips": "torso"}}, "steering": {steering}}}')
     with pytest.raises(InputError, match=said):

@@ -134,9 +134,15 @@ def test_building_again_replaces_and_nothing_piles_up(empty: ModuleType, small_r
     assert census() == first and "my own" in first["objects"]
 
 
-@pytest.mark.parametrize("missing, said", [
-    ("clouds", "No point cloud"), ("trajectories.npz", "No trajectories"), ("body.toml", "No armature"), ("motion.csv", "No action"),
-])
+@pytest.mark.parametrize(
+    "missing, said",
+    [
+        ("clouds", "No point cloud"),
+        ("trajectories.npz", "No trajectories"),
+        ("body.toml", "No armature"),
+        ("motion.csv", "No action"),
+    ],
+)
 def test_what_is_missing_is_left_out_and_said(empty: ModuleType, small_run: SmallRun, missing: str, said: str) -> None:
     from tricap.addon.scene.build import build_scene
 

@@ -54,8 +54,9 @@ def test_clouds_without_points_have_colours(empty: ModuleType, small_run: SmallR
 
 
 @pytest.mark.parametrize("failure", ["footage", "cancelled", "no OpenVDB"])
-def test_a_build_that_fails_leaves_what_was_there(empty: ModuleType, small_run: SmallRun, monkeypatch: pytest.MonkeyPatch, failure: str
-                                                  ) -> None:
+def test_a_build_that_fails_leaves_what_was_there(
+    empty: ModuleType, small_run: SmallRun, monkeypatch: pytest.MonkeyPatch, failure: str
+) -> None:
     from tricap.addon.scene import build, clips, implicit
 
     def refuse(*_: object, **__: object) -> None:
@@ -80,8 +81,15 @@ def test_footage_lies_where_blender_sees_it() -> None:
     from tricap.addon.scene.preview import undistorted
 
     matrix = np.array([[400.0, 0, 97.3], [0, 400.0, 68.9], [0, 0, 1]])
-    camera = Camera(name="C", size_px=(192, 144), matrix=matrix, distortions=np.array([-0.12, 0.05, 6e-4, -4e-4, 0.01]),
-                    affinity=np.array([0.02, 0.003]), R_cam_world=np.eye(3), t_cam_world_m=np.zeros(3))
+    camera = Camera(
+        name="C",
+        size_px=(192, 144),
+        matrix=matrix,
+        distortions=np.array([-0.12, 0.05, 6e-4, -4e-4, 0.01]),
+        affinity=np.array([0.02, 0.003]),
+        R_cam_world=np.eye(3),
+        t_cam_world_m=np.zeros(3),
+    )
     columns = undistorted(np.tile(np.arange(192, dtype=np.float32), (144, 1)), camera)
     for X in ([0.2, 0.1, 2.0], [-0.35, -0.2, 2.0], [0.4, -0.25, 2.0]):
         u, v = 400.0 * 1.02 * X[0] / X[2] + 97.3, 400.0 * X[1] / X[2] + 68.9
@@ -107,13 +115,28 @@ def test_a_thousand_frames_of_a_whole_body(empty: ModuleType, small_run: SmallRu
     pick = random.integers(0, joints.shape[1], 2300)
     offset = random.normal(0, 0.05, (2300, 3))
     for frame in frames:
-        write_cloud(out / "clouds" / f"{frame:04d}.ply", xyz_m=joints[frame, pick] + offset, sigma_m=np.full(2300, 1e-3), normals=offset,
-                    intensity=np.full(2300, 99.0))
+        write_cloud(
+            out / "clouds" / f"{frame:04d}.ply",
+            xyz_m=joints[frame, pick] + offset,
+            sigma_m=np.full(2300, 1e-3),
+            normals=offset,
+            intensity=np.full(2300, 99.0),
+        )
     xyz = joints[:, pick[:1200]] + offset[:1200]
     xyz[random.random(xyz.shape[:2]) < 0.6] = np.nan
-    store.save(out / "trajectories.npz", dict(
-        frames=frames, time_s=frames / 25.0, xyz_m=xyz, velocity_m_s=np.zeros_like(xyz), acceleration_m_s2=np.zeros_like(xyz),
-        sigma_m=np.full(xyz.shape[:2], 1e-3), status=np.ones(xyz.shape[:2], dtype=np.int8)), {})
+    store.save(
+        out / "trajectories.npz",
+        dict(
+            frames=frames,
+            time_s=frames / 25.0,
+            xyz_m=xyz,
+            velocity_m_s=np.zeros_like(xyz),
+            acceleration_m_s2=np.zeros_like(xyz),
+            sigma_m=np.full(xyz.shape[:2], 1e-3),
+            status=np.ones(xyz.shape[:2], dtype=np.int8),
+        ),
+        {},
+    )
     start = time.process_time()
     report = build_scene(out, tmp_path / "long.blend", Monitor())
     seconds, megabytes = time.process_time() - start, (tmp_path / "long.blend").stat().st_size / 1e6

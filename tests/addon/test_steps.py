@@ -315,8 +315,9 @@ def test_a_click_that_contradicts_itself_is_told_at_its_step(blender: ModuleType
 
 
 @pytest.mark.slow
-def test_clicks_are_intersected_once(blender: ModuleType, states: ModuleType, sample: Path, tmp_path: Path,
-                                     monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clicks_are_intersected_once(
+    blender: ModuleType, states: ModuleType, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Not whenever something in the scene changes; again for other clicks and another calibration, and a fault is not forgotten."""
     scene, asked, real = opened(blender, sample, tmp_path), list[str](), states.clicked_depth
     monkeypatch.setattr(states, "_met", {})

@@ -73,8 +73,16 @@ def test_no_code_of_a_project_runs(blender: ModuleType, small_run: SmallRun, ran
     assert not ran.exists()
 
 
-@pytest.mark.parametrize("line", ['rig = "../secret/rig.toml"', 'rig = "/etc/hostname"', 'model = "../secret/m.toml"',
-                                  'images = "../secret/*.png"', 'images = "/etc/*"'])
+@pytest.mark.parametrize(
+    "line",
+    [
+        'rig = "../secret/rig.toml"',
+        'rig = "/etc/hostname"',
+        'model = "../secret/m.toml"',
+        'images = "../secret/*.png"',
+        'images = "/etc/*"',
+    ],
+)
 def test_a_take_reads_nothing_outside_its_folder(blender: ModuleType, small_run: SmallRun, tmp_path: Path, line: str) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     (tmp_path / "secret").mkdir()

@@ -56,6 +56,7 @@ def refused(act: Callable[[], object], *words: str) -> None:
 
 def run(bpy: ModuleType, take: Path, out: Path) -> Callable[[], object]:
     """Pressing Run, with names of objects compared before and after."""
+
     def pressed() -> object:
         before = sorted(bpy.data.objects.keys())
         try:
@@ -63,6 +64,7 @@ def run(bpy: ModuleType, take: Path, out: Path) -> Callable[[], object]:
         except RuntimeError:
             assert sorted(bpy.data.objects.keys()) == before, "what was in the scene stays there"
             raise
+
     return pressed
 
 
@@ -128,20 +130,24 @@ def click_outside(take: Path) -> None:
     replace(take / "take.toml", "frame = 0", "frame = 400")
 
 
-@pytest.mark.parametrize(("spoil", "words"), [
-    (no_take, ("take.toml",)),
-    (damaged_take, ("take.toml",)),
-    (no_calibration, ("rig.toml", "calibrat")),
-    (other_calibration, ("L",)),
-    (calibration_of_other_pictures, ("256", "384")),
-    (no_movie, ("left.mp4",)),
-    (missing_view, ("R",)),
-    (a_text_among_the_pictures, ("0001.png",)),
-    (swapped_views, ("L and R are swapped",)),
-    (one_view_clicked, ("elbow.R", "two views")),
-    (click_on_the_background, ("clicked joints",)),
-    (click_outside, ("400",)),
-], ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (no_take, ("take.toml",)),
+        (damaged_take, ("take.toml",)),
+        (no_calibration, ("rig.toml", "calibrat")),
+        (other_calibration, ("L",)),
+        (calibration_of_other_pictures, ("256", "384")),
+        (no_movie, ("left.mp4",)),
+        (missing_view, ("R",)),
+        (a_text_among_the_pictures, ("0001.png",)),
+        (swapped_views, ("L and R are swapped",)),
+        (one_view_clicked, ("elbow.R", "two views")),
+        (click_on_the_background, ("clicked joints",)),
+        (click_outside, ("400",)),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
 def test_wrong_input(scene: ModuleType, take: Path, spoil: Callable[[Path], None], words: tuple[str, ...]) -> None:
     spoil(take)
     refused(run(scene, take, take.with_name("results")), *words)
@@ -149,8 +155,9 @@ def test_wrong_input(scene: ModuleType, take: Path, spoil: Callable[[Path], None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
-def test_esc(scene: ModuleType, take: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, stage: str,
-             capfd: pytest.CaptureFixture[str]) -> None:
+def test_esc(
+    scene: ModuleType, take: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, stage: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     """At each stage: a warning, the scene as it was, and the next run goes on to the same numbers."""
     jobs = importlib.import_module(f"{ADDON}.jobs")
 
@@ -256,8 +263,11 @@ def stay_in_pose_mode(bpy: ModuleType) -> None:
     bpy.ops.object.mode_set(mode="POSE")
 
 
-@pytest.mark.parametrize("meddle", [delete_the_body, delete_everything, delete_the_collection, rename_everything, purge,
-                                    delete_actions_and_materials, stay_in_pose_mode], ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    "meddle",
+    [delete_the_body, delete_everything, delete_the_collection, rename_everything, purge, delete_actions_and_materials, stay_in_pose_mode],
+    ids=lambda f: f.__name__,
+)
 def test_our_objects_are_meddled_with(scene: ModuleType, take: Path, recording: Path, meddle: Callable[[ModuleType], None]) -> None:
     """Nothing to complain of: the scene is built anew. (`scene` then builds it once more.)"""
     meddle(scene)
@@ -283,9 +293,16 @@ def half_a_cloud(out: Path) -> None:
     (out / "clouds" / "0001.ply").write_bytes(data[: len(data) // 2])
 
 
-@pytest.mark.parametrize(("spoil", "words"), [(no_results, ("results",)), (results_of_something_else, ("run.json",)),
-                                              (half_a_motion, ("motion.csv",)), (half_a_cloud, ("0001.ply",))],
-                         ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (no_results, ("results",)),
+        (results_of_something_else, ("run.json",)),
+        (half_a_motion, ("motion.csv",)),
+        (half_a_cloud, ("0001.ply",)),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
 def test_wrong_results(scene: ModuleType, recording: Path, tmp_path: Path, spoil: Callable[[Path], None], words: tuple[str, ...]) -> None:
     out = Path(shutil.copytree(recording.with_name("out"), tmp_path / "results"))
     spoil(out)

@@ -47,8 +47,12 @@ def rig() -> Rig:
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     matrix = np.array([[1000, 0, 384], [0, 1000, 288], [0, 0, 1.0]])
     places = zip("LCR", (-0.4, 0.0, 0.4))
-    return Rig(cameras=tuple(Camera(name=name, size_px=(768, 576), matrix=matrix, R_cam_world=R,
-                                    t_cam_world_m=-R @ np.array([x, -4.0, 0.0])) for name, x in places))
+    return Rig(
+        cameras=tuple(
+            Camera(name=name, size_px=(768, 576), matrix=matrix, R_cam_world=R, t_cam_world_m=-R @ np.array([x, -4.0, 0.0]))
+            for name, x in places
+        )
+    )
 
 
 def walk(shape: BodyShape, frames: int) -> np.ndarray:
@@ -101,6 +105,7 @@ def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
             result = real[name](*args, **kwargs)
             spent[name] = spent.get(name, 0.0) + time.process_time() - began
             return result
+
         return call
 
     try:
@@ -112,10 +117,16 @@ def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
         for name, function in real.items():
             setattr(sequence, name, function)
     true = np.stack(list(joint_positions(shape.skeleton, shape.lengths_m, motion).values()), axis=1)
-    return {"frames": frames, "points_a_frame": float(np.mean([len(c.xyz_m) for c in clouds])), "click_frame_s": spent["fit_click_frame"],
-            "frame_to_frame_ms_a_frame": 1e3 * spent["follow"] / max(frames - 1, 1), "sequence_ms_a_frame": 1e3 * spent["solve"] / frames,
-            "covariance_ms_a_frame": 1e3 * spent["_covariance"] / frames,
-            "iterations": fit.iterations, "joints_mm": 1e3 * float(np.linalg.norm(fit.motion.joints_m - true, axis=2).mean())}
+    return {
+        "frames": frames,
+        "points_a_frame": float(np.mean([len(c.xyz_m) for c in clouds])),
+        "click_frame_s": spent["fit_click_frame"],
+        "frame_to_frame_ms_a_frame": 1e3 * spent["follow"] / max(frames - 1, 1),
+        "sequence_ms_a_frame": 1e3 * spent["solve"] / frames,
+        "covariance_ms_a_frame": 1e3 * spent["_covariance"] / frames,
+        "iterations": fit.iterations,
+        "joints_mm": 1e3 * float(np.linalg.norm(fit.motion.joints_m - true, axis=2).mean()),
+    }
 
 
 def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
@@ -127,8 +138,10 @@ def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
     motion = walk(shape, 1)
     seen = cloud(shape, motion[0], 0, random)
     points = thinned(seen, settings.voxel_m)
-    clicks = {name: {c.name: c.project(X) for c in cameras.cameras}
-              for name, X in joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()}
+    clicks = {
+        name: {c.name: c.project(X) for c in cameras.cameras}
+        for name, X in joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()
+    }
     given = FitInput(rig=cameras, model="full", clouds=[seen], clicks={0: clicks}, time_s=np.zeros(1))
     fit: Conditions = sequence.conditions(given, settings)
     vector = fit.parameters.vector()
@@ -159,7 +172,8 @@ def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
     ways: dict[str, Callable[[int], np.ndarray]] = {
         "ours": lambda most: solve(problem, start[None], vector, steps=most, furthest=FURTHEST).motion[0],
         "scipy_jacobian": lambda most: least_squares(residual, start, jacobian, xtol=1e-4, ftol=1e-4, max_nfev=most).x,
-        "scipy_2point": lambda most: least_squares(residual, start, xtol=1e-4, ftol=1e-4, max_nfev=most).x}
+        "scipy_2point": lambda most: least_squares(residual, start, xtol=1e-4, ftol=1e-4, max_nfev=most).x,
+    }
 
     def cost(x: np.ndarray) -> float:
         return float(residual(x) @ residual(x))
@@ -181,15 +195,21 @@ def ablation(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
     base = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
     rows: list[tuple[str, tuple[str, ...], FitSettings]] = [
         ("points", (), base),
-        ("points, wide beliefs of the shape", (),
-         replace(base, length_sigma=1.0, proportion_sigma=1.0, radius_sigma=1.0, roundness_sigma=1.0)),
-        ("+ trajectories", ("trajectories",), base), ("+ trajectories + outlines", ("trajectories", "contours"), base),
+        (
+            "points, wide beliefs of the shape",
+            (),
+            replace(base, length_sigma=1.0, proportion_sigma=1.0, radius_sigma=1.0, roundness_sigma=1.0),
+        ),
+        ("+ trajectories", ("trajectories",), base),
+        ("+ trajectories + outlines", ("trajectories", "contours"), base),
         ("  in turns as published", ("trajectories", "contours"), replace(base, method="alternating")),
         ("  the published residual", ("trajectories", "contours"), replace(base, residual="paper")),
         ("  one ellipsoid a bone", ("trajectories", "contours"), replace(base, balls="one")),
-        ("  complete model", ("trajectories", "contours"), replace(base, balls="complete"))]
-    scenes = [limb_scene.make_scene(frames=frames, seed=s, shape=limb_scene.other_person("arm.R", np.random.default_rng(s)))
-              for s in range(seeds)]
+        ("  complete model", ("trajectories", "contours"), replace(base, balls="complete")),
+    ]
+    scenes = [
+        limb_scene.make_scene(frames=frames, seed=s, shape=limb_scene.other_person("arm.R", np.random.default_rng(s))) for s in range(seeds)
+    ]
     extra = [{"trajectories": s.trajectories, "contours": limb_scene.outlines(s)} for s in scenes]
     return [{"with": name} | _errors(scenes, [{k: e[k] for k in used} for e in extra], settings) for name, used, settings in rows]
 
@@ -204,12 +224,23 @@ def muscled(shape: BodyShape, random: np.random.Generator) -> BodyShape:
 def of_muscles(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
     """What the arrangement of the balls is worth on arms with muscles; 1 mm of noise."""
     settings = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
-    scenes = [limb_scene.make_scene(frames=frames, seed=s, noise=0.001, points=600,
-                                    shape=muscled(limb_scene.other_person("arm.R", np.random.default_rng(s)), np.random.default_rng(s)))
-              for s in range(seeds)]
+    scenes = [
+        limb_scene.make_scene(
+            frames=frames,
+            seed=s,
+            noise=0.001,
+            points=600,
+            shape=muscled(limb_scene.other_person("arm.R", np.random.default_rng(s)), np.random.default_rng(s)),
+        )
+        for s in range(seeds)
+    ]
     extra = [{"trajectories": s.trajectories, "contours": limb_scene.outlines(s)} for s in scenes]
-    kinds = (("three balls", {}), ("one ellipsoid", {"balls": "one"}), ("complete", {"balls": "complete"}),
-             ("complete, weights free", {"balls": "complete", "weights": True}))
+    kinds = (
+        ("three balls", {}),
+        ("one ellipsoid", {"balls": "one"}),
+        ("complete", {"balls": "complete"}),
+        ("complete, weights free", {"balls": "complete", "weights": True}),
+    )
     return [{"with": f"muscles: {name}"} | _errors(scenes, extra, replace(settings, **changes)) for name, changes in kinds]
 
 
@@ -238,10 +269,14 @@ def _errors(scenes: list, extra: list[dict], settings: FitSettings) -> dict[str,
         at = s.shape.skeleton.layout["elbow.R flexion"]
         elbow.append(np.degrees(fit.motion.values[:, at] - s.motion[:, at]))
     e = 1e3 * np.concatenate(joints)
-    return {"across_mm": float(np.sqrt((e[..., [0, 2]] ** 2).sum(-1).mean())), "depth_mm": float(np.sqrt((e[..., 1] ** 2).mean())),
-            "surface_mm": float(np.sqrt((np.concatenate(seen) ** 2).mean())), "cpu_s": (time.process_time() - began) / len(scenes),
-            "radii_percent": 100 * float(np.sqrt(np.mean(np.concatenate(radii) ** 2))) if radii else float("nan"),
-            "elbow_deg": float(np.sqrt(np.mean(np.concatenate(elbow) ** 2)))}
+    return {
+        "across_mm": float(np.sqrt((e[..., [0, 2]] ** 2).sum(-1).mean())),
+        "depth_mm": float(np.sqrt((e[..., 1] ** 2).mean())),
+        "surface_mm": float(np.sqrt((np.concatenate(seen) ** 2).mean())),
+        "cpu_s": (time.process_time() - began) / len(scenes),
+        "radii_percent": 100 * float(np.sqrt(np.mean(np.concatenate(radii) ** 2))) if radii else float("nan"),
+        "elbow_deg": float(np.sqrt(np.mean(np.concatenate(elbow) ** 2))),
+    }
 
 
 def main() -> None:
@@ -251,9 +286,11 @@ def main() -> None:
     arguments = parser.parse_args()
     settings = FitSettings()
     postures = [beside_scipy(settings, seed) for seed in range(1, 1 + POSTURES)]
-    result = {"sequence": [fit_times(frames, settings) for frames in (10, 40)],
-              "one_frame": {key: float(np.median([row[key] for row in postures])) for key in postures[0]},
-              "ablation": [*ablation(), *of_muscles()]}
+    result = {
+        "sequence": [fit_times(frames, settings) for frames in (10, 40)],
+        "one_frame": {key: float(np.median([row[key] for row in postures])) for key in postures[0]},
+        "ablation": [*ablation(), *of_muscles()],
+    }
     for row in (*result["sequence"], *postures, result["one_frame"]):
         print("  ".join(f"{key} {value:.4g}" for key, value in row.items()))
     for row in result["ablation"]:

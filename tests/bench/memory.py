@@ -97,8 +97,10 @@ def long_fit(frames: int, at_once: int) -> None:
     shape, random, rig = fit.default_shape(fit.read_model("full")), np.random.default_rng(0), fit.rig()
     motion = fit.walk(shape, KINDS)
     clouds = ToAndFro([fit.cloud(shape, m, t, random) for t, m in enumerate(motion)], frames)
-    clicks = {name: {c.name: c.project(X) for c in rig.cameras}
-              for name, X in fit.joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()}
+    clicks = {
+        name: {c.name: c.project(X) for c in rig.cameras}
+        for name, X in fit.joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()
+    }
     given = fit.FitInput(rig=rig, model="full", clouds=clouds, clicks={0: clicks}, time_s=np.arange(frames) / fit.FPS)
     sequence.fit_sequence(given, fit.FitSettings(sequence_steps=2))
 
@@ -167,8 +169,12 @@ def table_row(lengths: tuple[int, int] = TABLE_LENGTHS) -> dict[str, object]:
     """The row of the table of trajectories."""
     few, many = (_child_peak_mb(TABLE_CHILD, frames) for frames in lengths)
     added = 1024 * (many - few) / (lengths[1] - lengths[0])
-    return {"stage": "table", "peak_mb": {str(lengths[0]): round(few, 1), str(lengths[1]): round(many, 1)}, "kb_per_frame": round(added, 1),
-            "mb_20_minutes": round(many + max(0.0, added) * (CLIP_FRAMES - lengths[1]) / 1024)}
+    return {
+        "stage": "table",
+        "peak_mb": {str(lengths[0]): round(few, 1), str(lengths[1]): round(many, 1)},
+        "kb_per_frame": round(added, 1),
+        "mb_20_minutes": round(many + max(0.0, added) * (CLIP_FRAMES - lengths[1]) / 1024),
+    }
 
 
 def fit_growth(lengths: tuple[int, int] = FIT_LENGTHS, at_once: int = SHORT) -> float:
@@ -181,8 +187,12 @@ def fit_row() -> dict[str, object]:
     """The row of the fit of a whole body."""
     frames, added = 2 * AT_ONCE, fit_growth()
     peak = fit_peak_mb(frames, AT_ONCE)
-    return {"stage": "fit", "peak_mb": {str(frames): round(peak, 1)}, "kb_per_frame": round(added, 1),
-            "mb_20_minutes": round(peak + added * (CLIP_FRAMES - frames) / 1024)}
+    return {
+        "stage": "fit",
+        "peak_mb": {str(frames): round(peak, 1)},
+        "kb_per_frame": round(added, 1),
+        "mb_20_minutes": round(peak + added * (CLIP_FRAMES - frames) / 1024),
+    }
 
 
 def growth(stages: tuple[str, ...], lengths: list[int], width_px: int = 192, pictures: int = 40) -> list[dict[str, object]]:
@@ -196,8 +206,14 @@ def growth(stages: tuple[str, ...], lengths: list[int], width_px: int = 192, pic
             peaks = {n: peak_mb(stage, take, folder / f"out{n}") for n, take in takes.items()}
             added = 1024 * (peaks[lengths[-1]] - peaks[lengths[-2]]) / (lengths[-1] - lengths[-2])
             whole = peaks[lengths[-1]] + max(0.0, added) * (CLIP_FRAMES - lengths[-1]) / 1024
-            rows.append({"stage": stage, "peak_mb": {str(n): round(p, 1) for n, p in peaks.items()}, "kb_per_frame": round(added, 1),
-                         "mb_20_minutes": round(whole)})
+            rows.append(
+                {
+                    "stage": stage,
+                    "peak_mb": {str(n): round(p, 1) for n, p in peaks.items()},
+                    "kb_per_frame": round(added, 1),
+                    "mb_20_minutes": round(whole),
+                }
+            )
     return rows
 
 

@@ -314,8 +314,9 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
     assert "is a take already" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(("change", "said"), [({"--model": "fulll"}, "no body model “fulll”. Did you mean “full”"),
-                                              ({"L": "rig.toml"}, "neither a folder")])
+@pytest.mark.parametrize(
+    ("change", "said"), [({"--model": "fulll"}, "no body model “fulll”. Did you mean “full”"), ({"L": "rig.toml"}, "neither a folder")]
+)
 def test_new_refuses_what_no_run_could_read(take: Path, tmp_path: Path, capfd: Capture, change: dict[str, str], said: str) -> None:
     views = [f"{name}={take / change.get(name, name)}" for name in "LCR"]
     assert commands.main(["new", str(tmp_path / "new"), "--views", *views, "--model", change.get("--model", "full")]) == 2

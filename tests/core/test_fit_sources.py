@@ -57,13 +57,23 @@ def test_a_missing_file_shifts_no_other(tmp_path) -> None:
     assert sorted(set(found.frame.tolist())) == [0, 1, 2]
 
 
-@pytest.mark.parametrize(("frames", "seeds", "keyframes", "used", "missing", "said"), [
-    (range(0, 9), 2, (5,), [2, 5], "", ""), (range(0, 4), 2, (5,), [2], "", "in frame 5 are not used: only frames 0 to 3 are fitted."),
-    (range(4, 9), 2, (5,), [5], "", "in frame 2 .* begins at other clicks"), (range(6, 9), 2, (5,), [], "in the frames 6 to 8", "")])
+@pytest.mark.parametrize(
+    ("frames", "seeds", "keyframes", "used", "missing", "said"),
+    [
+        (range(0, 9), 2, (5,), [2, 5], "", ""),
+        (range(0, 4), 2, (5,), [2], "", "in frame 5 are not used: only frames 0 to 3 are fitted."),
+        (range(4, 9), 2, (5,), [5], "", "in frame 2 .* begins at other clicks"),
+        (range(6, 9), 2, (5,), [], "in the frames 6 to 8", ""),
+    ],
+)
 def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, missing, said) -> None:
     joints = {"knee.R": {"L": np.zeros(2)}}
-    take = SimpleNamespace(seeds=Seeds(frame=seeds, joints=joints), keyframes=tuple(Seeds(frame=f, joints=joints) for f in keyframes),
-                           body_model="full", keypoints=())
+    take = SimpleNamespace(
+        seeds=Seeds(frame=seeds, joints=joints),
+        keyframes=tuple(Seeds(frame=f, joints=joints) for f in keyframes),
+        body_model="full",
+        keypoints=(),
+    )
     footage = SimpleNamespace(take=take, frames=frames)
     assert sorted(clicks_in(footage)) == used
     assert missing in missing_for_fit(footage) and bool(missing) == bool(missing_for_fit(footage))
@@ -77,8 +87,11 @@ def test_coco_annotations_and_results(tmp_path) -> None:
     found = read_source(_footage(tmp_path), _source(files="results.json", view="L"))
     assert sorted(set(found.frame.tolist())) == [3, 10]
     assert found.place[found.joint.index("hip.L")].tolist() == [11.0, 3.0]
-    table = {"images": [{"id": 7, "file_name": "b10.png"}, {"id": 9, "file_name": "b2.png"}], "categories": [{"keypoints": ["RKnee"]}],
-             "annotations": [{"image_id": 7, "keypoints": [1.0, 2.0, 2]}, {"image_id": 9, "keypoints": [3.0, 4.0, 2]}]}
+    table = {
+        "images": [{"id": 7, "file_name": "b10.png"}, {"id": 9, "file_name": "b2.png"}],
+        "categories": [{"keypoints": ["RKnee"]}],
+        "annotations": [{"image_id": 7, "keypoints": [1.0, 2.0, 2]}, {"image_id": 9, "keypoints": [3.0, 4.0, 2]}],
+    }
     (tmp_path / "coco.json").write_text(json.dumps(table))
     found = read_source(_footage(tmp_path), _source(files="coco.json", view="L"))
     assert found.joint == ("knee.R", "knee.R")
@@ -95,9 +108,22 @@ def test_points_in_space(tmp_path) -> None:
     assert np.allclose(found.place.reshape(4, 2, 3), X, atol=1e-6) and (found.sigma == 0.03).all()
 
 
-@pytest.mark.parametrize(("name", "joint"), [
-    ("RKnee", "knee.R"), ("left_hip", "hip.L"), ("MidHip", "pelvis"), ("Neck", "neck"), ("LBigToe", "toe.L"), ("LHeel", ""), ("Nose", ""),
-    ("crown", ""), ("right_wrist", "wrist.R"), ("elbow.L", "elbow.L"), ("left_eye", "")])
+@pytest.mark.parametrize(
+    ("name", "joint"),
+    [
+        ("RKnee", "knee.R"),
+        ("left_hip", "hip.L"),
+        ("MidHip", "pelvis"),
+        ("Neck", "neck"),
+        ("LBigToe", "toe.L"),
+        ("LHeel", ""),
+        ("Nose", ""),
+        ("crown", ""),
+        ("right_wrist", "wrist.R"),
+        ("elbow.L", "elbow.L"),
+        ("left_eye", ""),
+    ],
+)
 def test_names_of_joints(name: str, joint: str) -> None:
     assert joint_named(name) == joint
 
@@ -108,11 +134,19 @@ def test_every_layout_has_the_limbs() -> None:
         assert {f"{j}.{s}" for j in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for s in "LR"} <= {joint_named(n) for n in names}
 
 
-@pytest.mark.parametrize(("table", "sentence"), [
-    (dict(files="kp/*.json"), "must name its view"), (dict(files="kp/*.json", view="X"), "must name its view"),
-    (dict(files="a.trc", view="C"), "has no view"), (dict(files="../a.trc"), "inside the take"), (dict(files="a.txt"), "are read from"),
-    (dict(files="a.trc", names={"a": "kne.R"}), "knee.R"), (dict(files="a.trc", sigmas=3), "sigma"),
-    (dict(files="a.trc", sigma=-1), "positive")])
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        (dict(files="kp/*.json"), "must name its view"),
+        (dict(files="kp/*.json", view="X"), "must name its view"),
+        (dict(files="a.trc", view="C"), "has no view"),
+        (dict(files="../a.trc"), "inside the take"),
+        (dict(files="a.txt"), "are read from"),
+        (dict(files="a.trc", names={"a": "kne.R"}), "knee.R"),
+        (dict(files="a.trc", sigmas=3), "sigma"),
+        (dict(files="a.trc", sigma=-1), "positive"),
+    ],
+)
 def test_bad_sources_are_refused(table, sentence) -> None:
     with pytest.raises(InputError, match=sentence):
         _source(**table)
@@ -122,9 +156,14 @@ def test_bad_files_are_refused(tmp_path) -> None:
     footage = _footage(tmp_path)
     with pytest.raises(InputError, match="There are no keypoints"):
         read_source(footage, _source(files="kp/*.json", view="C"))
-    for text, sentence in (("{", "no JSON"), ("[1]", "no known kind"), ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "x, y, confidence"),
-                           ('{"people": []}', "nobody"), ('{"people": [{"pose_keypoints_2d": [1, 2, 1]}]}', "no known layout"),
-                           ('[{"image_id": 1, "keypoints": "abc"}]', "x, y, confidence")):
+    for text, sentence in (
+        ("{", "no JSON"),
+        ("[1]", "no known kind"),
+        ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "x, y, confidence"),
+        ('{"people": []}', "nobody"),
+        ('{"people": [{"pose_keypoints_2d": [1, 2, 1]}]}', "no known layout"),
+        ('[{"image_id": 1, "keypoints": "abc"}]', "x, y, confidence"),
+    ):
         (tmp_path / "k.json").write_text(text)
         with pytest.raises(InputError, match=sentence):
             read_source(footage, _source(files="k.json", view="C"))

@@ -118,5 +118,3 @@ def test_a_wrong_argument_takes_nothing_away(take: Path, tmp_path: Path, capfd: 
                        (["contour", "--view", "X"], "has no view “X”")):  # fmt: skip
         assert said in refused([argv[0], str(take), *argv[1:], "--out", str(out), "--quiet"], capfd)
         assert names(out) == before
-
-

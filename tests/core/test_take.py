@@ -74,7 +74,8 @@ def test_both_fields(footage: Path) -> None:
 def test_corrections_and_keyframes(tmp_path: Path) -> None:
     more = (
         '[body]\nmodel = "arm.R"\nlocked = ["elbow.R twist"]\n[body.limits]\n"elbow.R flexion" = [0, 140]\n'
-        + KEYFRAME + KEYFRAME.replace("frame = 3", "frame = 1")
+        + KEYFRAME
+        + KEYFRAME.replace("frame = 3", "frame = 1")
         + '[[corrections]]\nkind = "trajectory"\nview = "L"\nframe = 4\nxy = [3, 4.5]\n'
         + '[[corrections]]\nkind = "region"\nview = "C"\nframes = [2, 9]\npolygon = [[0, 0], [9, 0], [0, 9.5]]\n'
     )
@@ -90,7 +91,7 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
     take = read(tmp_path, text(dict(rig=None)))
     assert (take.reference_view, take.interlaced, take.frames, take.body_model) == ("C", "none", None, None)
     assert take.rig_path.name == "rig.toml" and not take.seeds.joints and not take.seeds.surface
-    two = read(tmp_path, text(views=VIEWS.split("[[views]]\nname = \"R\"")[0]))
+    two = read(tmp_path, text(views=VIEWS.split('[[views]]\nname = "R"')[0]))
     assert two.reference_view == "C"
 
 
@@ -116,8 +117,8 @@ FAULTS = {
     "fps NaN": (text(dict(fps="nan")), "`fps` of .* is nan"),
     "fps infinite": (text(dict(fps="inf")), "`fps` of .* is inf"),
     "interlaced": (text(dict(interlaced='"od"')), "`interlaced` of .* is 'od'; write one of: none, odd, even, both"),
-    "first_field": (text(dict(interlaced='"both"', first_field='"top"')), "`first_field` of .* is 'top'; write \"odd\" or \"even\""),
-    "first_field alone": (text(dict(interlaced='"odd"', first_field='"even"')), "only beside interlaced = \"both\""),
+    "first_field": (text(dict(interlaced='"both"', first_field='"top"')), '`first_field` of .* is \'top\'; write "odd" or "even"'),
+    "first_field alone": (text(dict(interlaced='"odd"', first_field='"even"')), 'only beside interlaced = "both"'),
     "interlaced true": (text(dict(interlaced="true")), "`interlaced` of .* is True"),
     "reference view": (text(dict(reference_view='"M"')), "`reference_view` of .* is 'M'"),
     "frames a number": (text(dict(frames="3")), "`frames` of .* is 3; write"),

@@ -26,7 +26,7 @@ def test_every_kind_of_value_comes_back_exactly() -> None:
 
 def test_people_can_read_it() -> None:
     text = toml_text(FULL)
-    assert '[[views]]\nname = "L"\n' in text and "\n[seeds.joints]\n\"elbow.R\" = { L = [612.125, 180.5]" in text
+    assert '[[views]]\nname = "L"\n' in text and '\n[seeds.joints]\n"elbow.R" = { L = [612.125, 180.5]' in text
     assert "\n[settings.matching]\npatch_px = 17\nrobust = true\n" in text and text.endswith("\n")
 
 

@@ -12,8 +12,18 @@ from pathlib import Path
 
 SUITE = "sid"
 # cattr is what Blender's extension system imports; xvfb is the display, with Mesa's software renderer.
-PACKAGES = ("blender", "libgl1", "libegl1", "libgl1-mesa-dri", "xvfb", "python3-numpy", "python3-scipy", "python3-cattr",
-            "python3-requests", "python3-zstandard")
+PACKAGES = (
+    "blender",
+    "libgl1",
+    "libegl1",
+    "libgl1-mesa-dri",
+    "xvfb",
+    "python3-numpy",
+    "python3-scipy",
+    "python3-cattr",
+    "python3-requests",
+    "python3-zstandard",
+)
 STAMP = "tricap-packages.txt"
 BLENDER = "Blender 5.2"
 SPACE_BYTES = 2_500_000_000

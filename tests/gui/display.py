@@ -80,5 +80,7 @@ class Pulse:
     def __str__(self) -> str:
         gaps = 1e3 * self.gaps_s()
         half, most, nearly_all = np.percentile(gaps, [50, 95, 99])
-        return (f"{len(gaps)} gaps: 50 % {half:.0f} ms, 95 % {most:.0f} ms, 99 % {nearly_all:.0f} ms, longest {np.max(gaps):.0f} ms, "
-                f"{(gaps > 100).sum()} over 100 ms (load of the machine {os.getloadavg()[0]:.1f})")
+        return (
+            f"{len(gaps)} gaps: 50 % {half:.0f} ms, 95 % {most:.0f} ms, 99 % {nearly_all:.0f} ms, longest {np.max(gaps):.0f} ms, "
+            f"{(gaps > 100).sum()} over 100 ms (load of the machine {os.getloadavg()[0]:.1f})"
+        )

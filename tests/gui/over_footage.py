@@ -161,6 +161,7 @@ def corrected() -> drive.Steps:
     """A click takes a trajectory out, four a region; both stand in take.toml, and the tracks follow."""
     project = module("addon.project")
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
+
     def taken() -> int:
         return len(bpy.context.scene.tricap_correcting.corrections)
 

@@ -15,8 +15,7 @@ DRIVER = Path(__file__).with_name("drive.py")
 TIMED_OUT = 124
 
 
-def run_script(root: Path, package: Path, script: Path, out: Path, limit_s: float, data: Path | None,
-               size: tuple[int, int]) -> int:
+def run_script(root: Path, package: Path, script: Path, out: Path, limit_s: float, data: Path | None, size: tuple[int, int]) -> int:
     """Install `package` into an empty profile, open Blender's window in the chroot `root`, and let `script` drive it (see drive.py).
 
     What the script writes to its folder `drive.OUT` is in `out` afterwards, with log.txt; `data`, a file or folder, is copied to
@@ -56,8 +55,22 @@ def _shared_folder(root: Path) -> Iterator[Path]:
 def _display(root: Path, inside: Path, size: tuple[int, int]) -> Iterator[str]:
     """A virtual display of the chroot; its picture lies in the file that drive.py reads."""
     (root / inside.relative_to("/") / "screen").mkdir()
-    command = ["chroot", root, "Xvfb", "-displayfd", "1", "-screen", "0", f"{size[0]}x{size[1]}x24", "-nolisten", "tcp",
-               "+extension", "GLX", "-fbdir", inside / "screen"]
+    command = [
+        "chroot",
+        root,
+        "Xvfb",
+        "-displayfd",
+        "1",
+        "-screen",
+        "0",
+        f"{size[0]}x{size[1]}x24",
+        "-nolisten",
+        "tcp",
+        "+extension",
+        "GLX",
+        "-fbdir",
+        inside / "screen",
+    ]
     server = subprocess.Popen([str(part) for part in command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert server.stdout is not None
     try:
@@ -72,8 +85,17 @@ def _display(root: Path, inside: Path, size: tuple[int, int]) -> Iterator[str]:
 
 def _environment(inside: Path, display: str) -> dict[str, str]:
     keep = {name: value for name, value in os.environ.items() if name in ("LANG", "PATH", "TERM")}
-    return {**keep, "DISPLAY": display, "HOME": str(inside), "XDG_CACHE_HOME": f"/{SHARE}/cache", "LIBGL_ALWAYS_SOFTWARE": "1",
-            "BLENDER_USER_RESOURCES": str(inside / "profile"), "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1", "LC_ALL": "C.UTF-8"}
+    return {
+        **keep,
+        "DISPLAY": display,
+        "HOME": str(inside),
+        "XDG_CACHE_HOME": f"/{SHARE}/cache",
+        "LIBGL_ALWAYS_SOFTWARE": "1",
+        "BLENDER_USER_RESOURCES": str(inside / "profile"),
+        "PYTHONUNBUFFERED": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "LC_ALL": "C.UTF-8",
+    }
 
 
 def _install(root: Path, inside: Path, environment: dict[str, str]) -> None:
@@ -85,8 +107,23 @@ def _install(root: Path, inside: Path, environment: dict[str, str]) -> None:
 
 def _drive(root: Path, inside: Path, script: str, size: tuple[int, int], environment: dict[str, str], limit_s: float, log: Path) -> int:
     start = f"import sys; sys.path.insert(0, {str(inside)!r}); import drive; drive.run({script!r})"
-    command = ["chroot", root, "blender", "--enable-event-simulate", "--no-window-focus", "--gpu-backend", "opengl",
-               "--window-geometry", 0, 0, *size, "--python-exit-code", "3", "--python-expr", start]
+    command = [
+        "chroot",
+        root,
+        "blender",
+        "--enable-event-simulate",
+        "--no-window-focus",
+        "--gpu-backend",
+        "opengl",
+        "--window-geometry",
+        0,
+        0,
+        *size,
+        "--python-exit-code",
+        "3",
+        "--python-expr",
+        start,
+    ]
     with log.open("w") as lines:
         blender = subprocess.Popen([str(part) for part in command], env=environment, stdin=subprocess.DEVNULL, stdout=lines, stderr=lines)
         try:

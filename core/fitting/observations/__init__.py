@@ -23,9 +23,26 @@ from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
 from .symmetry import Symmetry
 
-__all__ = ["Apart", "Block", "ClickedJoints", "EmptySpace", "EqualRadii", "FootOnFloor", "FromBlocks", "JointLimits", "Keypoints",
-           "MaterialSteps", "MotionPrior", "Observation", "Proportions", "ShapePrior", "SilhouetteRays", "StepsFromFixed", "SurfacePoints",
-           "Symmetry"]
+__all__ = [
+    "Apart",
+    "Block",
+    "ClickedJoints",
+    "EmptySpace",
+    "EqualRadii",
+    "FootOnFloor",
+    "FromBlocks",
+    "JointLimits",
+    "Keypoints",
+    "MaterialSteps",
+    "MotionPrior",
+    "Observation",
+    "Proportions",
+    "ShapePrior",
+    "SilhouetteRays",
+    "StepsFromFixed",
+    "SurfacePoints",
+    "Symmetry",
+]
 
 
 class Observation(Protocol):

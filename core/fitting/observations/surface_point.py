@@ -66,8 +66,14 @@ class SurfacePoints(FromBlocks):
             gradient = there.gradient
             slope = np.sqrt(np.einsum("ni,ni->n", gradient, gradient)) * np.abs(there.distance[1])
             scale = np.clip(slope, SCALE_RANGE[0] * typical, SCALE_RANGE[1] * typical)
-        return _Scaled(rows=rows, bone=bone, balls=state.balls, shares=there.shares, scale=scale,
-                       log_radius=there.shares @ state.log_radii[there.part.balls])
+        return _Scaled(
+            rows=rows,
+            bone=bone,
+            balls=state.balls,
+            shares=there.shares,
+            scale=scale,
+            log_radius=there.shares @ state.log_radii[there.part.balls],
+        )
 
     def at(self, xyz_m: np.ndarray) -> "SurfacePoints":
         """The same weights at other places (N, 3)."""

@@ -124,7 +124,7 @@ def planted(places: np.ndarray, on: np.ndarray, shortest: float) -> np.ndarray:
             for first, last in runs(still):
                 near = np.linalg.norm(level - level[(first + last) // 2], axis=1) < LEFT_M
                 begin, end = next(span for span in runs(near) if span[0] <= first < span[1])
-                result[a + begin:a + end] |= last > first + 1
+                result[a + begin : a + end] |= last > first + 1
     return result
 
 

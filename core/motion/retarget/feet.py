@@ -80,8 +80,14 @@ def _leg(rig: Rig, side: str, bones: Mapping[str, tuple[int, ...]], floor_m: flo
     under = np.array([1.0, 1.0, 0.0])
     sole = np.concatenate(skin) if skin else np.array([ankle * under, ball * under]) + (0, 0, low)
     tips = np.concatenate(toes) if toes else np.array([tip * under + (0, 0, low)])
-    return Leg(side=side, **{k: tuple(v) for k, v in bones.items()}, ball_m=ball, ankle_m=float(ankle[2] - sole[:, 2].min()), sole_m=sole,
-               tip_m=tips)
+    return Leg(
+        side=side,
+        **{k: tuple(v) for k, v in bones.items()},
+        ball_m=ball,
+        ankle_m=float(ankle[2] - sole[:, 2].min()),
+        sole_m=sole,
+        tip_m=tips,
+    )
 
 
 def level_feet(since_rest: np.ndarray, flat: np.ndarray, A: np.ndarray) -> np.ndarray:
@@ -163,7 +169,7 @@ def about_ball(leg: Leg, rig: Rig, R: np.ndarray, toe: np.ndarray, begin: int, e
     """s_f (end − begin, 3): how the ankle moves in a contact, about the ball where that stands and not at all where only the heel does."""
     arm = _arm(leg, rig, R)[begin:end]
     step = np.zeros_like(arm)
-    step[1:] = -np.diff(arm, axis=0) * (toe[begin:end - 1] & toe[begin + 1:end])[:, None]
+    step[1:] = -np.diff(arm, axis=0) * (toe[begin : end - 1] & toe[begin + 1 : end])[:, None]
     return np.cumsum(step, axis=0)
 
 
@@ -200,8 +206,14 @@ def stiffness(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
     return np.eye(3) + (k - 1.0)[:, None, None] * along[:, :, None] * along[:, None, :]
 
 
-def carry_root(stands: list[Stand], ankles: Mapping[str, np.ndarray], hips: Mapping[str, np.ndarray], stiff: Mapping[str, np.ndarray],
-               fps: float, leg_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def carry_root(
+    stands: list[Stand],
+    ankles: Mapping[str, np.ndarray],
+    hips: Mapping[str, np.ndarray],
+    stiff: Mapping[str, np.ndarray],
+    fps: float,
+    leg_m: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Corrections of the root: shift c (T, 3), turn ω (T, 3) [rad], and the contacts' places X (K, 3; z is 0).  (1)
 
     By side: ankles (T, 3), hip joints against the middle of the hips (T, 3), and W^½ (T, 3, 3).
@@ -211,19 +223,23 @@ def carry_root(stands: list[Stand], ankles: Mapping[str, np.ndarray], hips: Mapp
         return np.zeros((t, 3)), np.zeros((t, 3)), np.zeros((0, 3))
     frame = np.concatenate([np.arange(s.begin, s.end) for s in stands])
     which = np.repeat(np.arange(k), [s.end - s.begin for s in stands])
-    W = np.concatenate([stiff[s.side][s.begin:s.end] for s in stands])  # (n, 3, 3)
-    misfit = np.concatenate([s.path_m - ankles[s.side][s.begin:s.end] for s in stands])
-    lever = W @ -cross_matrix(np.concatenate([hips[s.side][s.begin:s.end] for s in stands]))  # ω × h = −[h]× ω
-    A = sparse.hstack([_placed(np.concatenate([W, lever], axis=2), 6 * frame[:, None] + np.arange(6), 6 * t),  # c and ω by frame
-                       _placed(-W[:, :, :2], 2 * which[:, None] + np.arange(2), 2 * k)])
+    W = np.concatenate([stiff[s.side][s.begin : s.end] for s in stands])  # (n, 3, 3)
+    misfit = np.concatenate([s.path_m - ankles[s.side][s.begin : s.end] for s in stands])
+    lever = W @ -cross_matrix(np.concatenate([hips[s.side][s.begin : s.end] for s in stands]))  # ω × h = −[h]× ω
+    A = sparse.hstack(
+        [
+            _placed(np.concatenate([W, lever], axis=2), 6 * frame[:, None] + np.arange(6), 6 * t),  # c and ω by frame
+            _placed(-W[:, :, :2], 2 * which[:, None] + np.arange(2), 2 * k),
+        ]
+    )
     smooth = _roughness(t, 2) * (SMOOTH_S * fps) ** 4 + _roughness(t, 1) * LEVEL * (SMOOTH_S * fps) ** 2
     shifts, turns = np.diag([1.0] * 3 + [0.0] * 3), np.diag([0.0] * 3 + [1.0] * 3) * (TILT * leg_m) ** 2
     hold = sparse.kron(smooth + HOLD * sparse.identity(t), shifts) + sparse.kron(smooth + sparse.identity(t), turns)
     normal = (A.T @ A + sparse.block_diag([hold, 1e-9 * sparse.identity(2 * k)])).tocsc()
     solved = splu(normal, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})  # a band with a border
     x = solved.solve(A.T @ np.einsum("nij,nj->ni", W, misfit).ravel())
-    frames = x[:6 * t].reshape(t, 6)
-    return frames[:, :3], frames[:, 3:], np.column_stack([x[6 * t:].reshape(k, 2), np.zeros(k)])
+    frames = x[: 6 * t].reshape(t, 6)
+    return frames[:, :3], frames[:, 3:], np.column_stack([x[6 * t :].reshape(k, 2), np.zeros(k)])
 
 
 def _placed(blocks: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
@@ -253,8 +269,9 @@ def step_over(leg: Leg, rig: Rig, R: np.ndarray, ankle: np.ndarray, floor_m: flo
     return _eased(leg, rig, R, (*leg.foot, *leg.toe), vector_from_matrix(level), ankle, floor_m, swinging)
 
 
-def _eased(leg: Leg, rig: Rig, R: np.ndarray, bones: tuple[int, ...], turn: np.ndarray, ankle: np.ndarray, floor_m: float,
-           swinging: np.ndarray) -> np.ndarray:
+def _eased(
+    leg: Leg, rig: Rig, R: np.ndarray, bones: tuple[int, ...], turn: np.ndarray, ankle: np.ndarray, floor_m: float, swinging: np.ndarray
+) -> np.ndarray:
     """R with `bones` turned by the least part of the Rodrigues vectors `turn` (T, 3) that clears the floor; not if that is no help."""
     before = ankle[:, 2] + lowest(leg, rig, R) - floor_m
     some = np.flatnonzero(swinging & (before < 0.0))
@@ -278,24 +295,33 @@ def _turned(R: np.ndarray, bones: tuple[int, ...], vector: np.ndarray) -> np.nda
     return R
 
 
-def ankle_goals(leg: Leg, rig: Rig, R: np.ndarray, stands: list[Stand], places: np.ndarray, ankle: np.ndarray, floor_m: float,
-                blend: float) -> tuple[np.ndarray, np.ndarray]:
+def ankle_goals(
+    leg: Leg, rig: Rig, R: np.ndarray, stands: list[Stand], places: np.ndarray, ankle: np.ndarray, floor_m: float, blend: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Where the ankle shall be (T, 3), and R with swinging feet turned where they must: planted in contacts, let go over `blend` frames,
     and never so low that the sole is in the floor. `ankle` (T, 3): where the leg has it."""
     own = [(stand, place) for stand, place in zip(stands, places) if stand.side == leg.side]
     goal, swinging = ankle.copy(), np.ones(len(ankle), dtype=bool)
     for k, (stand, place) in enumerate(own):
-        pull = stand.path_m + place - ankle[stand.begin:stand.end]
+        pull = stand.path_m + place - ankle[stand.begin : stand.end]
         goal += let_go(pull, [(s.begin, s.end) for s, _ in own], k, len(ankle), blend)
-        swinging[stand.begin:stand.end] = False
+        swinging[stand.begin : stand.end] = False
     leg_m = float(np.linalg.norm(rig.head_m[leg.thigh[0]] - rig.head_m[leg.foot[0]]))
     R = step_over(leg, rig, R, goal, floor_m - RAISED * leg_m, swinging)
     goal[:, 2] += np.maximum(floor_m - goal[:, 2] - lowest(leg, rig, R), 0.0)
     return goal, R
 
 
-def bend_limb(rig: Rig, R: np.ndarray, thigh: tuple[int, ...], shin: tuple[int, ...], foot: int, hip_m: np.ndarray, goal_m: np.ndarray,
-              forward: np.ndarray) -> np.ndarray:
+def bend_limb(
+    rig: Rig,
+    R: np.ndarray,
+    thigh: tuple[int, ...],
+    shin: tuple[int, ...],
+    foot: int,
+    hip_m: np.ndarray,
+    goal_m: np.ndarray,
+    forward: np.ndarray,
+) -> np.ndarray:
     """R with thigh and shin (or the bones of an arm) turned so that the ankle is at goal (T, 3), the hip staying at (T, 3).  (3)
 
     `forward` (T, 3): where a straight knee would bend to. A goal out of reach is approached as far as the leg is long.

@@ -35,8 +35,9 @@ def find_arms(rig: Rig, rig_map: RigMap) -> dict[str, Arm]:
     """The arms of a rig that have upper arm, forearm and hand."""
     arms = {}
     for side in SIDES:
-        upper, fore, hand = (tuple(rig.index[n] for n in rig_map.bones.get(sided(part, side), ()))
-                             for part in ("upper_arm", "forearm", "hand"))
+        upper, fore, hand = (
+            tuple(rig.index[n] for n in rig_map.bones.get(sided(part, side), ())) for part in ("upper_arm", "forearm", "hand")
+        )
         if upper and fore and hand:
             arms[side] = Arm(upper=upper, fore=fore, hand=hand[0])
     return arms
@@ -69,15 +70,25 @@ def hold_hands(source: Motion, source_map: RigMap, moved: Motion, target_map: Ri
         arm = arms[side]
         if np.abs(off).max() < 1e-6:
             continue
-        bent = bend_limb(moved.rig, R, arm.upper, arm.fore, arm.hand, moved.head_m[:, arm.upper[0]], moved.head_m[:, arm.hand] + off,
-                         _out(moved, arm))
+        bent = bend_limb(
+            moved.rig, R, arm.upper, arm.fore, arm.hand, moved.head_m[:, arm.upper[0]], moved.head_m[:, arm.hand] + off, _out(moved, arm)
+        )
         held = np.flatnonzero(total > 0)
         R[held] = bent[held]
     return R
 
 
-def _pulls(source: Motion, source_map: RigMap, moved: Motion, target_map: RigMap, scale: float, side: str,
-           palms: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray], reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def _pulls(
+    source: Motion,
+    source_map: RigMap,
+    moved: Motion,
+    target_map: RigMap,
+    scale: float,
+    side: str,
+    palms: Mapping[str, np.ndarray],
+    now: Mapping[str, np.ndarray],
+    reach: float,
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Goals (T, 3) of a palm and their weights (T,).  (1)"""
     pulls = []
     for role in ANCHORS:

@@ -21,8 +21,8 @@ def needed_keys(times: np.ndarray, values: np.ndarray, tolerance: float) -> np.n
         a, b = stack.pop()
         if b - a < 2:
             continue
-        part = ((times[a:b + 1] - times[a]) / (times[b] - times[a]))[:, None]
-        off = np.linalg.norm(values[a:b + 1] - (values[a] + part * (values[b] - values[a])), axis=1)
+        part = ((times[a : b + 1] - times[a]) / (times[b] - times[a]))[:, None]
+        off = np.linalg.norm(values[a : b + 1] - (values[a] + part * (values[b] - values[a])), axis=1)
         worst = a + int(np.argmax(off))
         if off[worst - a] > tolerance:
             keep[worst] = True

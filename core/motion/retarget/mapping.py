@@ -63,7 +63,7 @@ def read_preset(path: Path) -> Preset:
     sides = table.get("sides", {"L": "L", "R": "R"})
     prefixes = table.get("prefixes", [""])
     if not isinstance(sides, dict) or set(sides) != {"L", "R"} or not all(isinstance(x, str) for x in [*sides.values(), *prefixes]):
-        raise InputError(f"{path} has odd “sides” or “prefixes”; write {{\"L\": \"Left\", \"R\": \"Right\"}} and a list of texts.")
+        raise InputError(f'{path} has odd “sides” or “prefixes”; write {{"L": "Left", "R": "Right"}} and a list of texts.')
     parts = {key: _by_role(table.get(key, {}), sides, key, path) for key in ("bones", "twist")}
     steering = _steering(table["steering"], sides, path) if "steering" in table else None
     return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), steering=steering, **parts)
@@ -75,8 +75,11 @@ def _steering(table: Any, sides: Map[str, str], path: Path) -> Steering:
         raise InputError(f"{path} says nothing of how controls follow each other; “steering” needs a table “follows” with a name by name.")
 
     def both(part: Any) -> dict[str, Any]:
-        return {str(key).replace("{s}", side): value.replace("{s}", side) if isinstance(value, str) else value
-                for key, value in (part.items() if isinstance(part, dict) else ()) for side in sides.values()}
+        return {
+            str(key).replace("{s}", side): value.replace("{s}", side) if isinstance(value, str) else value
+            for key, value in (part.items() if isinstance(part, dict) else ())
+            for side in sides.values()
+        }
 
     follows, skin, properties = (both(table.get(key)) for key in ("follows", "skin", "properties"))
     if not all(isinstance(name, str) for name in [*follows.values(), *skin.values()]):
@@ -114,9 +117,11 @@ def write_map(path: Path, rig_map: RigMap, name: str) -> None:
         InputError: the file cannot be written.
     """
     steering = rig_map.steering
-    store.write_json(path, {"name": name, "bones": {r: list(c) for r, c in rig_map.bones.items()},
-                            "twist": {r: list(c) for r, c in rig_map.twist.items()}}
-                     | ({"steering": steering.table()} if steering is not None else {}))
+    store.write_json(
+        path,
+        {"name": name, "bones": {r: list(c) for r, c in rig_map.bones.items()}, "twist": {r: list(c) for r, c in rig_map.twist.items()}}
+        | ({"steering": steering.table()} if steering is not None else {}),
+    )
 
 
 def apply_preset(rig: Rig, preset: Preset) -> RigMap:
@@ -132,8 +137,13 @@ def apply_preset(rig: Rig, preset: Preset) -> RigMap:
     if not bones:
         raise InputError(f"None of the bones of the mapping “{preset.name}” are in this rig; choose another or let it be found.")
     missing = tuple(f"{role}: no bone “{preset.bones[role][0]}”" for role in preset.bones if role not in bones)
-    return RigMap(bones=bones, twist={role: chain for role, chain in twist.items() if chain and role in bones}, missing=missing,
-                  origin=f"mapping “{preset.name}”", steering=preset.steering)
+    return RigMap(
+        bones=bones,
+        twist={role: chain for role, chain in twist.items() if chain and role in bones},
+        missing=missing,
+        origin=f"mapping “{preset.name}”",
+        steering=preset.steering,
+    )
 
 
 def fit_of(rig: Rig, preset: Preset) -> tuple[float, int]:
@@ -170,8 +180,10 @@ def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
         return shaped
     if named.bones:
         return named
-    raise InputError("No part of a body could be recognised in this rig, neither by its bones' names nor by its shape;"
-                     " write a mapping (see docs/retargeting.md).")
+    raise InputError(
+        "No part of a body could be recognised in this rig, neither by its bones' names nor by its shape;"
+        " write a mapping (see docs/retargeting.md)."
+    )
 
 
 def _is_limb(named: RigMap) -> bool:
@@ -238,8 +250,11 @@ def _chain(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
 def _fingers(rig: Rig, readings: Map[str, Reading], side: str, bones: dict[str, tuple[str, ...]]) -> None:
     hand = bones.get(sided("hand", side))
     for finger in FINGERS if hand else ():
-        found = sorted((int(r.finger.split(".")[1]), n) for n, r in readings.items()
-                       if r.side == side and r.finger.startswith(finger) and hand and _hangs_on(rig, n, hand[-1]))
+        found = sorted(
+            (int(r.finger.split(".")[1]), n)
+            for n, r in readings.items()
+            if r.side == side and r.finger.startswith(finger) and hand and _hangs_on(rig, n, hand[-1])
+        )
         numbers = [n for k, n in found if k > 0]
         if len({k for k, _ in found if k > 0}) == len(numbers):
             for k, name in enumerate(numbers[:3], 1):
@@ -297,8 +312,14 @@ def _central_end(rig: Rig, top: int, arms: Sequence[int], necks: Sequence[int]) 
     bone, found = top, None
     while True:
         width = rig.height_m * 0.02
-        ahead = [c for c in rig.children[bone] if c not in on_arms and abs(rig.head_m[c][0] - rig.head_m[top][0]) < width
-                 and rig.head_m[c][2] > rig.head_m[bone][2] - width and rig.tail_m[c][2] > rig.head_m[c][2]]
+        ahead = [
+            c
+            for c in rig.children[bone]
+            if c not in on_arms
+            and abs(rig.head_m[c][0] - rig.head_m[top][0]) < width
+            and rig.head_m[c][2] > rig.head_m[bone][2] - width
+            and rig.tail_m[c][2] > rig.head_m[c][2]
+        ]
         if not ahead or len(rig.children[bone]) > 3 and bone != top:
             return found
         bone = found = max(ahead, key=lambda c: rig.tail_m[c][2])
@@ -318,16 +339,27 @@ def _completed(rig: Rig, found: RigMap) -> RigMap:
                 line = [rig.names[b] for b in rig.path(first, rig.index[following[0]])[:-1]]
                 bones[role] = tuple(n for n in line if n in bones[role] or n not in used) or bones[role]
             line_bones = {rig.index[n] for n in bones[role]}
-            beside = [n for b, n in enumerate(rig.names) if n not in used and n not in bones[role] and rig.parents[b] in line_bones
-                      and read_name(n).twist and not rig.children[b]]
+            beside = [
+                n
+                for b, n in enumerate(rig.names)
+                if n not in used and n not in bones[role] and rig.parents[b] in line_bones and read_name(n).twist and not rig.children[b]
+            ]
             if beside:
                 twist[role] = (*twist.get(role, ()), *beside)
     bones |= _up_to_the_head(rig, bones)
     known = {name for chain in bones.values() for name in chain}
-    missing = found.missing + tuple(f"{role}: no bone was recognised" for role in NEEDED if role not in bones and not any(
-        text.startswith(role) for text in found.missing))
-    return RigMap(bones={role: bones[role] for role in ROLES if role in bones}, twist=twist, missing=missing, notes=found.notes + (
-        (f"{len(rig.names) - len(known)} other bones follow their parents",) if len(rig.names) > len(known) else ()), origin=found.origin)
+    missing = found.missing + tuple(
+        f"{role}: no bone was recognised"
+        for role in NEEDED
+        if role not in bones and not any(text.startswith(role) for text in found.missing)
+    )
+    return RigMap(
+        bones={role: bones[role] for role in ROLES if role in bones},
+        twist=twist,
+        missing=missing,
+        notes=found.notes + ((f"{len(rig.names) - len(known)} other bones follow their parents",) if len(rig.names) > len(known) else ()),
+        origin=found.origin,
+    )
 
 
 def _up_to_the_head(rig: Rig, bones: Map[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:

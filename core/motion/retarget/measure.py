@@ -27,22 +27,32 @@ class Figures:
     frames: int
 
     def __str__(self) -> str:
-        return (f"limb directions {self.direction_rms_deg:.2f}° RMS (worst {self.direction_worst_deg:.1f}°), feet slide up to"
-                f" {self.slide_mm:.1f} mm in {self.contacts} contacts, sink {self.penetration_mm:.1f} mm,"
-                f" largest turn from frame to frame {self.largest_step_deg:.0f}°")
+        return (
+            f"limb directions {self.direction_rms_deg:.2f}° RMS (worst {self.direction_worst_deg:.1f}°), feet slide up to"
+            f" {self.slide_mm:.1f} mm in {self.contacts} contacts, sink {self.penetration_mm:.1f} mm,"
+            f" largest turn from frame to frame {self.largest_step_deg:.0f}°"
+        )
 
 
-def measure(source: Motion, source_map: RigMap, target: Motion, target_map: RigMap, contacts: Contacts | None,
-            floor_m: float = 0.0) -> Figures:
+def measure(
+    source: Motion, source_map: RigMap, target: Motion, target_map: RigMap, contacts: Contacts | None, floor_m: float = 0.0
+) -> Figures:
     """Compare a target's motion with its source's, frame by frame (both have the same frames)."""
     ours, theirs = directions(target, target_map), directions(source, source_map)
     error = {role: _angle_deg(ours[role], theirs[role]) for role in ours if role in theirs}
     slides, sunk, floating = _feet(target, target_map, contacts, floor_m)
     worst = max((float(e.max()) for e in error.values()), default=0.0)
-    return Figures(direction_rms_deg=_rms(list(error.values())), direction_worst_deg=worst,
-                   by_part_deg={role: _rms([e]) for role, e in error.items()}, slide_mm=1e3 * max(slides, default=0.0),
-                   penetration_mm=1e3 * sunk, float_mm=1e3 * floating, largest_step_deg=_largest_step_deg(target), contacts=len(slides),
-                   frames=len(target.frames))
+    return Figures(
+        direction_rms_deg=_rms(list(error.values())),
+        direction_worst_deg=worst,
+        by_part_deg={role: _rms([e]) for role, e in error.items()},
+        slide_mm=1e3 * max(slides, default=0.0),
+        penetration_mm=1e3 * sunk,
+        float_mm=1e3 * floating,
+        largest_step_deg=_largest_step_deg(target),
+        contacts=len(slides),
+        frames=len(target.frames),
+    )
 
 
 def _angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:

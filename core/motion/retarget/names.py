@@ -11,12 +11,16 @@ from dataclasses import dataclass
 
 WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 LEFT, RIGHT = {"l", "left", "lft", "lf"}, {"r", "right", "rgt", "rt"}
-NOISE = set("""j bip bip01 b bn sk c cc base def org jnt joint bone bones mixamorig neo character ctr m f avg valve biped g rig skin bind jt
-    bend stretch sub x armature bone1 metarig anim human skeleton""".split())
+NOISE = set(
+    """j bip bip01 b bn sk c cc base def org jnt joint bone bones mixamorig neo character ctr m f avg valve biped g rig skin bind jt
+    bend stretch sub x armature bone1 metarig anim human skeleton""".split()
+)
 # bones that steer others or carry things: never a part of the body
-STEERING = set("""ik pole control ctrl target end nub tip slot socket heel goal helper mch vis tweak gizmo prop weapon attach site lock
+STEERING = set(
+    """ik pole control ctrl target end nub tip slot socket heel goal helper mch vis tweak gizmo prop weapon attach site lock
     parent master widget roll pivot offset handle look aim fk2 leaf eff effector secondary
-    hair skirt cloth breast bust eye jaw tongue""".split())
+    hair skirt cloth breast bust eye jaw tongue""".split()
+)
 ENDS = {"end", "nub", "tip", "leaf", "site", "eff", "effector"}  # bones that only tell where the one before ends
 TWIST = {"twist", "twst", "roll"}
 
@@ -25,7 +29,7 @@ SURE = {
     "head": "head skull",
     "neck": "neck lowerneck upperneck cervical necklower neckupper",
     "spine": "spine back lowerback upperback torso chest thorax abdomen waist upperchest ribcage spinelower spineupper chestlower "
-             "chestupper abdomenlower abdomenupper abdomen2 stomach",
+    "chestupper abdomenlower abdomenupper abdomen2 stomach",
     "clavicle": "clavicle collar collarbone clav",
     "upper_arm": "upperarm uparm humerus shldr armupper bicep armup",
     "forearm": "forearm lowerarm lowarm elbow radius armlower ulna armlow foarm",
@@ -103,12 +107,12 @@ def side_of_words(words: list[str]) -> tuple[str, list[str]]:
         return words[0][0].upper(), [words[0][1:], *words[1:]]
     for prefix, side in (("left", "L"), ("right", "R")):
         if words and words[0].startswith(prefix):
-            return side, [words[0][len(prefix):], *words[1:]]
+            return side, [words[0][len(prefix) :], *words[1:]]
     return "", words
 
 
 def _finger(core: str, plain: list[str], words: list[str]) -> str:
-    """"LeftHandIndex1" -> "index.1"; the base in the palm counts as 0."""
+    """ "LeftHandIndex1" -> "index.1"; the base in the palm counts as 0."""
     found = FINGER.search(core)
     if not found or "toe" in core or "foot" in core:
         return ""

@@ -15,18 +15,47 @@ from .rig import Motion, Rig
 from .roles import SIDES, sided
 from .turns import shortest, transposed, unit
 
-WORDS = {"hip": "thigh", "knee": "shin", "ankle": "foot", "toe": "toe", "bigtoe": "toe", "toes": "toe", "ball": "toe",
-         "shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand", "clavicle": "clavicle", "hand": "fingers", "finger": "fingers"}
-CENTRAL = {"pelvis": "hips", "hips": "hips", "midhip": "hips", "hip": "hips", "root": "hips", "neck": "neck", "head": "head",
-           "nose": "nose", "chest": "chest", "spine": "spine", "thorax": "chest"}
+WORDS = {
+    "hip": "thigh",
+    "knee": "shin",
+    "ankle": "foot",
+    "toe": "toe",
+    "bigtoe": "toe",
+    "toes": "toe",
+    "ball": "toe",
+    "shoulder": "upper_arm",
+    "elbow": "forearm",
+    "wrist": "hand",
+    "clavicle": "clavicle",
+    "hand": "fingers",
+    "finger": "fingers",
+}
+CENTRAL = {
+    "pelvis": "hips",
+    "hips": "hips",
+    "midhip": "hips",
+    "hip": "hips",
+    "root": "hips",
+    "neck": "neck",
+    "head": "head",
+    "nose": "nose",
+    "chest": "chest",
+    "spine": "spine",
+    "thorax": "chest",
+}
 # part, the joint it begins at, the joint it ends at, the part it hangs on, where the left one points in the rest pose
-LIMBS = (("upper_arm", "upper_arm", "forearm", "spine", (1.0, 0.0, 0.0)), ("forearm", "forearm", "hand", "upper_arm", (1.0, 0.0, 0.0)),
-         ("hand", "hand", "fingers", "forearm", (1.0, 0.0, 0.0)), ("thigh", "thigh", "shin", "hips", (0.0, 0.0, -1.0)),
-         ("shin", "shin", "foot", "thigh", (0.0, 0.0, -1.0)), ("foot", "foot", "toe", "shin", (0.0, -1.0, 0.0)))
+LIMBS = (
+    ("upper_arm", "upper_arm", "forearm", "spine", (1.0, 0.0, 0.0)),
+    ("forearm", "forearm", "hand", "upper_arm", (1.0, 0.0, 0.0)),
+    ("hand", "hand", "fingers", "forearm", (1.0, 0.0, 0.0)),
+    ("thigh", "thigh", "shin", "hips", (0.0, 0.0, -1.0)),
+    ("shin", "shin", "foot", "thigh", (0.0, 0.0, -1.0)),
+    ("foot", "foot", "toe", "shin", (0.0, -1.0, 0.0)),
+)
 
 
 def joint_of(name: str) -> str:
-    """"RKnee", "knee.R", "right_knee" -> "shin.R"; "" for points that are no joint of ours."""
+    """ "RKnee", "knee.R", "right_knee" -> "shin.R"; "" for points that are no joint of ours."""
     words = [word.lower() for word in WORD.findall(name)]
     side, words = side_of_words(words)
     core = "".join(word for word in words if not word.isdigit() and word not in ("joint", "center", "centre", "jc"))
@@ -109,9 +138,16 @@ def _motion(rows: Mapping[str, Row], points: Markers) -> Motion:
     low = min(0.0, float(head[:, 2].min()))
     head = head - (0.0, 0.0, low)
     tail = head + direction * np.array([lengths[name] for name in names])[:, None]
-    rig = Rig(names=names, parents=np.array([order[rows[name][2]] if rows[name][2] else -1 for name in names]), R_rest=R_rest,
-              head_m=head, tail_m=tail, connected=np.zeros(len(names), dtype=bool), inherits_rotation=np.ones(len(names), dtype=bool),
-              roles={name: name for name in names})
+    rig = Rig(
+        names=names,
+        parents=np.array([order[rows[name][2]] if rows[name][2] else -1 for name in names]),
+        R_rest=R_rest,
+        head_m=head,
+        tail_m=tail,
+        connected=np.zeros(len(names), dtype=bool),
+        inherits_rotation=np.ones(len(names), dtype=bool),
+        roles={name: name for name in names},
+    )
     R = np.stack([turned[name] @ R_rest[order[name]] for name in names], axis=1)
     return Motion(rig=rig, fps=points.fps, frames=points.frames, R=R, head_m=np.stack([rows[name][0] for name in names], axis=1))
 
@@ -132,8 +168,9 @@ def _facing(rows: Mapping[str, Row], name: str, along: np.ndarray, before: np.nd
     return np.stack([x, np.cross(along, x), along], axis=2)
 
 
-def _rest_head(rows: Mapping[str, Row], name: str, above: str, heads: Mapping[str, np.ndarray], a: np.ndarray,
-               turned: Mapping[str, np.ndarray]) -> np.ndarray:
+def _rest_head(
+    rows: Mapping[str, Row], name: str, above: str, heads: Mapping[str, np.ndarray], a: np.ndarray, turned: Mapping[str, np.ndarray]
+) -> np.ndarray:
     """In the rest pose a part begins where it mostly lies as seen from what it hangs on."""
     if not above:
         return np.array([0.0, 0.0, 1.0]) if name == "hips" else np.median(a, axis=0)

@@ -51,6 +51,7 @@ def with_person_like_rest(motion: Motion, rig_map: RigMap) -> tuple[Motion, str]
         def place(role: str) -> np.ndarray | None:
             name = rig_map.first(role)
             return places[..., rig.index[name], :] if name else None
+
         return place
 
     if float(person_like(head(rig.head_m))) >= LIKE_A_PERSON:
@@ -58,7 +59,8 @@ def with_person_like_rest(motion: Motion, rig_map: RigMap) -> tuple[Motion, str]
     scores = person_like(head(motion.head_m))
     best = int(np.argmax(scores))
     along = np.einsum("bji,bj->bi", rig.R_rest, rig.tail_m - rig.head_m)
-    posed = replace(rig, R_rest=motion.R[best], head_m=motion.head_m[best],
-                    tail_m=motion.head_m[best] + np.einsum("bij,bj->bi", motion.R[best], along))
+    posed = replace(
+        rig, R_rest=motion.R[best], head_m=motion.head_m[best], tail_m=motion.head_m[best] + np.einsum("bij,bj->bi", motion.R[best], along)
+    )
     note = f"the source's rest pose is no person's: frame {motion.frames[best]:g} was taken instead"
     return replace(motion, rig=posed), note if scores[best] >= GOOD else f"{note}, in which the limbs are bent; twists may be off"

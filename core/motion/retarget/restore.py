@@ -39,8 +39,9 @@ def held_turns(rig: Rig, rig_map: RigMap, before: np.ndarray, after: np.ndarray)
     return {role: turn for role, turn in found.items() if np.abs(turn).max() > LEAST}
 
 
-def lacking(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, aligned: Mapping[str, np.ndarray], R: np.ndarray
-            ) -> tuple[UnshownChain, ...]:
+def lacking(
+    source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, aligned: Mapping[str, np.ndarray], R: np.ndarray
+) -> tuple[UnshownChain, ...]:
     """The parts, and bones of parts, that the target has not, and where it has those of chains from; the target moves as R (T, B, 3, 3)."""
     D, rig = source.R @ transposed(source.rig.R_rest), source.rig
     body = body_axes(rig, source_map) @ body_axes(target, target_map).T
@@ -54,9 +55,17 @@ def lacking(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap,
             bones = bones if part in SPREAD else [kept(bones, role)]
             along = target.height_m / max(rig.height_m, 1e-9) * A.T @ (rig.tail_m[bones[-1]] - rig.head_m[bones[0]])
             ref = target.index[target_map.bones[beside][-1]]
-            chains.append(UnshownChain(
-                role=role, order=(-1,) * len(bones), ends=fractions_of(rig, bones), along_m=along, beside=beside,
-                size=len(target_map.bones[beside]), turn=np.stack([_against(D[:, b] @ A, target, R, ref) for b in bones])))
+            chains.append(
+                UnshownChain(
+                    role=role,
+                    order=(-1,) * len(bones),
+                    ends=fractions_of(rig, bones),
+                    along_m=along,
+                    beside=beside,
+                    size=len(target_map.bones[beside]),
+                    turn=np.stack([_against(D[:, b] @ A, target, R, ref) for b in bones]),
+                )
+            )
     return tuple(chains)
 
 
@@ -74,8 +83,9 @@ def _part_of_chain(role: str, D: list[np.ndarray], ends: np.ndarray, target: Rig
     else:
         order = tuple(partners_of(ends, places))
     turn = [_against(D[k], target, R, own[_next(order, k)]) for k in range(len(order)) if order[k] < 0]
-    return UnshownChain(role=role, order=order, ends=ends, along_m=np.zeros(3), beside=role, size=len(own),
-                        turn=np.reshape(turn, (-1, len(R), 3)))
+    return UnshownChain(
+        role=role, order=order, ends=ends, along_m=np.zeros(3), beside=role, size=len(own), turn=np.reshape(turn, (-1, len(R), 3))
+    )
 
 
 def _next(order: tuple[int, ...], k: int) -> int:
@@ -140,12 +150,23 @@ def _with_chain(motion: Motion, rig_map: RigMap, chain: UnshownChain, beside: li
     R = [matrix_from_vector(turn) @ motion.R[:, ref] @ rig.R_rest[ref].T for turn, (_, ref) in zip(chain.turn, new)]
     places, n = [k for k, _ in new], len(new)
     names = {k: rig.names[b] for k, b in own} | {k: f"{chain.role}, {k + 1} (unshown)" for k in places}
-    longer = Rig(names=(*rig.names, *(names[k] for k in places)), parents=np.array([*rig.parents, *(ref for _, ref in new)]),
-                 R_rest=np.concatenate([rig.R_rest, np.broadcast_to(np.eye(3), (n, 3, 3))]), head_m=np.concatenate([head, bounds[places]]),
-                 tail_m=np.concatenate([tail, bounds[1:][places]]), connected=np.append(rig.connected, np.zeros(n, dtype=bool)),
-                 inherits_rotation=np.append(rig.inherits_rotation, np.ones(n, dtype=bool)), roles=rig.roles, sole_m=rig.sole_m)
-    more = replace(motion, rig=longer, R=np.concatenate([motion.R, *(turned[:, None] for turned in R)], axis=1),
-                   head_m=np.concatenate([moving, np.repeat(start[:, None], n, axis=1)], axis=1))
+    longer = Rig(
+        names=(*rig.names, *(names[k] for k in places)),
+        parents=np.array([*rig.parents, *(ref for _, ref in new)]),
+        R_rest=np.concatenate([rig.R_rest, np.broadcast_to(np.eye(3), (n, 3, 3))]),
+        head_m=np.concatenate([head, bounds[places]]),
+        tail_m=np.concatenate([tail, bounds[1:][places]]),
+        connected=np.append(rig.connected, np.zeros(n, dtype=bool)),
+        inherits_rotation=np.append(rig.inherits_rotation, np.ones(n, dtype=bool)),
+        roles=rig.roles,
+        sole_m=rig.sole_m,
+    )
+    more = replace(
+        motion,
+        rig=longer,
+        R=np.concatenate([motion.R, *(turned[:, None] for turned in R)], axis=1),
+        head_m=np.concatenate([moving, np.repeat(start[:, None], n, axis=1)], axis=1),
+    )
     chain_names = tuple(names[k] for k in range(len(chain.order)))
     return more, replace(rig_map, bones={**rig_map.bones, chain.role: chain_names}, hung=rig_map.hung | ({chain.role} if hung else set()))
 

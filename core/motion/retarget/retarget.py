@@ -1,6 +1,6 @@
 """Retargeting as a whole: the motion of a source onto a target rig.
 
-    mapping (both) → contacts (source) → rotations (transfer) → root, scaled by the legs → feet → pose channels
+mapping (both) → contacts (source) → rotations (transfer) → root, scaled by the legs → feet → pose channels
 """
 
 from collections.abc import Container, Mapping
@@ -32,13 +32,20 @@ LYING = 0.3  # height of the head over the hips, per distance
 class RetargetSettings:
     """What of the motion is taken over."""
 
-    root: str = knob("travel", "how the body moves through the room: as the source, on the spot, or not at all",
-                     choices=("travel", "in place", "still"))
+    root: str = knob(
+        "travel", "how the body moves through the room: as the source, on the spot, or not at all", choices=("travel", "in place", "still")
+    )
     scale: float = knob(0.0, "size of the target's steps against the source's; 0: by the length of the legs", low=0.0, high=1000.0)
-    hands: str = knob("free", "hands follow their arms, or keep their distance from each other, head, hips and thighs where they are near",
-                      choices=("free", "keep"))
-    twist: str = knob("bones", "spread the twist of the limbs over twist bones, or half of a hand's also over a forearm that has none",
-                      choices=("off", "bones", "forearms"))
+    hands: str = knob(
+        "free",
+        "hands follow their arms, or keep their distance from each other, head, hips and thighs where they are near",
+        choices=("free", "keep"),
+    )
+    twist: str = knob(
+        "bones",
+        "spread the twist of the limbs over twist bones, or half of a hand's also over a forearm that has none",
+        choices=("off", "bones", "forearms"),
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -63,8 +70,16 @@ class Retargeted:
         return replace(self.motion, head_m=self.motion.head_m + self.kept_back_m[:, None])
 
 
-def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, settings: RetargetSettings | None = None,
-             feet_settings: FeetSettings | None = None, monitor: Monitor | None = None, floor_m: float = 0.0) -> Retargeted:
+def retarget(
+    source: Motion,
+    source_map: RigMap,
+    target: Rig,
+    target_map: RigMap,
+    settings: RetargetSettings | None = None,
+    feet_settings: FeetSettings | None = None,
+    monitor: Monitor | None = None,
+    floor_m: float = 0.0,
+) -> Retargeted:
     """The motion of `source` on the rig `target`; `floor_m` is the floor's height under the target.
 
     Raises:
@@ -92,13 +107,19 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     free, driven = turned.R, turned.driven
     travels, carrier = settings.root != "in place", _carrier(target, target_map) if "hips" in aligned and settings.root != "still" else -1
     monitor.step("retargeting", 2, 4)
-    R, shift, moved_m = _grounded(source, source_map, target, target_map, free, driven, carrier, scale, legs, contacts, feet_settings,
-                                  floor_m)
+    R, shift, moved_m = _grounded(
+        source, source_map, target, target_map, free, driven, carrier, scale, legs, contacts, feet_settings, floor_m
+    )
     unshown = Unshown(
-        frames=source.frames, held=held_turns(target, target_map, free, R), moved_m=moved_m if travels else moved_m * (0.0, 0.0, 1.0),
-        twisted=_twisted(target, target_map, untwisted.R, free) if settings.twist == "forearms" else {}, feet=asdict(feet_settings),
+        frames=source.frames,
+        held=held_turns(target, target_map, free, R),
+        moved_m=moved_m if travels else moved_m * (0.0, 0.0, 1.0),
+        twisted=_twisted(target, target_map, untwisted.R, free) if settings.twist == "forearms" else {},
+        feet=asdict(feet_settings),
         stands={state: getattr(contacts, state) if contacts is not None and legs else {} for state in STATES},
-        level_m=floor_m + _ankle_level(legs), chains=lacking(source, source_map, target, target_map, aligned, free))
+        level_m=floor_m + _ankle_level(legs),
+        chains=lacking(source, source_map, target, target_map, aligned, free),
+    )
     monitor.step("retargeting", 3, 4)
     kept_back_m = (shift - shift[0]) * (0.0 if travels else 1.0, 0.0 if travels else 1.0, 0.0)
     shift = shift - kept_back_m
@@ -111,14 +132,28 @@ def retarget(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap
     notes = (*source.notes, *filter(None, [rest_note, lies(source, source_map)]), *_notes(source_map, target_map, aligned))
     monitor.step("retargeting", 4, 4)
     loose = {b: head[:, b] - head_of(target, R, head, b) for b in loose_parts(target, target_map) if driven[b] and b != carrier}
-    return Retargeted(motion=moved, basis=channels(target, R), shift_m=shift, carrier=carrier, loose_m=loose, driven=driven, scale=scale,
-                      roles=tuple(aligned), contacts=contacts, notes=notes, kept_back_m=kept_back_m)
+    return Retargeted(
+        motion=moved,
+        basis=channels(target, R),
+        shift_m=shift,
+        carrier=carrier,
+        loose_m=loose,
+        driven=driven,
+        scale=scale,
+        roles=tuple(aligned),
+        contacts=contacts,
+        notes=notes,
+        kept_back_m=kept_back_m,
+    )
 
 
 def _twisted(target: Rig, target_map: RigMap, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
     """By role how lone forearms were twisted, which cannot be read from them."""
-    return {role: turned_by(role, target, target_map, before, after) for role in (sided("forearm", side) for side in SIDES)
-            if len(target_map.bones.get(role, ())) == 1 and role not in target_map.twist}
+    return {
+        role: turned_by(role, target, target_map, before, after)
+        for role in (sided("forearm", side) for side in SIDES)
+        if len(target_map.bones.get(role, ())) == 1 and role not in target_map.twist
+    }
 
 
 def _ankle_level(legs: Mapping[str, feet.Leg]) -> float:
@@ -199,9 +234,20 @@ def _check_lengths(rig: Rig, rig_map: RigMap, which: str) -> None:
                 raise InputError(f"The bone “{name}” of the {which} has no length; mend the rig's rest pose or map another bone.")
 
 
-def _grounded(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, carrier: int,
-              scale: float, legs: Mapping[str, feet.Leg], contacts: Contacts | None, settings: FeetSettings, floor_m: float
-              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _grounded(
+    source: Motion,
+    source_map: RigMap,
+    target: Rig,
+    target_map: RigMap,
+    R: np.ndarray,
+    driven: np.ndarray,
+    carrier: int,
+    scale: float,
+    legs: Mapping[str, feet.Leg],
+    contacts: Contacts | None,
+    settings: FeetSettings,
+    floor_m: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R with feet on the floor, the carrier's shift (T, 3), and what of it is for the feet's standing (T, 3)."""
     shift = unmoved = np.zeros((len(R), 3))
     if carrier < 0:
@@ -218,15 +264,42 @@ def _grounded(source: Motion, source_map: RigMap, target: Rig, target_map: RigMa
     heads = heads_of(target, R, carrier, shift, target_map)
     stands = feet.find_stands(legs, contacts, target, R, floor_m)
     moved, tilt, places = feet.carry_root(
-        stands, {side: heads[:, leg.foot[0]] for side, leg in legs.items()}, {s: heads[:, leg.thigh[0]] - path for s, leg in legs.items()},
-        {side: feet.stiffness(leg, target, R) for side, leg in legs.items()}, source.fps, _leg_m(target, target_map))
+        stands,
+        {side: heads[:, leg.foot[0]] for side, leg in legs.items()},
+        {s: heads[:, leg.thigh[0]] - path for s, leg in legs.items()},
+        {side: feet.stiffness(leg, target, R) for side, leg in legs.items()},
+        source.fps,
+        _leg_m(target, target_map),
+    )
     R, shift = _tilted(target, target_map, R, driven, carrier, shift, tilt, path + moved)
-    return _pinned(target, target_map, R, driven, heads_of(target, R, carrier, shift, target_map), legs, stands, places, floor_m,
-                   settings.blend_s * source.fps), shift, moved
+    return (
+        _pinned(
+            target,
+            target_map,
+            R,
+            driven,
+            heads_of(target, R, carrier, shift, target_map),
+            legs,
+            stands,
+            places,
+            floor_m,
+            settings.blend_s * source.fps,
+        ),
+        shift,
+        moved,
+    )
 
 
-def _tilted(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, carrier: int, shift: np.ndarray, tilt: np.ndarray,
-            middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _tilted(
+    target: Rig,
+    target_map: RigMap,
+    R: np.ndarray,
+    driven: np.ndarray,
+    carrier: int,
+    shift: np.ndarray,
+    tilt: np.ndarray,
+    middle: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """The hips turned by the Rodrigues vectors `tilt` (T, 3), the middle between the hip joints being at `middle` (T, 3)."""
     R = R.copy()
     for name in target_map.bones["hips"]:
@@ -236,8 +309,16 @@ def _tilted(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, 
     return R, shift + middle - hip_centre(now, target_map)
 
 
-def _travel(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap, contacts: Contacts | None, scale: float,
-            legs: Mapping[str, feet.Leg], floor_m: float) -> np.ndarray:
+def _travel(
+    source: Motion,
+    source_map: RigMap,
+    target: Rig,
+    target_map: RigMap,
+    contacts: Contacts | None,
+    scale: float,
+    legs: Mapping[str, feet.Leg],
+    floor_m: float,
+) -> np.ndarray:
     """Where the middle of the hips goes (T, 3): as the source's, scaled, with the ankles' levels on the floor as the origin of height."""
     path = hip_centre(source, source_map)
     if contacts is None or not legs:
@@ -247,8 +328,18 @@ def _travel(source: Motion, source_map: RigMap, target: Rig, target_map: RigMap,
     return scale * (path - (0.0, 0.0, contacts.ankle_level_m)) + (0.0, 0.0, floor_m + _ankle_level(legs))
 
 
-def _pinned(target: Rig, target_map: RigMap, R: np.ndarray, driven: np.ndarray, heads: np.ndarray, legs: Mapping[str, feet.Leg],
-            stands: list[feet.Stand], places: np.ndarray, floor_m: float, blend: float) -> np.ndarray:
+def _pinned(
+    target: Rig,
+    target_map: RigMap,
+    R: np.ndarray,
+    driven: np.ndarray,
+    heads: np.ndarray,
+    legs: Mapping[str, feet.Leg],
+    stands: list[feet.Stand],
+    places: np.ndarray,
+    floor_m: float,
+    blend: float,
+) -> np.ndarray:
     """R with the legs bent so that standing feet stand."""
     front = -body_axes(target, target_map)[:, 1]
     for leg in legs.values():

@@ -42,8 +42,14 @@ class Rig:
 
     def __post_init__(self) -> None:
         n = len(self.names)
-        for name, shape, dtype in (("parents", (n,), np.intp), ("R_rest", (n, 3, 3), float), ("head_m", (n, 3), float),
-                                   ("tail_m", (n, 3), float), ("connected", (n,), bool), ("inherits_rotation", (n,), bool)):
+        for name, shape, dtype in (
+            ("parents", (n,), np.intp),
+            ("R_rest", (n, 3, 3), float),
+            ("head_m", (n, 3), float),
+            ("tail_m", (n, 3), float),
+            ("connected", (n,), bool),
+            ("inherits_rotation", (n,), bool),
+        ):
             object.__setattr__(self, name, frozen(getattr(self, name), shape, dtype, name))
         if n == 0:
             raise InputError("The rig has no bones; choose an armature with bones.")

@@ -24,17 +24,17 @@ def sided(part: str, side: str) -> str:
 
 
 def part_of(role: str) -> str:
-    """"forearm.L" -> "forearm"."""
+    """ "forearm.L" -> "forearm"."""
     return role[:-2] if role.endswith((".L", ".R")) else role
 
 
 def side_of(role: str) -> str:
-    """"forearm.L" -> "L"; "" for the torso."""
+    """ "forearm.L" -> "L"; "" for the torso."""
     return role[-1] if role.endswith((".L", ".R")) else ""
 
 
 def finger_roles(side: str) -> tuple[str, ...]:
-    """"thumb.1.L", … "pinky.3.L"."""
+    """ "thumb.1.L", … "pinky.3.L"."""
     return tuple(f"{finger}.{k}.{side}" for finger in FINGERS for k in (1, 2, 3))
 
 

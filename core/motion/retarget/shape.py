@@ -33,8 +33,14 @@ def by_shape(rig: Rig) -> RigMap | None:
     if legs is None or _end(rig, legs[0])[2] > rig.head_m[:, 2].min() + 0.2 * rig.height_m:
         return None
     fork = rig.common(legs[0].line[0], legs[1].line[0])
-    arms = [pair for pair in pairs if fork is not None and not set(pair[0].line) & {*legs[0].line, *legs[1].line}
-            and rig.head_m[pair[0].line[0]][2] > rig.head_m[fork][2] + 0.15 * rig.height_m and fork in rig.ancestors(pair[0].line[0])]
+    arms = [
+        pair
+        for pair in pairs
+        if fork is not None
+        and not set(pair[0].line) & {*legs[0].line, *legs[1].line}
+        and rig.head_m[pair[0].line[0]][2] > rig.head_m[fork][2] + 0.15 * rig.height_m
+        and fork in rig.ancestors(pair[0].line[0])
+    ]
     arm = max(arms, key=lambda pair: pair[0].length_m, default=None)
     if fork is None or arm is None:
         return None
@@ -52,7 +58,8 @@ def by_shape(rig: Rig) -> RigMap | None:
         if top[:-1]:
             bones["neck"] = tuple(rig.names[b] for b in top[:-1])
     notes = ("recognised by its shape, not by names: look it over",) + (
-        () if told else ("left and right are a guess: the feet do not say which way is forward",))
+        () if told else ("left and right are a guess: the feet do not say which way is forward",)
+    )
     return _completed(rig, RigMap(bones=bones, notes=notes, origin="shape"))
 
 
@@ -62,7 +69,7 @@ def _pairs(rig: Rig) -> list[tuple[_Branch, _Branch]]:
     for fork, children in enumerate(rig.children):
         branches = [b for b in (_branch(rig, child) for child in children) if b.length_m > SHORTEST_LIMB * rig.height_m]
         for i, a in enumerate(branches):
-            for b in branches[i + 1:]:
+            for b in branches[i + 1 :]:
                 if _mirrored(rig, fork, a, b):
                     pairs.append((a, b))
     return pairs
@@ -101,7 +108,7 @@ def _mirrored(rig: Rig, fork: int, a: _Branch, b: _Branch) -> bool:
 def _sides(rig: Rig, legs: tuple[_Branch, _Branch], arms: tuple[_Branch, _Branch]) -> tuple[dict[str, tuple[str, ...]], bool]:
     """Limbs by role. Forward is where the feet point: from the ankle to the end of the foot."""
     parts = [_parts(rig, branch, ("thigh", "shin"), ("foot", "toe"), "") for branch in legs]
-    feet = [line[line.index(part["shin"][-1]) + 1:] for part, line in zip(parts, (legs[0].line, legs[1].line))]
+    feet = [line[line.index(part["shin"][-1]) + 1 :] for part, line in zip(parts, (legs[0].line, legs[1].line))]
     forward = np.zeros(3)
     for line in feet:
         if line:
@@ -129,7 +136,7 @@ def _parts(rig: Rig, branch: _Branch, limb: tuple[str, str], after: tuple[str, .
     parts: dict[str, tuple[int, ...]] = {limb[0]: (line[k],)}
     if len(line) > k + 1:
         parts[limb[1]] = (line[k + 1],)
-    for part, bone in zip(after, line[k + 2:]):
+    for part, bone in zip(after, line[k + 2 :]):
         parts[part] = (bone,)
     if before and k > 0:
         parts[before] = (line[k - 1],)
@@ -141,8 +148,13 @@ def _upwards(rig: Rig, chest: int, taken: set[int]) -> list[int]:
     line: list[int] = []
     bone = chest
     while True:
-        ahead = [c for c in _parts_of_it(rig, bone) if c not in taken and rig.head_m[c][2] >= rig.head_m[bone][2] - 1e-6
-                 and np.linalg.norm((rig.head_m[c] - rig.head_m[chest])[:2]) < 0.06 * rig.height_m]
+        ahead = [
+            c
+            for c in _parts_of_it(rig, bone)
+            if c not in taken
+            and rig.head_m[c][2] >= rig.head_m[bone][2] - 1e-6
+            and np.linalg.norm((rig.head_m[c] - rig.head_m[chest])[:2]) < 0.06 * rig.height_m
+        ]
         if not ahead or len(line) > 6:
             return line
         bone = max(ahead, key=lambda c: _branch(rig, c).length_m)

@@ -23,8 +23,11 @@ class Steering:
 
     def table(self) -> dict[str, dict[str, Any]]:
         """As plain values, in the form of a mapping's file."""
-        return {"follows": dict(self.follows), "skin": dict(self.skin),
-                "properties": {bone: dict(values) for bone, values in self.properties.items()}}
+        return {
+            "follows": dict(self.follows),
+            "skin": dict(self.skin),
+            "properties": {bone: dict(values) for bone, values in self.properties.items()},
+        }
 
     def of_controls(self, *chains: Mapping[str, tuple[str, ...]]) -> "Steering | None":
         """This, as long as `chains` (bones by role) name nothing else than its controls."""
@@ -50,5 +53,12 @@ def controls_of(rig: Rig, steering: Steering, chains: Mapping[str, tuple[str, ..
     rows = [rig.index[name] for name in names]
     place = {name: i for i, name in enumerate(names)}
     parents = [place[parent] if (parent := above(name)) is not None else -1 for name in names]
-    return Rig(names=tuple(names), parents=np.array(parents), R_rest=rig.R_rest[rows], head_m=rig.head_m[rows], tail_m=rig.tail_m[rows],
-               connected=np.zeros(len(names), dtype=bool), inherits_rotation=np.ones(len(names), dtype=bool))
+    return Rig(
+        names=tuple(names),
+        parents=np.array(parents),
+        R_rest=rig.R_rest[rows],
+        head_m=rig.head_m[rows],
+        tail_m=rig.tail_m[rows],
+        connected=np.zeros(len(names), dtype=bool),
+        inherits_rotation=np.ones(len(names), dtype=bool),
+    )

@@ -38,6 +38,7 @@ class Turned:
 
 def body_axes(rig: Rig, rig_map: RigMap) -> np.ndarray:
     """The body's left, back and up (columns, in the world) in the rest pose; the world's axes for a person who faces −Y."""
+
     def place(role: str) -> np.ndarray | None:
         name = rig_map.first(role) if role not in rig_map.hung else None
         return rig.head_m[rig.index[name]] if name else None
@@ -237,8 +238,9 @@ def _twist(target: Rig, R: np.ndarray, bone: int, d: np.ndarray, end: int | None
     return np.unwrap(twist_about(relative, target.R_rest[a].T @ d))
 
 
-def _spread(target: Rig, R: np.ndarray, chain: list[int], beside: list[int], d: np.ndarray, twist: np.ndarray, *, outwards: bool,
-            alone: bool) -> None:
+def _spread(
+    target: Rig, R: np.ndarray, chain: list[int], beside: list[int], d: np.ndarray, twist: np.ndarray, *, outwards: bool, alone: bool
+) -> None:
     """Write into R; `alone`: a lone bone takes half of the twist that comes from its end."""
     before, n, m = R.copy(), len(chain), len(beside)
     if outwards:

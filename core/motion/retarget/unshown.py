@@ -65,36 +65,69 @@ class Unshown:
 
     def at(self, frames: np.ndarray) -> "Unshown":
         """The same at other frames (T',): on straight lines between its own, before and after them as at its ends."""
+
         def there(values: np.ndarray) -> np.ndarray:
             flat = values.reshape(-1, *values.shape[-2:])
             found = [[np.interp(frames, self.frames, column) for column in part.T] for part in flat]
-            return np.array(found, dtype=float).reshape(len(flat), 3, len(frames)).transpose(0, 2, 1).reshape(
-                *values.shape[:-2], len(frames), 3)
+            return (
+                np.array(found, dtype=float)
+                .reshape(len(flat), 3, len(frames))
+                .transpose(0, 2, 1)
+                .reshape(*values.shape[:-2], len(frames), 3)
+            )
 
         near = np.abs(np.asarray(frames)[:, None] - self.frames).argmin(axis=1)
-        chains = tuple(UnshownChain(role=c.role, order=c.order, ends=c.ends, along_m=c.along_m, beside=c.beside, size=c.size,
-                                    turn=there(c.turn)) for c in self.chains)
-        return Unshown(frames=np.asarray(frames, dtype=float), held={role: there(v) for role, v in self.held.items()},
-                       twisted={role: there(v) for role, v in self.twisted.items()}, moved_m=there(self.moved_m),
-                       stands={state: {side: on[near] for side, on in sides.items()} for state, sides in self.stands.items()},
-                       feet=self.feet, level_m=self.level_m, chains=chains)
+        chains = tuple(
+            UnshownChain(role=c.role, order=c.order, ends=c.ends, along_m=c.along_m, beside=c.beside, size=c.size, turn=there(c.turn))
+            for c in self.chains
+        )
+        return Unshown(
+            frames=np.asarray(frames, dtype=float),
+            held={role: there(v) for role, v in self.held.items()},
+            twisted={role: there(v) for role, v in self.twisted.items()},
+            moved_m=there(self.moved_m),
+            stands={state: {side: on[near] for side, on in sides.items()} for state, sides in self.stands.items()},
+            feet=self.feet,
+            level_m=self.level_m,
+            chains=chains,
+        )
 
 
 def to_text(unshown: Unshown) -> str:
     """As JSON."""
+
     def whole(values: np.ndarray) -> list[Any]:
         return list(np.round(np.asarray(values) / STEP).astype(int).tolist())
 
     def marks(on: np.ndarray) -> str:
         return "".join("01"[int(v)] for v in on)
 
-    return json.dumps({
-        "format": FORMAT, "version": VERSION, "frames": unshown.frames.tolist(), "feet": dict(unshown.feet), "level_m": unshown.level_m,
-        "stands": {state: {side: marks(on) for side, on in sides.items()} for state, sides in unshown.stands.items()},
-        "held": {role: whole(v) for role, v in unshown.held.items()}, "twisted": {role: whole(v) for role, v in unshown.twisted.items()},
-        "moved": whole(unshown.moved_m),
-        "chains": [{"role": c.role, "order": list(c.order), "ends": c.ends.tolist(), "along_m": c.along_m.tolist(), "beside": c.beside,
-                    "size": c.size, "turn": whole(c.turn)} for c in unshown.chains]}, separators=(",", ":"))
+    return json.dumps(
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "frames": unshown.frames.tolist(),
+            "feet": dict(unshown.feet),
+            "level_m": unshown.level_m,
+            "stands": {state: {side: marks(on) for side, on in sides.items()} for state, sides in unshown.stands.items()},
+            "held": {role: whole(v) for role, v in unshown.held.items()},
+            "twisted": {role: whole(v) for role, v in unshown.twisted.items()},
+            "moved": whole(unshown.moved_m),
+            "chains": [
+                {
+                    "role": c.role,
+                    "order": list(c.order),
+                    "ends": c.ends.tolist(),
+                    "along_m": c.along_m.tolist(),
+                    "beside": c.beside,
+                    "size": c.size,
+                    "turn": whole(c.turn),
+                }
+                for c in unshown.chains
+            ],
+        },
+        separators=(",", ":"),
+    )
 
 
 def from_text(text: str) -> Unshown:
@@ -116,17 +149,35 @@ def from_text(text: str) -> Unshown:
                 raise ValueError("no numbers")
             return found
 
-        stands = {state: {side: frozen([c == "1" for c in on], (t,), bool, state) for side, on in table["stands"][state].items()}
-                  for state in STATES}
+        stands = {
+            state: {side: frozen([c == "1" for c in on], (t,), bool, state) for side, on in table["stands"][state].items()}
+            for state in STATES
+        }
         if not t or not np.isfinite(frames).all() or (np.diff(frames) <= 0).any() or len({tuple(sides) for sides in stands.values()}) > 1:
             raise ValueError("frames or sides do not go together")
-        chains = tuple(UnshownChain(role=str(c["role"]), order=tuple(int(k) for k in c["order"]), ends=np.array(c["ends"], dtype=float),
-                                    along_m=np.array(c["along_m"], dtype=float), beside=str(c["beside"]), size=int(c["size"]),
-                                    turn=values(c["turn"], -1)) for c in table["chains"])
+        chains = tuple(
+            UnshownChain(
+                role=str(c["role"]),
+                order=tuple(int(k) for k in c["order"]),
+                ends=np.array(c["ends"], dtype=float),
+                along_m=np.array(c["along_m"], dtype=float),
+                beside=str(c["beside"]),
+                size=int(c["size"]),
+                turn=values(c["turn"], -1),
+            )
+            for c in table["chains"]
+        )
         if not all(np.isfinite([*c.ends, *c.along_m]).all() and (np.diff(c.ends) >= 0).all() for c in chains):
             raise ValueError("parts end nowhere")
-        return Unshown(frames=frames, held={str(role): values(rows, -1) for role, rows in table["held"].items()},
-                       twisted={str(role): values(rows, -1) for role, rows in table["twisted"].items()}, moved_m=values(table["moved"]),
-                       stands=stands, feet=dict(table["feet"]), level_m=float(table["level_m"]), chains=chains)
+        return Unshown(
+            frames=frames,
+            held={str(role): values(rows, -1) for role, rows in table["held"].items()},
+            twisted={str(role): values(rows, -1) for role, rows in table["twisted"].items()},
+            moved_m=values(table["moved"]),
+            stands=stands,
+            feet=dict(table["feet"]),
+            level_m=float(table["level_m"]),
+            chains=chains,
+        )
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(f"What the action remembers of its motion is damaged ({type(error).__name__}); retarget it anew.") from error

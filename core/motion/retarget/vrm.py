@@ -8,8 +8,16 @@ from ...errors import InputError
 from .roles import sided
 
 LARGEST_JSON = 1 << 28
-PARTS = {"shoulder": "clavicle", "upperarm": "upper_arm", "lowerarm": "forearm", "hand": "hand", "upperleg": "thigh", "lowerleg": "shin",
-         "foot": "foot", "toes": "toe"}
+PARTS = {
+    "shoulder": "clavicle",
+    "upperarm": "upper_arm",
+    "lowerarm": "forearm",
+    "hand": "hand",
+    "upperleg": "thigh",
+    "lowerleg": "shin",
+    "foot": "foot",
+    "toes": "toe",
+}
 
 
 def read_humanoid(path: Path) -> dict[str, str]:
@@ -34,11 +42,11 @@ def read_humanoid(path: Path) -> dict[str, str]:
 
 
 def role_of(bone: str) -> str:
-    """"leftUpperArm" -> "upper_arm.L"; "" for bones that are no role of ours."""
+    """ "leftUpperArm" -> "upper_arm.L"; "" for bones that are no role of ours."""
     if bone in ("hips", "head", "neck"):
         return bone if bone != "neck" else ""
     for word, side in (("left", "L"), ("right", "R")):
         if bone.startswith(word):
-            part = PARTS.get(bone[len(word):].lower())
+            part = PARTS.get(bone[len(word) :].lower())
             return sided(part, side) if part else ""
     return ""

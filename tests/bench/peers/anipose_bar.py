@@ -24,8 +24,16 @@ def main() -> None:
         f, _, _, k1 = given["interior"][c, :4]
         middle = (given["size_px"] - 1) / 2
         matrix = [[f, 0, middle[0]], [0, f, middle[1]], [0, 0, 1]]
-        cameras.append(Camera(matrix=matrix, dist=[k1, 0, 0, 0, 0], size=given["size_px"].tolist(), rvec=cv2.Rodrigues(given["R"][c])[0],
-                              tvec=given["t"][c], name=str(c)))
+        cameras.append(
+            Camera(
+                matrix=matrix,
+                dist=[k1, 0, 0, 0, 0],
+                size=given["size_px"].tolist(),
+                rvec=cv2.Rodrigues(given["R"][c])[0],
+                tvec=given["t"][c],
+                name=str(c),
+            )
+        )
     group = CameraGroup(cameras)
     group.triangulate(points[:, :10])  # what it compiles first is not its time
     start = time.process_time()

@@ -40,8 +40,9 @@ def test_the_largest_family_has_the_skins_surface(shape: BodyShape, found: list[
 
     def rms_m(chosen: list[Metaballs], about: str | None) -> float:
         near = np.ones(len(points), dtype=bool) if about is None else np.linalg.norm(points - head[bones.index(about)], axis=1) < 0.15
-        F = np.max([field(balls, shape.lengths_m, R, head, points[near], np.ones(len(balls.weight), dtype=bool))
-                    for balls in chosen], axis=0)
+        F = np.max(
+            [field(balls, shape.lengths_m, R, head, points[near], np.ones(len(balls.weight), dtype=bool)) for balls in chosen], axis=0
+        )
         return float(np.sqrt((((F - THRESHOLD) / slope[near]) ** 2).mean()))
 
     assert rms_m(found, None) < 0.5e-3 and rms_m(found, "thigh.R") < 0.5e-3

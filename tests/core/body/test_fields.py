@@ -16,8 +16,14 @@ from tricap.core.commands import main
 from tricap.core.errors import InputError
 
 # Where f = 1/2: closed forms, of the definitions at the head of fields.py.
-THRESHOLD_RADII = {"exponential": np.sqrt(np.log(2) / 2), "Blinn": 0.5, "Wyvill": 0.5, "quadric": 1 - 1 / np.sqrt(3),
-                   "Blender": np.sqrt(1 - 0.5 ** (1 / 3)), "Shen": np.sqrt(0.5)}
+THRESHOLD_RADII = {
+    "exponential": np.sqrt(np.log(2) / 2),
+    "Blinn": 0.5,
+    "Wyvill": 0.5,
+    "quadric": 1 - 1 / np.sqrt(3),
+    "Blender": np.sqrt(1 - 0.5 ** (1 / 3)),
+    "Shen": np.sqrt(0.5),
+}
 NAMES = list(POTENTIALS)
 
 

@@ -63,9 +63,11 @@ def test_a_seam_that_is_hard_to_round_off_leaves_the_others_where_they_are(tmp_p
     """Collarbones that reach forwards: at their shoulders it takes many rounds, at the hips one."""
     model = tmp_path / "forward.toml"
     text = (Path(model_file.__file__).parent / "models" / "full.toml").read_text(encoding="utf-8")
-    for old, new in (("stature = 0.055\nlength_sigma", "stature = 0.0495\nlength_sigma"),
-                     ("y = [-0.3, 0.0, -1.0]", "y = [-0.32, -0.32, -1.0]"),
-                     ("y = [-1.0, 0.0, -0.24]", "y = [-1.0, 0.13, -0.15]")):
+    for old, new in (
+        ("stature = 0.055\nlength_sigma", "stature = 0.0495\nlength_sigma"),
+        ("y = [-0.3, 0.0, -1.0]", "y = [-0.32, -0.32, -1.0]"),
+        ("y = [-1.0, 0.0, -0.24]", "y = [-1.0, 0.13, -0.15]"),
+    ):
         assert text.count(old) == 1
         text = text.replace(old, new)
     model.write_text(text, encoding="utf-8")
@@ -128,8 +130,11 @@ def test_the_throat_above_a_short_neck_is_on_the_surface() -> None:
     shape = person_shape(default_shape(read_model("upper_body")))
     balls, names = shape.metaballs, [bone.name for bone in shape.skeleton.bones]
     stout = np.array([{"neck": 0.8, "head": 1.1}.get(names[b], 1.0) for b in balls.bone_index])
-    short = replace(shape, lengths_m=np.where(np.array(names) == "neck", 0.03, shape.lengths_m),
-                    metaballs=replace(balls, radii_m=stout[:, None] * balls.radii_m))
+    short = replace(
+        shape,
+        lengths_m=np.where(np.array(names) == "neck", 0.03, shape.lengths_m),
+        metaballs=replace(balls, radii_m=stout[:, None] * balls.radii_m),
+    )
     skin = one_skin(short, SkinSettings(), DETAIL)
     throat = np.isin(skin.weights.argmax(axis=1), [names.index(name) for name in ("chest", "neck", "head")])
     assert rms_of_quads(short, skin, throat) < 0.25e-3  # measured 0.21 mm; 0.32

@@ -39,9 +39,18 @@ def test_weights_that_were_fitted_keep_their_sigmas(tmp_path: Path) -> None:
         read_body(tmp_path / "body.toml")
 
 
-@pytest.mark.parametrize(("old", "new"), [("tricap-body", "other"), ("version = 1", "version = 9"), ("head =", "heed ="),
-                                          ("[[bones]]", "[[bonse]]"), ("= [", "= [["),
-                                          ('bone = "forearm.R"', 'bone = "nose"'), ("weight = 1.0", 'weight = "much"')])
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("tricap-body", "other"),
+        ("version = 1", "version = 9"),
+        ("head =", "heed ="),
+        ("[[bones]]", "[[bonse]]"),
+        ("= [", "= [["),
+        ('bone = "forearm.R"', 'bone = "nose"'),
+        ("weight = 1.0", 'weight = "much"'),
+    ],
+)
 def test_faulty_bodies_are_refused(old: str, new: str, tmp_path: Path) -> None:
     path = tmp_path / "body.toml"
     write_body(path, default_shape(read_model("arm.R")))

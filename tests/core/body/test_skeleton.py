@@ -97,8 +97,10 @@ def test_a_whole_body_is_its_own_mirror_image() -> None:
     other = mirrored(model, "full")
     names, lengths = model.skeleton.joint_names, _lengths(model.skeleton)
     motion = RNG.normal(0, 0.3, len(model.skeleton.dofs))
-    signs = np.array([-1 if dof.axis == "x" else 1 for dof in model.skeleton.base_dofs]
-                     + [1 if dof.axis == "x" else -1 for dof in model.skeleton.dofs[3:]])
+    signs = np.array(
+        [-1 if dof.axis == "x" else 1 for dof in model.skeleton.base_dofs]
+        + [1 if dof.axis == "x" else -1 for dof in model.skeleton.dofs[3:]]
+    )
     a = joint_positions(model.skeleton, lengths, motion)
     b = joint_positions(other.skeleton, lengths, motion * signs)
     for name in names:
@@ -139,8 +141,10 @@ def test_a_model_without_bones_that_it_does_not_have_is_refused() -> None:
 def test_left_is_the_mirror_image_of_right(side: str) -> None:
     right, left = read_model(f"{side}.R"), read_model(f"{side}.L")
     motion = RNG.normal(0, 0.4, 8)
-    signs = np.array([-1 if dof.axis == "x" else 1 for dof in right.skeleton.base_dofs]
-                     + [1 if dof.axis == "x" else -1 for dof in right.skeleton.dofs[3:]])
+    signs = np.array(
+        [-1 if dof.axis == "x" else 1 for dof in right.skeleton.base_dofs]
+        + [1 if dof.axis == "x" else -1 for dof in right.skeleton.dofs[3:]]
+    )
     a = joint_positions(right.skeleton, _lengths(right.skeleton), motion)
     b = joint_positions(left.skeleton, _lengths(left.skeleton), motion * signs)
     for name, X in a.items():

@@ -116,8 +116,14 @@ def test_weak_metaballs_still_give_a_closed_skin_around_the_axis() -> None:
     shape = default_shape(read_model("arm.R"))
     balls = shape.metaballs
     thin = Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=balls.radii_m, weight=balls.weight * 0.4)
-    weak = BodyShape(model=shape.model, skeleton=shape.skeleton, lengths_m=shape.lengths_m, metaballs=thin,
-                     length_sigma_m=shape.length_sigma_m, radius_sigma_m=shape.radius_sigma_m)
+    weak = BodyShape(
+        model=shape.model,
+        skeleton=shape.skeleton,
+        lengths_m=shape.lengths_m,
+        metaballs=thin,
+        length_sigma_m=shape.length_sigma_m,
+        radius_sigma_m=shape.radius_sigma_m,
+    )
     assert np.isfinite(limb_skin(weak, posture(shape, 30.0)).vertices_m).all()
 
 

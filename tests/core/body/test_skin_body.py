@@ -72,8 +72,9 @@ def test_where_parts_meet_they_have_one_surface_without_a_seam(angles: dict[str,
     angles_deg: list[float] = []
     for index in range(1, 5):
         for bone in parts[index].junction[:-1] or parts[index].junction:
-            towards = Rays(origin=p - 0.02 * n, direction=n, reach=np.full(len(p), 0.04), bone=np.full(len(p), bone),
-                           station=np.zeros(len(p)))
+            towards = Rays(
+                origin=p - 0.02 * n, direction=n, reach=np.full(len(p), 0.04), bone=np.full(len(p), bone), station=np.zeros(len(p))
+            )
             rho, normals = part_root(shape, parts, index, R, head, towards)
             beside = np.abs((p - head[bone]) @ R[bone, :, 1] - shape.lengths_m[bone] / 2) < 0.6 * shape.lengths_m[bone]
             both = beside & (np.abs(rho - 0.02) < 1e-4)
@@ -156,8 +157,14 @@ def test_the_mirrored_body_has_the_mirrored_skin() -> None:
 def test_a_body_without_flesh_is_told() -> None:
     shape = whole_body()
     none = Metaballs(bone_index=np.zeros(0, dtype=int), centre=np.zeros((0, 3)), radii_m=np.zeros((0, 3)), weight=np.zeros(0))
-    bare = BodyShape(model="bare", skeleton=shape.skeleton, lengths_m=shape.lengths_m, metaballs=none, length_sigma_m=shape.length_sigma_m,
-                     radius_sigma_m=np.zeros((0, 3)))
+    bare = BodyShape(
+        model="bare",
+        skeleton=shape.skeleton,
+        lengths_m=shape.lengths_m,
+        metaballs=none,
+        length_sigma_m=shape.length_sigma_m,
+        radius_sigma_m=np.zeros((0, 3)),
+    )
     with pytest.raises(InputError, match="no metaballs"):
         body_skin(bare, posture(shape))
     with pytest.raises(InputError, match="no single chain"):

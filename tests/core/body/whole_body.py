@@ -31,17 +31,32 @@ LIMBS = (
 def whole_body() -> BodyShape:
     """The shape in its A-pose; the base is the pelvis."""
     table = [*TRUNK, *LIMBS, *(_mirrored(row) for row in LIMBS)]
-    bones = tuple(Bone(name=name, parent=parent, head_joint=head, tail_joint=tail, nominal_length_m=length, R_rest=rest_frame(y, z),
-                       dofs=tuple(Dof(name=f"{name} {axis}", axis=axis, limits=(-3.0, 3.0)) for axis in "xzy" if axis in axes))
-                  for name, parent, head, tail, length, y, z, axes, _ in table)
+    bones = tuple(
+        Bone(
+            name=name,
+            parent=parent,
+            head_joint=head,
+            tail_joint=tail,
+            nominal_length_m=length,
+            R_rest=rest_frame(y, z),
+            dofs=tuple(Dof(name=f"{name} {axis}", axis=axis, limits=(-3.0, 3.0)) for axis in "xzy" if axis in axes),
+        )
+        for name, parent, head, tail, length, y, z, axes, _ in table
+    )
     base = tuple(Dof(name=f"pelvis at {axis}", axis=axis) for axis in "xyz")
     skeleton = Skeleton(name="whole", bones=bones, base_dofs=base)
     lengths = np.array([row[4] for row in table])
     fleshy = [i for i, row in enumerate(table) if row[8] is not None]
     seen = [[np.broadcast_to(r, 2) for r in table[i][8]] for i in fleshy]
     balls = _trunk_of_round_balls(three_balls(np.array(fleshy), lengths, np.array(seen, dtype=float)))
-    return BodyShape(model="whole", skeleton=skeleton, lengths_m=lengths, metaballs=balls, length_sigma_m=np.full(len(lengths), np.nan),
-                     radius_sigma_m=np.full((len(balls.weight), 3), np.nan))
+    return BodyShape(
+        model="whole",
+        skeleton=skeleton,
+        lengths_m=lengths,
+        metaballs=balls,
+        length_sigma_m=np.full(len(lengths), np.nan),
+        radius_sigma_m=np.full((len(balls.weight), 3), np.nan),
+    )
 
 
 def _trunk_of_round_balls(balls: Metaballs) -> Metaballs:

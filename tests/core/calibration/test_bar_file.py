@@ -22,8 +22,16 @@ def rig() -> Rig:
     cameras = []
     for k, name in enumerate("LCR"):
         R = rotation_from_vector(np.array([0.1 * k, 0.4 * (k - 1), 0.05]))
-        cameras.append(Camera(name=name, size_px=(640, 480), matrix=np.diag([500.0, 500.0, 1.0]), distortions=np.zeros(5), R_cam_world=R,
-                              t_cam_world_m=np.array([0.1 * k, 0.0, 3.0])))
+        cameras.append(
+            Camera(
+                name=name,
+                size_px=(640, 480),
+                matrix=np.diag([500.0, 500.0, 1.0]),
+                distortions=np.zeros(5),
+                R_cam_world=R,
+                t_cam_world_m=np.array([0.1 * k, 0.0, 3.0]),
+            )
+        )
     return Rig(cameras=tuple(cameras))
 
 

@@ -33,8 +33,14 @@ def lamps_of(folder: Path) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
 def wand(shared_takes: Path) -> tuple[np.ndarray, CalibratedRig]:
     """The lamps, and the cameras calibrated from the outer two of them."""
     xy, sizes = lamps_of(shared_takes / "wand_4cam_ewand")
-    bar = BarObservations(names=tuple("0123"), size_px=np.array(sizes, dtype=float), xy_px=xy[:, :, [0, 2]], length_m=OUTER_M,
-                          frames=np.arange(len(xy)), labelled=True)
+    bar = BarObservations(
+        names=tuple("0123"),
+        size_px=np.array(sizes, dtype=float),
+        xy_px=xy[:, :, [0, 2]],
+        length_m=OUTER_M,
+        frames=np.arange(len(xy)),
+        labelled=True,
+    )
     return xy, calibrate_rig(bar, Monitor())
 
 

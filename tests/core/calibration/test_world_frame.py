@@ -135,13 +135,16 @@ def test_three_clicked_points_are_the_frame() -> None:
     assert np.abs(origin).max() < 1e-6 and np.abs(x[1:]).max() < 1e-6 < x[0] and abs(y[2]) < 1e-6 < y[1]
 
 
-@pytest.mark.parametrize("points, said", [
-    ({k: v for k, v in clicks().items() if k != "x"}, "“x” of the world's frame is clicked in 0 view"),
-    (clicks() | {"x": {CAMERAS[0].name: [1.0, 2.0]}}, "“x” of the world's frame is clicked in 1 view"),
-    (clicks() | {"x": {"none": [1.0, 2.0]}}, "view “none”, which the rig does not have"),
-    (clicks(80.0), "clicks of the point “y” of the world's frame miss each other by"),
-    (clicks() | {"y": clicks()["x"]}, "lie on one line"),
-])
+@pytest.mark.parametrize(
+    "points, said",
+    [
+        ({k: v for k, v in clicks().items() if k != "x"}, "“x” of the world's frame is clicked in 0 view"),
+        (clicks() | {"x": {CAMERAS[0].name: [1.0, 2.0]}}, "“x” of the world's frame is clicked in 1 view"),
+        (clicks() | {"x": {"none": [1.0, 2.0]}}, "view “none”, which the rig does not have"),
+        (clicks(80.0), "clicks of the point “y” of the world's frame miss each other by"),
+        (clicks() | {"y": clicks()["x"]}, "lie on one line"),
+    ],
+)
 def test_clicked_points_that_make_no_frame(points: dict[str, dict[str, list[float]]], said: str) -> None:
     with pytest.raises(InputError, match=said):
         frame_of_clicks(CAMERAS, points)

@@ -22,8 +22,16 @@ VIEW = np.array([0.0, 1.0, 0.0])  # the cameras look along +Y, at the front of t
 def front_rig() -> Rig:
     """Three cameras in a row, 0.4 m apart, 2.2 m before the origin."""
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    cameras = [Camera(name=name, size_px=(1000, 800), matrix=np.array([[1500, 0, 500], [0, 1500, 400], [0, 0, 1.0]]), R_cam_world=R,
-                      t_cam_world_m=-R @ np.array([x, -2.2, 0.0])) for name, x in zip("LCR", (-0.4, 0.0, 0.4))]
+    cameras = [
+        Camera(
+            name=name,
+            size_px=(1000, 800),
+            matrix=np.array([[1500, 0, 500], [0, 1500, 400], [0, 0, 1.0]]),
+            R_cam_world=R,
+            t_cam_world_m=-R @ np.array([x, -2.2, 0.0]),
+        )
+        for name, x in zip("LCR", (-0.4, 0.0, 0.4))
+    ]
     return Rig(cameras=tuple(cameras))
 
 
@@ -53,8 +61,16 @@ def swing(model: str, frames: int) -> np.ndarray:
     """A motion (frames, 8): the shoulder swings, the elbow (knee) bends from 40° to 75°."""
     phase = np.linspace(0, 1.2, frames)
     side = -1.0 if model.endswith(".L") else 1.0
-    degrees = np.stack([20 + 15 * np.sin(2 * phase), side * (-15 + 10 * np.cos(3 * phase)), side * 10 * phase, 40 + 35 * phase,
-                        side * 12 * np.sin(4 * phase)], axis=1)
+    degrees = np.stack(
+        [
+            20 + 15 * np.sin(2 * phase),
+            side * (-15 + 10 * np.cos(3 * phase)),
+            side * 10 * phase,
+            40 + 35 * phase,
+            side * 12 * np.sin(4 * phase),
+        ],
+        axis=1,
+    )
     base = np.array([side * 0.1, 0.02, 0.1]) + 0.01 * np.stack([side * np.sin(phase), np.cos(phase), phase], axis=1)
     return np.concatenate([base, np.radians(degrees)], axis=1)
 
@@ -128,6 +144,7 @@ def outlines(scene: Scene) -> list[ViewContours]:
             normal = outward_normals(xy)
             parts.append(np.column_stack([np.full(len(xy), frame), (xy + 0.5) / 4 - 0.5, normal]))
         table = np.concatenate(parts)
-        found.append(ViewContours(view=camera.name, frame=table[:, 0], xy_px=table[:, 1:3], normal=table[:, 3:],
-                                  sigma_px=np.full(len(table), 0.5)))
+        found.append(
+            ViewContours(view=camera.name, frame=table[:, 0], xy_px=table[:, 1:3], normal=table[:, 3:], sigma_px=np.full(len(table), 0.5))
+        )
     return found

@@ -81,8 +81,12 @@ def test_a_second_person_beside_the_first_does_not_matter(make_scene) -> None:
     alone = fit_sequence(_given(scene), SETTINGS)
     for t, c in enumerate(scene.clouds):
         other = c.xyz_m + np.array([0.6, 0.1, 0.0])
-        scene.clouds[t] = SimpleNamespace(frame=t, xyz_m=np.vstack([c.xyz_m, other]), normals=np.vstack([c.normals, c.normals]),
-                                          covariance_m2=np.concatenate([c.covariance_m2, c.covariance_m2]))
+        scene.clouds[t] = SimpleNamespace(
+            frame=t,
+            xyz_m=np.vstack([c.xyz_m, other]),
+            normals=np.vstack([c.normals, c.normals]),
+            covariance_m2=np.concatenate([c.covariance_m2, c.covariance_m2]),
+        )
     both = fit_sequence(_given(scene), SETTINGS)
     assert np.abs(both.motion.joints_m - alone.motion.joints_m).max() < 1e-3
 
@@ -101,8 +105,14 @@ def test_the_upper_body_is_fitted() -> None:
     skeleton = shape.skeleton
     motion = np.zeros((4, len(skeleton.dofs)))
     for t in range(4):
-        for name, value in {"shoulder.R flexion": 20 + 3 * t, "elbow.R flexion": 40 + 4 * t, "shoulder.L flexion": 10,
-                            "elbow.L flexion": 30, "spine flexion": 4 + t, "head rotation": 5 * t}.items():
+        for name, value in {
+            "shoulder.R flexion": 20 + 3 * t,
+            "elbow.R flexion": 40 + 4 * t,
+            "shoulder.L flexion": 10,
+            "elbow.L flexion": 30,
+            "spine flexion": 4 + t,
+            "head rotation": 5 * t,
+        }.items():
             motion[t, skeleton.layout[name]] = np.radians(value)
     motion[:, 2] = -0.3
     clouds = [_front(shape, m, t, rng) for t, m in enumerate(motion)]

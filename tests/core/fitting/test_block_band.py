@@ -13,19 +13,19 @@ def _random(T: int, D: int, S: int, seed: int) -> tuple[NormalEquations, np.ndar
     for t in range(T):
         for span in (1, 2, 3):
             row = np.zeros((2 * D, T * D + S))
-            row[:, t * D:(min(t + span, T)) * D] = rng.normal(size=(2 * D, (min(t + span, T) - t) * D))
-            row[:, T * D:] = rng.normal(size=(2 * D, S)) if span == 1 else 0.0
+            row[:, t * D : (min(t + span, T)) * D] = rng.normal(size=(2 * D, (min(t + span, T) - t) * D))
+            row[:, T * D :] = rng.normal(size=(2 * D, S)) if span == 1 else 0.0
             rows.append(row)
     J = np.concatenate(rows)
     N, b = J.T @ J, rng.normal(size=T * D + S)
     e = NormalEquations.empty(T, D, S)
     for t in range(T):
-        e.diagonal[t] = N[t * D:(t + 1) * D, t * D:(t + 1) * D]
-        e.border[t] = N[t * D:(t + 1) * D, T * D:]
+        e.diagonal[t] = N[t * D : (t + 1) * D, t * D : (t + 1) * D]
+        e.border[t] = N[t * D : (t + 1) * D, T * D :]
         for k, target in ((1, e.next1), (2, e.next2)):
             if t + k < T:
-                target[t] = N[(t + k) * D:(t + k + 1) * D, t * D:(t + 1) * D]
-    e.corner[:], e.g[:], e.h[:] = N[T * D:, T * D:], b[: T * D].reshape(T, D), b[T * D:]
+                target[t] = N[(t + k) * D : (t + k + 1) * D, t * D : (t + 1) * D]
+    e.corner[:], e.g[:], e.h[:] = N[T * D :, T * D :], b[: T * D].reshape(T, D), b[T * D :]
     return e, N, b
 
 
@@ -46,8 +46,8 @@ def test_solution_and_inverse_blocks_equal_dense_algebra(T: int, S: int) -> None
     for t in range(T):
         rows = slice(t * D, (t + 1) * D)
         assert np.allclose(pose[t], inverse[rows, rows], rtol=1e-7, atol=1e-11)
-        assert np.allclose(mixed[t], inverse[rows, T * D:], rtol=1e-7, atol=1e-11)
-    assert np.allclose(shape, inverse[T * D:, T * D:], rtol=1e-7, atol=1e-11)
+        assert np.allclose(mixed[t], inverse[rows, T * D :], rtol=1e-7, atol=1e-11)
+    assert np.allclose(shape, inverse[T * D :, T * D :], rtol=1e-7, atol=1e-11)
 
 
 @pytest.mark.parametrize("backwards", [False, True])

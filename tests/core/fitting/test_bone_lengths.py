@@ -95,8 +95,9 @@ def test_an_outline_beyond_the_hand_is_the_fingers_and_one_over_the_crown_is_the
         b = at[bone]
         X = state.head_m[b] + along * state.lengths_m[b] * state.R[b][:, 1] + 0.04 * state.R[b][:, 0]
         view = state.R[b][:, 2]
-        rays = Rays(origin_m=(X - 3 * view)[None], direction=view[None], outward=state.R[b][:, 0][None], angle=np.full(1, 1e-3),
-                    alike=np.ones(1))
+        rays = Rays(
+            origin_m=(X - 3 * view)[None], direction=view[None], outward=state.R[b][:, 0][None], angle=np.full(1, 1e-3), alike=np.ones(1)
+        )
         return touched(rays, state, full.surface, 0.1)[1]
 
     assert owners("hand.R", 0.6).tolist() == [at["hand.R"]] and not len(owners("hand.R", 1.2))

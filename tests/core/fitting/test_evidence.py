@@ -61,8 +61,11 @@ def test_a_limb_without_points_keeps_out_of_the_background(make_scene) -> None:
         a, b = scene.joints_m[t, elbow], scene.joints_m[t, wrist]
         along = (cloud.xyz_m - a) @ (b - a) / ((b - a) @ (b - a))
         keep = (along < -0.25) | (t == 0)  # the forearm is measured in the clicked frame alone
-        clouds.append(SimpleNamespace(frame=cloud.frame, xyz_m=cloud.xyz_m[keep], normals=cloud.normals[keep],
-                                      covariance_m2=cloud.covariance_m2[keep]))
+        clouds.append(
+            SimpleNamespace(
+                frame=cloud.frame, xyz_m=cloud.xyz_m[keep], normals=cloud.normals[keep], covariance_m2=cloud.covariance_m2[keep]
+            )
+        )
     errors = []
     for empty in ((), _empty(scene)):
         fit = fit_sequence(_given(scene, clouds=clouds, empty=empty), SETTINGS)
@@ -73,8 +76,9 @@ def test_a_limb_without_points_keeps_out_of_the_background(make_scene) -> None:
 def test_of_a_hand_the_middle_alone_keeps_out_of_the_background_and_less_exactly() -> None:
     parameters, far = ShapeParameters(default_shape(read_model("full"))), np.full((200, 250), 80, np.uint8)
     empty = [EmptyView(view="C", frame=np.arange(1), distance=Packed([far]), step_px=4, unit_px=0.5)]
-    given = FitInput(rig=limb_scene.front_rig(), model="full", clouds=[SimpleNamespace(frame=0)], clicks={}, time_s=np.zeros(1),
-                     empty=empty)
+    given = FitInput(
+        rig=limb_scene.front_rig(), model="full", clouds=[SimpleNamespace(frame=0)], clicks={}, time_s=np.zeros(1), empty=empty
+    )
     seen = EmptyViews(given, parameters, FitSettings(empty_sigma_px=4.0)).observe(0)[0]
     joints = np.array(parameters.skeleton.joint_names)
     hands = seen.sigma_px > 4.0
@@ -135,10 +139,14 @@ def test_keypoints_begin_the_fit_and_carry_it_without_clicks(make_scene, space) 
     rng = np.random.default_rng(3)
     names, frame = scene.shape.skeleton.joint_names, np.repeat(np.arange(6), 3)
     X = scene.joints_m.reshape(-1, 3)
-    views = [("", X + rng.normal(0, 0.008, X.shape), 0.01)] if space else [
-        (c.name, c.project(X) + rng.normal(0, 3.0, (len(X), 2)), 4.0) for c in scene.rig.cameras]
-    keypoints = [JointPlaces(view=view, frame=frame, joint=names * 6, place=place, sigma=np.full(18, sigma))
-                 for view, place, sigma in views]
+    views = (
+        [("", X + rng.normal(0, 0.008, X.shape), 0.01)]
+        if space
+        else [(c.name, c.project(X) + rng.normal(0, 3.0, (len(X), 2)), 4.0) for c in scene.rig.cameras]
+    )
+    keypoints = [
+        JointPlaces(view=view, frame=frame, joint=names * 6, place=place, sigma=np.full(18, sigma)) for view, place, sigma in views
+    ]
     fit = fit_sequence(_given(scene, clicks={}, keypoints=keypoints), SETTINGS)
     assert set(fit.motion.status) == {"fitted"}
     assert np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2).mean() < 8e-3  # measured 6.3 mm
@@ -167,8 +175,10 @@ def test_a_hidden_arm_stays_outside_of_the_trunk() -> None:
 
 def test_outlines_and_clicks_alone_are_enough(make_scene, other_person) -> None:
     scene = make_scene(frames=8, seed=5, shape=other_person("arm.R", np.random.default_rng(5)))
-    blind = [SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
-             for c in scene.clouds]
+    blind = [
+        SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
+        for c in scene.clouds
+    ]
     fit = fit_sequence(_given(scene, clouds=blind, contours=outlines(scene)), SETTINGS)
     errors = np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2)
     assert set(fit.motion.status) == {"fitted"} and fit.converged and np.isfinite(fit.motion.sigma0).all()
@@ -180,11 +190,14 @@ def test_outlines_and_clicks_alone_are_enough(make_scene, other_person) -> None:
 
 def test_keypoints_alone_are_enough(make_scene) -> None:
     scene = make_scene(frames=6, seed=3)
-    blind = [SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
-             for c in scene.clouds]
+    blind = [
+        SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
+        for c in scene.clouds
+    ]
     names, frame, X = scene.shape.skeleton.joint_names, np.repeat(np.arange(6), 3), scene.joints_m.reshape(-1, 3)
-    keypoints = [JointPlaces(view=c.name, frame=frame, joint=names * 6, place=c.project(X), sigma=np.full(18, 4.0))
-                 for c in scene.rig.cameras]
+    keypoints = [
+        JointPlaces(view=c.name, frame=frame, joint=names * 6, place=c.project(X), sigma=np.full(18, 4.0)) for c in scene.rig.cameras
+    ]
     fit = fit_sequence(_given(scene, clicks={}, keypoints=keypoints, clouds=blind), SETTINGS)
     assert set(fit.motion.status) == {"fitted"} and np.isnan(fit.motion.sigma0).all()
     assert np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2).max() < 8e-3
@@ -196,8 +209,10 @@ def test_outlines_make_a_thick_arm_thick(make_scene) -> None:
     r = shape.metaballs.radii_m.copy()
     r[:, [0, 2]] *= 1.5
     scene = make_scene(frames=2, seed=5, shape=replace(shape, metaballs=replace(shape.metaballs, radii_m=r)))
-    blind = [SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
-             for c in scene.clouds]
+    blind = [
+        SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
+        for c in scene.clouds
+    ]
     contours = [replace(c, sigma_px=3 * c.sigma_px) for c in outlines(scene)]
     fit = fit_sequence(_given(scene, clouds=blind, contours=contours), FitSettings())
     grown = fit.shape.metaballs.radii_m[:, [0, 2]] / shape.metaballs.radii_m[:, [0, 2]]

@@ -66,8 +66,17 @@ def test_a_forearm_is_found_whose_upper_arm_was_never_lost(standing) -> None:
     layout, bent = shape.skeleton.layout, before.copy()
     for name, degrees in (("shoulder.R twist", 40.0), ("elbow.R flexion", 95.0)):
         bent[layout[name]] = np.radians(degrees)
-    seen = {"chest": 200, "spine": 100, "upper_arm.R": 80, "upper_arm.L": 60, "forearm.L": 60, "thigh.L": 60, "shin.L": 60,
-            "thigh.R": 60, "shin.R": 60}
+    seen = {
+        "chest": 200,
+        "spine": 100,
+        "upper_arm.R": 80,
+        "upper_arm.L": 60,
+        "forearm.L": 60,
+        "thigh.L": 60,
+        "shin.L": 60,
+        "thigh.R": 60,
+        "shin.R": 60,
+    }
     vector = fit.parameters.vector(shape)
     (found,) = found_again(fit, points_of(shape, bent, seen | {"forearm.R": 80}), before, vector)
     true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)[WRIST] for m in (bent, before, found))
@@ -81,8 +90,18 @@ def test_a_shin_that_has_somebody_elses_points_is_found_where_its_own_are(standi
     fit, shape, straight = standing
     folded = straight.copy()
     folded[shape.skeleton.layout["knee.L flexion"]] = np.radians(60.0)
-    seen = {"chest": 200, "spine": 100, "thigh.L": 200, "thigh.R": 60, "shin.R": 60, "foot.R": 40, "upper_arm.R": 60, "forearm.R": 60,
-            "upper_arm.L": 60, "forearm.L": 60}
+    seen = {
+        "chest": 200,
+        "spine": 100,
+        "thigh.L": 200,
+        "thigh.R": 60,
+        "shin.R": 60,
+        "foot.R": 40,
+        "upper_arm.R": 60,
+        "forearm.R": 60,
+        "upper_arm.L": 60,
+        "forearm.L": 60,
+    }
     vector, other = fit.parameters.vector(shape), points_of(shape, folded, {"shin.L": 60})
 
     def with_other(points: CloudPoints) -> CloudPoints:
@@ -117,8 +136,19 @@ def test_the_foot_of_one_who_squats_is_found_flat_on_the_floor(standing) -> None
         before[layout[name]] = np.radians(degrees)
     squatting = before.copy()
     squatting[layout["ankle.R flexion"]] = np.radians(-40.0)  # the shin leans forwards by as much
-    seen = {"chest": 200, "spine": 100, "thigh.R": 60, "shin.R": 60, "thigh.L": 60, "shin.L": 60, "foot.L": 40, "upper_arm.R": 60,
-            "forearm.R": 60, "upper_arm.L": 60, "forearm.L": 60}
+    seen = {
+        "chest": 200,
+        "spine": 100,
+        "thigh.R": 60,
+        "shin.R": 60,
+        "thigh.L": 60,
+        "shin.L": 60,
+        "foot.L": 40,
+        "upper_arm.R": 60,
+        "forearm.R": 60,
+        "upper_arm.L": 60,
+        "forearm.L": 60,
+    }
     (found,) = found_again(fit, points_of(shape, squatting, seen | {"foot.R": 80}), before, fit.parameters.vector(shape))
     true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)["toe.R"] for m in (squatting, before, found))
     assert np.linalg.norm(was - true) > 0.09 and np.linalg.norm(now - true) < 0.02
@@ -130,8 +160,12 @@ def test_at_the_click_frame_a_forearm_bent_the_wrong_way_is_found(standing) -> N
     for name, degrees in (("shoulder.R twist", 40.0), ("elbow.R flexion", 95.0)):
         bent[layout[name]] = np.radians(degrees)
     elsewhere = [i for i, c in enumerate(fit.clicked[0].joint) if shape.skeleton.joint_names[c] not in (WRIST, "knuckles.R")]
-    clicks = replace(fit.clicked[0], cameras=tuple(fit.clicked[0].cameras[i] for i in elsewhere), joint=fit.clicked[0].joint[elsewhere],
-                     xy_px=fit.clicked[0].xy_px[elsewhere])
+    clicks = replace(
+        fit.clicked[0],
+        cameras=tuple(fit.clicked[0].cameras[i] for i in elsewhere),
+        joint=fit.clicked[0].joint[elsewhere],
+        xy_px=fit.clicked[0].xy_px[elsewhere],
+    )
     fit, points = replace(fit, clicked={0: clicks}), points_of(shape, bent, {"chest": 100, "upper_arm.R": 80, "forearm.R": 80})
     wrong = Solution(motion=before[None], vector=fit.parameters.vector(shape), cost=1.0, scales=Scales(), iterations=1, converged=True)
     support = fit.support(0, points, before, wrong.vector)

@@ -47,36 +47,56 @@ def _cases(parameters: ShapeParameters, state, rng):
     local = np.stack([rng.normal(0, 0.05, n), along * state.lengths_m[bone], rng.normal(0, 0.05, n)], axis=1)
     near = state.head_m[bone] + np.einsum("nij,nj->ni", state.R[bone], local)
     sigma = rng.uniform(0.001, 0.005, n)
-    camera = Camera(name="C", size_px=(800, 600), matrix=np.array([[900, 0, 400], [0, 900, 300], [0, 0, 1.0]]),
-                    distortions=np.array([-0.1, 0.05, 1e-3, -1e-3, 0.0]), t_cam_world_m=np.array([0, 0, 3.0]))
+    camera = Camera(
+        name="C",
+        size_px=(800, 600),
+        matrix=np.array([[900, 0, 400], [0, 900, 300], [0, 0, 1.0]]),
+        distortions=np.array([-0.1, 0.05, 1e-3, -1e-3, 0.0]),
+        t_cam_world_m=np.array([0, 0, 3.0]),
+    )
     shape = parameters.vector()
     root = rng.normal(0, 0.1, (len(state.lengths_m),) * 2)
-    return [SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma).scaled(state),
-            SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma, form="paper").scaled(state),
-            ClickedJoints(cameras=(camera,) * joints, joint=np.arange(joints), xy_px=rng.normal(400, 50, (joints, 2)), sigma_px=5.0),
-            JointLimits(low=np.full(dofs, -0.2), high=np.full(dofs, 0.2), sigma=0.03),
-            MotionPrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
-            ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)), EqualRadii(sigma=0.1, log_ratio=0.3),
-            Proportions(mean=shape[: len(root)], covariance=root @ root.T + 0.01 * np.eye(len(root))),
-            FootOnFloor(joint=np.arange(joints), height_m=rng.normal(0, 0.1, joints), floor_m=0.1, sigma_m=0.02),
-            Keypoints(joint=np.arange(joints), xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=rng.uniform(0.005, 0.02, joints)),
-            _apart(state, rng), _empty(camera, joints, rng), _rays(state, near, bone, sigma, rng),
-            Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=np.array([0.015, 0.03]))]
+    return [
+        SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma).scaled(state),
+        SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma, form="paper").scaled(state),
+        ClickedJoints(cameras=(camera,) * joints, joint=np.arange(joints), xy_px=rng.normal(400, 50, (joints, 2)), sigma_px=5.0),
+        JointLimits(low=np.full(dofs, -0.2), high=np.full(dofs, 0.2), sigma=0.03),
+        MotionPrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
+        ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)),
+        EqualRadii(sigma=0.1, log_ratio=0.3),
+        Proportions(mean=shape[: len(root)], covariance=root @ root.T + 0.01 * np.eye(len(root))),
+        FootOnFloor(joint=np.arange(joints), height_m=rng.normal(0, 0.1, joints), floor_m=0.1, sigma_m=0.02),
+        Keypoints(joint=np.arange(joints), xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=rng.uniform(0.005, 0.02, joints)),
+        _apart(state, rng),
+        _empty(camera, joints, rng),
+        _rays(state, near, bone, sigma, rng),
+        Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=np.array([0.015, 0.03])),
+    ]
 
 
 def _apart(state, rng):
     """Places on the last bone that are less than a large radius away from the bone before it."""
     last = len(state.lengths_m) - 1
-    return Apart(bone=np.full(6, last), fraction=rng.uniform(0.1, 0.6, 6), other=np.full(6, state.skeleton.parents[last]),
-                 radius_m=rng.uniform(0.5, 1.0, 6), sigma_m=0.01).scaled(state)
+    return Apart(
+        bone=np.full(6, last),
+        fraction=rng.uniform(0.1, 0.6, 6),
+        other=np.full(6, state.skeleton.parents[last]),
+        radius_m=rng.uniform(0.5, 1.0, 6),
+        sigma_m=0.01,
+    ).scaled(state)
 
 
 def _empty(camera: Camera, joints: int, rng) -> EmptySpace:
     """Distances that rise evenly to the right and downwards: without the kinks between the nodes of a real table."""
     rise = 0.05 * np.arange(201)[None, :] + 0.03 * np.arange(151)[:, None]
     view = Distances(camera=camera, values_px=rise, step_px=4.0, first_px=0.0)
-    return EmptySpace(views=[view, view], head=np.arange(joints), tail=(np.arange(joints) + 1) % joints,
-                      fraction=rng.uniform(0.1, 0.9, joints), sigma_px=np.linspace(2.0, 6.0, joints))
+    return EmptySpace(
+        views=[view, view],
+        head=np.arange(joints),
+        tail=(np.arange(joints) + 1) % joints,
+        fraction=rng.uniform(0.1, 0.9, joints),
+        sigma_px=np.linspace(2.0, 6.0, joints),
+    )
 
 
 def _rays(state, near, bone, sigma, rng):
@@ -98,7 +118,7 @@ def test_jacobians_equal_differences(model: str, seed: int, weights: bool) -> No
     x = np.concatenate([motion, vector])
 
     def state(x):
-        return parameters.state(x[: len(motion)], x[len(motion):])
+        return parameters.state(x[: len(motion)], x[len(motion) :])
 
     every = list(enumerate(names))
     some = every if len(every) < 50 else [every[k] for k in rng.choice(len(every), 30, replace=False)]  # of a whole body others each time
@@ -122,11 +142,12 @@ def test_jacobian_of_a_step_between_frames_equals_differences(model: str) -> Non
     x = np.concatenate([_motion(parameters, rng), _motion(parameters, rng), vector])
     names = [f"{name} of frame {k}" for k in "ab" for name in parameters.skeleton.dof_names] + list(parameters.layout.names)
     bone = np.arange(20) % len(parameters.skeleton.bones)
-    steps = MaterialSteps(from_m=rng.normal(0, 0.3, (20, 3)), to_m=rng.normal(0, 0.3, (20, 3)), bone=bone,
-                          sigma_m=rng.uniform(0.001, 0.005, 20))
+    steps = MaterialSteps(
+        from_m=rng.normal(0, 0.3, (20, 3)), to_m=rng.normal(0, 0.3, (20, 3)), bone=bone, sigma_m=rng.uniform(0.001, 0.005, 20)
+    )
 
     def states(x):
-        return parameters.state(x[:D], x[2 * D:]), parameters.state(x[D : 2 * D], x[2 * D:])
+        return parameters.state(x[:D], x[2 * D :]), parameters.state(x[D : 2 * D], x[2 * D :])
 
     J = steps.jacobian(*states(x))
     for k, name in enumerate(names):
@@ -145,8 +166,12 @@ def test_jacobian_of_a_step_from_a_fixed_frame_equals_differences(model: str, ba
     D, other = len(parameters.skeleton.dofs), _motion(parameters, rng)
     x = np.concatenate([_motion(parameters, rng), parameters.vector()])
     names = (*parameters.skeleton.dof_names, *parameters.layout.names)
-    steps = MaterialSteps(from_m=rng.normal(0, 0.3, (20, 3)), to_m=rng.normal(0, 0.3, (20, 3)),
-                          bone=np.arange(20) % len(parameters.skeleton.bones), sigma_m=rng.uniform(0.001, 0.005, 20))
+    steps = MaterialSteps(
+        from_m=rng.normal(0, 0.3, (20, 3)),
+        to_m=rng.normal(0, 0.3, (20, 3)),
+        bone=np.arange(20) % len(parameters.skeleton.bones),
+        sigma_m=rng.uniform(0.001, 0.005, 20),
+    )
 
     def observed(x):
         return StepsFromFixed(steps=steps, other=parameters.state(other, x[D:]), backwards=backwards), parameters.state(x[:D], x[D:])

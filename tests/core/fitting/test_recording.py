@@ -63,8 +63,17 @@ def test_arm_of_a_whole_person() -> None:
     clouds = [_cloud(t, v, triangles[seen[triangles].all(axis=1)], centre, rng) for t, (v, seen) in enumerate(zip(V, visible))]
     tracks = _tracks(V, visible & truth["textured"], rng)
     seeds = take["seeds"]
-    fit = fit_sequence(FitInput(rig=rig, model="arm.R", clouds=clouds, clicks={seeds["frame"]: seeds["joints"]}, click_frame=seeds["frame"],
-                                time_s=truth["time_s"], trajectories=tracks))
+    fit = fit_sequence(
+        FitInput(
+            rig=rig,
+            model="arm.R",
+            clouds=clouds,
+            clicks={seeds["frame"]: seeds["joints"]},
+            click_frame=seeds["frame"],
+            time_s=truth["time_s"],
+            trajectories=tracks,
+        )
+    )
     names = truth["joint_names"].tolist()
     true = np.stack([truth["joints_m"][:, names.index(JOINTS[joint])] for joint in fit.motion.joint_names], axis=1)
     error = fit.motion.joints_m - true

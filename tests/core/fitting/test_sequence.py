@@ -28,8 +28,14 @@ def _fit(scene, settings=KNOWN, click=0, **changes):
 
 
 def _given(scene, click=0, joints=None, **changes) -> FitInput:
-    values = dict(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={click: scene.clicks if joints is None else joints},
-                  click_frame=click, time_s=scene.time_s)
+    values = dict(
+        rig=scene.rig,
+        model=scene.model,
+        clouds=scene.clouds,
+        clicks={click: scene.clicks if joints is None else joints},
+        click_frame=click,
+        time_s=scene.time_s,
+    )
     return FitInput(**{**values, **changes})
 
 
@@ -108,12 +114,14 @@ def test_starts_thirty_degrees_off_all_converge(make_scene) -> None:
 def test_mirrored_scene_gives_the_mirrored_fit(make_scene) -> None:
     scene = make_scene(frames=3, seed=2)
     flip = np.array([-1.0, 1, 1])
-    clouds = [SimpleNamespace(frame=c.frame, xyz_m=c.xyz_m * flip, normals=c.normals * flip, covariance_m2=c.covariance_m2)
-              for c in scene.clouds]
+    clouds = [
+        SimpleNamespace(frame=c.frame, xyz_m=c.xyz_m * flip, normals=c.normals * flip, covariance_m2=c.covariance_m2) for c in scene.clouds
+    ]
     width = scene.rig.cameras[0].size_px[0]
     other = dict(L="R", C="C", R="L")  # the row of cameras is its own mirror image, and so is each image about its principal point
-    clicks = {name.replace(".R", ".L"): {other[v]: (width - xy[0], xy[1]) for v, xy in views.items()}
-              for name, views in scene.clicks.items()}
+    clicks = {
+        name.replace(".R", ".L"): {other[v]: (width - xy[0], xy[1]) for v, xy in views.items()} for name, views in scene.clicks.items()
+    }
     # voxels are cut from 0 upwards and are not their own mirror images: leave the points alone
     settings = FitSettings(model_sigma_m=0.0, voxel_m=0.001)
     right = _fit(scene, settings)
@@ -156,8 +164,9 @@ def test_a_limb_without_points_is_partial(make_scene) -> None:
     shoulder, elbow = scene.joints_m[2, :2]
     cloud = scene.clouds[2]
     upper = np.linalg.norm(cloud.xyz_m - shoulder, axis=1) < np.linalg.norm(elbow - shoulder) * 0.9
-    scene.clouds[2] = SimpleNamespace(frame=2, xyz_m=cloud.xyz_m[upper], normals=cloud.normals[upper],
-                                      covariance_m2=cloud.covariance_m2[upper])
+    scene.clouds[2] = SimpleNamespace(
+        frame=2, xyz_m=cloud.xyz_m[upper], normals=cloud.normals[upper], covariance_m2=cloud.covariance_m2[upper]
+    )
     fit = _fit(scene)
     assert fit.motion.status[2] == "partial"
     flexion = scene.shape.skeleton.layout["elbow.R flexion"]
@@ -169,8 +178,12 @@ def test_points_that_are_no_numbers_are_left_out(make_scene) -> None:
     whole = _fit(scene)
     c = scene.clouds[0]
     bad = np.vstack([c.xyz_m, np.full((5, 3), np.nan)])
-    scene.clouds[0] = SimpleNamespace(frame=0, xyz_m=bad, normals=np.vstack([c.normals, np.ones((5, 3))]),
-                                      covariance_m2=np.concatenate([c.covariance_m2, c.covariance_m2[:5]]))
+    scene.clouds[0] = SimpleNamespace(
+        frame=0,
+        xyz_m=bad,
+        normals=np.vstack([c.normals, np.ones((5, 3))]),
+        covariance_m2=np.concatenate([c.covariance_m2, c.covariance_m2[:5]]),
+    )
     assert np.array_equal(_fit(scene).motion.values, whole.motion.values)
 
 

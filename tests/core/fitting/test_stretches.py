@@ -13,8 +13,15 @@ KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.00
 def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three stretches, of which two hand over to the left and to the right; what tracks tell of a twist reaches all of them."""
     scene = make_scene(frames=24, seed=2)
-    given = FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={10: scene.clicks}, click_frame=10, time_s=scene.time_s,
-                     trajectories=scene.trajectories)
+    given = FitInput(
+        rig=scene.rig,
+        model=scene.model,
+        clouds=scene.clouds,
+        clicks={10: scene.clicks},
+        click_frame=10,
+        time_s=scene.time_s,
+        trajectories=scene.trajectories,
+    )
     whole = fit_sequence(given, KNOWN)
     for module in (sequence, stretches):
         monkeypatch.setattr(module, "AT_ONCE", 9)

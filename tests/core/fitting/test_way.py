@@ -41,8 +41,15 @@ def arrays(fit: object) -> dict[str, bytes]:
 def given(make_scene, monkeypatch: pytest.MonkeyPatch) -> FitInput:
     monkeypatch.setattr(frame_to_frame, "KEEP_EVERY", 2)
     scene = make_scene(frames=FRAMES, click=CLICK)
-    return FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={CLICK: scene.clicks}, click_frame=CLICK,
-                    time_s=scene.time_s, trajectories=scene.trajectories)
+    return FitInput(
+        rig=scene.rig,
+        model=scene.model,
+        clouds=scene.clouds,
+        clicks={CLICK: scene.clicks},
+        click_frame=CLICK,
+        time_s=scene.time_s,
+        trajectories=scene.trajectories,
+    )
 
 
 def test_a_stopped_fit_goes_on_with_the_same_bytes(given: FitInput, tmp_path: Path) -> None:

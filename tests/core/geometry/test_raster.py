@@ -91,7 +91,7 @@ def test_neighbours_leave_no_crack_and_share_no_sample(factor: int) -> None:
     assert len(raster.sample) == 160 * 120 * factor**2  # every sample is covered
     shown = np.zeros(len(triangles), dtype=int)
     for one in range(0, len(triangles), 7):  # a triangle alone covers just the samples that it has in the mesh
-        alone = rasterize(camera(), vertices, triangles[one:one + 1], factor=factor)
+        alone = rasterize(camera(), vertices, triangles[one : one + 1], factor=factor)
         shown[one] = len(alone.sample)
     assert np.array_equal(shown[::7], np.bincount(raster.triangle, minlength=len(triangles))[::7])
 
@@ -108,8 +108,10 @@ def test_vertices_and_edges_exactly_on_samples_are_covered_once() -> None:
 
 def test_a_field_is_the_frame_s_rows() -> None:
     vertices, triangles = sphere((0.0, 0.0, 1.0), 0.15, 20)
-    whole, field = rasterize(camera(**DISTORTED), vertices, triangles), rasterize(camera(**DISTORTED), vertices, triangles,
-                                                                               rows=np.arange(1, 120, 2))
+    whole, field = (
+        rasterize(camera(**DISTORTED), vertices, triangles),
+        rasterize(camera(**DISTORTED), vertices, triangles, rows=np.arange(1, 120, 2)),
+    )
     assert field.shape == (60, 160)
     assert np.array_equal(field.image(field.triangle, -1), whole.image(whole.triangle, -1)[1::2])
 

@@ -1,6 +1,5 @@
 """The epipolar curve through distorted lenses, and the proposal of a clicked surface point in the other views."""
 
-
 import numpy as np
 import pytest
 

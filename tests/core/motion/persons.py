@@ -10,18 +10,33 @@ from tricap.core.motion.retarget.turns import about, matrix_from_vector, shortes
 
 # role, parent, head, tail of the left side or the middle; faces −Y, metres
 PARTS = (
-    ("hips", "", (0, 0, 1.0), (0, 0, 1.1)), ("spine", "hips", (0, 0, 1.1), (0, 0, 1.45)), ("neck", "spine", (0, 0, 1.45), (0, 0, 1.55)),
+    ("hips", "", (0, 0, 1.0), (0, 0, 1.1)),
+    ("spine", "hips", (0, 0, 1.1), (0, 0, 1.45)),
+    ("neck", "spine", (0, 0, 1.45), (0, 0, 1.55)),
     ("head", "neck", (0, 0, 1.55), (0, 0, 1.75)),
-    ("clavicle", "spine", (0.03, 0, 1.42), (0.18, 0, 1.42)), ("upper_arm", "clavicle", (0.18, 0, 1.42), (0.46, 0, 1.42)),
-    ("forearm", "upper_arm", (0.46, 0, 1.42), (0.72, 0, 1.42)), ("hand", "forearm", (0.72, 0, 1.42), (0.85, 0, 1.42)),
-    ("thigh", "hips", (0.1, 0, 0.95), (0.1, 0, 0.52)), ("shin", "thigh", (0.1, 0, 0.52), (0.1, 0, 0.09)),
-    ("foot", "shin", (0.1, 0, 0.09), (0.1, -0.14, 0.02)), ("toe", "foot", (0.1, -0.14, 0.02), (0.1, -0.2, 0.02)),
+    ("clavicle", "spine", (0.03, 0, 1.42), (0.18, 0, 1.42)),
+    ("upper_arm", "clavicle", (0.18, 0, 1.42), (0.46, 0, 1.42)),
+    ("forearm", "upper_arm", (0.46, 0, 1.42), (0.72, 0, 1.42)),
+    ("hand", "forearm", (0.72, 0, 1.42), (0.85, 0, 1.42)),
+    ("thigh", "hips", (0.1, 0, 0.95), (0.1, 0, 0.52)),
+    ("shin", "thigh", (0.1, 0, 0.52), (0.1, 0, 0.09)),
+    ("foot", "shin", (0.1, 0, 0.09), (0.1, -0.14, 0.02)),
+    ("toe", "foot", (0.1, -0.14, 0.02), (0.1, -0.2, 0.02)),
 )
 MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
-def person(*, names: Mapping[str, str] | None = None, size: float = 1.0, arms_down_deg: float = 0.0, legs_apart_deg: float = 0.0,
-           heading_deg: float = 0.0, roll_seed: int | None = None, thigh_part: float = 0.5, without: tuple[str, ...] = ()) -> Rig:
+def person(
+    *,
+    names: Mapping[str, str] | None = None,
+    size: float = 1.0,
+    arms_down_deg: float = 0.0,
+    legs_apart_deg: float = 0.0,
+    heading_deg: float = 0.0,
+    roll_seed: int | None = None,
+    thigh_part: float = 0.5,
+    without: tuple[str, ...] = (),
+) -> Rig:
     """A rig; bones have their roles' names unless `names` says otherwise. `without`: parts whose children hang on their parents."""
     rows = []
     for role, parent, head, tail in PARTS:
@@ -41,9 +56,15 @@ def person(*, names: Mapping[str, str] | None = None, size: float = 1.0, arms_do
     R_rest = shortest(np.array([0.0, 1.0, 0.0]), along)
     if roll_seed is not None:
         R_rest = R_rest @ about(np.array([0.0, 1.0, 0.0]), np.random.default_rng(roll_seed).uniform(-np.pi, np.pi, len(rows)))
-    return Rig(names=tuple((names or {}).get(role, role) for role, _, _ in rows),
-               parents=np.array([order[parent] if parent else -1 for _, parent, _ in rows]), R_rest=R_rest, head_m=places[:, 0],
-               tail_m=places[:, 1], connected=np.zeros(len(rows), dtype=bool), inherits_rotation=np.ones(len(rows), dtype=bool))
+    return Rig(
+        names=tuple((names or {}).get(role, role) for role, _, _ in rows),
+        parents=np.array([order[parent] if parent else -1 for _, parent, _ in rows]),
+        R_rest=R_rest,
+        head_m=places[:, 0],
+        tail_m=places[:, 1],
+        connected=np.zeros(len(rows), dtype=bool),
+        inherits_rotation=np.ones(len(rows), dtype=bool),
+    )
 
 
 def _shaped(role: str, side: str, X: np.ndarray, arms_down_deg: float, legs_apart_deg: float, thigh_part: float) -> np.ndarray:
@@ -58,9 +79,16 @@ def _shaped(role: str, side: str, X: np.ndarray, arms_down_deg: float, legs_apar
     if role in ("thigh", "shin", "foot", "toe"):
         hip = np.array([sign * 0.1, 0, 0.95])
         turned = hip + (X - hip) @ about(np.array([0.0, -1.0, 0.0]), sign * np.radians(legs_apart_deg)).T
-        X = turned if role in ("thigh", "shin") else X + (hip + (np.array([sign * 0.1, 0, 0.09]) - hip)
-                                                          @ about(np.array([0.0, -1.0, 0.0]), sign * np.radians(legs_apart_deg)).T
-                                                          - np.array([sign * 0.1, 0, 0.09]))
+        X = (
+            turned
+            if role in ("thigh", "shin")
+            else X
+            + (
+                hip
+                + (np.array([sign * 0.1, 0, 0.09]) - hip) @ about(np.array([0.0, -1.0, 0.0]), sign * np.radians(legs_apart_deg)).T
+                - np.array([sign * 0.1, 0, 0.09])
+            )
+        )
     return X
 
 

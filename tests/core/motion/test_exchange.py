@@ -56,9 +56,19 @@ def test_points_come_back(tmp_path: Path, kind: str, axes: str) -> None:
         np.testing.assert_allclose(found.sigma_m, points.sigma_m, atol=1e-6)
 
 
-@pytest.mark.parametrize(("frames", "written"), [
-    (range(40), range(1, 41)), (range(7, 47), range(7, 47)), (range(-3, 2), range(1, 6)), (range(70000, 70005), range(1, 6)),
-    ((0, 1, 2, 10, 11), range(1, 13)), ((5, 9), range(5, 10)), ((0,), (1,))], ids=str)
+@pytest.mark.parametrize(
+    ("frames", "written"),
+    [
+        (range(40), range(1, 41)),
+        (range(7, 47), range(7, 47)),
+        (range(-3, 2), range(1, 6)),
+        (range(70000, 70005), range(1, 6)),
+        ((0, 1, 2, 10, 11), range(1, 13)),
+        ((5, 9), range(5, 10)),
+        ((0,), (1,)),
+    ],
+    ids=str,
+)
 def test_c3d_counts_from_one_and_the_take_keeps_its_numbers(tmp_path: Path, frames: range, written: range) -> None:
     points = cloud()
     numbers, some = np.array(frames), np.arange(len(frames))
@@ -102,8 +112,9 @@ def test_up_and_unit_are_said(tmp_path: Path, kind: str, axes: str) -> None:
     standing = squat(person(), frames=4)
     joint = {"thigh": "hip", "shin": "knee", "foot": "ankle", "upper_arm": "shoulder"}
     names = tuple(".".join([joint.get(part, part), *side]) for part, *side in (name.split(".") for name in standing.rig.names))
-    markers = Markers(names=names, fps=30.0, frames=standing.frames, xyz_m=standing.head_m,
-                      sigma_m=np.full(standing.head_m.shape[:2], np.nan))
+    markers = Markers(
+        names=names, fps=30.0, frames=standing.frames, xyz_m=standing.head_m, sigma_m=np.full(standing.head_m.shape[:2], np.nan)
+    )
     file, write = tmp_path / f"a.{kind}", {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}[kind]
     write(file, markers, axes=axes, unit="m")  # type: ignore[operator]
     flat, up = read_motion_source(file), read_motion_source(file, up=axes[0], unit="dm")
@@ -158,8 +169,13 @@ def test_points_make_a_motion_whose_limbs_point_alike() -> None:
     source = flail(person(), reach=0.4)
     joints = {"hip": "thigh", "knee": "shin", "ankle": "foot", "shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand", "toe": "toe"}
     places = {f"{side}{joint}": source.head_m[:, source.rig.index[f"{part}.{side}"]] for side in "LR" for joint, part in joints.items()}
-    points = Markers(names=tuple(places), fps=30.0, frames=source.frames, xyz_m=np.stack(list(places.values()), axis=1),
-                     sigma_m=np.full((len(source.frames), len(places)), np.nan))
+    points = Markers(
+        names=tuple(places),
+        fps=30.0,
+        frames=source.frames,
+        xyz_m=np.stack(list(places.values()), axis=1),
+        sigma_m=np.full((len(source.frames), len(places)), np.nan),
+    )
     motion = motion_from_points(points)
     ours, theirs = directions(motion, find_map(motion.rig)), directions(source, find_map(source.rig))
     assert len(ours) == 8
@@ -167,9 +183,19 @@ def test_points_make_a_motion_whose_limbs_point_alike() -> None:
         np.testing.assert_allclose(along, theirs[role], atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "joint"), [("RKnee", "shin.R"), ("elbow.L", "forearm.L"), ("left_ankle", "foot.L"), ("MidHip", "hips"),
-                                             ("LBigToe", "toe.L"), ("C7", ""), ("lfemur", "thigh.L"),
-                                             ("mixamorig:RightForeArm", "forearm.R")])
+@pytest.mark.parametrize(
+    ("name", "joint"),
+    [
+        ("RKnee", "shin.R"),
+        ("elbow.L", "forearm.L"),
+        ("left_ankle", "foot.L"),
+        ("MidHip", "hips"),
+        ("LBigToe", "toe.L"),
+        ("C7", ""),
+        ("lfemur", "thigh.L"),
+        ("mixamorig:RightForeArm", "forearm.R"),
+    ],
+)
 def test_joints_by_name(name: str, joint: str) -> None:
     assert (joint_of(name) or joint_of_bone(name)) == joint
 
@@ -206,13 +232,24 @@ def test_a_small_bvh(tmp_path: Path) -> None:
     assert read_motion_source(tmp_path / "a.bvh").frames.tolist() == [1, 2]
 
 
-@pytest.mark.parametrize(("old", "new", "word"), [
-    ("HIERARCHY", "SOMETHING", "not a BVH"), ("Frames: 2", "Frames: 3000000000", "promises"), ("Frames: 2", "Frames: 0", "motion needs"),
-    ("Frames: 2", "Frames: many", "number is needed"), ("Xposition", "Sideways", "channels"), ("CHANNELS 3", "CHANNELS 300", "channels"),
-    ("OFFSET 0 10 0", "OFFSET 0 ten 0", "number is needed"), ("OFFSET 0 10 0", "OFFSET 0 nan 0", "finite"),
-    ("0 1 0 0 0 0 90 0 0", "0 1 0 0", "promises"), ("0 1 0 0 0 0 90 0 0", "0 1 0 0 0 inf 90 0 0", "good values"),
-    ("}\nMOTION", "MOTION", "ends within"), ("Frame Time: 0.04", "Frame Time: 0", "motion needs"),
-    ("JOINT Chest\n {", "JOINT Chest\n", "Hips|no sense|damaged|number")])
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("HIERARCHY", "SOMETHING", "not a BVH"),
+        ("Frames: 2", "Frames: 3000000000", "promises"),
+        ("Frames: 2", "Frames: 0", "motion needs"),
+        ("Frames: 2", "Frames: many", "number is needed"),
+        ("Xposition", "Sideways", "channels"),
+        ("CHANNELS 3", "CHANNELS 300", "channels"),
+        ("OFFSET 0 10 0", "OFFSET 0 ten 0", "number is needed"),
+        ("OFFSET 0 10 0", "OFFSET 0 nan 0", "finite"),
+        ("0 1 0 0 0 0 90 0 0", "0 1 0 0", "promises"),
+        ("0 1 0 0 0 0 90 0 0", "0 1 0 0 0 inf 90 0 0", "good values"),
+        ("}\nMOTION", "MOTION", "ends within"),
+        ("Frame Time: 0.04", "Frame Time: 0", "motion needs"),
+        ("JOINT Chest\n {", "JOINT Chest\n", "Hips|no sense|damaged|number"),
+    ],
+)
 def test_damaged_bvh_is_said(tmp_path: Path, old: str, new: str, word: str) -> None:
     assert old in BVH
     (tmp_path / "a.bvh").write_text(BVH.replace(old, new))
@@ -225,14 +262,21 @@ def test_damaged_points_are_said(tmp_path: Path) -> None:
     data = (tmp_path / "a.c3d").read_bytes()
     write_trc(tmp_path / "a.trc", cloud())
     text = (tmp_path / "a.trc").read_text()
-    cases = [("b.c3d", data[:900], "not a C3D"), ("b.c3d", data[:1600], "too short|damaged"), ("b.c3d", b"P" * 4000, "not a C3D|damaged"),
-             ("b.c3d", data[:2] + struct.pack("<H", 65000) + data[4:], "too short|cannot hold"),
-             ("b.c3d", data[:16] + b"\xff\xff" + data[18:], "too short"),
-             ("b.trc", text.replace("PathFileType", "Path").encode(), "not a TRC"),
-             ("b.trc", text.replace("\t40\t3\tm", "\t3000000000\t3\tm").encode(), "promises"),
-             ("b.trc", text.replace("\t3\tm", "\t3\tfathom").encode(), "fathom"), ("b.trc", text[:-600].encode(), "promises"),
-             ("b.csv", b"", "no columns"), ("b.csv", b"a,b\n1,2\n", "no columns"), ("b.csv", b"frame,p x,p y,p z\n1,2\n", "rows"),
-             ("b.xyz", b"", "no motion that can be read")]
+    cases = [
+        ("b.c3d", data[:900], "not a C3D"),
+        ("b.c3d", data[:1600], "too short|damaged"),
+        ("b.c3d", b"P" * 4000, "not a C3D|damaged"),
+        ("b.c3d", data[:2] + struct.pack("<H", 65000) + data[4:], "too short|cannot hold"),
+        ("b.c3d", data[:16] + b"\xff\xff" + data[18:], "too short"),
+        ("b.trc", text.replace("PathFileType", "Path").encode(), "not a TRC"),
+        ("b.trc", text.replace("\t40\t3\tm", "\t3000000000\t3\tm").encode(), "promises"),
+        ("b.trc", text.replace("\t3\tm", "\t3\tfathom").encode(), "fathom"),
+        ("b.trc", text[:-600].encode(), "promises"),
+        ("b.csv", b"", "no columns"),
+        ("b.csv", b"a,b\n1,2\n", "no columns"),
+        ("b.csv", b"frame,p x,p y,p z\n1,2\n", "rows"),
+        ("b.xyz", b"", "no motion that can be read"),
+    ]
     for name, content, word in cases:
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=word):

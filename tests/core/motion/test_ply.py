@@ -11,8 +11,9 @@ from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
 
 def cloud(n: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(2)
-    return dict(xyz_m=rng.normal(size=(n, 3)), sigma_m=rng.uniform(size=n), normals=rng.normal(size=(n, 3)),
-                intensity=rng.uniform(0, 255, n))
+    return dict(
+        xyz_m=rng.normal(size=(n, 3)), sigma_m=rng.uniform(size=n), normals=rng.normal(size=(n, 3)), intensity=rng.uniform(0, 255, n)
+    )
 
 
 @pytest.mark.parametrize("n", [0, 1, 1000])
@@ -47,7 +48,7 @@ THREE = np.arange(9.0).astype("<f8").tobytes()
 def test_files_of_others(tmp_path: Path) -> None:
     faces = bytes([3]) + np.array([0, 1, 2], "<u4").tobytes() + bytes([4]) + np.array([2, 1, 0, 1], "<u4").tobytes()
     header = f"comment made elsewhere\nobj_info x\n{XYZ}\nproperty uchar red\nelement face 2\nproperty list uchar uint vertex_index"
-    rows = b"".join(THREE[24 * i:24 * i + 24] + bytes([9 + i]) for i in range(3))
+    rows = b"".join(THREE[24 * i : 24 * i + 24] + bytes([9 + i]) for i in range(3))
     (tmp_path / "o.ply").write_bytes(ply(header, rows + faces))
     back = read_ply(tmp_path / "o.ply")
     assert back.vertex["x"].dtype == np.float64 and back.vertex["red"].tolist() == [9, 10, 11]

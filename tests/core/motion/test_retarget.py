@@ -40,10 +40,23 @@ EXACT_DEG = 1e-5  # rounding of arccos-free angles; measured 2e-6
 BACK_DEG = 1e-4  # promised: 1°; the transfer is exact but for what the chains' spreading rounds, measured 3e-6
 
 
-@pytest.mark.parametrize("change", [
-    {}, {"size": 1.7}, {"arms_down_deg": 48.0}, {"legs_apart_deg": 12.0}, {"heading_deg": 180.0}, {"heading_deg": -70.0}, {"roll_seed": 5},
-    {"thigh_part": 0.6}, {"without": ("clavicle",)}, {"without": ("neck", "clavicle", "toe")},
-    {"size": 0.3, "arms_down_deg": 70.0, "roll_seed": 9, "heading_deg": 90.0}], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"size": 1.7},
+        {"arms_down_deg": 48.0},
+        {"legs_apart_deg": 12.0},
+        {"heading_deg": 180.0},
+        {"heading_deg": -70.0},
+        {"roll_seed": 5},
+        {"thigh_part": 0.6},
+        {"without": ("clavicle",)},
+        {"without": ("neck", "clavicle", "toe")},
+        {"size": 0.3, "arms_down_deg": 70.0, "roll_seed": 9, "heading_deg": 90.0},
+    ],
+    ids=str,
+)
 def test_limbs_point_where_the_sources_do(change: dict[str, object]) -> None:
     source, target = flail(person(roll_seed=1)), person(**change)  # type: ignore[arg-type]
     source_map, target_map = find_map(source.rig), find_map(target)
@@ -59,7 +72,7 @@ def test_there_and_back_again(other: str) -> None:
     maps = find_map(source.rig), find_map(rig)
     if other != "plain":
         rig, maps = split_limbs(rig, beside="beside" in other), (maps[0], find_map(split_limbs(rig, beside="beside" in other)))
-        assert (maps[1].twist if "beside" in other else len(maps[1].bones["shin.R"]) == 2), maps[1]
+        assert maps[1].twist if "beside" in other else len(maps[1].bones["shin.R"]) == 2, maps[1]
     there = retarget(source, maps[0], rig, maps[1], feet_settings=OFF)
     back = retarget(replace(there.motion, unshown=None), maps[1], source.rig, maps[0], feet_settings=OFF)
     turned = np.degrees(angle_of(transposed(source.R) @ back.motion.R))
@@ -84,13 +97,16 @@ def in_three(rig: Rig, first: float, second: float) -> Rig:
     """The spine cut at two parts of its length."""
     b = rig.index["spine"]
     cuts = rig.head_m[b] + np.array([[0.0], [first], [second], [1.0]]) * (rig.tail_m[b] - rig.head_m[b])
-    after = np.where(rig.parents >= b, rig.parents + 2, rig.parents)[b + 1:]
-    return Rig(names=(*rig.names[:b], "spine", "spine_2", "spine_3", *rig.names[b + 1:]),
-               parents=np.concatenate([rig.parents[:b + 1], [b, b + 1], after]),
-               R_rest=np.insert(rig.R_rest, [b, b], rig.R_rest[b], axis=0),
-               head_m=np.concatenate([rig.head_m[:b], cuts[:3], rig.head_m[b + 1:]]),
-               tail_m=np.concatenate([rig.tail_m[:b], cuts[1:], rig.tail_m[b + 1:]]),
-               connected=np.zeros(len(rig.names) + 2, dtype=bool), inherits_rotation=np.ones(len(rig.names) + 2, dtype=bool))
+    after = np.where(rig.parents >= b, rig.parents + 2, rig.parents)[b + 1 :]
+    return Rig(
+        names=(*rig.names[:b], "spine", "spine_2", "spine_3", *rig.names[b + 1 :]),
+        parents=np.concatenate([rig.parents[: b + 1], [b, b + 1], after]),
+        R_rest=np.insert(rig.R_rest, [b, b], rig.R_rest[b], axis=0),
+        head_m=np.concatenate([rig.head_m[:b], cuts[:3], rig.head_m[b + 1 :]]),
+        tail_m=np.concatenate([rig.tail_m[:b], cuts[1:], rig.tail_m[b + 1 :]]),
+        connected=np.zeros(len(rig.names) + 2, dtype=bool),
+        inherits_rotation=np.ones(len(rig.names) + 2, dtype=bool),
+    )
 
 
 def split_limbs(rig: Rig, *, beside: bool) -> Rig:
@@ -108,9 +124,15 @@ def split_limbs(rig: Rig, *, beside: bool) -> Rig:
     order = sorted(range(len(names)), key=lambda b: depth(parents, b))
     place = {b: i for i, b in enumerate(order)}
     n = len(names)
-    return Rig(names=tuple(names[b] for b in order), parents=np.array([place.get(parents[b], -1) for b in order]),
-               R_rest=np.array(R)[order], head_m=np.array(head)[order], tail_m=np.array(tail)[order], connected=np.zeros(n, dtype=bool),
-               inherits_rotation=np.ones(n, dtype=bool))
+    return Rig(
+        names=tuple(names[b] for b in order),
+        parents=np.array([place.get(parents[b], -1) for b in order]),
+        R_rest=np.array(R)[order],
+        head_m=np.array(head)[order],
+        tail_m=np.array(tail)[order],
+        connected=np.zeros(n, dtype=bool),
+        inherits_rotation=np.ones(n, dtype=bool),
+    )
 
 
 def depth(parents: list[int], b: int) -> int:
@@ -198,10 +220,15 @@ def test_twist_bones_take_their_share_by_place_not_by_name() -> None:
     """On Unreal's mannequin the first one is next to the wrist."""
     rig, b = person(), person().index["forearm.L"]
     places = rig.head_m[b] + np.array([[0.8], [0.4]]) * (rig.tail_m[b] - rig.head_m[b])
-    more = Rig(names=(*rig.names, "forearm_twist_01.L", "forearm_twist_02.L"), parents=np.array([*rig.parents, b, b]),
-               R_rest=np.concatenate([rig.R_rest, rig.R_rest[[b, b]]]), head_m=np.concatenate([rig.head_m, places]),
-               tail_m=np.concatenate([rig.tail_m, places + 0.02]), connected=np.zeros(len(rig.names) + 2, dtype=bool),
-               inherits_rotation=np.ones(len(rig.names) + 2, dtype=bool))
+    more = Rig(
+        names=(*rig.names, "forearm_twist_01.L", "forearm_twist_02.L"),
+        parents=np.array([*rig.parents, b, b]),
+        R_rest=np.concatenate([rig.R_rest, rig.R_rest[[b, b]]]),
+        head_m=np.concatenate([rig.head_m, places]),
+        tail_m=np.concatenate([rig.tail_m, places + 0.02]),
+        connected=np.zeros(len(rig.names) + 2, dtype=bool),
+        inherits_rotation=np.ones(len(rig.names) + 2, dtype=bool),
+    )
     R = retarget(flail(person(), frames=12), find_map(person()), more, find_map(more), feet_settings=OFF).motion.R
     outer, inner = (angle_of(transposed(R[:, b]) @ R[:, k]).max() for k in (-2, -1))
     assert outer > 1.5 * inner > 0.01
@@ -232,8 +259,10 @@ def test_a_motion_of_one_frame(frames: int, tmp_path: Path) -> None:
     write_bvh(tmp_path / "one.bvh", squat(person(), frames=frames))
     source, target = read_motion_source(tmp_path / "one.bvh"), person(thigh_part=0.55)
     result = retarget(source, find_map(source.rig), target, find_map(target))
-    assert len(result.motion.frames) == frames and measure(source, find_map(source.rig), result.motion, find_map(target),
-                                                           result.contacts).direction_rms_deg < 1.0
+    assert (
+        len(result.motion.frames) == frames
+        and measure(source, find_map(source.rig), result.motion, find_map(target), result.contacts).direction_rms_deg < 1.0
+    )
     assert len(resampled(result.motion, 60.0, 1.0).frames) == 2 * frames - 1
 
 
@@ -253,8 +282,9 @@ def test_the_full_models_clavicle_moves_the_targets(part: str) -> None:
 def test_root_modes() -> None:
     source, target = flail(person()), person(size=2.0)
     maps = find_map(source.rig), find_map(target)
-    travel, spot, still = (retarget(source, maps[0], target, maps[1], RetargetSettings(root=root), OFF) for root in
-                           ("travel", "in place", "still"))
+    travel, spot, still = (
+        retarget(source, maps[0], target, maps[1], RetargetSettings(root=root), OFF) for root in ("travel", "in place", "still")
+    )
     went = travel.motion.head_m[:, 0] - travel.motion.head_m[0, 0]
     np.testing.assert_allclose(went[-1], 2.0 * (source.head_m[-1, 0] - source.head_m[0, 0]), atol=1e-6)
     np.testing.assert_allclose(np.ptp(spot.motion.head_m[:, 0, :2], axis=0), 0.0, atol=1e-9)
@@ -265,8 +295,15 @@ def test_root_modes() -> None:
 def test_a_measured_arm_alone_moves_an_arm_alone() -> None:
     whole = flail(person())
     keep = [whole.rig.index[n] for n in ("upper_arm.R", "forearm.R")]
-    rig = Rig(names=("upper_arm.R", "forearm.R"), parents=np.array([-1, 0]), R_rest=whole.rig.R_rest[keep], head_m=whole.rig.head_m[keep],
-              tail_m=whole.rig.tail_m[keep], connected=np.zeros(2, dtype=bool), inherits_rotation=np.ones(2, dtype=bool))
+    rig = Rig(
+        names=("upper_arm.R", "forearm.R"),
+        parents=np.array([-1, 0]),
+        R_rest=whole.rig.R_rest[keep],
+        head_m=whole.rig.head_m[keep],
+        tail_m=whole.rig.tail_m[keep],
+        connected=np.zeros(2, dtype=bool),
+        inherits_rotation=np.ones(2, dtype=bool),
+    )
     source = Motion(rig=rig, fps=30.0, frames=whole.frames, R=whole.R[:, keep], head_m=whole.head_m[:, keep])
     target = person(arms_down_deg=45.0)
     result = retarget(source, find_map(rig), target, find_map(target))
@@ -297,9 +334,15 @@ def test_zero_pose_that_is_no_pose() -> None:
     head = np.zeros_like(rig.head_m)
     for b, p in enumerate(rig.parents):
         head[b] = head[p] + 0.3 * along if p >= 0 else 0.0
-    broken = Rig(names=rig.names, parents=rig.parents, R_rest=np.broadcast_to(np.eye(3), rig.R_rest.shape), head_m=head,
-                 tail_m=head + along, connected=rig.connected,
-                 inherits_rotation=rig.inherits_rotation)
+    broken = Rig(
+        names=rig.names,
+        parents=rig.parents,
+        R_rest=np.broadcast_to(np.eye(3), rig.R_rest.shape),
+        head_m=head,
+        tail_m=head + along,
+        connected=rig.connected,
+        inherits_rotation=rig.inherits_rotation,
+    )
     source = Motion(rig=broken, fps=30.0, frames=true.frames, R=true.R, head_m=true.head_m)
     target = person(arms_down_deg=45.0)
     result = retarget(source, find_map(rig), target, find_map(target), feet_settings=OFF)
@@ -315,8 +358,15 @@ def test_bad_input_is_said() -> None:
     head = target.head_m.copy()
     head[target.index["shin.L"]] = head[target.index["thigh.L"]]
     with pytest.raises(InputError, match="thigh.L.*no length"):
-        flat = Rig(names=target.names, parents=target.parents, R_rest=target.R_rest, head_m=head, tail_m=target.tail_m,
-                   connected=target.connected, inherits_rotation=target.inherits_rotation)
+        flat = Rig(
+            names=target.names,
+            parents=target.parents,
+            R_rest=target.R_rest,
+            head_m=head,
+            tail_m=target.tail_m,
+            connected=target.connected,
+            inherits_rotation=target.inherits_rotation,
+        )
         retarget(source, source_map, flat, find_map(target))
     with pytest.raises(InputError, match="no numbers"):
         Motion(rig=target, fps=30.0, frames=source.frames, R=source.R * np.nan, head_m=source.head_m)
@@ -354,8 +404,10 @@ def test_quaternions_do_not_jump() -> None:
 
 def test_channels_of_bones_that_do_not_inherit_rotation() -> None:
     rig = person(roll_seed=2)
-    free = Rig(**{f: getattr(rig, f) for f in rig.__dataclass_fields__ if f != "inherits_rotation"},
-               inherits_rotation=np.array(["head" not in name for name in rig.names]))
+    free = Rig(
+        **{f: getattr(rig, f) for f in rig.__dataclass_fields__ if f != "inherits_rotation"},
+        inherits_rotation=np.array(["head" not in name for name in rig.names]),
+    )
     motion = flail(rig)
     R, _ = posed(free, channels(free, motion.R))
     np.testing.assert_allclose(R, motion.R, atol=1e-12)

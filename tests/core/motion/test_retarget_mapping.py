@@ -26,27 +26,96 @@ def named(central: dict[str, str], limbs: dict[str, str], left: str, right: str)
 
 
 FAMILIES = {
-    "mixamo": named({"hips": "mixamorig7:Hips", "spine": "mixamorig7:Spine", "neck": "mixamorig7:Neck", "head": "mixamorig7:Head"},
-                    {"clavicle": "mixamorig7:{s}Shoulder", "upper_arm": "mixamorig7:{s}Arm", "forearm": "mixamorig7:{s}ForeArm",
-                     "hand": "mixamorig7:{s}Hand", "thigh": "mixamorig7:{s}UpLeg", "shin": "mixamorig7:{s}Leg",
-                     "foot": "mixamorig7:{s}Foot", "toe": "mixamorig7:{s}ToeBase"}, "Left", "Right"),
-    "collar": named({"hips": "Hips", "spine": "Chest", "neck": "Neck", "head": "Head"},
-                    {"clavicle": "{s}Collar", "upper_arm": "{s}Shoulder", "forearm": "{s}Elbow", "hand": "{s}Wrist", "thigh": "{s}Hip",
-                     "shin": "{s}Knee", "foot": "{s}Ankle", "toe": "{s}Toe"}, "Left", "Right"),
-    "spoken": named({"hips": "Hips", "spine": "Spine", "neck": "Neck", "head": "Head"},
-                    {"clavicle": "{s} shoulder", "upper_arm": "{s} arm", "forearm": "{s} elbow", "hand": "{s} wrist", "thigh": "{s} leg",
-                     "shin": "{s} knee", "foot": "{s} ankle", "toe": "{s} toe"}, "Left", "Right"),
-    "asf": named({"hips": "root", "spine": "thorax", "neck": "lowerneck", "head": "head"},
-                 {"clavicle": "{s}clavicle", "upper_arm": "{s}humerus", "forearm": "{s}radius", "hand": "{s}wrist", "thigh": "{s}femur",
-                  "shin": "{s}tibia", "foot": "{s}foot", "toe": "{s}toes"}, "l", "r"),
-    "biped": named({"hips": "Bip001 Pelvis", "spine": "Bip001 Spine", "neck": "Bip001 Neck", "head": "Bip001 Head"},
-                   {"clavicle": "Bip001 {s} Clavicle", "upper_arm": "Bip001 {s} UpperArm", "forearm": "Bip001 {s} Forearm",
-                    "hand": "Bip001 {s} Hand", "thigh": "Bip001 {s} Thigh", "shin": "Bip001 {s} Calf", "foot": "Bip001 {s} Foot",
-                    "toe": "Bip001 {s} Toe0"}, "L", "R"),
-    "smpl": named({"hips": "m_avg_Pelvis", "spine": "m_avg_Spine3", "neck": "m_avg_Neck", "head": "m_avg_Head"},
-                  {"clavicle": "m_avg_{s}_Collar", "upper_arm": "m_avg_{s}_Shoulder", "forearm": "m_avg_{s}_Elbow",
-                   "hand": "m_avg_{s}_Wrist", "thigh": "m_avg_{s}_Hip", "shin": "m_avg_{s}_Knee", "foot": "m_avg_{s}_Ankle",
-                   "toe": "m_avg_{s}_Foot"}, "L", "R"),
+    "mixamo": named(
+        {"hips": "mixamorig7:Hips", "spine": "mixamorig7:Spine", "neck": "mixamorig7:Neck", "head": "mixamorig7:Head"},
+        {
+            "clavicle": "mixamorig7:{s}Shoulder",
+            "upper_arm": "mixamorig7:{s}Arm",
+            "forearm": "mixamorig7:{s}ForeArm",
+            "hand": "mixamorig7:{s}Hand",
+            "thigh": "mixamorig7:{s}UpLeg",
+            "shin": "mixamorig7:{s}Leg",
+            "foot": "mixamorig7:{s}Foot",
+            "toe": "mixamorig7:{s}ToeBase",
+        },
+        "Left",
+        "Right",
+    ),
+    "collar": named(
+        {"hips": "Hips", "spine": "Chest", "neck": "Neck", "head": "Head"},
+        {
+            "clavicle": "{s}Collar",
+            "upper_arm": "{s}Shoulder",
+            "forearm": "{s}Elbow",
+            "hand": "{s}Wrist",
+            "thigh": "{s}Hip",
+            "shin": "{s}Knee",
+            "foot": "{s}Ankle",
+            "toe": "{s}Toe",
+        },
+        "Left",
+        "Right",
+    ),
+    "spoken": named(
+        {"hips": "Hips", "spine": "Spine", "neck": "Neck", "head": "Head"},
+        {
+            "clavicle": "{s} shoulder",
+            "upper_arm": "{s} arm",
+            "forearm": "{s} elbow",
+            "hand": "{s} wrist",
+            "thigh": "{s} leg",
+            "shin": "{s} knee",
+            "foot": "{s} ankle",
+            "toe": "{s} toe",
+        },
+        "Left",
+        "Right",
+    ),
+    "asf": named(
+        {"hips": "root", "spine": "thorax", "neck": "lowerneck", "head": "head"},
+        {
+            "clavicle": "{s}clavicle",
+            "upper_arm": "{s}humerus",
+            "forearm": "{s}radius",
+            "hand": "{s}wrist",
+            "thigh": "{s}femur",
+            "shin": "{s}tibia",
+            "foot": "{s}foot",
+            "toe": "{s}toes",
+        },
+        "l",
+        "r",
+    ),
+    "biped": named(
+        {"hips": "Bip001 Pelvis", "spine": "Bip001 Spine", "neck": "Bip001 Neck", "head": "Bip001 Head"},
+        {
+            "clavicle": "Bip001 {s} Clavicle",
+            "upper_arm": "Bip001 {s} UpperArm",
+            "forearm": "Bip001 {s} Forearm",
+            "hand": "Bip001 {s} Hand",
+            "thigh": "Bip001 {s} Thigh",
+            "shin": "Bip001 {s} Calf",
+            "foot": "Bip001 {s} Foot",
+            "toe": "Bip001 {s} Toe0",
+        },
+        "L",
+        "R",
+    ),
+    "smpl": named(
+        {"hips": "m_avg_Pelvis", "spine": "m_avg_Spine3", "neck": "m_avg_Neck", "head": "m_avg_Head"},
+        {
+            "clavicle": "m_avg_{s}_Collar",
+            "upper_arm": "m_avg_{s}_Shoulder",
+            "forearm": "m_avg_{s}_Elbow",
+            "hand": "m_avg_{s}_Wrist",
+            "thigh": "m_avg_{s}_Hip",
+            "shin": "m_avg_{s}_Knee",
+            "foot": "m_avg_{s}_Ankle",
+            "toe": "m_avg_{s}_Foot",
+        },
+        "L",
+        "R",
+    ),
 }
 
 
@@ -57,8 +126,18 @@ def test_families_are_recognised_by_their_names(family: str) -> None:
     assert {role: found.bones[role][0] for role in BODY if role in found.bones} == {role: names[role] for role in BODY}, found
 
 
-@pytest.mark.parametrize("change", [{}, {"arms_down_deg": 45.0}, {"heading_deg": 180.0}, {"heading_deg": 90.0, "size": 0.02},
-                                    {"without": ("clavicle",)}, {"legs_apart_deg": 10.0, "roll_seed": 4}], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"arms_down_deg": 45.0},
+        {"heading_deg": 180.0},
+        {"heading_deg": 90.0, "size": 0.02},
+        {"without": ("clavicle",)},
+        {"legs_apart_deg": 10.0, "roll_seed": 4},
+    ],
+    ids=str,
+)
 def test_a_rig_without_telling_names_is_recognised_by_its_shape(change: dict[str, object]) -> None:
     plain = person(**change)  # type: ignore[arg-type]
     names = {role: f"joint{i * 7 % 31}" for i, role in enumerate(plain.names)}
@@ -104,33 +183,66 @@ def test_bones_that_mark_an_end_are_no_parts() -> None:
     rig = person(names=names, without=("neck", "toe"))
     ends = [b for b in range(len(rig.names)) if not rig.children[b]]
     n = len(rig.names) + len(ends)
-    longer = Rig(names=(*rig.names, *(f"{rig.names[b]}_end" for b in ends)), parents=np.array([*rig.parents, *ends]),
-                 R_rest=np.concatenate([rig.R_rest, rig.R_rest[ends]]), head_m=np.concatenate([rig.head_m, rig.tail_m[ends]]),
-                 tail_m=np.concatenate([rig.tail_m, 2 * rig.tail_m[ends] - rig.head_m[ends]]),
-                 connected=np.zeros(n, dtype=bool), inherits_rotation=np.ones(n, dtype=bool))
+    longer = Rig(
+        names=(*rig.names, *(f"{rig.names[b]}_end" for b in ends)),
+        parents=np.array([*rig.parents, *ends]),
+        R_rest=np.concatenate([rig.R_rest, rig.R_rest[ends]]),
+        head_m=np.concatenate([rig.head_m, rig.tail_m[ends]]),
+        tail_m=np.concatenate([rig.tail_m, 2 * rig.tail_m[ends] - rig.head_m[ends]]),
+        connected=np.zeros(n, dtype=bool),
+        inherits_rotation=np.ones(n, dtype=bool),
+    )
     assert find_map(longer).bones == find_map(rig).bones and find_map(rig).origin == "shape"
 
 
-@pytest.mark.parametrize(("text", "word"), [
-    ("[]", "no mapping"), ("{", "not a JSON"), ('{"bones": {"elbow": "x"}}', "no part of the body"), ('{"bones": {"hips": 3}}', "no bones"),
-    ('{"bones": {}, "sides": {"L": 1}}', "sides"), ('{"bones": {"hips": "nowhere"}}', "None of the bones")])
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("[]", "no mapping"),
+        ("{", "not a JSON"),
+        ('{"bones": {"elbow": "x"}}', "no part of the body"),
+        ('{"bones": {"hips": 3}}', "no bones"),
+        ('{"bones": {}, "sides": {"L": 1}}', "sides"),
+        ('{"bones": {"hips": "nowhere"}}', "None of the bones"),
+    ],
+)
 def test_bad_mappings_are_said(tmp_path: Path, text: str, word: str) -> None:
     (tmp_path / "map.json").write_text(text)
     with pytest.raises(InputError, match=word):
         apply_preset(person(), read_preset(tmp_path / "map.json"))
 
 
-@pytest.mark.parametrize(("name", "side", "part"), [
-    ("DEF-upper_arm.L", "L", "upper_arm"), ("ValveBiped.Bip01_R_Calf", "R", "shin"), ("J_Bip_R_LowerArm", "R", "forearm"),
-    ("lShldrBend", "L", "upper_arm"), ("CC_Base_L_Thigh", "L", "thigh"), ("thigh_r", "R", "thigh"), ("IK-foot.l", "L", ""),
-    ("control-toe-roll.r", "R", ""), ("Head_End", "", ""), ("pelvis.L", "L", ""), ("Neo_LeftUpLeg", "L", "thigh")])
+@pytest.mark.parametrize(
+    ("name", "side", "part"),
+    [
+        ("DEF-upper_arm.L", "L", "upper_arm"),
+        ("ValveBiped.Bip01_R_Calf", "R", "shin"),
+        ("J_Bip_R_LowerArm", "R", "forearm"),
+        ("lShldrBend", "L", "upper_arm"),
+        ("CC_Base_L_Thigh", "L", "thigh"),
+        ("thigh_r", "R", "thigh"),
+        ("IK-foot.l", "L", ""),
+        ("control-toe-roll.r", "R", ""),
+        ("Head_End", "", ""),
+        ("pelvis.L", "L", ""),
+        ("Neo_LeftUpLeg", "L", "thigh"),
+    ],
+)
 def test_what_a_name_says(name: str, side: str, part: str) -> None:
     reading = read_name(name)
     assert (reading.side, reading.part) == (side, part)
 
 
-@pytest.mark.parametrize(("name", "finger"), [("LeftHandIndex1", "index.1"), ("thumb_02_l", "thumb.2"), ("leftLittleDistal", "pinky.3"),
-                                              ("f_ring.03.R", "ring.3"), ("LeftInHandMiddle", "middle.0")])
+@pytest.mark.parametrize(
+    ("name", "finger"),
+    [
+        ("LeftHandIndex1", "index.1"),
+        ("thumb_02_l", "thumb.2"),
+        ("leftLittleDistal", "pinky.3"),
+        ("f_ring.03.R", "ring.3"),
+        ("LeftInHandMiddle", "middle.0"),
+    ],
+)
 def test_fingers(name: str, finger: str) -> None:
     assert read_name(name).finger == finger
 

@@ -92,12 +92,20 @@ def test_it_is_written_as_text_and_read_again() -> None:
     np.testing.assert_allclose(later.moved_m, [again.moved_m[0], (a + b) / 2, again.moved_m[-1]], atol=1e-12)
 
 
-@pytest.mark.parametrize("damage", [
-    lambda t: t[:200], lambda t: "[]", lambda t: t.replace('"version":1', '"version":2'),
-    lambda t: t.replace('"frames":[0.0,', '"frames":['),
-    lambda t: t.replace('"frames":[0.0,', '"frames":[7.0,'), lambda t: json.dumps(json.loads(t) | {"held": {"hips": [[1, 2]]}}),
-    lambda t: json.dumps(json.loads(t) | {"moved": [[None, 0, 0]] * 4}),
-    lambda t: t.replace('"order":[0]', '"order":[5]')], ids=range(8))
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda t: t[:200],
+        lambda t: "[]",
+        lambda t: t.replace('"version":1', '"version":2'),
+        lambda t: t.replace('"frames":[0.0,', '"frames":['),
+        lambda t: t.replace('"frames":[0.0,', '"frames":[7.0,'),
+        lambda t: json.dumps(json.loads(t) | {"held": {"hips": [[1, 2]]}}),
+        lambda t: json.dumps(json.loads(t) | {"moved": [[None, 0, 0]] * 4}),
+        lambda t: t.replace('"order":[0]', '"order":[5]'),
+    ],
+    ids=range(8),
+)
 def test_damage_is_said(damage: object) -> None:
     there = onto(squat(person(), frames=4), simple()).motion
     assert isinstance(there.unshown, Unshown) and callable(damage)

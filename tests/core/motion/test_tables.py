@@ -18,10 +18,18 @@ def _motion() -> BodyMotion:
     rng = np.random.default_rng(0)
     values = rng.normal(0, 0.5, (4, 8))
     joints = joint_positions(shape.skeleton, shape.lengths_m, values)
-    return BodyMotion(frames=np.array([3, 4, 6, 7]), time_s=np.array([3, 4, 6, 7]) / 25, dof_names=shape.skeleton.dof_names, values=values,
-                      covariance=np.repeat(np.diag(np.arange(1, 9) * 1e-4)[None], 4, axis=0), joint_names=tuple(joints),
-                      joints_m=np.stack(list(joints.values()), axis=1), joint_sigma_m=np.full((4, 3), 0.002),
-                      status=("fitted", "partial", "bridged", "suspect"), sigma0=np.ones(4))
+    return BodyMotion(
+        frames=np.array([3, 4, 6, 7]),
+        time_s=np.array([3, 4, 6, 7]) / 25,
+        dof_names=shape.skeleton.dof_names,
+        values=values,
+        covariance=np.repeat(np.diag(np.arange(1, 9) * 1e-4)[None], 4, axis=0),
+        joint_names=tuple(joints),
+        joints_m=np.stack(list(joints.values()), axis=1),
+        joint_sigma_m=np.full((4, 3), 0.002),
+        status=("fitted", "partial", "bridged", "suspect"),
+        sigma0=np.ones(4),
+    )
 
 
 def test_motion_comes_back_within_the_digits_written(tmp_path: Path) -> None:
@@ -51,8 +59,9 @@ def test_joints_come_back_by_name_and_frame(tmp_path: Path) -> None:
     assert np.allclose(table.sigma_m["elbow.R"], 0.002)
 
 
-@pytest.mark.parametrize(("text", "word"), [("", "empty"), ("frame,time_s\n0,0\n", "no column"),
-                                            ("frame,time_s,shoulder.R x\n0,0\n", "values")])
+@pytest.mark.parametrize(
+    ("text", "word"), [("", "empty"), ("frame,time_s\n0,0\n", "no column"), ("frame,time_s,shoulder.R x\n0,0\n", "values")]
+)
 def test_faulty_tables_are_refused_in_a_sentence(tmp_path: Path, text: str, word: str) -> None:
     (tmp_path / "motion.csv").write_text(text)
     with pytest.raises(InputError, match=word):

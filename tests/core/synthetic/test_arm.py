@@ -55,8 +55,13 @@ def test_truth_has_the_promised_layout(take: Path) -> None:
 def test_clicks_are_near_the_joints_and_not_on_them(take: Path) -> None:
     truth, clicks = np.load(take / "truth.npz"), read_take(take).seeds.joints
     rig = read_rig(take / "rig.toml")
-    error = np.array([clicks[name][c.name] - c.project(truth["joints_m"][0, i])
-                      for i, name in enumerate(("shoulder.R", "elbow.R", "wrist.R")) for c in rig.cameras])
+    error = np.array(
+        [
+            clicks[name][c.name] - c.project(truth["joints_m"][0, i])
+            for i, name in enumerate(("shoulder.R", "elbow.R", "wrist.R"))
+            for c in rig.cameras
+        ]
+    )
     assert np.abs(error).max() <= 4.06 and np.abs(error).max() > 1.5
 
 

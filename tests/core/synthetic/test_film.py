@@ -9,8 +9,12 @@ from tricap.core.synthetic.figure import BARE_SKIN, CLOTH, Material, Part, super
 from tricap.core.synthetic.film import AMBIENT, LIGHT, Sensor, digitize, expose, paint, seen_vertices
 from tricap.core.synthetic.texture import solid_noise
 
-CAMERA = Camera(name="C", size_px=(160, 120), matrix=np.array([[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]]),
-                R_cam_world=np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))  # looks along +y, z up
+CAMERA = Camera(
+    name="C",
+    size_px=(160, 120),
+    matrix=np.array([[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]]),
+    R_cam_world=np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+)  # looks along +y, z up
 NOISE = solid_noise(1, cells=48)
 
 

@@ -108,8 +108,18 @@ def test_joints_angles_and_shape(take: Path, tmp_path: Path) -> None:
     wrong[:, i] += np.radians([2.0, 4.0, 2.0, 4.0])
     balls = shape.metaballs
     thick = Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=balls.radii_m * [1.1, 1.0, 1.1], weight=balls.weight)
-    put_fit(tmp_path, wrong, BodyShape(model=shape.model, skeleton=shape.skeleton, lengths_m=shape.lengths_m, metaballs=thick,
-                                       length_sigma_m=shape.length_sigma_m, radius_sigma_m=shape.radius_sigma_m))
+    put_fit(
+        tmp_path,
+        wrong,
+        BodyShape(
+            model=shape.model,
+            skeleton=shape.skeleton,
+            lengths_m=shape.lengths_m,
+            metaballs=thick,
+            length_sigma_m=shape.length_sigma_m,
+            radius_sigma_m=shape.radius_sigma_m,
+        ),
+    )
     score = score_run(take, tmp_path)
     assert score.joints is not None and score.joints.joints_mm["shoulder.R"] == pytest.approx(10.0)
     assert score.joints.joints_mm["wrist.R"] > 10 and score.joints.motion_rms_mm < 3
@@ -150,9 +160,13 @@ def test_results_of_something_else_are_refused(take: Path, truth: Truth, tmp_pat
     with pytest.raises(InputError, match="no frame of the recording"):
         score_run(take, tmp_path)
     (tmp_path / "clouds" / "0099.ply").unlink()
-    for name, text in (("joints.csv", "frame,joint,x\n"), ("joints.csv", "frame,joint,x,y,z\n0,elbow.R,a,0,0\n"),
-                       ("joints.csv", "frame,joint,x,y,z\n77,elbow.R,0,0,0\n"), ("trajectories.npz", "no archive"),
-                       ("motion.csv", "frame,elbow\n0,1\n")):
+    for name, text in (
+        ("joints.csv", "frame,joint,x\n"),
+        ("joints.csv", "frame,joint,x,y,z\n0,elbow.R,a,0,0\n"),
+        ("joints.csv", "frame,joint,x,y,z\n77,elbow.R,0,0,0\n"),
+        ("trajectories.npz", "no archive"),
+        ("motion.csv", "frame,elbow\n0,1\n"),
+    ):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=name):
             score_run(take, tmp_path)
