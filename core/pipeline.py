@@ -42,7 +42,7 @@ from .progress import Cancelled, Monitor
 from .report.pages import check_pictured, write_report
 from .report.silhouettes import Silhouettes, by_view, silhouettes_of
 from .results import KeptFit, Results, check_apart
-from .settings import from_table, nearest_name
+from .settings import current_names, from_table, nearest_name
 from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
 from .surface.cloud import PointCloud, SurfaceSettings
 from .surface.voxels import as_written
@@ -138,7 +138,7 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
         for name, table in source.items():
             if name not in SETTINGS:
                 raise InputError(f"There is no group of settings “{name}”{place}.{nearest_name(name, list(SETTINGS))}")
-            groups[name].update(table)
+            groups[name].update(current_names(SETTINGS[name], table, f"[{name}]{place}"))
     return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
 
 

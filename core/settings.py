@@ -16,10 +16,20 @@ LARGEST_NUMBER = 1e300  # beyond: infinity, or a whole number that no float can 
 
 
 def knob(
-    default: Any, about: str, *, unit: str = "", low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()
+    default: Any,
+    about: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    was: tuple[str, ...] = (),
 ) -> Any:
-    """A dataclass field that describes itself: `about` is one sentence, `low`/`high` are inclusive limits in `unit`."""
-    return dataclasses.field(default=default, metadata=dict(about=about, unit=unit, low=low, high=high, choices=choices))
+    """A dataclass field that describes itself: `about` is one sentence, `low`/`high` are inclusive limits in `unit`.
+
+    `was` are earlier names of the knob, under which files and commands of earlier versions may still set it.
+    """
+    return dataclasses.field(default=default, metadata=dict(about=about, unit=unit, low=low, high=high, choices=choices, was=was))
 
 
 def nearest_name(name: str, known: "list[str] | tuple[str, ...]") -> str:
@@ -33,15 +43,32 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     """Settings of class `cls` from a table of a file or of the command line.
 
     Raises:
-        InputError: an unknown name (the nearest known one is named), a value of the wrong kind or outside its limits.
+        InputError: an unknown name (the nearest known one is named), a value of the wrong kind or outside its limits, a knob set
+            under two of its names.
     """
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
-    for name, value in table.items():
+    for name, value in current_names(cls, table, where).items():
         if name not in fields:
             raise InputError(f"{where} has no setting “{name}”.{nearest_name(name, list(fields))}")
         values[name] = _checked(value, fields[name], where)
     return cls(**values)
+
+
+def current_names(cls: type, table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The table with each knob of `cls` under the name that it has today. Unknown names stay as they are.
+
+    Raises:
+        InputError: a knob is set under two of its names.
+    """
+    today = {earlier: f.name for f in dataclasses.fields(cls) for earlier in f.metadata.get("was", ())}
+    renamed: dict[str, Any] = {}
+    for given, value in table.items():
+        name = today.get(given, given)
+        if name in renamed:
+            raise InputError(f"{where} sets “{name}” twice, also under its earlier name; remove one of them.")
+        renamed[name] = value
+    return renamed
 
 
 def _checked(value: Any, field: "dataclasses.Field[Any]", where: str) -> Any:

@@ -17,7 +17,7 @@ class Sample:
     free: float = knob(1.0, "No limits.")
     correct: bool = knob(True, "Yes or no.")
     way: str = knob("odd", "Lines.", choices=("none", "odd"))
-    text: str = knob("x", "Any text.")
+    text: str = knob("x", "Any text.", was=("words", "label"))
 
 
 def test_a_table_becomes_settings_and_comes_back() -> None:
@@ -28,9 +28,16 @@ def test_a_table_becomes_settings_and_comes_back() -> None:
     assert from_table(Sample, dict(patch_px=17.0), "t").patch_px == 17
 
 
+def test_a_knob_is_found_under_its_earlier_names() -> None:
+    assert from_table(Sample, dict(words="y"), "t") == from_table(Sample, dict(label="y"), "t") == Sample(text="y")
+    assert "words" not in to_table(Sample())
+
+
 @pytest.mark.parametrize(
     ("table", "said"),
     [
+        (dict(words="y", text="y"), "sets “text” twice"),
+        (dict(label="y", words="y"), "sets “text” twice"),
         (dict(patch=13), "Did you mean “patch_px”?"),
         (dict(zzz=13), "Known are: patch_px, sigma"),
         (dict(patch_px=4), "between 5 and 51"),
