@@ -1,10 +1,51 @@
-"""The template grid: the points of the reference image that are measured, a regular net of cells."""
+"""What matching works on: the calibrated views of one moment, and the template grid, the points of the reference image that are measured."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..geometry.camera import Camera
 from ..images.fields import RowGrid
+from ..images.sampling import SplineImage
+from ..threads import in_threads
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Views:
+    """The calibrated views of one moment: the reference view, whose image is the template, and the search views."""
+
+    images: Sequence[SplineImage]  # (K,) the rows of every view
+    cameras: Sequence[Camera]  # (K,)
+    reference: int  # number of the reference view
+    rows: RowGrid  # where the images' rows lie in the full frame
+
+    @property
+    def template(self) -> SplineImage:
+        """The image of the reference view."""
+        return self.images[self.reference]
+
+    @property
+    def base(self) -> Camera:
+        """The camera of the reference view."""
+        return self.cameras[self.reference]
+
+    @property
+    def search(self) -> list[int]:
+        """The numbers of the search views, in the order of the cameras."""
+        return [k for k in range(len(self.cameras)) if k != self.reference]
+
+    def required_matches(self, pairs: bool) -> int:
+        """How many search views must match a point: two, or all there are; with `pairs` one."""
+        return 1 if pairs else min(2, len(self.cameras) - 1)
+
+    def select(self, numbers: Sequence[int]) -> "Views":
+        """Only these views; the first one becomes the reference."""
+        return Views(images=[self.images[k] for k in numbers], cameras=[self.cameras[k] for k in numbers], reference=0, rows=self.rows)
+
+    def smoothed(self, sigma_px: float) -> "Views":
+        """The same views with Gaussian-smoothed images, `sigma_px` in full-frame pixels."""
+        return replace(self, images=in_threads(lambda image: image.smoothed(sigma_px, self.rows.step), self.images))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
