@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import bpy
 
+from ...core import pipeline
 from ...core.errors import InputError
 from ...core.progress import Monitor
 from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
@@ -14,6 +14,7 @@ from ..jobs import JobOperator
 from ..scene.contents import Contents
 from .build_scene import put_into_scene
 from .run import measure
+from .stages import report_run
 
 NAME = "tricap_sample"
 EXTENSION = __package__.rpartition(".addon")[0]
@@ -27,7 +28,7 @@ class LoadSample(JobOperator, bpy.types.Operator):
     bl_label = "Load Sample and Run"
     bl_options = {"UNDO"}
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, Any, Contents | None]]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, pipeline.Run, Contents | None]]:
         """Where the recording and its results go: beside the .blend, or among the extension's own files while there is none."""
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
         take = base / NAME
@@ -36,18 +37,18 @@ class LoadSample(JobOperator, bpy.types.Operator):
         folders.check_writable(base)
         return lambda monitor: make_and_measure(take, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[Path, Any, Contents | None]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: tuple[Path, pipeline.Run, Contents | None]) -> set[str]:
         """The sample becomes the scene's project; build the scene."""
-        take, report, results = result
+        take, run, contents = result
         project.open_take(context.scene, take)
-        context.scene.tricap.out, context.scene.tricap.last = folders.for_user(take / project.RESULTS), str(report)
-        if results is not None:
-            put_into_scene(self, context, results)
-        self.report({"INFO"}, str(report))
+        context.scene.tricap.out = folders.for_user(take / project.RESULTS)
+        if contents is not None:
+            put_into_scene(self, context, contents)
+        report_run(self, context, run)
         return {"FINISHED"}
 
 
-def make_and_measure(take: Path, monitor: Monitor) -> tuple[Path, Any, Contents | None]:
+def make_and_measure(take: Path, monitor: Monitor) -> tuple[Path, pipeline.Run, Contents | None]:
     """The computation, free of bpy. A sample that is there already, with whatever was changed in it, is measured as it is."""
     if not is_arm_take(take):
         make_arm_take(take, SAMPLE, monitor)

@@ -11,7 +11,7 @@ from ...core.progress import Monitor
 from .. import project
 from ..scene.contents import Contents, read_contents
 from .build_scene import RELATIVE, put_into_scene
-from .stages import StageOperator
+from .stages import StageOperator, report_run
 
 
 class Run(StageOperator, bpy.types.Operator):
@@ -40,25 +40,26 @@ class Run(StageOperator, bpy.types.Operator):
         description="Put the results into this scene afterwards",
     )
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Any, Contents | None]]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[pipeline.Run, Contents | None]]:
         """Folders and settings as they are now."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)
         build = self.build
         return lambda monitor: measure(take, out, overrides, build, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[Any, Contents | None]) -> set[str]:
-        """Tell what was found and build the scene."""
-        report, results = result
-        context.scene.tricap.last = str(report)
-        if results is not None:
-            put_into_scene(self, context, results)
-        self.report({"INFO"}, str(report))
+    def finish(self, context: bpy.types.Context, result: tuple[pipeline.Run, Contents | None]) -> set[str]:
+        """Build the scene and report the run."""
+        run, contents = result
+        if contents is not None:
+            put_into_scene(self, context, contents)
+        report_run(self, context, run)
         return {"FINISHED"}
 
 
-def measure(take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor) -> tuple[Any, Contents | None]:
+def measure(
+    take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor
+) -> tuple[pipeline.Run, Contents | None]:
     """The computation, free of bpy: all that is not done yet, and its results read back for the scene."""
-    with pipeline.open_run(take, out, overrides) as report:
-        if not pipeline.is_complete(report):
-            pipeline.all_stages(report, monitor)
-    return report, read_contents(out, monitor) if build else None
+    with pipeline.open_run(take, out, overrides) as run:
+        if not pipeline.is_complete(run):
+            pipeline.all_stages(run, monitor)
+    return run, read_contents(out, monitor) if build else None

@@ -40,12 +40,17 @@ class StageOperator(JobOperator):
         return lambda monitor: run_stages(take, out, overrides, self.stages, monitor)
 
     def finish(self, context: bpy.types.Context, result: pipeline.Run) -> set[str]:
-        """Tell what was found."""
-        context.scene.tricap.last = str(result)
-        for sentence in result.account["warnings"]:
-            self.report({"WARNING"}, sentence)  # type: ignore[attr-defined]
-        self.report({"INFO"}, str(result))  # type: ignore[attr-defined]
+        """Report the run."""
+        report_run(self, context, result)
         return {"FINISHED"}
+
+
+def report_run(operator: Any, context: bpy.types.Context, run: pipeline.Run) -> None:
+    """Show a run's warnings and its summary, and keep the summary for the panel."""
+    context.scene.tricap.last = str(run)
+    for sentence in run.account["warnings"]:
+        operator.report({"WARNING"}, sentence)
+    operator.report({"INFO"}, str(run))
 
 
 def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> pipeline.Run:

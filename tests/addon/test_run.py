@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -31,6 +32,21 @@ def test_the_operator_gives_the_commands_numbers_and_a_scene(blender: ModuleType
         assert (tmp_path / "operator" / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
     assert "body fitted" in scene.tricap.last
     assert blender.data.objects["Body"].animation_data.action is not None
+
+
+def test_a_run_of_all_steps_reports_its_warnings(
+    blender: ModuleType, take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from bl_ext.user_default.tricap.addon.operators import run
+
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+
+    def warned(report: Any, monitor: Any) -> None:
+        report.warn("The rays miss each other by 9 px.")
+
+    monkeypatch.setattr(run.pipeline, "all_stages", warned)
+    assert blender.ops.tricap.run(take=str(take), out=str(tmp_path / "out"), build=False) == {"FINISHED"}
+    assert "Warning: The rays miss each other by 9 px." in capfd.readouterr().out.splitlines()
 
 
 def test_the_output_folder_is_chosen_beside_the_file_or_the_take(blender: ModuleType, take: Path, tmp_path: Path) -> None:
