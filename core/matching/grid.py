@@ -1,4 +1,4 @@
-"""What matching works on: the calibrated views of one moment, and the template grid, the points of the reference image that are measured."""
+"""What matching works on: the calibrated views of one moment, and the template grid, the points of the reference image to be measured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
