@@ -2,11 +2,16 @@
 is now that was moved."""
 
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from .bar_file import bar_path
 from .errors import InputError
 from .images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, natural
+from .person_sources import PERSON_SOURCES
+from .take import read_take
+from .take_file import make_take, read_table
 
 SIDES = {  # words for the sides, in the order in which the cameras stand
     "L": ("l", "left", "links", "gauche", "izquierda", "sinistra"),
@@ -60,6 +65,46 @@ def name_views(sources: Sequence[Path], taken: Sequence[str] = ()) -> list[tuple
             name, number = f"{short} {number}", number + 1
         named.append((name, path))
     return named
+
+
+def take_files(folder: Path, chosen: Sequence[str] = ()) -> list[Path]:
+    """The files and folders in FOLDER that its take.toml names, apart from the rig.
+
+    Empty where there is no take.toml, or where the `chosen` files are not the footage of all its views.
+
+    Raises:
+        InputError: take.toml cannot be read or is no take.
+    """
+    table = read_table(folder)
+    views = table.get("views", [])
+    footage = _in_folder(folder, [view.get("images") or view["movie"] for view in views])
+    if {folder / name for name in chosen} - {folder / "take.toml"} not in (set(), set(footage)):
+        return []
+    persons = [view[key] for view in views for key in PERSON_SOURCES if key in view]
+    model = table.get("body", {}).get("model", "")
+    others = [*persons, *(source["files"] for source in table.get("keypoints", [])), *([model] if model.endswith(".toml") else [])]
+    return list(dict.fromkeys([*footage, *_in_folder(folder, others)]))
+
+
+def copy_take(source: Path, folder: Path) -> None:
+    """Make FOLDER the same take as `source`: with its own take.toml and rig.toml, and links to the footage.
+
+    Raises:
+        InputError: `source` is no take, or something cannot be written.
+    """
+    rig_path, rig = read_take(source).rig_path, folder / "rig.toml"
+    make_take(folder, {**read_table(source), "rig": rig.name}, [(folder / path.name, path) for path in take_files(source)])
+    try:
+        for path, copy in ((rig_path, rig), (bar_path(rig_path), bar_path(rig))):
+            if path.exists():
+                shutil.copyfile(path, copy)
+    except OSError as error:
+        raise InputError(f"Cannot copy the cameras {rig_path} into {folder}: {error.strerror or error}.") from error
+
+
+def _in_folder(folder: Path, patterns: Sequence[str]) -> list[Path]:
+    """What lies directly in FOLDER of the files that these patterns name."""
+    return [path for pattern in patterns for path in sorted(folder.glob(Path(pattern).parts[0]))]
 
 
 def find_moved(links: Mapping[str, Path], place: Path) -> dict[Path, Path]:

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import InputError
-from ...core.footage_files import find_footage, find_moved, name_views
+from ...core.footage_files import copy_take, find_footage, find_moved, name_views, take_files
 from ...core.images.fields import BOTH
 from ...core.images.sequence import open_sequence
 from ...core.take_file import footage_entry, link_footage, read_table, relink_footage, unlink_footage
@@ -59,8 +59,9 @@ class AddFootage(Told, bpy.types.Operator):
         min=0.0,
         max=10000.0,
         options={"SKIP_SAVE"},  # type: ignore[valid-type]
-        description="Images do not tell it, movies do. 0: as in step 1",
+        description="Frame rate of image files; movies and takes have their own. 0: as in step 1",
     )
+    offered_fps: bpy.props.FloatProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]  # what the file browser began with
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
@@ -72,7 +73,8 @@ class AddFootage(Told, bpy.types.Operator):
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.filename, self.fps = "", context.scene.tricap.fps  # not the name of what was saved last
+        self.filename = ""  # not the name of what was saved last
+        self.fps = self.offered_fps = context.scene.tricap.fps
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
@@ -84,9 +86,27 @@ class AddFootage(Told, bpy.types.Operator):
             self.layout.prop(self, "fps")
 
     def do(self, context: bpy.types.Context) -> str:
-        """Link the footage into the project and show it as clips."""
-        scene = context.scene
-        sources = find_footage(folders.absolute(self.directory), [f.name for f in self.files])
+        """Link the footage into the project and show it as clips; the values of a take come along."""
+        scene, place, names = context.scene, folders.absolute(self.directory), [f.name for f in self.files if f.name]
+        fps = self.fps if self.fps != self.offered_fps else 0.0
+        if not project.bound(scene) and take_files(place, names):
+            return self._add_take(scene, place, fps)
+        return self._add_files(scene, place, names)
+
+    def _add_take(self, scene: bpy.types.Scene, place: Path, fps: float) -> str:
+        """A take: its footage is linked, and the project begins with its take.toml and cameras."""
+        folder = project.make_folder(scene)
+        copy_take(place, folder)
+        project.open_take(scene, folder)
+        show_frames(scene)
+        if fps:
+            scene.tricap.fps = fps
+        project.write(scene)
+        return f"{len(scene.tricap.views)} views, with the values of {place / 'take.toml'}. Check them in step 1."
+
+    def _add_files(self, scene: bpy.types.Scene, place: Path, names: list[str]) -> str:
+        """Movies and folders of images."""
+        sources = find_footage(place, names)
         folder, first = project.make_folder(scene), not project.bound(scene)
         old = [project.view_entry(view) for view in scene.tricap.views]
         made = [footage_entry(folder, name, path) for name, path in name_views(sources, [entry["name"] for entry in old])]

@@ -14,7 +14,7 @@ import pytest
 from tricap.core import pipeline
 from tricap.core.geometry.rig import read_rig, write_rig
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
-from tricap.core.take_file import read_table
+from tricap.core.take_file import read_table, write_table
 
 NAME = "bl_ext.user_default.tricap.addon"
 QUICK = {"growing": {"spacing_px": 6}}
@@ -432,6 +432,41 @@ def test_the_rate_of_images_is_asked_for(blender: ModuleType, why: Any, sample: 
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
     assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film"), fps=120.0) == {"FINISHED"}
     assert blender.context.scene.tricap.fps == 120.0 and why("footage").endswith("120 a second.")
+
+
+def recorded_at_30(sample: Path, folder: Path) -> Path:
+    """A take at 30 images a second, of which the right camera started one image earlier; its views are listed from right to left."""
+    shutil.copytree(sample, folder)
+    table = read_table(folder)
+    views = [{**view, **({"offset_frames": 1} if view["name"] == "R" else {})} for view in reversed(table["views"])]
+    write_table(folder, {**table, "fps": 30.0, "interlaced": "odd", "views": views, "frames": [0, 2]})
+    return folder
+
+
+@pytest.mark.parametrize("chosen", [[], [{"name": name} for name in ("take.toml", "L", "C", "R")]])
+def test_a_take_brings_its_values_with_its_footage(
+    blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path, chosen: list[Any]
+) -> None:
+    film = recorded_at_30(sample, tmp_path / "film")
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(film), files=chosen) == {"FINISHED"}
+    scene, made = blender.context.scene, read_table(tmp_path / "shot_tricap")
+    assert made == read_table(film) and scene.tricap.fps == 30.0 and scene.tricap.interlaced == "odd"
+    assert [(view.name, view.offset_frames) for view in scene.tricap.views] == [("R", 1), ("C", 0), ("L", 0)]
+    assert words().startswith("done done done") and why("footage").endswith("30 a second.")
+    assert (tmp_path / "shot_tricap" / "rig.toml").read_bytes() == (film / "rig.toml").read_bytes()
+    scene.tricap.views[0].offset_frames = 0
+    assert blender.ops.tricap.keep_mine() == {"FINISHED"} and read_table(film)["views"][0]["offset_frames"] == 1, (
+        "the recording stays as it is"
+    )
+
+
+def test_a_part_of_a_take_is_footage_alone(blender: ModuleType, sample: Path, tmp_path: Path) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    film = recorded_at_30(sample, tmp_path / "film")
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert blender.ops.tricap.add_footage(directory=str(film), files=[{"name": "L"}, {"name": "C"}]) == {"FINISHED"}
+    assert [view.name for view in blender.context.scene.tricap.views] == ["L", "C"] and blender.context.scene.tricap.fps == 25.0
 
 
 def test_moved_footage_is_found_again(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
