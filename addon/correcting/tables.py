@@ -91,7 +91,7 @@ def model_of(scene: bpy.types.Scene) -> BodyModel:
 def model_limits(model: BodyModel) -> dict[str, tuple[float, float]]:
     """The limits [degrees] of a model's angles, ±360 where it has none."""
     skeleton = model.skeleton
-    base = set(skeleton.layout.set("base").tolist())
+    base = set(skeleton.layout.group("base").tolist())
     rounded = {}
     for i, dof in enumerate(skeleton.dofs):
         if i not in base:

@@ -65,12 +65,12 @@ class Bone:
 
 
 class Layout:
-    """Where each parameter stands in a vector: `layout["elbow.R flexion"]` is its index, `layout.set("base")` a set's indices."""
+    """Where each parameter stands in a vector: `layout["elbow.R flexion"]` is its index, `layout.group("base")` the indices of a group."""
 
-    def __init__(self, names: Sequence[str], sets: Mapping[str, Sequence[int]]) -> None:
+    def __init__(self, names: Sequence[str], groups: Mapping[str, Sequence[int]]) -> None:
         self.names = tuple(names)
         self._index = {name: i for i, name in enumerate(self.names)}
-        self._sets = {name: np.array(indices, dtype=np.intp) for name, indices in sets.items()}
+        self._groups = {name: np.array(indices, dtype=np.intp) for name, indices in groups.items()}
 
     def __getitem__(self, name: str) -> int:
         if name not in self._index:
@@ -80,11 +80,11 @@ class Layout:
     def __len__(self) -> int:
         return len(self.names)
 
-    def set(self, name: str) -> np.ndarray:
-        """Indices of a set: "motion" (all), "base", "rotation", "twist" or the name of a joint."""
-        if name not in self._sets:
-            raise InputError(f"There is no set of degrees of freedom “{name}”.{nearest_name(name, list(self._sets))}")
-        return self._sets[name]
+    def group(self, name: str) -> np.ndarray:
+        """Indices of a group: of DOFs "motion" (all), "base", "rotation", "twist" or the name of a joint."""
+        if name not in self._groups:
+            raise InputError(f"There is no group of degrees of freedom “{name}”.{nearest_name(name, list(self._groups))}")
+        return self._groups[name]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -124,14 +124,14 @@ class Skeleton:
     def layout(self) -> Layout:
         """The owner of the order of the motion vector."""
         n = len(self.base_dofs)
-        sets: dict[str, list[int]] = dict(
+        groups: dict[str, list[int]] = dict(
             motion=list(range(len(self.dofs))), base=list(range(n)), rotation=list(range(n, len(self.dofs))), twist=[]
         )
         for i, dof in enumerate(self.dofs[n:], n):
-            sets.setdefault(dof.name.rpartition(" ")[0], []).append(i)
+            groups.setdefault(dof.name.rpartition(" ")[0], []).append(i)
             if dof.axis == "y":
-                sets["twist"].append(i)
-        return Layout(self.dof_names, sets)
+                groups["twist"].append(i)
+        return Layout(self.dof_names, groups)
 
     @cached_property
     def held(self) -> np.ndarray:

@@ -67,7 +67,7 @@ def limits_not_kept(given: FitInput, motion: BodyMotion) -> list[str]:
     low, high = np.degrees([dof.limits for dof in skeleton.dofs]).T
     values = np.degrees(motion.values)
     beyond = np.maximum(values - high, low - values)
-    beyond[:, skeleton.layout.set("base")] = 0.0  # a place, no angle
+    beyond[:, skeleton.layout.group("base")] = 0.0  # a place, no angle
     worst = np.argsort(-beyond.max(axis=0), kind="stable")
     told = [
         f"{skeleton.dofs[d].name} by up to {beyond[:, d].max():.0f}° (frame {motion.frames[int(beyond[:, d].argmax())]})"

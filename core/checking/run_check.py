@@ -146,7 +146,7 @@ def _body(folder: Path, figures: dict[str, Any]) -> list[Finding]:
     """Joint angles that are not known well enough, and limbs without points."""
     shape, joints = read_body(folder / "body.toml"), read_joints(folder / "joints.csv")
     motion = read_motion(folder / "motion.csv", shape.skeleton)
-    found = _angles(motion, set(shape.skeleton.layout.set("base").tolist()), figures)
+    found = _angles(motion, set(shape.skeleton.layout.group("base").tolist()), figures)
     frame = int(joints.frames[len(joints.frames) // 2]) if len(joints.frames) else -1
     path = folder / "clouds" / f"{frame:04d}.ply"
     if not path.is_file():

@@ -113,7 +113,7 @@ def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
     """The posture (D,) and others evenly around it (K, D), always the same ones, within the joints' limits; what is held stays."""
     skeleton = fit.model.skeleton
     spread = np.full(len(motion), AROUND_RAD)
-    spread[skeleton.layout.set("base")] = AROUND_M
+    spread[skeleton.layout.group("base")] = AROUND_M
     spread[skeleton.held] = 0.0
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
     moved = motion + spread * (2 * qmc.Halton(len(motion), scramble=False).random(OTHERS_AROUND + 1)[1:] - 1)  # its first is a corner
@@ -145,7 +145,7 @@ def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) ->
     near = crop(points, fit.parameters.state(solution.motion[0], solution.vector), REACH_M)
     problem = fit.problem(_observe(fit, near, 1.0), "shape")
     covariance = linearise(problem, solution.motion, solution.vector, solution.scales).equations.covariance()[2]
-    lengths = fit.parameters.layout.set("lengths")
+    lengths = fit.parameters.layout.group("lengths")
     between = np.isin(lengths, list(chain.from_iterable(clicked_chains(fit.model.skeleton, fit.located))))
     return solution.vector[lengths], np.where(between, np.sqrt(np.diag(covariance)[lengths]), np.inf)
 
@@ -162,7 +162,7 @@ def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np
     view = np.mean([camera.R_cam_world[2] for camera in fit.cameras], axis=0)
     for shift in (-DEPTH_SHIFT_M, DEPTH_SHIFT_M):
         moved = motion.copy()
-        moved[fit.model.skeleton.layout.set("base")] += shift * view
+        moved[fit.model.skeleton.layout.group("base")] += shift * view
         starts.append(moved)
     return starts
 

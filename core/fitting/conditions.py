@@ -144,8 +144,8 @@ class Conditions:
         known (else infinite)."""
         mean, s = self.parameters.vector(), self.settings
         sigma = np.full(len(mean), s.radius_sigma)
-        sigma[self.parameters.layout.set("weights")] = WEIGHT_SIGMA
-        of_lengths = self.parameters.layout.set("lengths")
+        sigma[self.parameters.layout.group("weights")] = WEIGHT_SIGMA
+        of_lengths = self.parameters.layout.group("lengths")
         mean[of_lengths], sigma[of_lengths] = lengths if lengths is not None else (mean[of_lengths], np.inf)
         radii = self.parameters.template.metaballs.radii_m
         found: list[Observation] = [
@@ -166,7 +166,7 @@ class Conditions:
         hold_motion: bool = False,
     ) -> Problem:
         """An adjustment in which the shape parameters of the set `free` may change, and the motion unless it is held."""
-        shape = self.parameters.layout.set(free) if free else NO_SHAPE
+        shape = self.parameters.layout.group(free) if free else NO_SHAPE
         held = np.arange(len(self.model.skeleton.dofs)) if hold_motion else self.model.skeleton.held
         return Problem(
             parameters=self.parameters,

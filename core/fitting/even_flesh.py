@@ -20,7 +20,7 @@ from .state import ShapeParameters
 
 def evened(parameters: ShapeParameters, vector: np.ndarray, covariance: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """The shape vector (S,) and its covariance (S, S) after (2)."""
-    radii, lengths = parameters.layout.set("radii"), parameters.layout.set("lengths")
+    radii, lengths = parameters.layout.group("radii"), parameters.layout.group("lengths")
     A = _second_differences(parameters.template)
     mixed = covariance[np.ix_(radii, lengths)]
     K = covariance[np.ix_(radii, radii)] - mixed @ np.linalg.pinv(covariance[np.ix_(lengths, lengths)], hermitian=True) @ mixed.T

@@ -168,7 +168,7 @@ def _next_posture(
     """The posture (D,) of frame index `i` and its support; None if the frame shows too little, and the posture is the prediction."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.prediction_sigma_deg))
-    sigma[skeleton.layout.set("base")] = s.prediction_sigma_m
+    sigma[skeleton.layout.group("base")] = s.prediction_sigma_m
     best, best_support, best_score = predictions[0], -1.0, -np.inf
 
     def adjusted(start: np.ndarray) -> tuple[np.ndarray, float, float]:

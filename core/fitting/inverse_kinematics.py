@@ -37,7 +37,7 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
         parameters=parameters,
         observe=lambda t, state: [*clicks.observations, *priors],
         of_shape=[lengths],
-        free_shape=parameters.layout.set("lengths"),
+        free_shape=parameters.layout.group("lengths"),
         held=parameters.skeleton.held,
     )
     return solve(problem, start[None], vector, steps=STEPS)
@@ -58,7 +58,7 @@ def clicked_stature(parameters: ShapeParameters, clicks: Clicks, priors: list[Ob
     lengths = np.log(parameters.template.lengths_m)
     covariance = ANYONES_SIGMA**2 + OWN_SIGMA**2 * np.eye(len(lengths))
     found = inverse_kinematics(parameters, clicks, priors, Proportions(mean=lengths, covariance=covariance))
-    return float(np.exp(np.mean(found.vector[parameters.layout.set("lengths")] - lengths))), CLICKED_STATURE_SIGMA
+    return float(np.exp(np.mean(found.vector[parameters.layout.group("lengths")] - lengths))), CLICKED_STATURE_SIGMA
 
 
 def trunk_joints(skeleton: Skeleton) -> list[str]:
@@ -126,7 +126,7 @@ def _towards(
 def _shift(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, known: list[int], motion: np.ndarray) -> None:
     """Bring the middle of the joints `known` to its place, by the base."""
     places = np.stack(list(joint_positions(skeleton, lengths, motion).values()))
-    motion[skeleton.layout.set("base")] += (xyz_m[known] - places[known]).mean(axis=0)
+    motion[skeleton.layout.group("base")] += (xyz_m[known] - places[known]).mean(axis=0)
 
 
 def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, placed: list[int], motion: np.ndarray) -> None:
@@ -166,7 +166,7 @@ def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> l
     """Soft limits, and the model's beliefs about DOFs; where it has none, a sigma of 180° or 10 m keeps the equations regular."""
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
     mean, sigma = np.array([(dof.prior_mean, dof.prior_sigma) for dof in skeleton.dofs]).T
-    base = skeleton.layout.set("base")
+    base = skeleton.layout.group("base")
     free = ~np.isfinite(sigma)
     mean[free] = np.clip(0.0, low, high)[free]
     sigma[free] = np.pi

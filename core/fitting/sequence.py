@@ -275,7 +275,7 @@ def _loosest(fit: Conditions) -> np.ndarray:
     """The largest sigma (D,) of accelerations."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
-    sigma[skeleton.layout.set("base")] = s.acceleration_m_s2
+    sigma[skeleton.layout.group("base")] = s.acceleration_m_s2
     return sigma
 
 

@@ -144,8 +144,8 @@ class ShapeParameters:
         balls, old = self.template.metaballs, self.template.lengths_m
         lengths, radii = np.exp(vector[: self.n_lengths]), balls.radii_m.copy()
         radii[:, 1] *= (lengths / old)[balls.bone_index]
-        radii[:, CROSS] = np.exp(vector[self.layout.set("radii")]).reshape(-1, 2)
-        weight = np.exp(vector[self.layout.set("weights")]) if self.weights else balls.weight
+        radii[:, CROSS] = np.exp(vector[self.layout.group("radii")]).reshape(-1, 2)
+        weight = np.exp(vector[self.layout.group("weights")]) if self.weights else balls.weight
         return lengths, Metaballs(bone_index=balls.bone_index, centre=balls.centre, radii_m=radii, weight=weight)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -199,7 +199,7 @@ class ShapeParameters:
         lengths, balls = self.body(vector)
         n = self.n_lengths
         length_sigma, radius_sigma = sigma[:n] * lengths, np.empty_like(balls.radii_m)
-        radius_sigma[:, CROSS] = sigma[self.layout.set("radii")].reshape(-1, 2) * balls.radii_m[:, CROSS]
+        radius_sigma[:, CROSS] = sigma[self.layout.group("radii")].reshape(-1, 2) * balls.radii_m[:, CROSS]
         radius_sigma[:, 1] = sigma[balls.bone_index] * balls.radii_m[:, 1]
         return BodyShape(
             model=self.template.model,
@@ -208,7 +208,7 @@ class ShapeParameters:
             metaballs=balls,
             length_sigma_m=length_sigma,
             radius_sigma_m=radius_sigma,
-            weight_sigma=sigma[self.layout.set("weights")] * balls.weight if self.weights else None,
+            weight_sigma=sigma[self.layout.group("weights")] * balls.weight if self.weights else None,
         )
 
 

@@ -61,7 +61,7 @@ def _of_body(body: BodyFit) -> list[Row]:
     skeleton, motion, rows = body.shape.skeleton, body.motion, []
     for bone, length, sigma in zip(skeleton.bones, body.shape.lengths_m, body.shape.length_sigma_m):
         rows.append(_row(f"length of {bone.name}", 1e3 * length, 1e3 * sigma, "mm", ESTIMATED))
-    base = set(skeleton.layout.set("base").tolist())
+    base = set(skeleton.layout.group("base").tolist())
     for d, name in enumerate(motion.dof_names):
         values = np.degrees(motion.values[:, d])
         if d in base or not np.isfinite(values).any():

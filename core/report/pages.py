@@ -151,7 +151,7 @@ def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, bod
     if trajectories is not None:
         graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.seen.sum(axis=1).astype(float)}))
     if body is not None:
-        angles = [i for i, dof in enumerate(body.shape.skeleton.dofs) if i not in set(body.shape.skeleton.layout.set("base").tolist())]
+        angles = [i for i, dof in enumerate(body.shape.skeleton.dofs) if i not in set(body.shape.skeleton.layout.group("base").tolist())]
         for i in angles:
             name = body.motion.dof_names[i]
             graphs.append(

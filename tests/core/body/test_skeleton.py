@@ -156,7 +156,7 @@ def test_left_is_the_mirror_image_of_right(side: str) -> None:
 def test_layout_answers_by_name_and_names_the_nearest() -> None:
     skeleton = read_model("arm.R").skeleton
     assert skeleton.layout["elbow.R flexion"] == 6
-    assert skeleton.layout.set("twist").tolist() == [5, 7]
+    assert skeleton.layout.group("twist").tolist() == [5, 7]
     with pytest.raises(InputError, match="elbow.R flexion"):
         skeleton.layout["elbow.R flexon"]
 

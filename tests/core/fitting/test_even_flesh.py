@@ -20,7 +20,7 @@ def with_a_ring(parameters: ShapeParameters) -> tuple[np.ndarray, np.ndarray]:
     """A vector whose spine is half as thick again in the middle as the model's, and where in it."""
     balls, names = parameters.template.metaballs, [bone.name for bone in parameters.skeleton.bones]
     middle = np.flatnonzero(balls.bone_index == names.index("spine"))[1]
-    rows = parameters.layout.set("radii")[2 * middle : 2 * middle + 2]
+    rows = parameters.layout.group("radii")[2 * middle : 2 * middle + 2]
     vector = parameters.vector()
     vector[rows] += np.log(1.5)
     return vector, rows
@@ -37,7 +37,7 @@ def test_a_ring_is_evened_out_as_far_as_it_was_not_measured(parameters: ShapePar
 
 def test_a_body_thicker_all_along_or_towards_its_ends_stays_as_it_is(parameters: ShapeParameters) -> None:
     vector = parameters.vector()
-    vector[parameters.layout.set("radii")] += np.log(1.3)
+    vector[parameters.layout.group("radii")] += np.log(1.3)
     found, _ = evened(parameters, vector, np.eye(len(vector)), SIGMA)
     np.testing.assert_allclose(found, vector, atol=1e-12)
 
@@ -46,5 +46,5 @@ def test_lengths_stay_even_where_they_are_seen_with_the_radii(parameters: ShapeP
     vector, rows = with_a_ring(parameters)
     J = np.random.default_rng(3).normal(size=(2 * len(vector), len(vector)))
     found, _ = evened(parameters, vector, np.linalg.inv(J.T @ J), SIGMA)
-    lengths = parameters.layout.set("lengths")
+    lengths = parameters.layout.group("lengths")
     assert np.array_equal(found[lengths], vector[lengths]) and not np.allclose(found[rows], vector[rows])

@@ -36,7 +36,7 @@ def test_held_segments_are_found_anew_when_the_body_grows() -> None:
 
     def get(grown: float) -> None:
         vector = parameters.vector()
-        vector[parameters.layout.set("radii")] += grown
+        vector[parameters.layout.group("radii")] += grown
         held.get("frame", parameters.state(motion, vector), lambda: asked.append(grown))
 
     get(0.0)
@@ -49,7 +49,7 @@ def test_held_segments_are_found_anew_when_the_body_grows() -> None:
 def test_profiles_follow_the_shape() -> None:
     parameters = ShapeParameters(default_shape(read_model("arm.R")))
     thin, thick = parameters.vector(), parameters.vector()
-    thick[parameters.layout.set("radii")] += 0.3
+    thick[parameters.layout.group("radii")] += 0.3
     states = [parameters.state(np.zeros(8), v) for v in (thin, thick)]
     radii = [s.profiles[1].radii_m.mean() for s in (*states, states[0])]
     assert radii[1] > 1.3 * radii[0] and radii[2] == radii[0]

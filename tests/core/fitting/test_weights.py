@@ -18,7 +18,7 @@ def test_weights_are_parameters_only_where_that_is_asked_for() -> None:
     shape = default_shape(read_model("arm.R"))
     without, with_weights = ShapeParameters(shape), ShapeParameters(shape, weights=True)
     assert len(with_weights.layout) == len(without.layout) + 6 == 2 + 12 + 6
-    assert not len(without.layout.set("weights")) and with_weights.layout.set("weights").tolist() == list(range(14, 20))
+    assert not len(without.layout.group("weights")) and with_weights.layout.group("weights").tolist() == list(range(14, 20))
     assert with_weights.layout.names[-1] == "weight forearm.R 3"
     vector = with_weights.vector()
     vector[-1] = np.log(1.3)
