@@ -1,1 +1,1 @@
-"""Telling Tricap what it did wrong: trajectories and regions to leave out, degrees of freedom to lock or to limit."""
+"""The user's corrections: trajectories to remove, regions to exclude, degrees of freedom to lock or to limit."""

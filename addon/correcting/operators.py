@@ -9,27 +9,27 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.take_file import take_of_table
 from .. import project, status
-from ..overlay import canvas, draw, layers, recording
+from ..overlay import canvas, draw, layers, results
 from ..overlay.operators import pointed
-from . import marks, tables
+from . import tables
 
 
 class Correct:
-    """Common to both corrections: a pointer in a view, and one step of undo."""
+    """Common to both corrections: clicks in a view, and one undo step."""
 
     hint = ""
     running = False
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """With footage, and one at a time."""
+        """With footage, and while no other correction runs."""
         return len(context.scene.tricap.views) > 0 and not Correct.running
 
     def begin(self, context: bpy.types.Context) -> set[str]:
         """Go modal."""
         area = context.area
         if area is None or canvas.clip_of(area) is None:
-            self.report({"ERROR"}, "Press this in the sidebar of a Clip Editor that shows a view: Open the Views makes them.")  # type: ignore[attr-defined]
+            self.report({"ERROR"}, "Press this in the sidebar of a Clip Editor that shows a view; Open the Views opens one for each view.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         Correct.running = True
         status.tell(context, self.hint)
@@ -37,10 +37,10 @@ class Correct:
         return {"RUNNING_MODAL"}
 
     def end(self, context: bpy.types.Context, how: set[str]) -> set[str]:
-        """Nothing is watched any more."""
+        """Leave the modal state."""
         Correct.running = False
-        marks.show_open("", [])
-        draw.show_looked(-1, None)
+        draw.show_region("", [])
+        draw.show_inspection(-1, None)
         status.tell(context, None)
         canvas.redraw_clips(context)
         return how
@@ -49,8 +49,8 @@ class Correct:
         """Blender ends the operator."""
         self.end(context, {"CANCELLED"})
 
-    def put(self, context: bpy.types.Context, kind: str, view: str, frames: tuple[int, int], corners: Any) -> bool:
-        """Add a correction if take.toml can hold it; else say why."""
+    def add(self, context: bpy.types.Context, kind: str, view: str, frames: tuple[int, int], corners: Any) -> bool:
+        """Add a correction if it is valid in take.toml; otherwise report why not."""
         try:
             if view not in project.clips_of(context.scene):
                 raise InputError(f"There is no view “{view}”.")
@@ -58,8 +58,8 @@ class Correct:
             try:
                 take_of_table(project.folder_of(context.scene), project.table(context.scene))
             except InputError:
-                said = context.scene.tricap_correcting.corrections
-                said.remove(len(said) - 1)
+                corrections = context.scene.tricap_correcting.corrections
+                corrections.remove(len(corrections) - 1)
                 raise
         except InputError as error:
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
@@ -69,69 +69,69 @@ class Correct:
 
 
 class RemoveTrajectory(Correct, bpy.types.Operator):
-    """Click trajectories that are wrong: the nearest one is taken out, in all frames, when the tracks are made again"""
+    """Click wrong trajectories: the nearest one is removed in all frames when step Tracks runs again"""
 
     bl_idname = "tricap.remove_trajectory"
     bl_label = "Remove Trajectories"
     bl_options = {"REGISTER", "UNDO"}
-    hint = "Click: take out the nearest trajectory    Backspace: not the last one    Esc: done"
+    hint = "Click: remove the nearest trajectory    Backspace: undo the last one    Esc: finish"
 
     view: bpy.props.StringProperty(name="View", description="Name of the view")  # type: ignore[valid-type]
-    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the present frame")  # type: ignore[valid-type]
-    x: bpy.props.FloatProperty(name="X", description="Pixels from the middle of the left column")  # type: ignore[valid-type]
-    y: bpy.props.FloatProperty(name="Y", description="Pixels from the middle of the top row, downwards")  # type: ignore[valid-type]
+    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the current frame")  # type: ignore[valid-type]
+    x: bpy.props.FloatProperty(name="X", description="In pixels, 0 at the centre of the left column")  # type: ignore[valid-type]
+    y: bpy.props.FloatProperty(name="Y", description="In pixels, 0 at the centre of the top row, downwards")  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Add one correction."""
         frame = context.scene.frame_current if self.frame < 0 else self.frame
-        return {"FINISHED"} if self.put(context, "trajectory", self.view, (frame, frame), [(self.x, self.y)]) else {"CANCELLED"}
+        return {"FINISHED"} if self.add(context, "trajectory", self.view, (frame, frame), [(self.x, self.y)]) else {"CANCELLED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Click one after the other."""
-        run = recording.current(context.scene)
+        """Start clicking."""
+        run = results.current(context.scene)
         if run is None or run.tracks() is None:
-            self.report({"ERROR"}, f"There are no trajectories yet. {recording.problem()}".strip())
+            self.report({"ERROR"}, f"There are no trajectories yet. {results.problem()}".strip())
             return {"CANCELLED"}
         self.added = 0
         return self.begin(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Show what is nearest; take it out by a click."""
+        """Show the nearest trajectory; remove it on a click."""
         if event.type in ("ESC", "RET", "NUMPAD_ENTER") and event.value == "PRESS":
             return self.end(context, {"FINISHED"} if self.added else {"CANCELLED"})
-        run, place = recording.current(context.scene), pointed(context, event)
+        run, place = results.current(context.scene), pointed(context, event)
         if run is None or place is None:
             return {"PASS_THROUGH"}
         view, xy, reach = place
-        frame, said = context.scene.frame_current, context.scene.tricap_correcting.corrections
+        frame, corrections = context.scene.frame_current, context.scene.tricap_correcting.corrections
         if event.type == "MOUSEMOVE":
-            draw.show_looked(frame, layers.look(run, view, frame, xy, reach))
+            draw.show_inspection(frame, layers.inspect(run, view, frame, xy, reach))
             canvas.redraw_clips(context, pictures_only=True)
         elif event.type == "BACK_SPACE" and event.value == "PRESS" and self.added:
-            said.remove(len(said) - 1)
+            corrections.remove(len(corrections) - 1)
             self.added -= 1
             canvas.redraw_clips(context)
         elif event.type == "LEFTMOUSE" and event.value == "PRESS":
             at = layers.track_place(run, view, frame, xy, reach)
             if at is None:
-                self.report({"WARNING"}, "There is no trajectory near the click; zoom in and click on it.")
-            elif self.put(context, "trajectory", view, (frame, frame), [np.round(at, 2)]):
+                self.report({"WARNING"}, "There is no trajectory near the click; zoom in and click on one.")
+            elif self.add(context, "trajectory", view, (frame, frame), [np.round(at, 2)]):
                 self.added += 1
             return {"RUNNING_MODAL"}
         return {"PASS_THROUGH"}
 
 
 class RemoveRegion(Correct, bpy.types.Operator):
-    """Click the corners of a region in a view: what is measured inside it is left out, from clouds, tracks and body"""
+    """Click the corners of a region in a view: everything measured inside it is excluded from clouds, tracks and body"""
 
     bl_idname = "tricap.remove_region"
-    bl_label = "Leave Out a Region"
+    bl_label = "Exclude Region"
     bl_options = {"REGISTER", "UNDO"}
-    hint = "Click: a corner    Return / right click: close the region    Backspace: not the last corner    Esc: no region"
+    hint = "Click: add a corner    Return / right click: close the region    Backspace: undo the last corner    Esc: cancel"
 
     view: bpy.props.StringProperty(name="View", description="Name of the view")  # type: ignore[valid-type]
-    first: bpy.props.IntProperty(name="From", default=-1, min=-1, description="First frame; −1: of the recording")  # type: ignore[valid-type]
-    last: bpy.props.IntProperty(name="To", default=-1, min=-1, description="Last frame; −1: of the recording")  # type: ignore[valid-type]
+    first: bpy.props.IntProperty(name="From", default=-1, min=-1, description="First frame; −1: the first of the footage")  # type: ignore[valid-type]
+    last: bpy.props.IntProperty(name="To", default=-1, min=-1, description="Last frame; −1: the last of the footage")  # type: ignore[valid-type]
     polygon: bpy.props.StringProperty(name="Polygon", description="Corners in pixels, as [[x, y], …]")  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -139,23 +139,23 @@ class RemoveRegion(Correct, bpy.types.Operator):
         try:
             corners = [(float(x), float(y)) for x, y in json.loads(self.polygon)]
         except (ValueError, TypeError):
-            self.report({"ERROR"}, f"The polygon {self.polygon!r} is no list of corners; write it as [[x, y], [x, y], [x, y]].")
+            self.report({"ERROR"}, f"The polygon {self.polygon!r} is not a list of corners; write it as [[x, y], [x, y], [x, y]].")
             return {"CANCELLED"}
         low, high = footage_frames(context.scene)
-        frames = (low if self.first < 0 else self.first, high if self.last < 0 else self.last)
-        if frames[1] < frames[0]:
-            self.report({"ERROR"}, f"The region goes from frame {frames[0]} to {frames[1]}; the first must not be later than the last.")
+        first, last = (low if self.first < 0 else self.first, high if self.last < 0 else self.last)
+        if last < first:
+            self.report({"ERROR"}, f"The region starts in frame {first} and ends in frame {last}; it must not end before it starts.")
             return {"CANCELLED"}
-        return {"FINISHED"} if self.put(context, "region", self.view, frames, corners) else {"CANCELLED"}
+        return {"FINISHED"} if self.add(context, "region", self.view, (first, last), corners) else {"CANCELLED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Click corner after corner."""
+        """Start clicking corners."""
         self.corners: list[tuple[float, float]] = []
         self.mine = ""
         return self.begin(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Collect corners; close the region."""
+        """Add corners; close the region."""
         if event.value != "PRESS":
             return {"PASS_THROUGH"}
         if event.type == "ESC":
@@ -172,44 +172,44 @@ class RemoveRegion(Correct, bpy.types.Operator):
             self.corners.append((round(float(place[1][0]), 2), round(float(place[1][1]), 2)))
         else:
             return {"PASS_THROUGH"}
-        marks.show_open(self.mine, self.corners)
+        draw.show_region(self.mine, self.corners)
         canvas.redraw_clips(context)
         return {"RUNNING_MODAL"}
 
     def _close(self, context: bpy.types.Context) -> set[str]:
         if len(self.corners) < 3:
-            self.report({"WARNING"}, "A region needs three corners at least.")
+            self.report({"WARNING"}, "A region needs at least three corners.")
             return {"RUNNING_MODAL"}
         frame = context.scene.frame_current
         one = context.scene.tricap_correcting.region_frames == "one"
-        done = self.put(context, "region", self.mine, (frame, frame) if one else footage_frames(context.scene), self.corners)
+        done = self.add(context, "region", self.mine, (frame, frame) if one else footage_frames(context.scene), self.corners)
         return self.end(context, {"FINISHED"} if done else {"CANCELLED"})
 
 
 class RemoveCorrection(bpy.types.Operator):
-    """Take this correction back"""
+    """Remove this correction"""
 
     bl_idname = "tricap.remove_correction"
-    bl_label = "Take Back"
+    bl_label = "Remove Correction"
     bl_options = {"REGISTER", "UNDO"}
 
-    index: bpy.props.IntProperty(name="Index", default=-1, description="Place in the list; −1: the chosen one")  # type: ignore[valid-type]
+    index: bpy.props.IntProperty(name="Index", default=-1, description="Place in the list; −1: the active one")  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Remove it from the list."""
-        said = context.scene.tricap_correcting
-        index = said.active if self.index < 0 else self.index
-        if not 0 <= index < len(said.corrections):
+        correcting = context.scene.tricap_correcting
+        index = correcting.active if self.index < 0 else self.index
+        if not 0 <= index < len(correcting.corrections):
             self.report({"ERROR"}, f"There is no correction number {index}.")
             return {"CANCELLED"}
-        said.corrections.remove(index)
-        said.active = min(said.active, max(len(said.corrections) - 1, 0))
+        correcting.corrections.remove(index)
+        correcting.active = min(correcting.active, max(len(correcting.corrections) - 1, 0))
         canvas.redraw_clips(context)
         return {"FINISHED"}
 
 
 class ListDofs(bpy.types.Operator):
-    """List the body model's degrees of freedom, to lock some at rest or to change their limits; the values begin as the model has them"""
+    """List the degrees of freedom of the body model, to lock them at rest or to change their limits"""
 
     bl_idname = "tricap.list_dofs"
     bl_label = "Locks and Limits"
@@ -226,13 +226,13 @@ class ListDofs(bpy.types.Operator):
 
 
 def footage_frames(scene: bpy.types.Scene) -> tuple[int, int]:
-    """First and last frame that any view has."""
+    """First and last frame of the footage of any view."""
     clips = list(project.clips_of(scene).values())
     return max(0, min(c.frame_start for c in clips)), max(c.frame_start + c.frame_duration - 1 for c in clips)
 
 
 def stop_correcting() -> None:
-    """A correction under way ends with its class."""
+    """Forget a running correction, whose class is being unregistered."""
     Correct.running = False
 
 

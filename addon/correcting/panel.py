@@ -1,4 +1,4 @@
-"""The section “Corrections” in the Clip Editor's sidebar, and the list of degrees of freedom for the step Body."""
+"""The panel *Corrections* in the Clip Editor's sidebar, and the list of degrees of freedom of step Body."""
 
 import bpy
 
@@ -9,7 +9,7 @@ from .properties import TricapCorrecting
 
 
 class TRICAP_UL_corrections(bpy.types.UIList):
-    """Trajectories and regions that are left out."""
+    """Removed trajectories and excluded regions."""
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
         """Kind, view and frames."""
@@ -19,10 +19,10 @@ class TRICAP_UL_corrections(bpy.types.UIList):
 
 
 class TRICAP_UL_dofs(bpy.types.UIList):
-    """Degrees of freedom with lock and limits; the list's own search finds one by name."""
+    """Degrees of freedom with lock and limits; the list can be searched by name."""
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
-        """Name, lock, lowest and highest."""
+        """Lock, name, lower and upper limit."""
         row = layout.row(align=True)
         row.prop(item, "locked", text="", icon="LOCKED" if item.locked else "UNLOCKED", emboss=False)
         row.label(text=item.name)
@@ -33,7 +33,7 @@ class TRICAP_UL_dofs(bpy.types.UIList):
 
 
 class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
-    """What is wrong is left out, and the later steps are made again."""
+    """Excludes what is wrong; the steps that depend on it run again."""
 
     bl_label = "Corrections"
     bl_order = 3
@@ -45,40 +45,40 @@ class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """The two tools and the list."""
-        layout, said = self.layout, context.scene.tricap_correcting
+        layout, correcting = self.layout, context.scene.tricap_correcting
         layout.operator_context = "INVOKE_DEFAULT"
         column = layout.column(align=True)
         column.operator("tricap.remove_trajectory", icon="TRACKER")
         column.operator("tricap.remove_region", icon="MESH_PLANE")
-        column.prop(said, "region_frames")
-        if said.corrections:
+        column.prop(correcting, "region_frames")
+        if correcting.corrections:
             row = layout.row()
-            row.template_list("TRICAP_UL_corrections", "", said, "corrections", said, "active", rows=3)
+            row.template_list("TRICAP_UL_corrections", "", correcting, "corrections", correcting, "active", rows=3)
             row.operator("tricap.remove_correction", text="", icon="REMOVE").index = -1
-            self._draw_chosen(layout, said)
-            sentence(layout, context, "They take effect when what is now stale is done again:", "INFO")
+            self._draw_active(layout, correcting)
+            sentence(layout, context, "They take effect when the outdated steps run again:", "INFO")
             layout.operator("tricap.run", icon="FF", text="Do Everything That Is Missing")
 
-    def _draw_chosen(self, layout: bpy.types.UILayout, said: TricapCorrecting) -> None:
-        if 0 <= said.active < len(said.corrections) and said.corrections[said.active].kind == "region":
+    def _draw_active(self, layout: bpy.types.UILayout, correcting: TricapCorrecting) -> None:
+        if 0 <= correcting.active < len(correcting.corrections) and correcting.corrections[correcting.active].kind == "region":
             row = layout.row(align=True)
-            row.prop(said.corrections[said.active], "first")
-            row.prop(said.corrections[said.active], "last")
+            row.prop(correcting.corrections[correcting.active], "first")
+            row.prop(correcting.corrections[correcting.active], "last")
 
 
 def draw_dofs(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """Locks and limits: a button that lists them, then the list."""
-    said = scene.tricap_correcting
-    if not said.dofs or said.dofs_model != project.model_of(scene):
+    """Locks and limits: a button that fills the list, then the list."""
+    correcting = scene.tricap_correcting
+    if not correcting.dofs or correcting.dofs_model != project.model_of(scene):
         layout.operator("tricap.list_dofs", icon="LOCKED")
         return
-    layout.template_list("TRICAP_UL_dofs", "", said, "dofs", said, "active_dof", rows=5)
-    if 0 <= said.active_dof < len(said.dofs):
+    layout.template_list("TRICAP_UL_dofs", "", correcting, "dofs", correcting, "active_dof", rows=5)
+    if 0 <= correcting.active_dof < len(correcting.dofs):
         row = layout.row(align=True)
         row.use_property_split = False
-        row.active = not said.dofs[said.active_dof].locked
-        row.prop(said.dofs[said.active_dof], "low")
-        row.prop(said.dofs[said.active_dof], "high")
+        row.active = not correcting.dofs[correcting.active_dof].locked
+        row.prop(correcting.dofs[correcting.active_dof], "low")
+        row.prop(correcting.dofs[correcting.active_dof], "high")
 
 
 CLASSES = (TRICAP_UL_corrections, TRICAP_UL_dofs, TRICAP_PT_corrections)

@@ -1,23 +1,23 @@
-"""What the user corrected, kept in the scene and written into take.toml: [[corrections]], `locked` and `limits` of [body]."""
+"""The user's corrections, stored in the scene and written to take.toml: [[corrections]], `locked` and `limits` of [body]."""
 
 import bpy
 
 
 class TricapCorner(bpy.types.PropertyGroup):
-    """A place in the image: full-frame pixels, the centre of the top-left pixel is (0, 0)."""
+    """A pixel: full-frame coordinates, (0, 0) is the centre of the top-left pixel."""
 
     x: bpy.props.FloatProperty(name="X", precision=2)  # type: ignore[valid-type]
     y: bpy.props.FloatProperty(name="Y", precision=2)  # type: ignore[valid-type]
 
 
 class TricapCorrection(bpy.types.PropertyGroup):
-    """A trajectory to remove (one corner, in frame `first`), or a region to leave out (three corners or more, `first` to `last`)."""
+    """A trajectory to remove (one corner, in frame `first`), or a region to exclude (three corners or more, frames `first` to `last`)."""
 
     kind: bpy.props.EnumProperty(
         name="Kind",
         items=[  # type: ignore[valid-type]
             ("trajectory", "Trajectory", "The trajectory nearest to a pixel is removed"),
-            ("region", "Region", "What is measured inside a polygon is left out"),
+            ("region", "Region", "Everything measured inside a polygon is excluded"),
         ],
     )
     view: bpy.props.StringProperty(name="View")  # type: ignore[valid-type]
@@ -27,12 +27,12 @@ class TricapCorrection(bpy.types.PropertyGroup):
 
 
 class TricapDof(bpy.types.PropertyGroup):
-    """A degree of freedom of the body model: whether it is held at rest, and its limits in degrees."""
+    """A degree of freedom of the body model: whether it is locked at rest, and its limits in degrees."""
 
     name: bpy.props.StringProperty(name="Name")  # type: ignore[valid-type]
-    locked: bpy.props.BoolProperty(name="Locked", description="Hold it at its rest value")  # type: ignore[valid-type]
-    low: bpy.props.FloatProperty(name="Lowest", description="Degrees", min=-360.0, max=360.0, precision=1)  # type: ignore[valid-type]
-    high: bpy.props.FloatProperty(name="Highest", description="Degrees", min=-360.0, max=360.0, precision=1)  # type: ignore[valid-type]
+    locked: bpy.props.BoolProperty(name="Locked", description="Lock it at its rest value")  # type: ignore[valid-type]
+    low: bpy.props.FloatProperty(name="Lower", description="Lower limit in degrees", min=-360.0, max=360.0, precision=1)  # type: ignore[valid-type]
+    high: bpy.props.FloatProperty(name="Upper", description="Upper limit in degrees", min=-360.0, max=360.0, precision=1)  # type: ignore[valid-type]
 
 
 class TricapCorrecting(bpy.types.PropertyGroup):
@@ -47,8 +47,8 @@ class TricapCorrecting(bpy.types.PropertyGroup):
         name="In",
         default="all",
         items=[
-            ("all", "All Frames", "The region is left out in the whole recording"),
-            ("one", "This Frame", "Only in the present frame; extend it in the list"),
+            ("all", "All Frames", "Exclude the region in all frames"),
+            ("one", "This Frame", "Exclude the region in the current frame only; change that in the list"),
         ],
     )
 

@@ -1,9 +1,9 @@
-"""What Blender is told of correcting: properties, operators, a section in the Clip Editor, and its part of take.toml."""
+"""Registers corrections: properties, operators, a panel in the Clip Editor, and their part of take.toml."""
 
 import bpy
 
 from .. import project
-from . import marks, operators, panel, properties, tables
+from . import operators, panel, properties, tables
 
 CLASSES = (*properties.CLASSES, *operators.CLASSES, *panel.CLASSES)
 
@@ -15,13 +15,11 @@ def register() -> None:
     bpy.types.Scene.tricap_correcting = bpy.props.PointerProperty(type=properties.TricapCorrecting)
     project.WRITERS.append(tables.write)
     project.READERS.append(tables.read)
-    marks.begin()
 
 
 def unregister() -> None:
     """Take everything away again, in reverse order."""
     operators.stop_correcting()
-    marks.end()
     project.READERS.remove(tables.read)
     project.WRITERS.remove(tables.write)
     del bpy.types.Scene.tricap_correcting

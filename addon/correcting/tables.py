@@ -1,6 +1,6 @@
-"""Corrections, locks and limits between the scene and take.toml's table.
+"""Corrections, locks and limits: from the scene to the table of take.toml and back.
 
-A number of the file that Blender, in single precision, keeps alike stays as the file has it.
+A number that equals the one in the file in Blender's single precision stays as it is in the file.
 """
 
 from typing import Any
@@ -13,50 +13,50 @@ from ...core.errors import InputError
 from ...core.take_file import Table
 from .. import project, properties
 
-FREE_DEG = 360.0  # stands for no limit
+UNLIMITED_DEG = 360.0  # stands for no limit
 
 
 def write(scene: bpy.types.Scene, made: Table) -> None:
-    """Put what the scene says into the table.
+    """Put the scene's corrections into the table.
 
     Raises:
-        InputError: limits are the wrong way round.
+        InputError: a lower limit is not below the upper one.
     """
-    said, old = scene.tricap_correcting, made.get("corrections", [])
-    corrections = [_entry(correction) for correction in said.corrections]
+    correcting, old = scene.tricap_correcting, made.get("corrections", [])
+    corrections = [_entry(correction) for correction in correcting.corrections]
     if corrections:
         made["corrections"] = [next((before for before in old if _alike(before, entry)), entry) for entry in corrections]
     else:
         made.pop("corrections", None)
-    if "body" in made and said.dofs and said.dofs_model == project.model_of(scene):
+    if "body" in made and correcting.dofs and correcting.dofs_model == project.model_of(scene):
         made["body"] = _with_dofs(scene, dict(made["body"]))
 
 
 def read(scene: bpy.types.Scene, table: Table) -> None:
-    """Make the scene say what the table says."""
-    said = scene.tricap_correcting
-    said.corrections.clear()
+    """Show the corrections of the table in the scene."""
+    correcting = scene.tricap_correcting
+    correcting.corrections.clear()
     for entry in table.get("corrections", []):
         if entry["kind"] == "trajectory":
             add(scene, "trajectory", entry["view"], entry["frame"], entry["frame"], [entry["xy"]])
         else:
             add(scene, "region", entry["view"], entry["frames"][0], entry["frames"][1] - 1, entry["polygon"])
     body = table.get("body", {})
-    said.dofs.clear()
-    said.dofs_model = ""
+    correcting.dofs.clear()
+    correcting.dofs_model = ""
     if body.get("locked") or body.get("limits"):
         list_dofs(scene, body.get("locked", []), body.get("limits", {}))
 
 
 def add(scene: bpy.types.Scene, kind: str, view: str, first: int, last: int, corners: Any) -> None:
-    """A further correction, chosen in the list."""
-    said = scene.tricap_correcting
-    correction = said.corrections.add()
+    """Add a correction and make it the active one."""
+    correcting = scene.tricap_correcting
+    correction = correcting.corrections.add()
     correction.kind, correction.view, correction.first, correction.last = kind, view, first, last
     for x, y in corners:
         corner = correction.corners.add()
         corner.x, corner.y = float(x), float(y)
-    said.active = len(said.corrections) - 1
+    correcting.active = len(correcting.corrections) - 1
 
 
 def list_dofs(scene: bpy.types.Scene, locked: Any = (), limits: Any = None) -> None:
@@ -65,15 +65,15 @@ def list_dofs(scene: bpy.types.Scene, locked: Any = (), limits: Any = None) -> N
     Raises:
         InputError: there is no body model.
     """
-    said = scene.tricap_correcting
+    correcting = scene.tricap_correcting
     model = model_of(scene)
-    said.dofs.clear()
+    correcting.dofs.clear()
     for name, (low, high) in model_limits(model).items():
-        dof = said.dofs.add()
+        dof = correcting.dofs.add()
         dof.name, dof.locked = name, name in locked
         dof.low, dof.high = (limits or {}).get(name, (low, high))
-    said.dofs_model = project.model_of(scene)
-    said.active_dof = 0
+    correcting.dofs_model = project.model_of(scene)
+    correcting.active_dof = 0
 
 
 def model_of(scene: bpy.types.Scene) -> BodyModel:
@@ -84,28 +84,28 @@ def model_of(scene: bpy.types.Scene) -> BodyModel:
     """
     name = project.model_of(scene)
     if not name:
-        raise InputError("Choose a body model first: it has the degrees of freedom.")
+        raise InputError("Choose a body model first; the degrees of freedom are those of the model.")
     return read_model(project.folder_of(scene) / name if name.endswith(".toml") else name)
 
 
 def model_limits(model: BodyModel) -> dict[str, tuple[float, float]]:
-    """The limits [degrees] of a model's angles, ±360 where it has none."""
+    """The limits [degrees] of a model's angles, ±360 where there is none."""
     skeleton = model.skeleton
     base = set(skeleton.layout.group("base").tolist())
     rounded = {}
     for i, dof in enumerate(skeleton.dofs):
         if i not in base:
-            low, high = (float(np.clip(np.degrees(v), -FREE_DEG, FREE_DEG)) for v in dof.limits)
+            low, high = (float(np.clip(np.degrees(v), -UNLIMITED_DEG, UNLIMITED_DEG)) for v in dof.limits)
             rounded[dof.name] = (round(low, 6), round(high, 6))
     return rounded
 
 
 def _with_dofs(scene: bpy.types.Scene, body: Table) -> Table:
-    said, usual = scene.tricap_correcting, model_limits(model_of(scene))
+    correcting, usual = scene.tricap_correcting, model_limits(model_of(scene))
     old = body.get("limits", {})
-    locked = [dof.name for dof in said.dofs if dof.locked and dof.name in usual]
+    locked = [dof.name for dof in correcting.dofs if dof.locked and dof.name in usual]
     limits = {}
-    for dof in said.dofs:
+    for dof in correcting.dofs:
         if dof.name in usual and not _same((dof.low, dof.high), usual[dof.name]):
             if not dof.low < dof.high:
                 raise InputError(f"The limits of “{dof.name}” are {dof.low:g}° to {dof.high:g}°; the first must be the lower one.")

@@ -1,1 +1,1 @@
-"""What is drawn over the footage in the Clip Editor, and the table of frames."""
+"""Results and corrections drawn over the footage in the Clip Editor, and the list of doubtful frames."""

@@ -1,6 +1,6 @@
-"""The picture in a Clip Editor: from Tricap's pixels to the region and back, and the few things that are drawn there.
+"""Drawing in a Clip Editor: from Tricap's pixels to the region and back, and lines, points, areas and text.
 
-Coordinates are Tricap's full-frame pixels. Batches are made once, in pixels of the image, and drawn under `image_space`: zooming and
+Coordinates are Tricap's full-frame pixels. Batches are made once, in image pixels, and drawn in `image_space`: zooming and
 panning cost nothing.
 """
 
@@ -21,7 +21,7 @@ TEXT_PX = 13
 
 
 class Canvas:
-    """How the image of a clip lies in a region of a Clip Editor."""
+    """The mapping between the image of a clip and a region of a Clip Editor."""
 
     def __init__(self, region: bpy.types.Region, size_px: tuple[int, int]) -> None:
         self.region, self.size_px = region, (int(size_px[0]), int(size_px[1]))
@@ -45,7 +45,7 @@ class Canvas:
 
     @contextmanager
     def image_space(self) -> Iterator[None]:
-        """What is drawn inside counts in image pixels."""
+        """Draw in image pixels inside this context."""
         origin, unit = self.to_region(np.zeros(2)), self.to_region(np.ones(2)) - self.to_region(np.zeros(2))
         with gpu.matrix.push_pop():
             gpu.matrix.multiply_matrix(Matrix.Translation((*origin, 0.0)) @ Matrix.Diagonal((*unit, 1.0, 1.0)))
@@ -53,13 +53,13 @@ class Canvas:
 
 
 def clip_of(area: bpy.types.Area) -> bpy.types.MovieClip | None:
-    """The clip that an area shows as footage, if it is a Clip Editor in its clip view."""
+    """The clip that an area shows, if it is a Clip Editor in clip view."""
     space = area.spaces.active if area.type == "CLIP_EDITOR" else None
     return space.clip if space is not None and space.view == "CLIP" else None
 
 
 def window_region(area: bpy.types.Area) -> bpy.types.Region:
-    """The region of an area that shows the picture."""
+    """The main region of an area."""
     return next(region for region in area.regions if region.type == "WINDOW")
 
 
@@ -69,7 +69,7 @@ def clip_areas(window: bpy.types.Window) -> list[bpy.types.Area]:
 
 
 def area_under(window: bpy.types.Window, x: int, y: int) -> bpy.types.Area | None:
-    """The Clip Editor whose picture lies under a place of the window; None over its sidebar, header or tools."""
+    """The Clip Editor whose image is at this place in the window; None over its sidebar, header or tools."""
     for area in window.screen.areas:
         if area.x <= x < area.x + area.width and area.y <= y < area.y + area.height:
             inside = {r.type for r in area.regions if r.width > 1 and r.x <= x < r.x + r.width and r.y <= y < r.y + r.height}
@@ -78,7 +78,7 @@ def area_under(window: bpy.types.Window, x: int, y: int) -> bpy.types.Area | Non
 
 
 def redraw_clips(context: bpy.types.Context, *, pictures_only: bool = False) -> None:
-    """Have all Clip Editors drawn again, with their sidebars or without."""
+    """Redraw all Clip Editors, with their sidebars unless `pictures_only`."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "CLIP_EDITOR":
@@ -103,7 +103,7 @@ def chain(points: np.ndarray, *, closed: bool = False) -> np.ndarray:
 
 
 def draw_lines(batch: gpu.types.GPUBatch, width: float, colour: Colour | None = None) -> None:
-    """Draw a batch of `line_batch`, in one colour if it has none of its own."""
+    """Draw a batch from `line_batch`, in one colour if it has no colours of its own."""
     shader = gpu.shader.from_builtin("POLYLINE_FLAT_COLOR" if colour is None else "POLYLINE_UNIFORM_COLOR")
     shader.bind()
     shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
@@ -122,7 +122,7 @@ def point_batch(points: np.ndarray, colours: np.ndarray) -> gpu.types.GPUBatch:
 
 
 def draw_points(batch: gpu.types.GPUBatch, size: float) -> None:
-    """Draw a batch of `point_batch`."""
+    """Draw a batch from `point_batch`."""
     gpu.state.point_size_set(size)
     batch.draw(gpu.shader.from_builtin("POINT_FLAT_COLOR"))
 
@@ -149,13 +149,13 @@ def ring(centre: np.ndarray, radius: float, corners: int = 24) -> np.ndarray:
 
 
 def cross(centre: np.ndarray, radius: float, gap: float = 0.0) -> np.ndarray:
-    """Segments (4, 2, 2) of a cross with a hole in its middle."""
+    """Segments (4, 2, 2) of a cross with a gap at its centre."""
     arms = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
     return np.stack([centre + gap * arms, centre + radius * arms], axis=1)
 
 
 def text(words: str, x: float, y: float, colour: Colour = (1.0, 1.0, 1.0, 1.0), *, size: float = TEXT_PX) -> None:
-    """Words with a shadow, at region pixels."""
+    """Draw text with a shadow, at region pixels."""
     scale = bpy.context.preferences.system.ui_scale
     blf.size(0, size * scale)
     blf.color(0, *colour)
@@ -167,12 +167,12 @@ def text(words: str, x: float, y: float, colour: Colour = (1.0, 1.0, 1.0, 1.0), 
 
 
 def text_height(*, size: float = TEXT_PX) -> float:
-    """Height of a line of words in region pixels."""
+    """Height of a line of text in region pixels."""
     blf.size(0, size * bpy.context.preferences.system.ui_scale)
     return float(blf.dimensions(0, "Ag")[1])
 
 
 def text_width(words: str, *, size: float = TEXT_PX) -> float:
-    """Width of words in region pixels."""
+    """Width of text in region pixels."""
     blf.size(0, size * bpy.context.preferences.system.ui_scale)
     return float(blf.dimensions(0, words)[0])

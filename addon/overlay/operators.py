@@ -1,20 +1,27 @@
-"""bpy.ops.tricap.look_closer(): point at something over the footage and read what is known of it."""
+"""bpy.ops.tricap.look_closer(): point at the footage and read what was measured there; bpy.ops.tricap.follow_contours(view="C")"""
+
+from collections.abc import Callable
+from pathlib import Path
 
 import bpy
 import numpy as np
 
-from .. import status
-from . import canvas, draw, layers, recording
+from ...core import pipeline
+from ...core.contour_command import Start, write_contours
+from ...core.progress import Monitor
+from .. import project, status
+from ..jobs import JobOperator
+from . import canvas, draw, layers, results
 
-PIXELS = 14.0  # of the screen, around the pointer
+REACH_SCREEN_PX = 14.0  # around the pointer
 
 
-class LookCloser(bpy.types.Operator):
-    """Point at the footage: the nearest matched point tells its sigma and shows its patches in all views (white: where matching starts,
-    green: as it was matched), the nearest trajectory why it was removed. Click keeps that on show, Esc ends"""
+class InspectPoints(bpy.types.Operator):
+    """Point at the footage to see the sigma of the nearest matched point and its patches in all views (white: where matching started,
+    green: where it ended), and why the nearest trajectory was removed. Click to leave it shown, Esc to end"""
 
     bl_idname = "tricap.look_closer"
-    bl_label = "Look Closer"
+    bl_label = "Inspect Points"
 
     running = False
 
@@ -22,29 +29,29 @@ class LookCloser(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         """In a view, after a run."""
         clip = canvas.clip_of(context.area) if context.area is not None else None
-        return clip is not None and bool(recording.view_of(clip)) and not cls.running
+        return clip is not None and bool(results.view_of(clip)) and not cls.running
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Follow the pointer."""
-        if recording.current(context.scene) is None:
-            self.report({"ERROR"}, f"There is nothing to look at: {recording.problem()}")
+        if results.current(context.scene) is None:
+            self.report({"ERROR"}, f"There is nothing to inspect: {results.problem()}")
             return {"CANCELLED"}
-        LookCloser.running = True
-        status.tell(context, "Point at the footage    Click: keep it on show    Esc: end")
+        InspectPoints.running = True
+        status.tell(context, "Point at the footage    Click: leave it shown    Esc: end")
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Look where the pointer is."""
+        """Inspect what is under the pointer."""
         if event.type in ("ESC", "RIGHTMOUSE") and event.value == "PRESS":
-            draw.show_looked(-1, None)
+            draw.show_inspection(-1, None)
             return self._end(context, {"CANCELLED"})
         place = pointed(context, event)
         if event.type == "MOUSEMOVE" and place is not None:
             view, xy, reach = place
-            run = recording.current(context.scene)
+            run = results.current(context.scene)
             frame = context.scene.frame_current
-            draw.show_looked(frame, layers.look(run, view, frame, xy, reach) if run is not None else None)
+            draw.show_inspection(frame, layers.inspect(run, view, frame, xy, reach) if run is not None else None)
             canvas.redraw_clips(context, pictures_only=True)
         if event.type == "LEFTMOUSE" and event.value == "PRESS" and place is not None:
             return self._end(context, {"FINISHED"})
@@ -55,22 +62,58 @@ class LookCloser(bpy.types.Operator):
         self._end(context, {"CANCELLED"})
 
     def _end(self, context: bpy.types.Context, how: set[str]) -> set[str]:
-        LookCloser.running = False
+        InspectPoints.running = False
         status.tell(context, None)
         canvas.redraw_clips(context)
         return how
 
 
 def pointed(context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, np.ndarray, float] | None:
-    """The view under the pointer, the pixel there, and how many image pixels PIXELS of the screen are."""
+    """The view under the pointer, the pixel there, and how many image pixels REACH_SCREEN_PX are."""
     area = canvas.area_under(context.window, event.mouse_x, event.mouse_y)
     clip = canvas.clip_of(area) if area is not None else None
-    view = recording.view_of(clip) if clip is not None else ""
+    view = results.view_of(clip) if clip is not None else ""
     if area is None or clip is None or not view:
         return None
     region = canvas.window_region(area)
     sheet = canvas.Canvas(region, tuple(clip.size))
-    return view, sheet.to_image((event.mouse_x - region.x, event.mouse_y - region.y)), PIXELS / max(sheet.zoom, 1e-6)
+    return view, sheet.to_image((event.mouse_x - region.x, event.mouse_y - region.y)), REACH_SCREEN_PX / max(sheet.zoom, 1e-6)
 
 
-CLASSES = (LookCloser,)
+class FollowContours(JobOperator, bpy.types.Operator):
+    """Track the outline of the person through the frames of a view; steps Surface and Tracks run first if need be. Step Body fits it"""
+
+    bl_idname = "tricap.follow_contours"
+    bl_label = "Track Outline"
+    bl_options = {"UNDO"}
+    step = "tracks"
+
+    view: bpy.props.StringProperty(name="View", description="Name of the view; empty: all views")  # type: ignore[valid-type]
+    from_body: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="From Fitted Body", description="Start from the outline of the fitted body instead of the measured surface"
+    )
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], list[str]]:
+        """Read folders and settings; write the project's take.toml."""
+        take, out, overrides = project.chosen(context.scene, "", "")
+        view, start = self.view, Start(body=self.from_body)
+        return lambda monitor: track_outline(take, out, overrides, view, monitor, start)
+
+    def finish(self, context: bpy.types.Context, result: list[str]) -> set[str]:
+        """Show the outline and report what was found."""
+        for sentence in result:
+            self.report({"INFO"}, sentence)
+        results.clear()
+        context.scene.tricap_overlay.contour = True
+        canvas.redraw_clips(context)
+        return {"FINISHED"}
+
+
+def track_outline(take: Path, out: Path, overrides: pipeline.Overrides, view: str, monitor: Monitor, start: Start) -> list[str]:
+    """The computation, without bpy: a sentence for each view."""
+    with pipeline.open_run(take, out, overrides, contours_aside=True) as run:
+        names = [view] if view else [v.name for v in run.footage.take.views]
+        return write_contours(run, names, monitor, start)
+
+
+CLASSES = (InspectPoints, FollowContours)

@@ -1,4 +1,4 @@
-"""The sections “Overlays” and “Frames” in the Clip Editor's sidebar."""
+"""The panels *Overlays* and *Worst Frames* in the Clip Editor's sidebar."""
 
 import dataclasses
 
@@ -8,13 +8,13 @@ import numpy as np
 from ..clicking.panel import ClipPanel
 from ..panels import sentence
 from ..properties import stages
-from . import recording
+from . import results
 
-WORST = 12
+LISTED_FRAMES = 12
 
 
 class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
-    """What is shown over the footage."""
+    """Results drawn over the footage."""
 
     bl_label = "Overlays"
     bl_order = 1
@@ -22,9 +22,9 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """The switches."""
         layout, shown = self.layout, context.scene.tricap_overlay
-        run = recording.current(context.scene)
+        run = results.current(context.scene)
         if run is None:
-            sentence(layout, context, recording.problem() or "Nothing was measured yet.", "INFO")
+            sentence(layout, context, results.problem() or "Nothing was measured yet.", "INFO")
             return
         column = layout.column()
         row = column.row()
@@ -47,22 +47,22 @@ class TRICAP_PT_overlays(ClipPanel, bpy.types.Panel):
         column.prop(shown, "graph")
         layout.operator("tricap.look_closer", icon="VIEWZOOM")
         if shown.contour:
-            _contour_knobs(layout, context)
-        if recording.problem():
-            sentence(layout, context, recording.problem(), "ERROR")
+            _draw_contour_settings(layout, context)
+        if results.problem():
+            sentence(layout, context, results.problem(), "ERROR")
 
-    def _draw_contour(self, layout: bpy.types.UILayout, context: bpy.types.Context, run: recording.Recording) -> None:
+    def _draw_contour(self, layout: bpy.types.UILayout, context: bpy.types.Context, run: results.RunResults) -> None:
         clip = context.space_data.clip
-        view = recording.view_of(clip) if clip is not None else ""
+        view = results.view_of(clip) if clip is not None else ""
         if view in run.cameras and not run.contours(view):
             row = layout.row()
             row.enabled = not context.window_manager.tricap.running
             row.operator("tricap.follow_contours", icon="MOD_OUTLINE").view = view
 
 
-def _contour_knobs(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+def _draw_contour_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     header, inside = layout.panel("tricap_group_contour", default_closed=True)
-    header.label(text="Following the Outline")
+    header.label(text="Outline Tracking")
     if inside is not None:
         inside.use_property_split, inside.use_property_decorate = True, False
         for field in dataclasses.fields(stages()["contour"]):
@@ -70,7 +70,7 @@ def _contour_knobs(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
 
 
 class TRICAP_PT_frames(ClipPanel, bpy.types.Panel):
-    """The worst frames: press one to go there."""
+    """The most doubtful frames: press one to go there."""
 
     bl_label = "Worst Frames"
     bl_order = 2
@@ -79,27 +79,27 @@ class TRICAP_PT_frames(ClipPanel, bpy.types.Panel):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only after a run."""
-        run = recording.current(context.scene)
+        run = results.current(context.scene)
         return run is not None and run.table() is not None
 
     def draw(self, context: bpy.types.Context) -> None:
-        """A row per frame: number, what is wrong, residual and sigma."""
-        run = recording.current(context.scene)
+        """A row per frame: its number, why it is doubtful, residual and sigma."""
+        run = results.current(context.scene)
         table = run.table() if run is not None else None
         if table is None:
             return
-        much, why = table.badness()
+        badness, reasons = table.badness()
         layout = self.layout
-        if not any(why):
-            layout.label(text="No frame stands out.", icon="CHECKMARK")
+        if not any(reasons):
+            layout.label(text="No frame is doubtful.", icon="CHECKMARK")
         column = layout.column(align=True)
-        for i in np.argsort(-much, kind="stable")[:WORST]:
+        for i in np.argsort(-badness, kind="stable")[:LISTED_FRAMES]:
             frame = int(table.frames[i])
             row = column.row(align=True)
             residual, sigma = (table.values[name][i] for name in ("residual_px", "sigma_mm"))
-            text = f"{frame}: {why[i] or 'fine'}"
+            text = f"{frame}: {reasons[i] or 'good'}"
             row.operator(
-                "tricap.go_to_frame", text=text, depress=frame == context.scene.frame_current, icon="ERROR" if why[i] else "CHECKMARK"
+                "tricap.go_to_frame", text=text, depress=frame == context.scene.frame_current, icon="ERROR" if reasons[i] else "CHECKMARK"
             ).frame = frame
             row.label(text=f"{residual:.2f} px  {sigma:.2f} mm" if np.isfinite(residual) else "no points")
 

@@ -1,32 +1,32 @@
-"""What Blender is told of the overlays: switches, operators, sections in the Clip Editor, and what draws."""
+"""Registers the overlays: switches, operators, panels in the Clip Editor, and the draw handler."""
 
 import bpy
 
-from . import contours, draw, operators, panel, properties, recording
+from . import draw, operators, panel, properties, results
 
-CLASSES = (*properties.CLASSES, *operators.CLASSES, *contours.CLASSES, *panel.CLASSES)
+CLASSES = (*properties.CLASSES, *operators.CLASSES, *panel.CLASSES)
 
 
 @bpy.app.handlers.persistent
-def _forget(*_: object) -> None:
-    recording.forget()
-    draw.show_looked(-1, None)
+def _clear(*_: object) -> None:
+    results.clear()
+    draw.show_inspection(-1, None)
 
 
 def register() -> None:
-    """Register everything, in order; the drawing itself only where there is a window."""
+    """Register everything, in order."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.tricap_overlay = bpy.props.PointerProperty(type=properties.TricapOverlay)
-    bpy.app.handlers.load_pre.append(_forget)
+    bpy.app.handlers.load_pre.append(_clear)
     draw.begin()
 
 
 def unregister() -> None:
     """Take everything away again, in reverse order."""
     draw.end()
-    _forget()
-    bpy.app.handlers.load_pre.remove(_forget)
+    _clear()
+    bpy.app.handlers.load_pre.remove(_clear)
     del bpy.types.Scene.tricap_overlay
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -16,10 +16,9 @@ from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.steering import controls_of
 from ...core.motion.retarget.turns import angle_of, transposed
 from ...core.progress import Monitor
-from .memory import remember
 from .programs import presets
 from .read import read_motion, read_rig, with_soles
-from .write import Written, write_action
+from .write import Written, store_residual_motion, write_action
 
 LOW = 0.1  # a rig whose feet are farther than this part of its height from its origin has its floor under its feet instead
 SAMPLES = 9
@@ -105,7 +104,7 @@ def apply(
     written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg, properties=steering.properties if steering else {})
     for action in filter(None, [written.action, written.raw]):
         if result.motion.unshown is not None:
-            remember(action, result.motion.unshown)
+            store_residual_motion(action, result.motion.unshown)
     figures = measure(source, source_map, result.travelling, target.rig_map, result.contacts, target.floor_m)
     notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source_map.missing]
     if written.muted:

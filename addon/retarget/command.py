@@ -14,7 +14,7 @@ from ...core.progress import Monitor
 from ...core.results import check_not_result
 from ...core.settings import from_table
 from ..command import check_simplify, standard_output_kept_clean
-from .programs import PROGRAMS
+from .programs import PROGRAMS, is_imported_by_blender
 
 FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
 
@@ -91,7 +91,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from ...core.motion.retarget.contacts import FeetSettings
     from ...core.motion.retarget.retarget import RetargetSettings
     from ..scene.build import save_blend
-    from . import apply, files, source
+    from . import apply, files
 
     if args.blend.suffix != ".blend":
         raise InputError(f"{args.blend.name} is no name of a Blender file; let it end in .blend.")
@@ -103,7 +103,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     table = {"root": args.root, "hands": args.hands, "twist": args.twist, "scale": args.scale}
     settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
-    motion = source.open_source(args.out, monitor, up=args.up, unit=args.unit)
+    motion = files.open_motion(args.out, monitor, up=args.up, unit=args.unit)
     motion_map = apply.map_of(motion.rig)
     files.open_rig(args.rig)
     armature_object = files.the_armature(args.armature, str(args.rig))
@@ -112,7 +112,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     apply.set_range(bpy.context.scene, motion)
     outcome = apply.apply(armature_object, motion, motion_map, target, result, args.out.stem or "Retargeted", args.simplify)
     bpy.context.scene.frame_set(bpy.context.scene.frame_start)
-    table = source.account(outcome, motion_map, target.rig_map)
+    table = outcome_table(outcome, motion_map, target.rig_map)
     if args.report:
         from .picture import draw
 
@@ -126,6 +126,30 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     return [f"{args.blend}: {outcome.figures}", *(f"Note: {note}" for note in outcome.notes)]
 
 
+def outcome_table(outcome: Any, source_map: Any, target_map: Any) -> dict[str, Any]:
+    """What a retargeting made, as the table of --json and --report. `outcome`: apply.Outcome; maps: RigMap."""
+    figures, result = outcome.figures, outcome.result
+    return {
+        "format": "tricap-retarget",
+        "version": 1,
+        "frames": figures.frames,
+        "keys": outcome.written.keys,
+        "scale": result.scale,
+        "direction_rms_deg": figures.direction_rms_deg,
+        "direction_worst_deg": figures.direction_worst_deg,
+        "by_part_deg": figures.by_part_deg,
+        "slide_mm": figures.slide_mm,
+        "penetration_mm": figures.penetration_mm,
+        "float_mm": figures.float_mm,
+        "largest_step_deg": figures.largest_step_deg,
+        "contacts": figures.contacts,
+        "notes": list(outcome.notes),
+        "source": {role: list(chain) for role, chain in source_map.bones.items()},
+        "target": {role: list(chain) for role, chain in target_map.bones.items()},
+        "mapped_by": target_map.origin,
+    }
+
+
 def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Write args.file (with the format's ending) in args.format; the lines to show.
 
@@ -133,9 +157,9 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: what is asked for is not in OUT, or the input needs mending.
         Cancelled: the monitor was cancelled.
     """
-    from .export import BY_BLENDER, IN_BLENDER, export_file, named_for
+    from .export import BY_BLENDER, export_file, named_for
 
     file = named_for(args.format, args.file, args.out)
-    if args.format in BY_BLENDER or args.out.suffix.lower() in IN_BLENDER and not args.out.is_dir():
+    if args.format in BY_BLENDER or is_imported_by_blender(args.out):
         _need_blender("export")
     return [f"{file}: {export_file(args.out, args.format, file, args.preset, monitor, up=args.up, unit=args.unit)}"]

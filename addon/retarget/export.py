@@ -17,10 +17,9 @@ from ...core.motion.tables import read_joints
 from ...core.motion.trc import write_trc
 from ...core.progress import Monitor
 from ...core.results import check_not_result
-from .programs import PROGRAMS, Program, bone_names, joint_names
+from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")
-IN_BLENDER = (".blend", ".fbx", ".glb", ".gltf", ".vrm")  # sources that Blender reads
 POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")}  # axes and unit that are the format's own
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
 ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "fbx", "abc", *POINTS)} | {
@@ -56,7 +55,7 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
     monitor.step("exporting", 0, 1)
     if kind == "ply":
         return _copy_skins(out, file)
-    in_blender = out.suffix.lower() in IN_BLENDER and not out.is_dir()
+    in_blender = is_imported_by_blender(out)
     if kind in POINTS and not in_blender:
         return _write_points(kind, file, points_of(out, up=up, unit=unit), program)
     motion = _opened(out, monitor) if in_blender else read_motion_source(out, up=up, unit=unit)
@@ -72,9 +71,9 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
 
 
 def _opened(path: Path, monitor: Monitor) -> Motion:
-    from .source import open_source
+    from .files import open_motion
 
-    return open_source(path, monitor)
+    return open_motion(path, monitor)
 
 
 def points_of(out: Path, *, up: str = "", unit: str = "") -> Markers:

@@ -12,9 +12,14 @@ from ...core.errors import InputError
 from ...core.motion.bvh import read_bvh
 from ...core.motion.retarget.mapping import find_map
 from ...core.motion.retarget.rest import with_person_like_rest
+from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.vrm import read_humanoid
+from ...core.motion.sources import read_motion_source
+from ...core.progress import Monitor
 from ..scene.armature import ROLES_KEY
 from .build import build_armature
+from .programs import is_imported_by_blender
+from .read import action_frames, read_motion, read_rig, with_residual_motion
 
 RIG_FILES = (".blend", ".glb", ".gltf", ".vrm", ".fbx", ".bvh")
 
@@ -36,6 +41,22 @@ def open_rig(path: Path) -> None:
         return
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     import_rig(path)
+
+
+def open_motion(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -> Motion:
+    """The motion in a run's folder or a file. A file that Blender imports replaces the open one. `up`, `unit`: see `read_motion_source`.
+
+    Raises:
+        InputError: it cannot be read, or does not have exactly one motion.
+    """
+    if not is_imported_by_blender(path):
+        return read_motion_source(path, up=up, unit=unit)
+    open_rig(path)
+    moving = [o for o in bpy.data.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action]
+    if len(moving) != 1:
+        raise InputError(f"{path.name} has {len(moving)} armatures with an action; it must have exactly one.")
+    source = moving[0]
+    return with_residual_motion(source, read_motion(source, read_rig(source), action_frames(source), monitor))
 
 
 def import_rig(path: Path) -> list[bpy.types.Object]:

@@ -18,8 +18,7 @@ from ...core.progress import Monitor
 from ..jobs import JobOperator
 from ..properties import snapshot
 from . import apply, preview, properties
-from .memory import recalled
-from .read import action_frames, read_motion, read_rig
+from .read import action_frames, read_motion, read_rig, with_residual_motion
 from .write import push_to_strip
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -71,7 +70,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         fps, start = scene.render.fps / scene.render.fps_base, scene.frame_start
         if moving is not None:
             self._name = f"{moving.name} on {self._target.name}"
-            motion = recalled(moving, read_motion(moving, read_rig(moving), action_frames(moving)))
+            motion = with_residual_motion(moving, read_motion(moving, read_rig(moving), action_frames(moving)))
             return lambda monitor: compute(lambda: motion, goal, settings, feet, monitor)
         path, said = Path(bpy.path.abspath(self.file or props.file)), properties.said(props)
         self._name = path.stem

@@ -8,6 +8,7 @@ from ...core.motion.retarget.mapping import Preset, find_map, read_preset
 from ...core.motion.retarget.points import joint_of
 from ...core.motion.retarget.rig import Rig
 
+IMPORTED_BY_BLENDER = (".blend", ".fbx", ".glb", ".gltf", ".vrm")  # motions in these files are opened by Blender
 PRESETS = Path(__file__).resolve().parent.parent / "presets"
 
 
@@ -73,3 +74,8 @@ def joint_names(joints: Sequence[str], program: Program) -> tuple[str, ...]:
 def _wanted(program: Program) -> tuple[dict[str, tuple[str, ...]], str]:
     preset = read_preset(PRESETS / f"{program.names}.json")
     return dict(preset.bones), preset.prefixes[0] if program.prefix is None else program.prefix
+
+
+def is_imported_by_blender(path: Path) -> bool:
+    """Whether Blender itself opens the motion at `path`; a run's folder and the other formats are read by core."""
+    return path.suffix.lower() in IMPORTED_BY_BLENDER and not path.is_dir()

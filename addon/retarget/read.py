@@ -3,7 +3,9 @@
 Frames are read by playing the scene once (constraints, drivers and layers included); all the rest is done on arrays.
 """
 
+import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 
 import bpy
 import numpy as np
@@ -11,11 +13,13 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.rig import Motion, Rig
+from ...core.motion.retarget.unshown import from_text
 from ...core.motion.retarget.vrm import role_of
 from ...core.progress import Monitor
 from ..scene.armature import ROLES_KEY
 
 UNIFORM = 1e-3  # scales along the axes may differ by this part
+RESIDUAL_KEY = "tricap_unshown"  # custom property of an action: its residual motion, and a digest of the keys that it belongs to
 
 
 def read_rig(armature_object: bpy.types.Object) -> Rig:
@@ -207,3 +211,42 @@ def action_frames(armature_object: bpy.types.Object) -> range:
         return range(scene.frame_start, scene.frame_end + 1)
     first, last = data.action.frame_range
     return range(int(np.ceil(first - 1e-4)), int(np.floor(last + 1e-4)) + 1)
+
+
+def with_residual_motion(armature_object: bpy.types.Object, motion: Motion) -> Motion:
+    """The motion of an armature, with the residual motion stored in its action, or with a note why that is not used.
+
+    Raises:
+        InputError: the stored residual motion is damaged.
+    """
+    action = action_with_residual(armature_object)
+    if action is None:
+        return motion
+    stored = action[RESIDUAL_KEY]
+    if keys_digest(action) != stored["keys"]:
+        note = (
+            f"“{action.name}” was edited since it was retargeted: the detail of its source that its rig cannot show is lost. "
+            "Edit in an NLA layer above it to keep that detail"
+        )
+        return replace(motion, notes=(*motion.notes, note))
+    return replace(motion, unshown=from_text(stored["motion"]).at(motion.frames))
+
+
+def action_with_residual(armature_object: bpy.types.Object) -> bpy.types.Action | None:
+    """The action with residual motion that the armature plays, if it plays exactly one, unscaled and unshifted."""
+    data = armature_object.animation_data
+    strips = [strip for track in data.nla_tracks if not track.mute for strip in track.strips if not strip.mute]
+    own_time = [s.action for s in strips if s.action and s.scale == 1.0 and s.repeat == 1.0 and s.frame_start == s.action_frame_start]
+    found = [action for action in (data.action, *own_time) if action is not None and RESIDUAL_KEY in action]
+    return found[0] if len(found) == 1 else None
+
+
+def keys_digest(action: bpy.types.Action) -> str:
+    """A digest of the frames and values of all keys of an action."""
+    total = hashlib.sha256()
+    curves = [curve for layer in action.layers for strip in layer.strips for bag in strip.channelbags for curve in bag.fcurves]
+    for curve in sorted(curves, key=lambda curve: (curve.data_path, curve.array_index)):
+        keys = np.empty(2 * len(curve.keyframe_points), dtype=np.float32)
+        curve.keyframe_points.foreach_get("co", keys)
+        total.update(f"{curve.data_path} {curve.array_index}".encode() + keys.tobytes())
+    return total.hexdigest()

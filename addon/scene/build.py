@@ -20,7 +20,7 @@ from ...core.errors import InputError
 from ...core.motion.ply import Ply
 from ...core.progress import Monitor
 from ...core.stages import STAGES
-from . import action, armature, cameras, clips, implicit, metaballs, skin, surroundings
+from . import action, armature, cameras, clips, metaballs, skin, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import at_rest
@@ -99,7 +99,7 @@ def write_scene(
         counts["trajectories"] = _add_trajectories(collection, contents, contents.trajectories, options, warnings)
     counts |= _add_body(collection, contents, warnings, options, blend)
     if surface is not None:
-        implicit.add_implicit(collection, *surface, potential_named(options.field))
+        skin.add_implicit(collection, *surface, potential_named(options.field))
     surroundings.add_lights(collection)
     if contents.footage is not None and contents.footage.rig.metadata.get("floor") is True:
         surroundings.add_floor(collection)
@@ -285,7 +285,7 @@ def _implicit_surface(
     if motion is not None:
         row = len(motion.frames) // 2 if options.frame is None else int(np.argmin(np.abs(motion.frames - options.frame)))
         posture, frame = motion.values[row], int(motion.frames[row])
-    return (implicit.implicit_surface(shape, posture, monitor, potential), frame) if np.isfinite(posture).all() else None
+    return (skin.implicit_surface(shape, posture, monitor, potential), frame) if np.isfinite(posture).all() else None
 
 
 def _add_body(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from . import nodes, paint
+from . import nodes
 
 NAME = "Cloud"
 POINT_RADIUS_M = 0.0015
@@ -83,10 +83,10 @@ def current_frame_group(material: bpy.types.Material) -> bpy.types.NodeTree:
 
 def _material(clouds: Sequence[CloudPoints], colour: str) -> bpy.types.Material:
     if colour == "intensity":
-        return paint.attribute_material(NAME, colour, 1.0 / _white(clouds))
+        return nodes.attribute_material(NAME, colour, 1.0 / _white(clouds))
     values = np.concatenate([cloud.sigma_m if colour == "sigma" else cloud.speed_m_s for cloud in clouds])
     values = values[np.isfinite(values)]
-    return paint.heat_material(NAME, colour, (float(np.percentile(values, REDDEST_PERCENTILE)) if len(values) else 0.0) or 1.0)
+    return nodes.heat_material(NAME, colour, (float(np.percentile(values, REDDEST_PERCENTILE)) if len(values) else 0.0) or 1.0)
 
 
 def _white(clouds: Sequence[CloudPoints]) -> float:

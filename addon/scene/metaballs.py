@@ -19,7 +19,7 @@ import numpy as np
 from ...core.body.families import families
 from ...core.body.metaballs import THRESHOLD, Metaballs
 from ...core.body.shape import BodyShape
-from . import paint
+from . import nodes
 
 NAME = "Flesh"
 KERNELS = ((0.1174, 0.8021), (0.3608, 1.1586), (0.3972, 1.5345), (0.1227, 2.0242))  # stiffness s_j, size a_j  (1)
@@ -37,7 +37,7 @@ def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.O
         bones = list(dict.fromkeys(balls.bone_index.tolist()))
         words = NAME if len(found) == 1 else f"{NAME} {shape.skeleton.bones[bones[0]].name}"
         family = free_family_name(words)
-        material = paint.plain_material(family, SKIN_COLOUR)
+        material = nodes.plain_material(family, SKIN_COLOUR)
         for i, b in enumerate(bones):
             bone = shape.skeleton.bones[b].name
             data = _data(family, balls, np.flatnonzero(balls.bone_index == b), shape.lengths_m, material)

@@ -1,8 +1,10 @@
 """The polygonal skin: one closed mesh of quads with texture coordinates, bound to the armature, and on request exact in every frame.
 
 The armature deforms the skin of the rest pose by blending bones, keeping volumes. The exact skin is the run's own, the implicit
-surface of every frame's posture found anew, as a mesh cache beside the .blend (PC2, Blender's Mesh Cache modifier): shape keys would
-put 120 MB into a file of 1,000 frames.
+surface of each frame's pose, as a mesh cache next to the .blend (PC2, Blender's Mesh Cache modifier): shape keys would
+add 120 MB to a file of 1,000 frames.
+
+The implicit surface of the fitted field itself, for checking metaballs and skin, is meshed by OpenVDB, which comes with Blender.
 """
 
 import struct
@@ -13,18 +15,23 @@ import bpy
 import numpy as np
 
 from ...core import store
+from ...core.body.field_grid import field_grid
+from ...core.body.fields import EXPONENTIAL, Potential
+from ...core.body.metaballs import THRESHOLD
 from ...core.body.one_skin import OneSkin, one_skin
 from ...core.body.shape import BodyShape
 from ...core.body.skin import SkinSettings, body_skin
 from ...core.body.skin_patches import corner_uv
 from ...core.errors import InputError
-from . import paint
+from ...core.progress import Monitor
+from . import nodes
 from .contents import FrameSkins
 
 NAME, EXACT_NAME = "Skin", "Exact skin"
 CACHE_MODIFIER = "Every frame"
 SKIN_COLOUR = (0.80, 0.52, 0.41)
 STEPS = 2000  # a weight is written in so many steps: coarser ones fold the inside of a sharply bent elbow
+IMPLICIT_SPACING_M = 0.005  # of the grid in which the implicit surface is sampled; the surface is then exact to 0.4 mm
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
 
@@ -80,7 +87,7 @@ def _mesh_object(
     mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
     layer = mesh.uv_layers.new(name="UVMap")
     layer.data.foreach_set("uv", uv.astype(np.float32).ravel())
-    mesh.materials.append(paint.plain_material(name, SKIN_COLOUR))
+    mesh.materials.append(nodes.plain_material(name, SKIN_COLOUR))
     mesh.update()
     skin_object = bpy.data.objects.new(name, mesh)
     collection.objects.link(skin_object)
@@ -99,3 +106,48 @@ def bind(skin_object: bpy.types.Object, armature_object: bpy.types.Object, bone_
             group.add(np.flatnonzero(level == step).tolist(), step / STEPS, "REPLACE")
     modifier = skin_object.modifiers.new("Armature", "ARMATURE")
     modifier.object, modifier.use_deform_preserve_volume = armature_object, True
+
+
+def implicit_surface(
+    shape: BodyShape, dof_values: np.ndarray, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) and quads (K, 4) of the surface F = ½ of the body in one pose, `dof_values` (D,) in radians and metres.
+
+    Raises:
+        InputError: this Blender was built without OpenVDB.
+        Cancelled: the monitor was cancelled.
+    """
+    openvdb = _openvdb()
+    sampled = field_grid(shape, dof_values, IMPLICIT_SPACING_M, monitor, potential)
+    grid = openvdb.FloatGrid()
+    grid.copyFromArray(THRESHOLD - sampled.values)  # a level set: negative inside
+    points, quads = grid.convertToQuads(0.0)
+    return sampled.origin_m + IMPLICIT_SPACING_M * points, quads
+
+
+def add_implicit(
+    collection: bpy.types.Collection, surface: tuple[np.ndarray, np.ndarray], frame: int, potential: Potential = EXPONENTIAL
+) -> bpy.types.Object:
+    """The surface as an object named after the frame, and after the field where it is not the fitted one."""
+    points, quads = surface
+    mesh = bpy.data.meshes.new(f"Implicit surface {frame:04d}" + (f" {potential.name}" if potential.name != EXPONENTIAL.name else ""))
+    mesh.from_pydata(points.tolist(), [], quads.tolist())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
+    mesh.update()
+    checked = bpy.data.objects.new(mesh.name, mesh)
+    checked.display_type, checked.hide_render = "WIRE", True
+    collection.objects.link(checked)
+    return checked
+
+
+def _openvdb():  # type: ignore[no-untyped-def]
+    if hasattr(bpy.utils, "expose_bundled_modules"):
+        bpy.utils.expose_bundled_modules()
+    try:
+        import openvdb
+    except ImportError as error:
+        raise InputError(
+            "This Blender was built without OpenVDB for Python, which the implicit surface is made with; "
+            "use the Blender from blender.org, or leave it out."
+        ) from error
+    return openvdb

@@ -5,7 +5,7 @@ import math
 import bpy
 import numpy as np
 
-from . import paint
+from . import nodes
 from .cloud import write
 from .trajectories import trail_group
 
@@ -33,7 +33,7 @@ def add_floor(collection: bpy.types.Collection) -> bpy.types.Object:
     faces = np.stack([first, first + len(lines), first + len(lines) + 1, first + 1], axis=-1).reshape(-1, 4)
     mesh = bpy.data.meshes.new("Floor")
     mesh.from_pydata(np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3).tolist(), [], faces.tolist())
-    mesh.materials.append(paint.plain_material("Floor", FLOOR_COLOUR))
+    mesh.materials.append(nodes.plain_material("Floor", FLOOR_COLOUR))
     floor = bpy.data.objects.new("Floor", mesh)
     floor.display_type, floor.hide_select = "WIRE", True
     collection.objects.link(floor)
@@ -52,7 +52,7 @@ def add_bar(collection: bpy.types.Collection, frames: np.ndarray, ends_m: np.nda
     write(mesh, "position", "FLOAT_VECTOR", ends_m.reshape(-1, 3))
     write(mesh, "frame", "INT", np.repeat(frames, 2))
     mesh.update()
-    material = paint.plain_material("Reference bar", BAR_COLOUR)
+    material = nodes.plain_material("Reference bar", BAR_COLOUR)
     mesh.materials.append(material)
     bar = bpy.data.objects.new("Reference bar", mesh)
     collection.objects.link(bar)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import bpy
 import numpy as np
 
-from . import nodes, paint
+from . import nodes
 from .cloud import write
 
 NAME, ARROWS_NAME = "Trajectories", "Velocities"
@@ -43,7 +43,7 @@ def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.n
     write(mesh, "velocity", "FLOAT_VECTOR", velocity)
     write(mesh, "segment", "INT", arrays["segment"][seen])
     mesh.update()
-    material = paint.heat_material(NAME, "speed", REDDEST_SPEED_M_S)
+    material = nodes.heat_material(NAME, "speed", REDDEST_SPEED_M_S)
     mesh.materials.append(material)
     trail_object = bpy.data.objects.new(NAME, mesh)
     collection.objects.link(trail_object)
@@ -75,7 +75,7 @@ def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray
     write(mesh, "frame", "INT", np.repeat(arrays["frames"][row], 4))
     write(mesh, "speed", "FLOAT", np.repeat(np.linalg.norm(velocity, axis=1), 4))
     mesh.update()
-    material = paint.heat_material(ARROWS_NAME, "speed", REDDEST_SPEED_M_S)
+    material = nodes.heat_material(ARROWS_NAME, "speed", REDDEST_SPEED_M_S)
     mesh.materials.append(material)
     arrows_object = bpy.data.objects.new(ARROWS_NAME, mesh)
     collection.objects.link(arrows_object)

@@ -97,8 +97,8 @@ def test_corrections_by_script(blender: ModuleType, scene: Any) -> None:
 
 @pytest.mark.parametrize(("wrong", "why"), [
     (dict(view="X", polygon="[[1, 2], [3, 4], [5, 9]]"), "no view “X”"), (dict(view="C", polygon="[[1, 2], [3, 4]]"), "three or more"),
-    (dict(view="C", polygon="here"), "no list of corners"), (dict(view="C", polygon="[[1, 2], [3, 4], [5]]"), "no list of corners"),
-    (dict(view="C", polygon="[[1, 2], [3, 4], [5, 9]]", first=4, last=2), "not be later")])  # fmt: skip
+    (dict(view="C", polygon="here"), "not a list of corners"), (dict(view="C", polygon="[[1, 2], [3, 4], [5]]"), "not a list of corners"),
+    (dict(view="C", polygon="[[1, 2], [3, 4], [5, 9]]", first=4, last=2), "not end before it starts")])  # fmt: skip
 def test_a_wrong_region_is_told_and_leaves_nothing(blender: ModuleType, scene: Any, wrong: dict[str, Any], why: str) -> None:
     with pytest.raises(RuntimeError, match=why):
         blender.ops.tricap.remove_region(**wrong)

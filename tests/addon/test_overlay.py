@@ -44,32 +44,32 @@ def scene(blender: ModuleType, empty: ModuleType, small_run: SmallRun) -> Any:
     module("project").open_take(scene, small_run.take)
     scene.tricap.out = str(out)
     scene.frame_set(3)
-    module("overlay.recording").forget()
+    module("overlay.results").clear()
     return scene
 
 
 @pytest.fixture
 def run(scene: Any) -> Any:
-    found = module("overlay.recording").current(scene)
-    assert found is not None, module("overlay.recording").problem()
+    found = module("overlay.results").current(scene)
+    assert found is not None, module("overlay.results").problem()
     return found
 
 
 def test_the_run_is_read_once_and_again_when_it_changed(run: Any, scene: Any, small_run: SmallRun) -> None:
-    recording = module("overlay.recording")
+    results = module("overlay.results")
     assert list(run.cameras) == ["L", "C", "R"] and run.reference == 1 and run.rows_at(0).step == 2
-    assert run.points(3) is run.points(3) and recording.current(scene) is run
+    assert run.points(3) is run.points(3) and results.current(scene) is run
     write_frame_table(small_run.out / "frames.csv", run.table())
-    assert recording.current(scene) is not run
+    assert results.current(scene) is not run
 
 
 def test_nothing_was_measured_yet(scene: Any, small_run: SmallRun) -> None:
-    recording = module("overlay.recording")
+    results = module("overlay.results")
     (small_run.out / "run.json").unlink()
-    assert recording.current(scene) is None and recording.problem() == "Nothing was measured yet."
+    assert results.current(scene) is None and results.problem() == "Nothing was measured yet."
     scene.tricap.take = scene.tricap.out = ""
     scene.tricap.views.clear()
-    assert recording.current(scene) is None and "Save the Blender file" in recording.problem()
+    assert results.current(scene) is None and "Save the Blender file" in results.problem()
 
 
 def test_a_damaged_file_is_told_and_the_rest_is_shown(run: Any, small_run: SmallRun) -> None:
@@ -80,23 +80,23 @@ def test_a_damaged_file_is_told_and_the_rest_is_shown(run: Any, small_run: Small
 
 
 def test_a_run_json_that_no_run_wrote(scene: Any, small_run: SmallRun) -> None:
-    recording, sound = module("overlay.recording"), {"format": "tricap-run", "version": 1}
+    results, sound = module("overlay.results"), {"format": "tricap-run", "version": 1}
     for said in ({"settings": []}, {"settings": {"matching": {"patch_px": "wide"}}}, {"stages": [1]}):
         store.write_json(small_run.out / "run.json", sound | said)
-        recording.forget()
-        assert recording.current(scene) is None and "run.json" in recording.problem()
+        results.clear()
+        assert results.current(scene) is None and "run.json" in results.problem()
 
 
 def test_points_are_coloured_by_sigma(run: Any, small_run: SmallRun) -> None:
     layers = module("overlay.layers")
-    found = layers.sigmas(run, "L", 3, 2.0)
+    found = layers.coloured_points(run, "L", 3, 2.0)
     points = run.points(3)
-    assert np.allclose(found.xy_px, small_run.rig["L"].project(points.xyz_m), atol=1e-3) and found.most_mm == 2.0
-    assert np.allclose(found.colours, layers.ramp(np.array([0.5]))), "1 mm of 2 mm"
-    assert layers.sigmas(run, "L", 3, 0.0).most_mm == pytest.approx(1.0, rel=1e-5)
-    blue, red = layers.ramp(np.array([0.0, 7.0]))
+    assert np.allclose(found.xy_px, small_run.rig["L"].project(points.xyz_m), atol=1e-3) and found.red_mm == 2.0
+    assert np.allclose(found.colours, layers.heat_colours(np.array([0.5]))), "1 mm of 2 mm"
+    assert layers.coloured_points(run, "L", 3, 0.0).red_mm == pytest.approx(1.0, rel=1e-5)
+    blue, red = layers.heat_colours(np.array([0.0, 7.0]))
     assert blue[2] == 1.0 and red[0] == 1.0 and red[2] < 0.2
-    assert layers.sigmas(run, "L", 99, 0.0) is None
+    assert layers.coloured_points(run, "L", 99, 0.0) is None
 
 
 def test_tails_before_and_after_the_filters(run: Any, small_run: SmallRun) -> None:
@@ -106,7 +106,7 @@ def test_tails_before_and_after_the_filters(run: Any, small_run: SmallRun) -> No
     segments, colours = layers.tails(run, "C", 7, 3, "kept")
     elbow = small_run.rig["C"].project(small_run.joints_m["elbow.R"][-4:])
     assert np.allclose(segments[:, 1], elbow[1:], atol=1e-3) and (np.diff(colours[:, 3]) > 0).all(), "the older the paler"
-    assert layers.removed_here(run.tracks(), 7) == [("not rigid", 1)] and layers.removed_here(run.tracks(), 70) == []
+    assert layers.removal_counts(run.tracks(), 7) == [("not rigid", 1)] and layers.removal_counts(run.tracks(), 70) == []
 
 
 def test_one_filter_at_a_time(run: Any) -> None:
@@ -115,7 +115,7 @@ def test_one_filter_at_a_time(run: Any) -> None:
     history.status[5, 1] = TrackStatus.TOO_SHORT  # frame 7
     both = {by: len(layers.tails(run, "C", 7, 3, "before", by)[0]) for by in (layers.ALL, "TOO_SHORT", "NOT_RIGID", "TOO_FAST")}
     assert both == {layers.ALL: 6, "TOO_SHORT": 4, "NOT_RIGID": 5, "TOO_FAST": 3}
-    assert layers.removed_here(history, 7, "TOO_SHORT") == [("too short", 1)] and not layers.removed_here(history, 7, "NOT_RIGID")
+    assert layers.removal_counts(history, 7, "TOO_SHORT") == [("too short", 1)] and not layers.removal_counts(history, 7, "NOT_RIGID")
 
 
 def test_points_before_the_filters_of_the_surface(run: Any, small_run: SmallRun) -> None:
@@ -133,20 +133,20 @@ def test_points_before_the_filters_of_the_surface(run: Any, small_run: SmallRun)
 def test_looking_closer_tells_why(run: Any, small_run: SmallRun) -> None:
     layers = module("overlay.layers")
     wrist = small_run.rig["C"].project(small_run.joints_m["wrist.R"][1])
-    assert layers.look(run, "C", 3, wrist, 3.0).words == ("trajectory 1: removed here (not rigid)",)
+    assert layers.inspect(run, "C", 3, wrist, 3.0).lines == ("trajectory 1: removed here (not rigid)",)
     elbow = small_run.rig["C"].project(small_run.joints_m["elbow.R"][1])
-    found = layers.look(run, "C", 3, elbow, 8.0)
-    assert found.words[0] == "point: sigma 1.00 mm" and found.words[-1] == "trajectory 0: kept" and set(found.xy_px) == {"L", "C", "R"}
-    assert not found.found and "cache" in found.words[1]
-    assert layers.look(run, "C", 3, np.array([2.0, 2.0]), 3.0) is None and layers.look(run, "C", 99, elbow, 3.0) is None
+    found = layers.inspect(run, "C", 3, elbow, 8.0)
+    assert found.lines[0] == "point: sigma 1.00 mm" and found.lines[-1] == "trajectory 0: kept" and set(found.xy_px) == {"L", "C", "R"}
+    assert not found.matched_boxes and "cache" in found.lines[1]
+    assert layers.inspect(run, "C", 3, np.array([2.0, 2.0]), 3.0) is None and layers.inspect(run, "C", 99, elbow, 3.0) is None
 
 
 def test_the_curve_of_a_graph() -> None:
-    from tricap.addon.overlay.layers import curve
+    from tricap.addon.overlay.layers import graph_curve
 
-    height, usual = curve(np.array([1.0, 2.0, np.nan, 2.0, 9.0]))
+    height, usual = graph_curve(np.array([1.0, 2.0, np.nan, 2.0, 9.0]))
     assert usual == 2.0 and np.allclose(height, [0.25, 0.5, np.nan, 0.5, 1.0], equal_nan=True)
-    assert curve(np.array([np.nan]))[1] == 0.0 and curve(np.zeros(2))[0].tolist() == [0.5, 0.5]
+    assert graph_curve(np.array([np.nan]))[1] == 0.0 and graph_curve(np.zeros(2))[0].tolist() == [0.5, 0.5]
 
 
 def test_switches_are_saved_and_off_at_first(blender: ModuleType, scene: Any, tmp_path: Path) -> None:
@@ -227,9 +227,9 @@ def test_it_is_drawn_where_it_is(drawn: Any, run: Any, small_run: SmallRun) -> N
     picture = drawn(contour=False, tracks=True, which="both")
     way = small_run.rig["C"].project(small_run.joints_m["elbow.R"][:2]).mean(axis=0)
     assert lit(picture, way)[2] > 0.6
-    module("overlay.draw").show_looked(3, module("overlay.layers").look(run, "C", 3, corners.mean(axis=0), 9.0))
+    module("overlay.draw").show_inspection(3, module("overlay.layers").inspect(run, "C", 3, corners.mean(axis=0), 9.0))
     assert drawn(tracks=False, graph=True).max() > 0.5
-    module("overlay.draw").show_looked(-1, None)
+    module("overlay.draw").show_inspection(-1, None)
 
 
 def test_the_clicks_are_drawn_where_they_are(blender: ModuleType, drawn: Any, scene: Any, run: Any) -> None:
@@ -260,24 +260,24 @@ def test_a_real_run_is_looked_at_and_corrected(blender: ModuleType, empty: Modul
     module("project").open_take(scene, tmp_path / "arm")
     scene.tricap.out = str(tmp_path / "out")
     assert ops.track() == {"FINISHED"}
-    run = module("overlay.recording").current(scene)
+    run = module("overlay.results").current(scene)
     points, history = run.points(1), run.tracks()
     assert len(points.xyz_m) > 500 and np.isfinite(points.correlation).all() and history.kept.sum() > 100
     number = int(np.flatnonzero(history.kept[1])[10])
     xy = history.at(run.cameras["L"], 1)[0][number]
-    found = layers.look(run, "L", 1, points.xy_px[100, 0], 4.0)
-    assert set(found.found) == {"L", "C", "R"} and np.isfinite(found.found["R"]).all()
+    found = layers.inspect(run, "L", 1, points.xy_px[100, 0], 4.0)
+    assert set(found.matched_boxes) == {"L", "C", "R"} and np.isfinite(found.matched_boxes["R"]).all()
     assert ops.remove_trajectory(view="L", frame=1, x=float(xy[0]), y=float(xy[1])) == {"FINISHED"}
     assert ops.track() == {"FINISHED"}
-    run = module("overlay.recording").current(scene)
+    run = module("overlay.results").current(scene)
     status = run.tracks().status[:, number]
     assert set(status[np.isfinite(run.tracks().xyz_m[:, number, 0])]) == {TrackStatus.REMOVED_BY_USER}
     assert ops.follow_contours(view="C") == {"FINISHED"} and scene.tricap_overlay.contour
-    contour = module("overlay.recording").current(scene).contour("C", 1)
+    contour = module("overlay.results").current(scene).contour("C", 1)
     outline, on_edge = contour.xy_px, contour.seen
     assert len(outline) > 50 and on_edge.mean() > 0.4
     scene.tricap.contour.spacing_px = 8.0
     assert ops.follow_contours(view="C") == {"FINISHED"}
-    assert len(module("overlay.recording").current(scene).contour("C", 1).xy_px) == pytest.approx(len(outline) / 2, rel=0.1)
+    assert len(module("overlay.results").current(scene).contour("C", 1).xy_px) == pytest.approx(len(outline) / 2, rel=0.1)
     with pytest.raises(RuntimeError, match="no body"):
         ops.follow_contours(view="C", from_body=True)

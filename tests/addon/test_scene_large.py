@@ -57,7 +57,7 @@ def test_clouds_without_points_have_colours(empty: ModuleType, small_run: SmallR
 def test_a_build_that_fails_leaves_what_was_there(
     empty: ModuleType, small_run: SmallRun, monkeypatch: pytest.MonkeyPatch, failure: str
 ) -> None:
-    from tricap.addon.scene import build, clips, implicit
+    from tricap.addon.scene import build, clips, skin
 
     def refuse(*_: object, **__: object) -> None:
         raise Cancelled("implicit", 0, 1) if failure == "cancelled" else InputError("It cannot be.")
@@ -68,7 +68,7 @@ def test_a_build_that_fails_leaves_what_was_there(
         opened = clips.open_clip
         monkeypatch.setattr(clips, "open_clip", lambda name, file: refuse() if name.endswith("R") else opened(name, file))
     else:
-        monkeypatch.setattr(implicit, "field_grid" if failure == "cancelled" else "_openvdb", refuse)
+        monkeypatch.setattr(skin, "field_grid" if failure == "cancelled" else "_openvdb", refuse)
     with pytest.raises((InputError, Cancelled)):
         build.build_scene(small_run.out, options=build.SceneOptions(implicit=True))
     assert (sorted(o.name for o in empty.data.objects), sorted(c.name for c in empty.data.movieclips)) == before

@@ -137,9 +137,9 @@ def watched() -> drive.Steps:
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
     yield from drive.press(area, "tricap.look_closer")
     yield from drive.move(*track_place("R"))
-    looked = module("addon.overlay.draw").looked
-    yield from drive.wait_for(lambda: looked(2) is not None, 10, "there is something under the pointer")
-    found = looked(2)
+    shown_inspection = module("addon.overlay.draw").shown_inspection
+    yield from drive.wait_for(lambda: shown_inspection(2) is not None, 10, "there is something under the pointer")
+    found = shown_inspection(2)
     drive.say(*found.words)
     drive.check(set(found.found) == {"L", "C", "R"}, "its patch is known in all views")
     yield from drive.settle()
@@ -149,7 +149,7 @@ def watched() -> drive.Steps:
 
 def track_place(view: str) -> tuple[float, float]:
     """Where a kept trajectory is in the window."""
-    run = module("addon.overlay.recording").current(bpy.context.scene)
+    run = module("addon.overlay.results").current(bpy.context.scene)
     history, points = run.tracks(), run.points(2)
     xy, status = history.at(run.cameras[view], 2)
     near = np.linalg.norm(xy[:, None] - points.xy_px[None, :, list(run.cameras).index(view)], axis=2).min(axis=1)
@@ -178,6 +178,6 @@ def corrected() -> drive.Steps:
     said = project.table(bpy.context.scene).get("corrections", [])
     drive.check([c["kind"] for c in said] == ["trajectory", "region"], "take.toml gets both corrections")
     bpy.ops.tricap.track()
-    run = module("addon.overlay.recording").current(bpy.context.scene)
-    words = dict(module("addon.overlay.layers").removed_here(run.tracks(), 2))
+    run = module("addon.overlay.results").current(bpy.context.scene)
+    words = dict(module("addon.overlay.layers").removal_counts(run.tracks(), 2))
     drive.check(words.get("removed by user", 0) > 1, f"the tracks are made without them: {words}")

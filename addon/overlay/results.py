@@ -1,4 +1,4 @@
-"""The run whose results are shown: its folder, cameras and what was read from it, kept until the files change. No drawing in here."""
+"""The results that are shown: a run's folder, its cameras, and what was read from it, cached until the files change."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -22,12 +22,12 @@ from ...core.take import open_take, read_take
 from ...core.tracking.contour import Contour
 from .. import folders, project
 
-KEPT = 48  # things of single frames
+CACHED_FRAMES = 48  # things of single frames that are cached at most
 
 
 @dataclass(eq=False, kw_only=True)
-class Recording:
-    """An OUT folder and the cameras of its views. Each thing is read once; a problem is kept as its sentence."""
+class RunResults:
+    """The results in OUT and the cameras of its views. Each file is read once; `problem` is why one could not be read."""
 
     out: Path
     cameras: dict[str, Camera]
@@ -39,47 +39,47 @@ class Recording:
 
     def points(self, frame: int) -> FramePoints | None:
         """The points of a frame, if it has any."""
-        return self.kept(("points", frame), lambda: read_points(self.out, frame, list(self.cameras.values()), self.rows_at(frame)))
+        return self.cached(("points", frame), lambda: read_points(self.out, frame, list(self.cameras.values()), self.rows_at(frame)))
 
     def removed(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """What the surface's filters took out of a frame."""
-        found: tuple[np.ndarray, np.ndarray] = self.kept(("removed", frame), lambda: read_removed(self.out, frame))
+        """Pixels (M, K, 2) of the points that the surface's filters removed from a frame, and which filter did (M,)."""
+        found: tuple[np.ndarray, np.ndarray] = self.cached(("removed", frame), lambda: read_removed(self.out, frame))
         return found
 
     def tracks(self) -> TrackHistory | None:
         """All trajectories, if there are any."""
-        return self.kept("tracks", lambda: read_tracks(self.out))
+        return self.cached("tracks", lambda: read_tracks(self.out))
 
     def outline(self, view: str, frame: int) -> list[Any]:
         """The fitted body's outline."""
-        return self.kept(("outline", view, frame), lambda: body_outline(self.out, frame, self.cameras[view])) or []
+        return self.cached(("outline", view, frame), lambda: body_outline(self.out, frame, self.cameras[view])) or []
 
     def contours(self, view: str) -> Mapping[int, Contour]:
         """The tracked contours of a view, by frame."""
-        return self.kept(f"contours of {view}", lambda: ContourTable(self.out / "contours" / f"{view}.csv")) or {}
+        return self.cached(f"contours of {view}", lambda: ContourTable(self.out / "contours" / f"{view}.csv")) or {}
 
     def contour(self, view: str, frame: int) -> Contour | None:
         """The tracked contour in a frame, if there is one."""
-        return self.kept(("contour", view, frame), lambda: self.contours(view).get(frame))  # type: ignore[no-any-return]
+        return self.cached(("contour", view, frame), lambda: self.contours(view).get(frame))  # type: ignore[no-any-return]
 
     def table(self) -> FrameTable | None:
-        """How good the frames are, if a run wrote that."""
+        """The quality of the frames, if a run wrote it."""
         path = self.out / "frames.csv"
-        return self.kept("table", lambda: read_frame_table(path) if path.is_file() else None)
+        return self.cached("table", lambda: read_frame_table(path) if path.is_file() else None)
 
     def has(self, key: Any) -> bool:
-        """Whether something was read or made already."""
+        """Whether something is cached."""
         return key in self._read
 
-    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What `make` gives, made once; None, and its sentence in `problem`, where the files are damaged."""
+    def cached(self, key: Any, make: Callable[[], Any]) -> Any:
+        """The result of `make`, made once; None where the files are damaged, with the reason in `problem`."""
         if key not in self._read:
             try:
                 self._read[key] = make()
             except InputError as error:
                 self.problem, self._read[key] = str(error), None
             singles = [k for k in self._read if isinstance(k, tuple)]
-            if len(singles) > KEPT:
+            if len(singles) > CACHED_FRAMES:
                 del self._read[singles[0]]
         elif isinstance(key, tuple):
             self._read.move_to_end(key)
@@ -89,8 +89,8 @@ class Recording:
 _current: dict[str, Any] = {"key": None, "recording": None, "problem": ""}
 
 
-def current(scene: bpy.types.Scene) -> Recording | None:
-    """The recording of a scene; None where nothing was run yet (`problem` says why)."""
+def current(scene: bpy.types.Scene) -> RunResults | None:
+    """The results of a scene's project; None where there are none (`problem` has the reason)."""
     try:
         key = _key(scene)
     except InputError as error:
@@ -102,18 +102,18 @@ def current(scene: bpy.types.Scene) -> Recording | None:
             _current["recording"] = _open(scene)
         except InputError as error:
             _current["problem"] = str(error)
-    found: Recording | None = _current["recording"]
+    found: RunResults | None = _current["recording"]
     return found
 
 
 def problem() -> str:
-    """Why there is nothing to show, or what could not be read."""
+    """Why there is nothing to show, or which file could not be read."""
     found = _current["recording"]
     return str(_current["problem"] or (found.problem if found is not None else ""))
 
 
-def forget() -> None:
-    """Read everything anew when it is asked for."""
+def clear() -> None:
+    """Empty the cache: everything is read again when it is needed."""
     _current.update(key=None, recording=None, problem="")
 
 
@@ -128,7 +128,7 @@ def _key(scene: bpy.types.Scene) -> tuple[Any, ...]:
     return folder, out, *(path.stat().st_mtime_ns if path.exists() else 0 for path in watched)
 
 
-def _open(scene: bpy.types.Scene) -> Recording:
+def _open(scene: bpy.types.Scene) -> RunResults:
     folder, out = project.folder_of(scene), folders.output_folder("", scene)
     if not (out / "run.json").is_file():
         raise InputError("Nothing was measured yet.")
@@ -136,4 +136,4 @@ def _open(scene: bpy.types.Scene) -> Recording:
     matching = run.get("settings", {}).get("matching", {})
     patch = from_table(MatchingSettings, {name: v for name, v in matching.items() if name == "patch_px"}, "[matching] of run.json")
     cameras = {view.name: camera for view, camera in zip(footage.take.views, footage.rig.cameras)}
-    return Recording(out=out, cameras=cameras, reference=footage.take.reference, rows_at=footage.take.rows_at, patch_px=patch.patch_px)
+    return RunResults(out=out, cameras=cameras, reference=footage.take.reference, rows_at=footage.take.rows_at, patch_px=patch.patch_px)

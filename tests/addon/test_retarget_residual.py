@@ -1,4 +1,4 @@
-"""What a rig cannot show stays with the action: through the operators, a file and a strip; not once it was edited."""
+"""What a rig cannot show is stored with its action: through the operators, a file and a strip; it is dropped once the action was edited."""
 
 from pathlib import Path
 from types import ModuleType
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.__main__ import main
-from tricap.addon.retarget import memory
+from tricap.addon.retarget import read
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.read import action_frames, read_motion, read_rig
 from tricap.addon.retarget.write import push_to_strip
@@ -46,16 +46,16 @@ def test_the_operators_bring_all_bones_back(blender: ModuleType) -> None:
     assert bpy.ops.tricap.retarget(source="Twin", target="Few") == {"FINISHED"}
     assert bpy.ops.tricap.retarget(source="Few", target="Full") == {"FINISHED"}
     assert off_deg(wanted, played(full)) < BACK_DEG
-    point = memory.played_action(few).layers[0].strips[0].channelbags[0].fcurves[0].keyframe_points[3]
+    point = read.action_with_residual(few).layers[0].strips[0].channelbags[0].fcurves[0].keyframe_points[3]
     point.co[1] += 0.01
     assert bpy.ops.tricap.retarget(source="Few", target="Full") == {"FINISHED"}
     assert off_deg(wanted, played(full)) > 5.0 and "was edited" in bpy.context.scene.tricap_retarget.last
-    few.animation_data.action[memory.KEY] = {"motion": "{", "keys": memory.digest(few.animation_data.action)}
+    few.animation_data.action[read.RESIDUAL_KEY] = {"motion": "{", "keys": read.keys_digest(few.animation_data.action)}
     with pytest.raises(RuntimeError, match="damaged"):
         bpy.ops.tricap.retarget(source="Few", target="Full")
 
 
-def test_a_file_and_a_strip_remember(empty: ModuleType, tmp_path: Path) -> None:
+def test_a_file_and_a_strip_keep_the_residual_motion(empty: ModuleType, tmp_path: Path) -> None:
     full, few = scene_with_both()
     few.animation_data_clear()
     empty.ops.wm.save_as_mainfile(filepath=str(tmp_path / "full.blend"), copy=True)
@@ -87,9 +87,9 @@ def test_a_file_and_a_strip_remember(empty: ModuleType, tmp_path: Path) -> None:
     few = empty.data.objects["Few"]
     action = few.animation_data.action
     push_to_strip(few, action)
-    assert memory.played_action(few) == action and memory.recalled(few, played(few)).unshown is not None
+    assert read.action_with_residual(few) == action and read.with_residual_motion(few, played(few)).unshown is not None
     few.animation_data.nla_tracks[0].strips[0].scale = 2.0
-    assert memory.recalled(few, played(few)).unshown is None
+    assert read.with_residual_motion(few, played(few)).unshown is None
     few.animation_data_clear()
     with pytest.raises(InputError, match="no action"):
         played(few)
