@@ -1,1 +1,1 @@
-"""A run's results as native Blender data: cameras, footage, cloud, trajectories, armature, action and metaballs."""
+"""A run's results as native Blender data: cameras, footage, cloud, trajectories, armature, action, metaballs and skins."""

@@ -1,6 +1,6 @@
-"""The motion as an action: one curve per DOF, one per DOF's sigma, keyed in every frame, in bulk.
+"""The motion as an action: an F-curve for each DOF and for each DOF's sigma, with a key in every frame.
 
-The sigma of a DOF is a custom property of the bone that carries it ("sigma elbow.R flexion"), in the unit of its channel:
+The sigma of a DOF is a custom property of its bone ("sigma elbow.R flexion"), in the unit of its channel:
 radians, or metres for the base.
 """
 
@@ -17,14 +17,14 @@ from .simplify import kept_keys
 
 NAME, SIMPLE_NAME = "Measured motion", "Simplified motion"
 MEASURED_KEY = "tricap_measured_motion"  # custom property of the armature: the measured action while another one plays
-METRES_PER_RADIAN = 0.2  # of the tolerance: 1° of an angle counts like 3.5 mm of the base
-LIMITS_TOLERANCE_RAD = 1e-6
+METRES_PER_RADIAN = 0.2  # converts the tolerance of angles to the base's location: 1° corresponds to 3.5 mm
+LIMITS_TOLERANCE_RAD = 1e-6  # overstepping below this is rounding
 
 
 def add_action(
     armature_object: bpy.types.Object, shape: BodyShape, frames: np.ndarray, dof_names: Sequence[str], values: np.ndarray, sigma: np.ndarray
 ) -> bpy.types.Action:
-    """Key the armature with the motion: frames (T,), values and sigma (T, D) in rad and metres. NaN gives no key."""
+    """Key the armature with the motion: frames (T,), values and sigma (T, D) in radians and metres. NaN gets no key."""
     action = bpy.data.actions.new(NAME)
     armature_object.animation_data_create().action = action
     channels = armature.channel_of(shape)
@@ -37,7 +37,7 @@ def add_action(
         key(action, armature_object, f'{path}["sigma {name}"]', 0, frames, sigma[:, column])
     motion = {name: values[:, column] for column, name in enumerate(dof_names)}
     for bone in shape.skeleton.bones:
-        _mute_limits_that_bind(armature_object.pose.bones[bone.name], bone, motion)
+        _mute_exceeded_limits(armature_object.pose.bones[bone.name], bone, motion)
     return action
 
 
@@ -49,11 +49,11 @@ def add_simplified(
     values: np.ndarray,
     tolerance_deg: float,
 ) -> bpy.types.Action:
-    """A second action with few keys, every angle of `values` (T, D) within `tolerance_deg`; it becomes the armature's.
+    """Give the armature a second action with fewer keys, with every angle of `values` (T, D) within `tolerance_deg`.
 
-    The measured motion stays in the file, in its own action. Places count `METRES_PER_RADIAN`.
+    The measured motion stays in the file as its own action.
     """
-    armature_object[MEASURED_KEY] = armature_object.animation_data.action  # which gives it a user
+    armature_object[MEASURED_KEY] = armature_object.animation_data.action  # the property counts as a user, so that the action is saved
     action = bpy.data.actions.new(SIMPLE_NAME)
     armature_object.animation_data.action = action
     channels = armature.channel_of(shape)
@@ -76,7 +76,7 @@ def key(
     values: np.ndarray,
     interpolation: str = "LINEAR",
 ) -> None:
-    """Key one channel of an object in these frames; NaN gives no key."""
+    """Key one channel of an object in these frames; NaN gets no key."""
     known = np.isfinite(values)
     curve = action.fcurve_ensure_for_datablock(owner, path, index=index)
     points = curve.keyframe_points
@@ -87,8 +87,8 @@ def key(
     curve.update()
 
 
-def _mute_limits_that_bind(pose_bone: bpy.types.PoseBone, bone: Bone, motion: Mapping[str, np.ndarray]) -> None:
-    """What is played is what was measured: limits that the motion oversteps must not bend it.
+def _mute_exceeded_limits(pose_bone: bpy.types.PoseBone, bone: Bone, motion: Mapping[str, np.ndarray]) -> None:
+    """Mute the joint limits that the measured motion exceeds, so that they do not change it.
 
     The constraint decomposes the pose again, which gives the same angles only below 90° about the middle axis and 180° about the others.
     """

@@ -2,7 +2,7 @@
 
 Blender's pose of a bone is  M_bone = M_parent · Rest_rel · Euler(channels in its rotation mode), which is equation (1) of
 core.body.skeleton. So a bone gets the skeleton's rest frame (y from head to tail) and rotation mode, and its Euler channels are
-the angles of the DOFs; channels that are no DOF are locked. The base of the model is a bone of its own, `root`, with the world's
+the angles of the DOFs; channels without a DOF are locked. The base of the model is a bone of its own, `root`, with the world's
 axes at the world's origin: its location channels are the base DOFs in metres.
 """
 
@@ -19,7 +19,7 @@ from ...core.motion.retarget.roles import model_roles
 ROOT = "root"
 ROOT_LENGTH_M = 0.1
 NAME = "Body"
-ROLES_KEY = "tricap_roles"  # custom property of armature data: bones by the part of the body that they are
+ROLES_KEY = "tricap_roles"  # custom property of armature data: the bone of each part of the body
 
 
 def add_armature(collection: bpy.types.Collection, shape: BodyShape) -> bpy.types.Object:
@@ -41,7 +41,7 @@ def add_armature(collection: bpy.types.Collection, shape: BodyShape) -> bpy.type
 
 
 def channel_of(shape: BodyShape) -> dict[str, tuple[str, str, int]]:
-    """Where each DOF lives: its name -> (bone, "location" or "rotation_euler", index)."""
+    """The channel of each DOF: its name -> (bone, "location" or "rotation_euler", index)."""
     channels = {dof.name: (ROOT, "location", "xyz".index(dof.axis)) for dof in shape.skeleton.base_dofs}
     for bone in shape.skeleton.bones:
         channels |= {dof.name: (bone.name, "rotation_euler", "xyz".index(dof.axis)) for dof in bone.dofs}
@@ -69,7 +69,7 @@ def _edit_bones(armature_object: bpy.types.Object, shape: BodyShape) -> None:
 
 
 def _bone_collections(armature: bpy.types.Armature) -> None:
-    """Base, trunk, and the limbs of each side, by the bones' names and what they hang on."""
+    """Bone collections: base, trunk, and the limbs of each side, by the bones' names and their ancestors."""
     for bone in armature.bones:
         name = "Base" if bone.name == ROOT else _region(bone)
         (armature.collections.get(name) or armature.collections.new(name)).assign(bone)

@@ -1,6 +1,6 @@
-"""The one place where axes flip.
+"""The one place where axes are converted between Tricap, Blender and libmv.
 
-World: Tricap's world is Blender's (metres, right-handed, Z up); nothing flips there.
+World: Tricap's world is Blender's (metres, right-handed, Z up); nothing is converted.
 
 Camera: OpenCV's camera looks along +z, x right, y down; Blender's looks along −z, x right, y up:
 
@@ -12,12 +12,12 @@ edge of the bottom-left pixel, so that
     u = (x + ½) / w ,   v = 1 − (y + ½) / h                                                        (2)
 
 Lens: with the sensor fitted to the width, Blender shifts the picture in units of the width, and the pixel aspect is its
-only way to tell fx from fy:
+only means to distinguish fx from fy:
 
     lens = fx · sensor_width / w ,  aspect_y / aspect_x = fx / fy                                  (3)
     shift_x = ½ − u(cx) ,  shift_y = (½ − v(cy)) · (h / w) · (fx / fy)                             (4)
 
-Brown's decentring: libmv, Blender's tracker, has the roles of p1 and p2 exchanged and y upwards:
+Brown's decentring: libmv, Blender's tracker, exchanges p1 and p2 and has y upwards:
 
     p1(libmv) = p2(OpenCV) ,  p2(libmv) = −p1(OpenCV)                                              (5)
 """
@@ -35,7 +35,7 @@ SENSOR_WIDTH_MM = 36.0
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """What a Blender camera needs to project like `Camera` without distortion; lengths in millimetres."""
+    """The lens of a Blender camera that projects like `Camera` without distortion; lengths in millimetres."""
 
     lens_mm: float
     sensor_width_mm: float
@@ -90,7 +90,7 @@ def lens(camera: Camera) -> Lens:
 
 
 def principal_point_bottom_up_px(camera: Camera) -> tuple[float, float]:
-    """The principal point in pixels from the outer edge of the bottom-left pixel, as the tracker wants it.  (2)"""
+    """The principal point in pixels from the outer edge of the bottom-left pixel, as Blender's tracker expects it.  (2)"""
     w, h = camera.size_px
     u, v = uv_from_pixel(camera.matrix[:2, 2], camera.size_px)
     return float(u * w), float(v * h)

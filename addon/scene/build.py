@@ -1,4 +1,4 @@
-"""Building the scene of a run: everything that was measured, in one collection, in the take's own frame numbers.
+"""Builds the scene of a run: all its results, in one collection, in the take's frame numbers.
 
 read_contents (any thread) → write_scene (main thread) → save_blend
 """
@@ -23,29 +23,29 @@ from ...core.stages import STAGES
 from . import action, armature, cameras, clips, metaballs, skin, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
-from .rest_pose import at_rest
+from .rest_pose import with_rest_pose
 from .trajectories import add_arrows, add_trajectories, sparser
 
 COLLECTION = "Tricap"
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
-OUT_KEY = "tricap_out"  # custom property of the collection: the folder it was built from
-KEYS_KEY = "tricap_keys"  # and the keys of the stages that had been done (core/stages.py)
+OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
+KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/stages.py)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
-    """What a user may want otherwise."""
+    """The user's choices for a scene."""
 
-    detail: int = DETAIL  # the skin's level of detail: pieces of each edge
-    exact_skin: bool = False  # also the skin of every frame, as the run found it: a mesh cache beside the .blend
-    implicit: bool = False  # also the implicit surface itself, in the middle frame
-    field: str = EXPONENTIAL.name  # of its balls, one of core.body.fields.POTENTIALS
+    detail: int = DETAIL  # of the skin: pieces per edge
+    exact_skin: bool = False  # also the run's skin of every frame: a mesh cache next to the .blend
+    implicit: bool = False  # also the implicit surface itself
+    field: str = EXPONENTIAL.name  # of the implicit surface, one of core.body.fields.POTENTIALS
     rest_pose: str = "A"  # of the armature, one of rest_pose.POSES
-    simplify_deg: float = 0.0  # above 0: the armature plays a second action with few keys, within this tolerance
+    simplify_deg: float = 0.0  # above 0: the armature plays a second action with fewer keys, within this tolerance
     colour: str = "intensity"  # of the cloud, one of cloud.COLOURS
     arrows: bool = False  # velocities as arrows
     frame: int | None = None  # of the implicit surface; None: the middle one
-    most_points: int = 300_000  # of the cloud, and of all trajectories' places, in all frames: more are thinned evenly
+    most_points: int = 300_000  # of the cloud, and of the trajectories, in all frames together; more are thinned evenly
 
 
 DEFAULTS = SceneOptions()
@@ -53,7 +53,7 @@ DEFAULTS = SceneOptions()
 
 @dataclass(frozen=True, kw_only=True)
 class SceneReport:
-    """What was built: names and counts for people, and what had to be left out and why."""
+    """What was built: names and counts, and warnings about missing parts."""
 
     collection: str
     counts: dict[str, int]
@@ -61,11 +61,11 @@ class SceneReport:
     blend: Path | None = None
 
     def __str__(self) -> str:
-        return ", ".join(f"{count} {what}" for what, count in self.counts.items() if count) or "nothing to show"
+        return ", ".join(f"{count} {what}" for what, count in self.counts.items() if count) or "nothing"
 
 
 def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = None, options: SceneOptions = DEFAULTS) -> SceneReport:
-    """Put the results in OUT into the open scene, replacing what an earlier build left, and save a copy as `blend`.
+    """Put the results in OUT into the open scene in place of those of an earlier build, and save a copy as `blend`.
 
     Raises:
         InputError: OUT is no folder of results or damaged, or the file cannot be written.
@@ -78,9 +78,9 @@ def build_scene(out: Path, blend: Path | None = None, monitor: Monitor | None = 
 def write_scene(
     contents: Contents, blend: Path | None = None, options: SceneOptions = DEFAULTS, monitor: Monitor | None = None
 ) -> SceneReport:
-    """The second half of `build_scene`: main thread only. What can fail is done before anything of an earlier build is removed."""
+    """The second half of `build_scene`: main thread only. Everything that can fail comes before the removal of an earlier build."""
     if options.exact_skin and blend is None:
-        raise InputError("The exact skin is kept in a file beside the Blender file; give the Blender file a name.")
+        raise InputError("The exact skin is saved next to the Blender file; give the Blender file a name.")
     scene = bpy.context.scene
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
@@ -112,7 +112,7 @@ def write_scene(
 
 
 def remove_earlier() -> None:
-    """Remove the collections that earlier builds made in this scene, with their objects and data that nobody else uses."""
+    """Remove the collections of earlier builds from this scene, with their objects and the data that nothing else uses."""
     scene = bpy.context.scene
     for collection in [child for child in scene.collection.children_recursive if OUT_KEY in child]:
         objects = [o for o in collection.all_objects if len(o.users_collection) == 1]
@@ -125,48 +125,48 @@ def remove_earlier() -> None:
             scene.active_clip = None
         bpy.data.batch_remove(objects)
         bpy.data.collections.remove(collection)
-        for _ in range(2):  # materials are free only once their meshes and node groups are gone
+        for _ in range(2):  # materials have no users only once their meshes and node groups are removed
             free = {id_ for id_ in used if id_.users == 0}
             used -= free
             bpy.data.batch_remove(free)
 
 
 def set_time(scene: bpy.types.Scene, contents: Contents) -> None:
-    """The scene's frames are the take's frames, at the take's rate."""
+    """Give the scene the take's frames and frame rate."""
     whole = max(1, math.ceil(contents.fps - 1e-6))
     scene.render.fps, scene.render.fps_base = whole, whole / contents.fps
     scene.frame_start, scene.frame_end = contents.frames
 
 
 def save_blend(path: Path) -> None:
-    """Save a copy of the open file as `path`, whole or not at all; the open file keeps its name. What was there stays as .blend1, unless
-    it is that of a run.
+    """Save a copy of the open file as `path`, completely or not at all; the open file keeps its name. An earlier file becomes .blend1,
+    unless it is the body.blend of a run.
 
     Raises:
         InputError: the file cannot be written.
     """
     path = path.resolve()
     if path.suffix != ".blend":
-        raise InputError(f"{path.name} is no name of a Blender file; let it end in .blend.")
+        raise InputError(f"{path.name} is not the name of a Blender file; let it end in .blend.")
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.blend")
     try:
         store.try_writing(part)
-        with _caches_beside(path):
+        with _relative_caches(path):
             bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, relative_remap=True, compress=True)
         if path.exists() and not (path.name == "body.blend" and (path.parent / "run.json").exists()):
-            os.replace(path, path.with_suffix(".blend1"))  # as Blender keeps the version before
+            os.replace(path, path.with_suffix(".blend1"))  # as Blender itself does
         os.replace(part, path)
     except (OSError, RuntimeError) as error:
-        said = getattr(error, "strerror", None) or str(error).strip()
-        raise InputError(f"Cannot write {path}: {said}. Choose another folder or free some space.") from error
+        reason = getattr(error, "strerror", None) or str(error).strip()
+        raise InputError(f"Cannot write {path}: {reason}. Choose another folder or free some space.") from error
     finally:
         if part.exists():
             part.unlink()
 
 
 @contextmanager
-def _caches_beside(path: Path) -> Iterator[None]:
-    """While the file is saved, mesh caches beside it are named relative to it, so that both can be moved together."""
+def _relative_caches(path: Path) -> Iterator[None]:
+    """While the file is saved, mesh caches in its folder have relative paths, so that both can be moved together."""
     modifiers = [m for o in bpy.data.objects for m in o.modifiers if m.type == "MESH_CACHE"]
     kept = [(m, m.filepath) for m in modifiers if not m.filepath.startswith("//") and Path(m.filepath).parent == path.parent]
     for modifier, file in kept:
@@ -182,13 +182,13 @@ Opened = list[tuple[bpy.types.MovieClip, list[Path]]]
 
 
 def _opened_clips(scene: bpy.types.Scene, contents: Contents) -> Opened:
-    """The clip of every view and the files that it shows."""
+    """The clip of each view and its files."""
     opened: Opened = []
     footage = contents.footage
     try:
         for view, camera, sequence in zip(footage.take.views, footage.rig.cameras, footage.sequences) if footage else ():
-            made = [folder / clips.FIELDS / view.name for folder in (footage.take.folder, contents.out)]
-            files = clips.shown_files(sequence, footage.take.instants, made[0] if made[0].is_dir() else made[1])
+            beside_take, in_out = (folder / clips.FIELDS / view.name for folder in (footage.take.folder, contents.out))
+            files = clips.shown_files(sequence, footage.take.instants, beside_take if beside_take.is_dir() else in_out)
             opened.append((clips.clip_of_view(scene, view.name, files[0], camera), files))
     except InputError:
         bpy.data.batch_remove([clip for clip, _ in opened if clip.users == 0])
@@ -208,7 +208,7 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
         camera_object = cameras.add_camera(collection, camera)
         camera_object["tricap_interlaced"] = take.interlaced
         if clip.name.startswith(name := f"Footage {view.name}"):
-            clip.name = name  # which an earlier build's clip had until now
+            clip.name = name  # until now the clip of an earlier build had it
         clip.frame_start = -take.instants.per_image * view.offset_frames
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
@@ -218,7 +218,7 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
 
 
 def _add_bar(collection: bpy.types.Collection, first: int, frames: np.ndarray, ends_m: np.ndarray) -> int:
-    """The bar as it was waved, in another recording: from the scene's first frame on; not in rendered pictures."""
+    """The waved bar of the calibration recording, starting in the scene's first frame; not rendered."""
     surroundings.add_bar(collection, frames - frames[0] + first, ends_m).hide_render = True
     return len(frames)
 
@@ -228,7 +228,7 @@ def _add_cloud(collection: bpy.types.Collection, contents: Contents, options: Sc
     every = -(-whole // options.most_points) or 1
     if every > 1:
         where = contents.out / "clouds"
-        warnings.append(f"The scene's cloud is one in {every} of {whole} points, so that it stays quick; all are in {where}.")
+        warnings.append(f"The scene shows one in {every} of {whole} cloud points to stay responsive; {where} has all.")
     shown = [_cloud_points(frame, ply, every, contents) for frame, ply in contents.clouds.items()]
     if shown:
         _name_segments(add_cloud(collection, shown, options.colour), contents)
@@ -236,7 +236,7 @@ def _add_cloud(collection: bpy.types.Collection, contents: Contents, options: Sc
 
 
 def _cloud_points(frame: int, ply: Ply, every: int, contents: Contents) -> CloudPoints:
-    xyz, ready = ply.xyz_m[::every], contents.ready
+    xyz, prepared = ply.xyz_m[::every], contents.prepared
     names = ("sigma", "nx", "ny", "nz", "intensity")
     column = {name: ply.vertex[name][::every] if name in ply.vertex else np.zeros(len(xyz)) for name in names}
     normals = np.stack([column[name] for name in ("nx", "ny", "nz")], axis=-1)
@@ -246,18 +246,18 @@ def _cloud_points(frame: int, ply: Ply, every: int, contents: Contents) -> Cloud
         sigma_m=column["sigma"],
         normals=normals,
         intensity=column["intensity"],
-        velocity_m_s=ready.velocity_m_s[frame][::every],
-        segment=ready.segment[frame][::every],
+        velocity_m_s=prepared.velocity_m_s[frame][::every],
+        segment=prepared.segment[frame][::every],
     )
 
 
 def _add_trajectories(
     collection: bpy.types.Collection, contents: Contents, arrays: Mapping[str, np.ndarray], options: SceneOptions, warnings: list[str]
 ) -> int:
-    assert contents.ready.track_segment is not None
-    shown, every = sparser({**arrays, "segment": contents.ready.track_segment}, options.most_points)
+    assert contents.prepared.track_segment is not None
+    shown, every = sparser({**arrays, "segment": contents.prepared.track_segment}, options.most_points)
     if every > 1:
-        warnings.append(f"The scene shows one in {every} of {arrays['xyz_m'].shape[1]} trajectories, so that it stays quick.")
+        warnings.append(f"The scene shows one in {every} of {arrays['xyz_m'].shape[1]} trajectories to stay responsive.")
     _name_segments(add_trajectories(collection, shown), contents)
     if options.arrows:
         add_arrows(collection, shown)
@@ -265,15 +265,15 @@ def _add_trajectories(
 
 
 def _name_segments(thing: bpy.types.Object, contents: Contents) -> None:
-    """Say on an object which bone each number is."""
-    if contents.ready.bones:
-        thing[SEGMENTS_KEY] = list(contents.ready.bones)
+    """Store the names of the bones that the attribute `segment` numbers with an object."""
+    if contents.prepared.bones:
+        thing[SEGMENTS_KEY] = list(contents.prepared.bones)
 
 
 def _implicit_surface(
     contents: Contents, options: SceneOptions, monitor: Monitor | None
 ) -> tuple[tuple[np.ndarray, np.ndarray], int] | None:
-    """The implicit surface in the chosen or the middle frame, and which that is; None without a posture there.
+    """The implicit surface in the chosen or the middle frame, and that frame; None where it has no pose.
 
     Raises:
         InputError: the field is unknown, or this Blender was built without OpenVDB.
@@ -281,11 +281,11 @@ def _implicit_surface(
     shape, motion, potential = contents.shape, contents.motion, potential_named(options.field)
     if shape is None:
         return None
-    posture, frame = np.zeros(len(shape.skeleton.dof_names)), contents.frames[0]
+    dof_values, frame = np.zeros(len(shape.skeleton.dof_names)), contents.frames[0]
     if motion is not None:
         row = len(motion.frames) // 2 if options.frame is None else int(np.argmin(np.abs(motion.frames - options.frame)))
-        posture, frame = motion.values[row], int(motion.frames[row])
-    return (skin.implicit_surface(shape, posture, monitor, potential), frame) if np.isfinite(posture).all() else None
+        dof_values, frame = motion.values[row], int(motion.frames[row])
+    return (skin.implicit_surface(shape, dof_values, monitor, potential), frame) if np.isfinite(dof_values).all() else None
 
 
 def _add_body(
@@ -297,21 +297,21 @@ def _add_body(
     n = len(shape.skeleton.dof_names)
     values, sigma = (motion.values, motion.sigma) if motion is not None else (np.zeros((0, n)), np.zeros((0, n)))
     measured_shape = shape
-    shape, values, sigma = at_rest(shape, values, sigma, options.rest_pose)
+    shape, values, sigma = with_rest_pose(shape, values, sigma, options.rest_pose)
     armature_object = armature.add_armature(collection, shape)
     flesh = metaballs.add_metaballs(collection, armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
-        found = contents.ready.skin if shape is measured_shape and options.detail == DETAIL else None
-        shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, found)
+        prepared_skin = contents.prepared.skin if shape is measured_shape and options.detail == DETAIL else None
+        shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, prepared_skin)
         if contents.skins is not None and blend is not None:
             shown = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
             counts["exact skin faces"] = len(shown.data.polygons)
     except InputError as error:
         warnings.append(f"No polygonal skin in the scene: {error}")
     else:
-        for other in {*flesh, skin_object} - {shown}:  # they lie in the surface of the one that is shown
-            other.hide_set(True)  # by the eye alone: metaballs stay live, for whoever opens it or reads them by a script
+        for other in {*flesh, skin_object} - {shown}:  # they coincide with the surface that is shown
+            other.hide_set(True)  # by the eye icon only: metaballs stay evaluated, for users and for scripts
             other.hide_render = True
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:

@@ -1,4 +1,4 @@
-"""Blender cameras that see what the calibrated cameras saw."""
+"""Blender cameras with the poses and lenses of the calibrated cameras."""
 
 import bpy
 import numpy as np
@@ -39,26 +39,26 @@ def frame_render(scene: bpy.types.Scene, reference: Camera) -> None:
 
 
 def frame_faults(rig: Rig, reference: Camera) -> list[str]:
-    """Where other cameras' pictures cannot be shown exactly, because a Blender scene has one render size and pixel aspect."""
+    """Warnings about cameras whose pictures cannot be shown exactly: a Blender scene has only one render size and pixel aspect."""
     faults = []
     w, h = reference.size_px
     for camera in rig.cameras:
         if camera.size_px[0] * h != camera.size_px[1] * w:
             faults.append(
-                f"Camera {camera.name} has pictures of another shape than {reference.name};"
+                f"Camera {camera.name} has another aspect ratio than {reference.name};"
                 " set the scene's resolution to its own to look through it."
             )
             continue
         off_px = abs(axes.lens(camera).pixel_aspect_y / axes.lens(reference).pixel_aspect_y - 1.0) * camera.size_px[1] / 2
         if off_px > ASPECT_TOLERANCE_PX:
-            faults.append(f"Camera {camera.name} has another pixel aspect than {reference.name}: up to {off_px:.1f} px off at the rim.")
+            faults.append(f"Camera {camera.name} has another pixel aspect than {reference.name}: up to {off_px:.1f} px off at the border.")
         if abs(camera.affinity[1]) * camera.size_px[1] / 2 > ASPECT_TOLERANCE_PX:
             faults.append(f"Camera {camera.name} has a shear that a Blender camera cannot show.")
     return faults
 
 
 def look_through() -> None:
-    """Let every 3-D view look through the scene's camera, and show the materials' colours."""
+    """Let every 3D Viewport look through the scene's camera and show the materials' colours."""
     for screen in bpy.data.screens:
         for area in screen.areas:
             if area.type == "VIEW_3D":
@@ -67,7 +67,7 @@ def look_through() -> None:
                 space.shading.color_type = "MATERIAL"
 
 
-def seen_from(scene: bpy.types.Scene, camera_object: bpy.types.Object, xyz_m: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+def projected(scene: bpy.types.Scene, camera_object: bpy.types.Object, xyz_m: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """Pixels (N, 2) of world points (N, 3) as the Blender camera itself projects them (without distortion)."""
     from bpy_extras.object_utils import world_to_camera_view
     from mathutils import Vector

@@ -13,7 +13,8 @@ from ...core.images.sequence import Sequence, open_sequence
 from .. import folders
 from . import axes
 
-FIELDS, FIELDS_KEY = "fields", "tricap_fields"  # folder of pictures of fields; of a clip that shows them, which field is first
+FIELDS = "fields"  # folder of the pictures of single fields
+FIELDS_KEY = "tricap_fields"  # custom property of a clip that shows single fields: the first field
 CLIP_KEY = "tricap_clip"  # custom property of a camera: the clip behind it
 
 
@@ -41,7 +42,7 @@ def open_clip(name: str, first_file: Path) -> bpy.types.MovieClip:
 
 
 def clip_of_view(scene: bpy.types.Scene, name: str, first_file: Path, camera: Camera) -> bpy.types.MovieClip:
-    """The clip that the project has for a view, if it shows this file, else a new one; with the camera's lens."""
+    """The project's clip of a view if it shows this file, else a new one; with the camera's lens."""
     project = getattr(scene, "tricap", None)  # the command `tricap scene` builds without the add-on's properties
     own = next((view.clip for view in project.views if view.name == name and view.clip is not None), None) if project else None
     if own is None or Path(bpy.path.abspath(own.filepath)).resolve() != first_file.resolve():
@@ -51,25 +52,25 @@ def clip_of_view(scene: bpy.types.Scene, name: str, first_file: Path, camera: Ca
 
 
 def first_file(folder: Path, images: str | None, movie: str | None, view: str, fields: Instants) -> Path:
-    """The file by which Blender opens the footage of a view of the take in `folder`; of both fields the first one's picture.
+    """The file that Blender opens for a view of the take in `folder`; with both fields, the picture of the first one.
 
     Raises:
-        InputError: the footage is missing, or there is no room for pictures of its fields.
+        InputError: the footage is missing, or the pictures of its fields cannot be written.
     """
     return shown_files(open_sequence(folder, images=images, movie=movie, view=view), fields, folder / FIELDS / view)[0]
 
 
 def shown_files(sequence: Sequence, fields: Instants, folder: Path) -> tuple[Path, ...]:
-    """The files that Blender shows of a sequence: its own, or pictures of both fields, made in `folder` if they are not there.
+    """The files that Blender shows of a sequence: its own, or pictures of both fields, written to `folder` if they are not there.
 
     Raises:
-        InputError: the pictures cannot be made.
+        InputError: the pictures cannot be written.
     """
     return sequence.files() if fields.per_image == 1 else field_pictures(sequence, fields, folder)
 
 
 def frames_per_image(clip: bpy.types.MovieClip) -> int:
-    """How many frames of a clip an image of the footage has: two where it shows fields."""
+    """Frames of the clip per image of the footage: two where it shows single fields."""
     return 2 if clip.get(FIELDS_KEY) else 1
 
 
@@ -88,7 +89,7 @@ def set_lens(clip: bpy.types.MovieClip, camera: Camera) -> None:
 
 
 def clip_faults(clip: bpy.types.MovieClip, camera: Camera, files: Collection[Path], label: str) -> list[str]:
-    """What keeps Blender from showing the footage as Tricap reads it, in sentences."""
+    """Warnings where Blender does not show the footage as Tricap reads it."""
     faults = []
     if tuple(clip.size) != camera.size_px:
         faults.append(
@@ -97,8 +98,8 @@ def clip_faults(clip: bpy.types.MovieClip, camera: Camera, files: Collection[Pat
         )
     if files and clip.frame_duration < len(files):
         faults.append(
-            f"Blender shows only {clip.frame_duration} of the {len(files)} images of {label}: their names are not numbered"
-            " without a gap; rename them to see all of them behind the camera."
+            f"Blender shows only {clip.frame_duration} of the {len(files)} images of {label}: the numbers in their names have"
+            " gaps; rename them to see all of them behind the camera."
         )
     return faults
 
@@ -119,8 +120,8 @@ def show_behind(camera_data: bpy.types.Camera, clip: bpy.types.MovieClip) -> Non
 def clip_behind(camera_data: bpy.types.Camera) -> bpy.types.MovieClip | None:
     """The clip that `show_behind` put there; None if it was deleted since.
 
-    Blender (4.5, 5.2) leaves a deleted clip's address in the background image, and crashes when that is looked at or given back; a
-    property that points to the clip is emptied. So the background goes first, untouched.
+    Blender (4.5, 5.2) leaves a dangling pointer to a deleted clip in the background image, and crashes when it is read or freed; a
+    custom property that points to the clip is cleared instead. So the background image is removed without being read.
     """
     clip = camera_data.get(CLIP_KEY)
     if clip is None and CLIP_KEY in camera_data:

@@ -1,6 +1,6 @@
-"""The point clouds of all frames as ONE mesh object of points; geometry nodes show the current frame's.
+"""The point clouds of all frames as ONE mesh object; geometry nodes show the points of the current frame.
 
-Named attributes on the points: frame and segment (int, see `ready`), sigma [m], intensity and speed [m/s] (float), normal and velocity
+Named attributes on the points: frame and segment (int, see prepare.py), sigma [m], intensity and speed [m/s] (float), normal and velocity
 [m/s] (vector).
 """
 
@@ -15,12 +15,12 @@ from . import nodes
 NAME = "Cloud"
 POINT_RADIUS_M = 0.0015
 COLOURS = ("intensity", "sigma", "speed")
-REDDEST_PERCENTILE = 98.0
+REDDEST_PERCENTILE = 98.0  # of the values: painted red
 
 
 @dataclass(frozen=True, kw_only=True)
 class CloudPoints:
-    """The points of one frame: xyz_m and normals (N, 3), sigma_m, intensity and segment (N,), velocity_m_s (N, 3) 0 = unknown."""
+    """The points of one frame: xyz_m and normals (N, 3), sigma_m, intensity and segment (N,), velocity_m_s (N, 3), 0 = unknown."""
 
     frame: int
     xyz_m: np.ndarray
@@ -37,7 +37,7 @@ class CloudPoints:
 
 
 def add_cloud(collection: bpy.types.Collection, clouds: Sequence[CloudPoints], colour: str = "intensity") -> bpy.types.Object:
-    """One object with the points of all `clouds`, of which the scene shows those of its current frame; `colour` is one of COLOURS."""
+    """One object with the points of all `clouds`; the viewport shows those of the current frame. `colour` is one of COLOURS."""
     mesh = bpy.data.meshes.new(NAME)
     mesh.vertices.add(sum(len(cloud.xyz_m) for cloud in clouds))
     write(mesh, "position", "FLOAT_VECTOR", np.concatenate([cloud.xyz_m for cloud in clouds]))
@@ -58,14 +58,14 @@ def add_cloud(collection: bpy.types.Collection, clouds: Sequence[CloudPoints], c
 
 
 def write(mesh: bpy.types.Mesh, name: str, data_type: str, values: np.ndarray, domain: str = "POINT") -> None:
-    """A named attribute in one go; `values` has one row per point (or edge, by `domain`)."""
+    """Write a named attribute; `values` has one row per point (or edge, by `domain`)."""
     attribute = mesh.attributes.get(name) or mesh.attributes.new(name, data_type, domain)
     key = "vector" if data_type == "FLOAT_VECTOR" else "value"
     attribute.data.foreach_set(key, np.ascontiguousarray(values, dtype=np.int32 if data_type == "INT" else np.float32).ravel())
 
 
 def current_frame_group(material: bpy.types.Material) -> bpy.types.NodeTree:
-    """Geometry nodes: keep the points whose attribute `frame` is the scene's frame, and show them as little balls."""
+    """Geometry nodes: keep the points whose attribute `frame` is the current frame, as small spheres."""
     group, group_input, group_output = nodes.new_group("Tricap current frame")
     time = nodes.add(group, "GeometryNodeInputSceneTime")
     selection = nodes.compare(group, "EQUAL", nodes.attribute(group, "frame", "INT"), time.outputs["Frame"])

@@ -1,7 +1,7 @@
-"""What a run left in its output folder, read for the scene. No Blender in here: it may be read on a worker thread.
+"""The results in a run's output folder, read for the scene. No bpy here: they may be read on a worker thread.
 
-A part that is missing, because its stage did not run or its files were moved, is None or empty, and `warnings` says so.
-A part that is there but damaged is an InputError.
+A part that is missing, because its stage did not run or its files were moved, is None or empty, with a sentence in `warnings`.
+A damaged part is an InputError.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,14 +23,14 @@ from ...core.progress import Monitor
 from ...core.run_json import read_run
 from ...core.settings import from_table
 from ...core.take import Footage, open_take, read_take
-from .ready import Ready, find_ready
+from .prepare import Prepared, prepare
 
-DEFAULT_FPS = 25.0
+DEFAULT_FPS = 25.0  # of a scene whose take is missing
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameSkins:
-    """The skins that a run wrote: frames (T,) rising, vertices_m (T, V, 3) float32, and how finely they are sampled."""
+    """The skins that a run wrote: frames (T,) ascending, vertices_m (T, V, 3) float32, and the settings of their sampling."""
 
     frames: np.ndarray
     vertices_m: np.ndarray
@@ -39,7 +39,7 @@ class FrameSkins:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Contents:
-    """The parts of OUT. `shape` as its skin shows it, `clouds` by frame, `trajectories` as in their file; `motion`: radians, metres."""
+    """The parts of OUT. `shape`: as shown by its skin; `clouds`: by frame; `trajectories`: arrays of their file."""
 
     out: Path
     run: Mapping[str, Any]
@@ -47,10 +47,10 @@ class Contents:
     clouds: Mapping[int, Ply] = field(default_factory=dict)
     trajectories: Mapping[str, np.ndarray] | None = None
     shape: BodyShape | None = None
-    motion: MotionTable | None = None
+    motion: MotionTable | None = None  # radians, metres
     skin_settings: SkinSettings = field(default_factory=SkinSettings)
-    skins: FrameSkins | None = None  # only where they were asked for
-    ready: Ready = field(default_factory=Ready)
+    skins: FrameSkins | None = None  # only on request
+    prepared: Prepared = field(default_factory=Prepared)
     bar: tuple[np.ndarray, np.ndarray] | None = None  # frames (T,) of its own recording, and ends (T, 2, 3) [m] of the reference bar
     warnings: tuple[str, ...] = ()
 
@@ -61,7 +61,7 @@ class Contents:
 
     @property
     def frames(self) -> tuple[int, int]:
-        """First and last frame that anything was measured in, by the take's own numbers."""
+        """First and last frame with results, in the take's frame numbers."""
         known = [*self.clouds, *(self.motion.frames if self.motion else ()), *(self.trajectories["frames"] if self.trajectories else ())]
         if not known and self.footage:
             known = [self.footage.frames.start, self.footage.frames.stop - 1]
@@ -77,7 +77,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     """
     out = Path(out)
     if not (out / "run.json").is_file():
-        raise InputError(f"{out} holds no results of Tricap (no run.json); choose the output folder of a run.")
+        raise InputError(f"{out} has no results of Tricap (no run.json); choose the output folder of a run.")
     run = read_run(out / "run.json")
     warnings: list[str] = []
     footage = _footage(run, out, warnings)
@@ -90,7 +90,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     monitor.step("reading results", 3, 3)
     settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     person = None if shape is None else shape_for_skin(shape, settings)
-    ready = find_ready(clouds, trajectories, person, motion, settings, monitor)
+    prepared = prepare(clouds, trajectories, person, motion, settings, monitor)
     return Contents(
         out=out,
         run=run,
@@ -100,7 +100,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
         shape=person,
         motion=motion,
         skin_settings=settings,
-        ready=ready,
+        prepared=prepared,
         skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
         bar=_bar(footage, warnings),
         warnings=tuple(warnings),
@@ -118,17 +118,17 @@ def _bar(footage: Footage | None, warnings: list[str]) -> tuple[np.ndarray, np.n
 def _footage(run: Mapping[str, Any], out: Path, warnings: list[str]) -> Footage | None:
     try:
         if "take" not in run:
-            raise InputError(f"{out / 'run.json'} does not say which take was run.")
+            raise InputError(f"{out / 'run.json'} does not name the take.")
         return open_take(read_take(Path(run["take"])))
     except InputError as error:
-        warnings.append(f"No cameras and footage in the scene, and {DEFAULT_FPS:g} frames per second: {error}")
+        warnings.append(f"No cameras and footage in the scene, and its rate is {DEFAULT_FPS:g} fps: {error}")
         return None
 
 
 def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Ply]:
     files = {int(path.stem): path for path in sorted(folder.glob("*.ply")) if path.stem.isdecimal()}
     if not files:
-        warnings.append(f"No point cloud in the scene: {folder} holds no clouds.")
+        warnings.append(f"No point cloud in the scene: {folder} has no clouds.")
     clouds = {}
     for i, (frame, path) in enumerate(sorted(files.items())):
         monitor.step("reading clouds", i, len(files))
@@ -139,14 +139,14 @@ def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Pl
 def _skins(settings: SkinSettings, folder: Path, monitor: Monitor, warnings: list[str]) -> FrameSkins | None:
     files = {int(path.stem): path for path in folder.glob("*.ply") if path.stem.isdecimal()}
     if not files:
-        warnings.append(f"No exact skin in the scene: {folder} holds no skins; run the fit again.")
+        warnings.append(f"No exact skin in the scene: {folder} has no skins; run the fit again.")
         return None
     vertices = []
     for i, frame in enumerate(sorted(files)):
         monitor.step("reading skins", i, len(files))
         vertices.append(read_ply(files[frame]).xyz_m.astype("<f4"))
         if len(vertices[-1]) != len(vertices[0]):
-            raise InputError(f"{files[frame]} has {len(vertices[-1])} points, the skins before {len(vertices[0])}; run the fit again.")
+            raise InputError(f"{files[frame]} has {len(vertices[-1])} points, earlier skins have {len(vertices[0])}; run the fit again.")
     return FrameSkins(frames=np.array(sorted(files)), vertices_m=np.stack(vertices), settings=settings)
 
 

@@ -1,4 +1,4 @@
-"""The metaball skin: families of Blender metaballs that follow the bones, with the surface of the fitted field.
+"""The metaball skin: groups of Blender metaballs that follow the bones, with the surface of the fitted field.
 
 Our field is  F = Σ w exp(−2 d)  with d the squared distance in units of the radii l, surface F = ½. Blender's is
 Σ s max(0, 1 − ρ²)³ with compact support. The exponential is a sum of three of Blender's kernels at the same place,
@@ -8,9 +8,10 @@ Our field is  F = Σ w exp(−2 d)  with d the squared distance in units of the 
 so every fitted ball becomes four ellipsoids of sizes a_j · l and stiffness w · s_j, threshold ½. The coefficients are a least
 squares fit to limbs of three balls: a limb of 40 mm is off by 0.04 mm RMS (with three kernels 0.09, at
 most 0.33 mm). Blender adds the fields of all
-objects whose names agree but for the number; that is one family, polygonised in the object without a number.
+objects whose names differ only in the number; Blender calls these a family and polygonises it in the object without a number.
 
-Which balls make a family, so that hips and shoulders are as thick as fitted and arms do not melt into flanks: core.body.families.
+core.body.families decides which balls form a family, so that hips and shoulders are as thick as fitted and arms do not fuse with
+the flanks.
 """
 
 import bpy
@@ -24,7 +25,7 @@ from . import nodes
 NAME = "Flesh"
 KERNELS = ((0.1174, 0.8021), (0.3608, 1.1586), (0.3972, 1.5345), (0.1227, 2.0242))  # stiffness s_j, size a_j  (1)
 STIFFNESS_MAX = 10.0  # Blender's own limit
-SIZE_MAX = 16.0  # largest half axis / radius (Blender's limit: 20): the viewport draws circles of the radius, which the flesh then hides
+SIZE_MAX = 16.0  # largest half axis / radius (Blender's limit: 20): the circles that the viewport draws at the radius lie in the flesh
 RESOLUTION_M, RENDER_RESOLUTION_M = 0.008, 0.005
 SKIN_COLOUR = (0.80, 0.52, 0.41)
 
@@ -50,7 +51,7 @@ def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.O
 
 
 def free_family_name(name: str) -> str:
-    """`name`, or with a letter behind it, so that no metaball of the file belongs to the same family."""
+    """`name`, with a letter appended if another metaball family of the file has that name."""
     taken = {_stem(other.name) for other in bpy.data.objects}
     for letter in ("", *(f" {chr(code)}" for code in range(ord("B"), ord("Z") + 1))):
         if name + letter not in taken:

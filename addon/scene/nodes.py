@@ -61,13 +61,13 @@ def active(sockets: Any, name: str) -> bpy.types.NodeSocket:
 
 
 def arrange(group: bpy.types.NodeTree) -> None:
-    """Put the nodes side by side, so that a person who opens the group can read it."""
+    """Place the nodes side by side, so that the group is readable in the editor."""
     for i, node in enumerate(group.nodes):
         node.location = (220.0 * (i % 6), -260.0 * (i // 6))
 
 
 def plain_material(name: str, colour: tuple[float, float, float], roughness: float = 0.6) -> bpy.types.Material:
-    """One colour, also in the solid viewport."""
+    """One colour, also in solid shading."""
     material = bpy.data.materials.new(name)
     material.diffuse_color = (*colour, 1.0)
     shader = _shader(material)
@@ -93,7 +93,7 @@ def attribute_material(name: str, attribute: str, scale: float) -> bpy.types.Mat
 
 
 def heat_material(name: str, attribute: str, largest: float) -> bpy.types.Material:
-    """From blue (0) over green to red (`largest`) by the attribute."""
+    """From blue (0) over green to red (`largest`), by the attribute."""
     material = bpy.data.materials.new(name)
     material.diffuse_color = (0.2, 0.7, 1.0, 1.0)
     shader = _shader(material)
@@ -110,6 +110,6 @@ def heat_material(name: str, attribute: str, largest: float) -> bpy.types.Materi
 
 
 def _shader(material: bpy.types.Material) -> bpy.types.Node:
-    if bpy.app.version < (5, 0, 0):  # later versions always use nodes, and warn when told to
+    if bpy.app.version < (5, 0, 0):  # later versions always use nodes, and warn about this
         material.use_nodes = True
     return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")

@@ -1,8 +1,8 @@
-"""Points followed in the images of one camera, as Blender's own data: the footage as a picture in space, an animated empty for every point
-before it, and curves between those that are joined.
+"""2-D tracks of one camera as Blender data: the footage as an image empty, an animated empty in front of it for every point, and curves
+between joined points.
 
-The picture stands upright in the xz plane, its longer side one metre, and everything is its child: it can be moved, turned and scaled.
-A curve's two points hang on their empties (Hook modifiers), so an empty that is moved by hand takes its curves along.
+The image stands upright in the xz plane, its longer side is one metre, and it is the parent of everything: it can be moved, rotated and
+scaled. The ends of a curve are hooked to their empties (Hook modifiers), so that they follow an empty that is moved by hand.
 """
 
 import re
@@ -19,14 +19,16 @@ from ...core.tracking.point_tables import PlanarTable
 from .action import key
 
 COLLECTION, PICTURE = "2-D Tracks", "Footage"
-POINT_M, LINE_M, BEFORE_M = 0.006, 0.0012, 0.002  # radius of a point and of a line, and how far they lie before the picture
+POINT_M = 0.006  # radius of a point
+LINE_M = 0.0012  # radius of a curve
+IN_FRONT_M = 0.002  # distance of points and curves from the image
 HIDDEN = ("hide_viewport", "hide_render")
 
 
 def add_planar(scene: bpy.types.Scene, table: PlanarTable, joined: Many[tuple[str, str]], footage: Sequence | None) -> bpy.types.Collection:
     """A new collection with the points of a table, the curves that join them by name, and the footage where there is one.
 
-    A point is hidden where it is not seen, and a curve where one of its points is.
+    A point is hidden in frames where it was not tracked, and a curve where one of its points is hidden.
 
     Raises:
         InputError: Blender cannot read the footage.
@@ -40,22 +42,22 @@ def add_planar(scene: bpy.types.Scene, table: PlanarTable, joined: Many[tuple[st
     picture.rotation_euler.x = pi / 2
     if footage is not None:
         _show(picture, footage, images)
-    seen = np.isfinite(table.xy_px).all(axis=2)
-    places = on_picture(table.xy_px, size)
-    points = [_point(collection, picture, name, table.frames, places[:, n], seen[:, n]) for n, name in enumerate(table.names)]
+    tracked = np.isfinite(table.xy_px).all(axis=2)
+    positions = on_picture(table.xy_px, size)
+    points = [_point(collection, picture, name, table.frames, positions[:, n], tracked[:, n]) for n, name in enumerate(table.names)]
     index = {name: n for n, name in enumerate(table.names)}
     for a, b in joined:
-        both = seen[:, index[a]] & seen[:, index[b]]
+        both = tracked[:, index[a]] & tracked[:, index[b]]
         _line(collection, picture, points[index[a]], points[index[b]], table.frames, both)
     scene.frame_start, scene.frame_end = min(scene.frame_start, int(table.frames[0])), max(scene.frame_end, int(table.frames[-1]))
     return collection
 
 
 def on_picture(xy_px: np.ndarray, size_px: np.ndarray) -> np.ndarray:
-    """Places (…, 3) in the picture's own axes [m] of pixels (…, 2)."""
+    """Positions (…, 3) in the image empty's axes [m] of pixels (…, 2)."""
     longer = size_px.max()
     x, y = (xy_px[..., 0] + 0.5 - size_px[0] / 2) / longer, (size_px[1] / 2 - xy_px[..., 1] - 0.5) / longer
-    return np.stack([x, y, np.full_like(x, BEFORE_M)], axis=-1)
+    return np.stack([x, y, np.full_like(x, IN_FRONT_M)], axis=-1)
 
 
 def _images(footage: Sequence) -> bpy.types.Image:
@@ -79,7 +81,7 @@ def _show(picture: bpy.types.Object, footage: Sequence, images: bpy.types.Image)
 
 
 def _point(
-    collection: bpy.types.Collection, picture: bpy.types.Object, name: str, frames: np.ndarray, places: np.ndarray, seen: np.ndarray
+    collection: bpy.types.Collection, picture: bpy.types.Object, name: str, frames: np.ndarray, positions: np.ndarray, tracked: np.ndarray
 ) -> bpy.types.Object:
     point = bpy.data.objects.new(name, None)
     point.empty_display_type, point.empty_display_size, point.parent = "SPHERE", POINT_M, picture
@@ -87,8 +89,8 @@ def _point(
     action = bpy.data.actions.new(name)
     point.animation_data_create().action = action
     for axis in range(3):
-        key(action, point, "location", axis, frames, np.where(seen, places[:, axis], np.nan))
-    _hide(point, action, frames, seen)
+        key(action, point, "location", axis, frames, np.where(tracked, positions[:, axis], np.nan))
+    _hide(point, action, frames, tracked)
     return point
 
 
@@ -98,7 +100,7 @@ def _line(
     a: bpy.types.Object,
     b: bpy.types.Object,
     frames: np.ndarray,
-    seen: np.ndarray,
+    tracked: np.ndarray,
 ) -> None:
     data = bpy.data.curves.new(f"{a.name} – {b.name}", "CURVE")
     data.dimensions, data.bevel_depth = "3D", LINE_M
@@ -112,10 +114,10 @@ def _line(
         hook.vertex_indices_set([end])
     action = bpy.data.actions.new(data.name)
     line.animation_data_create().action = action
-    _hide(line, action, frames, seen)
+    _hide(line, action, frames, tracked)
 
 
-def _hide(shown: bpy.types.Object, action: bpy.types.Action, frames: np.ndarray, seen: np.ndarray) -> None:
-    changes = np.flatnonzero(np.diff(seen, prepend=~seen[:1]))
+def _hide(shown: bpy.types.Object, action: bpy.types.Action, frames: np.ndarray, tracked: np.ndarray) -> None:
+    changes = np.flatnonzero(np.diff(tracked, prepend=~tracked[:1]))
     for path in HIDDEN:
-        key(action, shown, path, 0, frames[changes], (~seen[changes]).astype(np.float64), "CONSTANT")
+        key(action, shown, path, 0, frames[changes], (~tracked[changes]).astype(np.float64), "CONSTANT")

@@ -1,4 +1,4 @@
-"""Pictures of the scene: the body shaded beside the body over the footage, and a turn around it. Workbench: quick, without a graphics card.
+"""Pictures of the scene: the body shaded, next to the body over the footage; and a turntable movie. Workbench: fast, without a GPU.
 
 The footage is undistorted with the calibrated lens, so that it fits the ideal camera that Blender renders with.
 """
@@ -19,29 +19,30 @@ from ...core.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.geometry.camera_derivatives import image_of, interior_of
 from ...core.progress import Monitor
+from . import cloud, trajectories
 from .contents import Contents
 
-BACKGROUND = 40  # grey behind the body
-OPACITY = 0.6
+BACKGROUND = 40  # grey level behind the body
+OPACITY = 0.6  # of the body over the footage
 TURN_FRAMES, TURN_SIZE_PX, TURN_FPS = 48, (480, 640), 24.0
 TURN_LENS_MM = 50.0
 SHOWN = ("MESH", "META")
-HIDDEN = ("Cloud", "Trajectories", "Velocities")
+HIDDEN = (cloud.NAME, trajectories.NAME, trajectories.ARROWS_NAME)
 
 
 def preview(contents: Contents, path: Path, frame: int | None = None) -> None:
-    """Write a picture of one frame (default the middle one): the body shaded, beside it the body over the reference view's footage.
+    """Write a picture of one frame (default the middle one): the body shaded, and next to it the body over the reference view's footage.
 
     Raises:
         InputError: there is no body or no footage to show, or the file cannot be written.
     """
     footage = contents.footage
     if contents.shape is None or footage is None:
-        raise InputError(f"There is no preview of {contents.out}: it takes a fitted body and the footage; run the take first.")
+        raise InputError(f"A preview of {contents.out} needs a fitted body and the footage; run the take first.")
     scene = bpy.context.scene
     frame = (scene.frame_start + scene.frame_end) // 2 if frame is None else frame
     scene.frame_set(frame)
-    with _body_alone(scene):
+    with _only_body(scene):
         picture = _rendered(scene)
     reference = footage.take.reference
     grey = footage.sequences[reference].read(footage.number(reference, frame))
@@ -61,7 +62,7 @@ def turntable(path: Path, frame: int | None = None, monitor: Monitor | None = No
     scene, monitor = bpy.context.scene, monitor or Monitor()
     scene.frame_set((scene.frame_start + scene.frame_end) // 2 if frame is None else frame)
     pictures = []
-    with _body_alone(scene), _turning_camera(scene) as turn:
+    with _only_body(scene), _turning_camera(scene) as turn:
         for i in range(TURN_FRAMES):
             monitor.step("turntable", i, TURN_FRAMES)
             turn(2 * math.pi * i / TURN_FRAMES)
@@ -71,7 +72,7 @@ def turntable(path: Path, frame: int | None = None, monitor: Monitor | None = No
 
 
 def undistorted(grey: np.ndarray, camera: Camera) -> np.ndarray:
-    """The picture as Blender's camera sees it: an ideal lens of the same principal point and focal lengths, affinity included."""
+    """The image through Blender's camera: an ideal lens of the same principal point and focal lengths, affinity included."""
     interior = interior_of(camera)
     f, cx, cy, b1 = interior[0], *interior[1:3], interior[8]
     y, x = np.indices(grey.shape, dtype=np.float64)
@@ -81,8 +82,8 @@ def undistorted(grey: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 @contextmanager
-def _body_alone(scene: bpy.types.Scene) -> Iterator[None]:
-    """Workbench on a clear ground, without cloud and trails; everything as before afterwards."""
+def _only_body(scene: bpy.types.Scene) -> Iterator[None]:
+    """Render with Workbench on a transparent background, without cloud and trails; restores the scene afterwards."""
     render, shading = scene.render, scene.display.shading
     kept = render.engine, render.film_transparent, shading.light, shading.color_type, shading.show_cavity
     hidden = [o for o in scene.objects if o.type in SHOWN and not o.hide_render and o.name.split(".")[0] in HIDDEN]
@@ -136,13 +137,13 @@ def _extent(scene: bpy.types.Scene) -> tuple[Vector, float]:
         for end in (bone.head, bone.tail)
     ]
     if not ends:
-        raise InputError("There is nothing to turn around: the scene has no body; run the fit first.")
+        raise InputError("A turntable needs a body; run the fit first.")
     low, high = (Vector(pick(p[i] for p in ends) for i in range(3)) for pick in (min, max))
     return (low + high) / 2, (high - low).length / 2 + 0.1
 
 
 def _rendered(scene: bpy.types.Scene) -> np.ndarray:
-    """The scene's camera's picture (h, w, 4), BGR and alpha, 0…255."""
+    """A render of the scene (h, w, 4), BGR and alpha, 0…255."""
     with tempfile.TemporaryDirectory() as folder:
         kept = scene.render.filepath, scene.render.image_settings.file_format, scene.render.image_settings.color_mode
         scene.render.filepath = str(Path(folder) / "picture.png")

@@ -4,8 +4,8 @@ A bone with three angles can take up any turn of its rest frame R_0 → Q R_0, f
 
     Euler' = (Rest_rel')ᵀ · M_parentᵀ · M                                                                 (1)
 
-has the three angles again; everything that hangs on it is turned along and keeps its channels. The pose, the metaballs and the skin are
-the same; only those three channels, counted from another rest, no longer are the numbers of motion.csv.
+has the three angles again; everything that descends from it turns along and keeps its channels. The pose, the metaballs and the skin are
+the same; only those three channels, relative to another rest pose, differ from the values in motion.csv.
 """
 
 import dataclasses
@@ -18,12 +18,12 @@ from ...core.body.skeleton import Dof, bone_frames, frames_and_axes
 from ...core.body.skin_rays import swing
 
 POSES = ("A", "T")
-LEVEL = {".R": np.array([-1.0, 0.0, 0.0]), ".L": np.array([1.0, 0.0, 0.0])}
+T_POSE_ARM = {".R": np.array([-1.0, 0.0, 0.0]), ".L": np.array([1.0, 0.0, 0.0])}
 ARM = "upper_arm"
 
 
-def at_rest(shape: BodyShape, values: np.ndarray, sigma: np.ndarray, pose: str) -> tuple[BodyShape, np.ndarray, np.ndarray]:
-    """The same person and motion (T, D), with sigmas (T, D), counted from the rest pose `pose` of POSES. "A" is the model's own."""
+def with_rest_pose(shape: BodyShape, values: np.ndarray, sigma: np.ndarray, pose: str) -> tuple[BodyShape, np.ndarray, np.ndarray]:
+    """The same person and motion (T, D), with sigmas (T, D), relative to the rest pose `pose` of POSES. "A" is the model's own."""
     skeleton = shape.skeleton
     turned = [b for b, bone in enumerate(skeleton.bones) if pose == "T" and bone.name[:-2] == ARM and len(bone.dofs) == 3]
     if not turned:
@@ -31,7 +31,7 @@ def at_rest(shape: BodyShape, values: np.ndarray, sigma: np.ndarray, pose: str) 
     turn = [np.eye(3)] * len(skeleton.bones)
     for b, parent in enumerate(skeleton.parents):
         rest = skeleton.bones[b].R_rest
-        turn[b] = swing(rest[:, 1], LEVEL[skeleton.bones[b].name[-2:]]) if b in turned else turn[parent] if parent >= 0 else np.eye(3)
+        turn[b] = swing(rest[:, 1], T_POSE_ARM[skeleton.bones[b].name[-2:]]) if b in turned else turn[parent] if parent >= 0 else np.eye(3)
     bones = tuple(
         dataclasses.replace(bone, R_rest=Q @ bone.R_rest, dofs=tuple(map(_unlimited, bone.dofs)) if b in turned else bone.dofs)
         for b, (bone, Q) in enumerate(zip(skeleton.bones, turn))
@@ -39,12 +39,12 @@ def at_rest(shape: BodyShape, values: np.ndarray, sigma: np.ndarray, pose: str) 
     other = dataclasses.replace(shape, skeleton=dataclasses.replace(skeleton, bones=bones))
     known = np.isfinite(values).all(axis=1)
     new_values, new_sigma = values.copy(), sigma.copy()
-    new_values[known] = _recounted(shape, other, values[known], turned)
-    new_sigma[known] = _carried_sigma(shape, other, values[known], new_values[known], sigma[known], turned)
+    new_values[known] = _relative_to(shape, other, values[known], turned)
+    new_sigma[known] = _propagated_sigma(shape, other, values[known], new_values[known], sigma[known], turned)
     return other, new_values, new_sigma
 
 
-def _recounted(shape: BodyShape, other: BodyShape, values: np.ndarray, turned: list[int]) -> np.ndarray:
+def _relative_to(shape: BodyShape, other: BodyShape, values: np.ndarray, turned: list[int]) -> np.ndarray:
     R, _ = bone_frames(shape.skeleton, shape.lengths_m, values)
     new = values.copy()
     for b in turned:
@@ -60,10 +60,10 @@ def _recounted(shape: BodyShape, other: BodyShape, values: np.ndarray, turned: l
     return new
 
 
-def _carried_sigma(
+def _propagated_sigma(
     shape: BodyShape, other: BodyShape, values: np.ndarray, new: np.ndarray, sigma: np.ndarray, turned: list[int]
 ) -> np.ndarray:
-    """Both sets of angles turn the same bone: A θ̇ = A' θ̇' with the axes A in the world, so θ̇' = A'⁻¹ A θ̇."""
+    """Both sets of angles rotate the same bone: A θ̇ = A' θ̇' with the axes A in the world, so θ̇' = A'⁻¹ A θ̇."""
     before, after = (frames_and_axes(s.skeleton, s.lengths_m, v)[2] for s, v in ((shape, values), (other, new)))
     carried = sigma.copy()
     for b in turned:
@@ -75,7 +75,7 @@ def _carried_sigma(
 
 
 def _unlimited(dof: Dof) -> Dof:
-    """Limits are counted from the model's own rest pose and mean nothing in another."""
+    """Remove the limits: they are relative to the model's own rest pose."""
     return dataclasses.replace(dof, limits=(-np.inf, np.inf))
 
 

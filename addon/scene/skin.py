@@ -30,7 +30,7 @@ from .contents import FrameSkins
 NAME, EXACT_NAME = "Skin", "Exact skin"
 CACHE_MODIFIER = "Every frame"
 SKIN_COLOUR = (0.80, 0.52, 0.41)
-STEPS = 2000  # a weight is written in so many steps: coarser ones fold the inside of a sharply bent elbow
+WEIGHT_STEPS = 2000  # quantisation of the weights; coarser ones fold the inside of a sharply bent elbow
 IMPLICIT_SPACING_M = 0.005  # of the grid in which the implicit surface is sampled; the surface is then exact to 0.4 mm
 PC2_HEADER = struct.Struct("<12siiffi")  # magic, version, points, first frame, frames per sample, samples
 
@@ -41,22 +41,22 @@ def add_skin(
     shape: BodyShape,
     detail: int = 1,
     settings: SkinSettings = SkinSettings(),  # noqa: B008  frozen
-    found: OneSkin | None = None,
+    prepared: OneSkin | None = None,
 ) -> bpy.types.Object:
-    """The skin of the rest pose as one closed mesh, bound to the armature, sampled as the run's settings say; `detail` cuts it finer.
-    It may have been found before.
+    """The skin of the rest pose as one closed mesh, bound to the armature, sampled by the run's settings; `detail` subdivides it.
+    `prepared`: the skin, if it was computed before.
 
     Raises:
         InputError: the body has no metaballs.
     """
-    skin = found or one_skin(shape, settings, detail)
+    skin = prepared or one_skin(shape, settings, detail)
     skin_object = _mesh_object(collection, NAME, skin.vertices_m, skin.faces, skin.uv)
     bind(skin_object, armature_object, skin.bone_names, skin.weights)
     return skin_object
 
 
 def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: FrameSkins, cache: Path) -> bpy.types.Object:
-    """The skin as the run found it in every frame. Writes `cache` (.pc2); missing frames hold the skin before them.
+    """The run's skin of every frame. Writes `cache` (.pc2); missing frames repeat the previous skin.
 
     Raises:
         InputError: the skins are not those of this body, or the cache cannot be written.
@@ -67,9 +67,9 @@ def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: Fr
             f"The run's skins have {skins.vertices_m.shape[1]} points, that of body.toml {len(rest.vertices_m)}; run the fit again."
         )
     first, last = int(skins.frames[0]), int(skins.frames[-1])
-    held = np.searchsorted(skins.frames, np.arange(first, last + 1), side="right") - 1
-    head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(rest.vertices_m), float(first), 1.0, len(held))
-    store.write_bytes(cache, head + skins.vertices_m[held].tobytes())
+    row_of_frame = np.searchsorted(skins.frames, np.arange(first, last + 1), side="right") - 1
+    head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(rest.vertices_m), float(first), 1.0, len(row_of_frame))
+    store.write_bytes(cache, head + skins.vertices_m[row_of_frame].tobytes())
     skin_object = _mesh_object(collection, EXACT_NAME, rest.vertices_m, rest.faces, corner_uv(rest))
     if len(rest.part_sizes) > 1:  # where parts overlap, shade by the surface they share
         skin_object.data.normals_split_custom_set_from_vertices(rest.normals.tolist())
@@ -95,15 +95,15 @@ def _mesh_object(
 
 
 def bind(skin_object: bpy.types.Object, armature_object: bpy.types.Object, bone_names: Sequence[str], weights: np.ndarray) -> None:
-    """Let the armature deform the object, keeping volumes, by the bones' shares in its vertices (V, B), written in steps."""
+    """Let the armature deform the object, preserving volume, by the bones' weights (V, B)."""
     skin_object.parent = armature_object
     for bone, share in zip(bone_names, weights.T):
-        level = np.round(STEPS * share).astype(int)
+        level = np.round(WEIGHT_STEPS * share).astype(int)
         if not level.any():
             continue
         group = skin_object.vertex_groups.new(name=bone)
         for step in np.unique(level[level > 0]):
-            group.add(np.flatnonzero(level == step).tolist(), step / STEPS, "REPLACE")
+            group.add(np.flatnonzero(level == step).tolist(), step / WEIGHT_STEPS, "REPLACE")
     modifier = skin_object.modifiers.new("Armature", "ARMATURE")
     modifier.object, modifier.use_deform_preserve_volume = armature_object, True
 

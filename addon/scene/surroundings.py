@@ -1,4 +1,4 @@
-"""What is around the person: lights, the floor, and the reference bar of a calibration."""
+"""The surroundings of the person: lights, the floor, and the reference bar of a calibration."""
 
 import math
 
@@ -15,7 +15,7 @@ FLOOR_COLOUR, BAR_COLOUR = (0.35, 0.36, 0.38), (0.9, 0.75, 0.1)
 
 
 def add_lights(collection: bpy.types.Collection) -> None:
-    """A sun from the front left above, and a weaker one from the right, so that a rendered picture is not black."""
+    """A sun from the front left above, and a weaker one from the right, so that renders are not black."""
     for name, strength, turned in LIGHTS:
         data = bpy.data.lights.new(name, "SUN")
         data.energy, data.angle = strength, math.radians(10)
@@ -41,9 +41,9 @@ def add_floor(collection: bpy.types.Collection) -> bpy.types.Object:
 
 
 def add_bar(collection: bpy.types.Collection, frames: np.ndarray, ends_m: np.ndarray) -> bpy.types.Object:
-    """The reference bar in every frame (T,) of its footage from its ends (T, 2, 3); the scene shows that of its current frame.
+    """The reference bar in every frame (T,) of its footage from its ends (T, 2, 3); the viewport shows that of the current frame.
 
-    One mesh of edges with the attribute `frame`; the modifier's Trail shows the frames before as well.
+    One mesh of edges with the attribute `frame`; the modifier's Trail also shows earlier frames.
     """
     mesh = bpy.data.meshes.new("Reference bar")
     mesh.vertices.add(2 * len(frames))

@@ -1,7 +1,7 @@
 """The trajectories of all tracked points as ONE mesh of edges; geometry nodes show the trail behind the current frame.
 
-A point that was seen in two successive frames gives an edge. Named attributes on the points: frame, track and segment (int, see
-`ready`), sigma [m] and speed [m/s] (float), velocity [m/s] (vector).
+A point that is visible in two successive frames gives an edge. Named attributes on the points: frame, track and segment (int, see
+prepare.py), sigma [m] and speed [m/s] (float), velocity [m/s] (vector).
 """
 
 from collections.abc import Mapping
@@ -13,35 +13,35 @@ from . import nodes
 from .cloud import write
 
 NAME, ARROWS_NAME = "Trajectories", "Velocities"
-ARROW_S = 0.1  # an arrow shows the way of this time
+ARROW_S = 0.1  # an arrow has the length of the path in this time
 BARB = 0.25  # length of an arrow's barbs, as a fraction of it
 TRAIL_FRAMES = 10
 TRAIL_RADIUS_M = 0.0006
-REDDEST_SPEED_M_S = 2.0  # the speed that is painted reddest
+REDDEST_SPEED_M_S = 2.0  # painted red
 
 
 def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
-    """One object from the arrays of trajectories.npz and the bones of their points: frames (T,), xyz_m (T, N, 3) with NaN = not seen,
+    """One object from the arrays of trajectories.npz and the bones of their points: frames (T,), xyz_m (T, N, 3) with NaN = not visible,
     velocity_m_s, sigma_m (T, N), segment (T, N)."""
     xyz, frames = arrays["xyz_m"], arrays["frames"]
-    seen = np.isfinite(xyz).all(axis=-1)  # (T, N)
-    row, track = np.nonzero(seen)
-    index = np.full(seen.shape, -1)
+    visible = np.isfinite(xyz).all(axis=-1)  # (T, N)
+    row, track = np.nonzero(visible)
+    index = np.full(visible.shape, -1)
     index[row, track] = np.arange(len(row))
-    joined = seen[:-1] & seen[1:] & (np.diff(frames) == 1)[:, None]
+    joined = visible[:-1] & visible[1:] & (np.diff(frames) == 1)[:, None]
     edges = np.stack([index[:-1][joined], index[1:][joined]], axis=-1)
     mesh = bpy.data.meshes.new(NAME)
     mesh.vertices.add(len(row))
     mesh.edges.add(len(edges))
     mesh.edges.foreach_set("vertices", np.ascontiguousarray(edges, dtype=np.int32).ravel())
-    write(mesh, "position", "FLOAT_VECTOR", xyz[seen])
+    write(mesh, "position", "FLOAT_VECTOR", xyz[visible])
     write(mesh, "frame", "INT", frames[row])
     write(mesh, "track", "INT", track)
-    write(mesh, "sigma", "FLOAT", np.nan_to_num(arrays["sigma_m"][seen]))
-    velocity = np.nan_to_num(arrays["velocity_m_s"][seen])
+    write(mesh, "sigma", "FLOAT", np.nan_to_num(arrays["sigma_m"][visible]))
+    velocity = np.nan_to_num(arrays["velocity_m_s"][visible])
     write(mesh, "speed", "FLOAT", np.linalg.norm(velocity, axis=-1))
     write(mesh, "velocity", "FLOAT_VECTOR", velocity)
-    write(mesh, "segment", "INT", arrays["segment"][seen])
+    write(mesh, "segment", "INT", arrays["segment"][visible])
     mesh.update()
     material = nodes.heat_material(NAME, "speed", REDDEST_SPEED_M_S)
     mesh.materials.append(material)
@@ -52,20 +52,20 @@ def add_trajectories(collection: bpy.types.Collection, arrays: Mapping[str, np.n
 
 
 def sparser(arrays: Mapping[str, np.ndarray], most: int) -> tuple[Mapping[str, np.ndarray], int]:
-    """Every k-th trajectory, so that at most about `most` places are left, and k."""
+    """Every k-th trajectory, so that at most about `most` positions are left, and k."""
     k = -(-int(np.isfinite(arrays["xyz_m"][..., 0]).sum()) // most) or 1
     return (arrays if k == 1 else {name: a[:, ::k] if a.ndim > 1 else a for name, a in arrays.items()}), k
 
 
 def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray]) -> bpy.types.Object:
-    """One object with an arrow for the velocity of every point in every frame; the scene shows those of its current frame."""
-    known = np.isfinite(arrays["xyz_m"]).all(axis=-1) & np.isfinite(arrays["velocity_m_s"]).all(axis=-1)
-    row, _ = np.nonzero(known)
-    at, velocity = arrays["xyz_m"][known], arrays["velocity_m_s"][known]
-    way = ARROW_S * velocity
-    aside = np.cross(way, [0.0, 1.0, 0.0])
-    aside *= 0.5 * BARB * np.linalg.norm(way, axis=1, keepdims=True) / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-12)
-    corners = np.stack([at, at + way, at + (1 - BARB) * way + aside, at + (1 - BARB) * way - aside], axis=1)
+    """One object with an arrow for the velocity of every point in every frame; the viewport shows those of the current frame."""
+    has_velocity = np.isfinite(arrays["xyz_m"]).all(axis=-1) & np.isfinite(arrays["velocity_m_s"]).all(axis=-1)
+    row, _ = np.nonzero(has_velocity)
+    at, velocity = arrays["xyz_m"][has_velocity], arrays["velocity_m_s"][has_velocity]
+    arrow = ARROW_S * velocity
+    aside = np.cross(arrow, [0.0, 1.0, 0.0])
+    aside *= 0.5 * BARB * np.linalg.norm(arrow, axis=1, keepdims=True) / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-12)
+    corners = np.stack([at, at + arrow, at + (1 - BARB) * arrow + aside, at + (1 - BARB) * arrow - aside], axis=1)
     edges = 4 * np.arange(len(at))[:, None, None] + np.array([[0, 1], [1, 2], [1, 3]])
     mesh = bpy.data.meshes.new(ARROWS_NAME)
     mesh.vertices.add(4 * len(at))
@@ -84,7 +84,7 @@ def add_arrows(collection: bpy.types.Collection, arrays: Mapping[str, np.ndarray
 
 
 def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy.types.NodeTree:
-    """Geometry nodes: keep what lies up to `Trail` frames behind the scene's frame, as thin threads."""
+    """Geometry nodes: the edges of the last `Trail` frames before the current one, as thin tubes."""
     group, group_input, group_output = nodes.new_group("Tricap trail")
     trail = group.interface.new_socket("Trail", in_out="INPUT", socket_type="NodeSocketInt")
     trail.default_value, trail.min_value = frames, 0
@@ -99,16 +99,16 @@ def trail_group(material: bpy.types.Material, frames: int = TRAIL_FRAMES) -> bpy
     profile = nodes.add(group, "GeometryNodeCurvePrimitiveCircle")
     profile.inputs["Resolution"].default_value = 3
     nodes.active(profile.inputs, "Radius").default_value = TRAIL_RADIUS_M
-    thread = nodes.add(group, "GeometryNodeCurveToMesh")
+    tube = nodes.add(group, "GeometryNodeCurveToMesh")
     paint_node = nodes.add(group, "GeometryNodeSetMaterial")
     paint_node.inputs["Material"].default_value = material
     chain = (
         (group_input.outputs[0], keep.inputs["Geometry"]),
         (both.outputs[0], keep.inputs["Selection"]),
         (keep.outputs["Selection"], curve.inputs["Mesh"]),
-        (curve.outputs["Curve"], thread.inputs["Curve"]),
-        (profile.outputs["Curve"], thread.inputs["Profile Curve"]),
-        (thread.outputs["Mesh"], paint_node.inputs["Geometry"]),
+        (curve.outputs["Curve"], tube.inputs["Curve"]),
+        (profile.outputs["Curve"], tube.inputs["Profile Curve"]),
+        (tube.outputs["Mesh"], paint_node.inputs["Geometry"]),
         (paint_node.outputs["Geometry"], group_output.inputs[0]),
     )
     for source, target in chain:

@@ -35,7 +35,7 @@ def test_blender_cameras_project_like_the_rig(empty: ModuleType, fy_over_fx: flo
         empty.context.view_layer.update()
         xy = random.uniform((-20, -20), np.array(SIZE) + 20, (40, 2))
         xyz = ideal.points_at_depth(xy, random.uniform(0.5, 6, 40))
-        np.testing.assert_allclose(cameras.seen_from(scene, seen, xyz, SIZE), xy, atol=PROJECTION_PX)
+        np.testing.assert_allclose(cameras.projected(scene, seen, xyz, SIZE), xy, atol=PROJECTION_PX)
 
 
 def test_axes_go_there_and_back() -> None:

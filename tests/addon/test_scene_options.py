@@ -54,7 +54,7 @@ def test_exact_skins_that_cannot_be(empty: ModuleType, small_run: SmallRun, tmp_
     for path in (small_run.out / "skin").iterdir():
         path.unlink()
     store.write_json(small_run.out / "run.json", said)
-    assert any("holds no skins" in warning for warning in build_scene(small_run.out, tmp_path / "a.blend", options=wanted).warnings)
+    assert any("has no skins" in warning for warning in build_scene(small_run.out, tmp_path / "a.blend", options=wanted).warnings)
 
 
 def test_the_implicit_surface_is_that_of_the_field(empty: ModuleType, small_run: SmallRun) -> None:
@@ -176,12 +176,12 @@ def test_the_bar_beside_the_rig_is_in_the_scene(empty: ModuleType, small_run: Sm
 
 @pytest.mark.parametrize("model", ["arm.R", "full"])
 def test_in_t_pose_the_person_moves_the_same(empty: ModuleType, model: str) -> None:
-    from tricap.addon.scene.rest_pose import at_rest
+    from tricap.addon.scene.rest_pose import with_rest_pose
 
     shape = default_shape(read_model(model))
     random = np.random.default_rng(3)
     values = random.uniform(-0.6, 0.6, (12, len(shape.skeleton.dof_names)))
-    other, new, sigma = at_rest(shape, values, np.full(values.shape, 0.01), "T")
+    other, new, sigma = with_rest_pose(shape, values, np.full(values.shape, 0.01), "T")
     upper = next(bone for bone in other.skeleton.bones if bone.name == "upper_arm.R")
     np.testing.assert_allclose(upper.R_rest[:, 1], [-1, 0, 0], atol=1e-12)
     for a, b in zip(bone_frames(shape.skeleton, shape.lengths_m, values), bone_frames(other.skeleton, other.lengths_m, new)):
@@ -189,7 +189,7 @@ def test_in_t_pose_the_person_moves_the_same(empty: ModuleType, model: str) -> N
     changed = np.flatnonzero(np.abs(new - values).max(axis=0) > 1e-6)
     assert {shape.skeleton.dof_names[i].partition(" ")[0] for i in changed} <= {"shoulder.R", "shoulder.L"}
     assert np.isfinite(sigma).all() and (sigma > 0).all()
-    same = at_rest(shape, values, sigma, "A")
+    same = with_rest_pose(shape, values, sigma, "A")
     assert same[0] is shape and same[1] is values
 
 

@@ -1,6 +1,6 @@
-"""What the scene shows that takes a while to find and needs no Blender: found on the worker thread, so that the window waits for little.
+"""What the scene needs that takes long to compute and needs no bpy. Computed on the worker thread, so that the window stays responsive.
 
-Which bone of the fitted body each point belongs to, how fast the nearest tracked point is, and the skin of the rest pose.
+The bone of the fitted body that each point belongs to, the velocity of the nearest tracked point, and the skin of the rest pose.
 """
 
 from collections.abc import Mapping
@@ -20,58 +20,58 @@ from ...core.motion.ply import Ply
 from ...core.motion.tables import MotionTable
 from ...core.progress import Monitor
 
-NOBODY = -1
-GATE_M = 0.04  # a point further from every limb's surface is nobody's
-NEAR_M = 0.03  # a cloud's point has the speed of a tracked point within this distance
+NO_BONE = -1
+GATE_M = 0.04  # a point farther from the surface of every limb belongs to no bone
+NEAR_M = 0.03  # a cloud point takes the velocity of the nearest tracked point within this distance
 STAGE = "preparing the scene"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Ready:
-    """Of each cloud by frame: the velocities (N, 3) [m/s], 0 = unknown, and the numbers (N,) of the bones; numbers (T, N) of the tracks."""
+class Prepared:
+    """For each cloud, by frame: velocities (N, 3) [m/s], 0 = unknown, and bone numbers (N,). For the trajectories: bone numbers (T, N)."""
 
-    bones: tuple[str, ...] = ()  # names by number; none without a posture in any frame
+    bones: tuple[str, ...] = ()  # names by number; empty without a pose in any frame
     velocity_m_s: Mapping[int, np.ndarray] = field(default_factory=dict)
     segment: Mapping[int, np.ndarray] = field(default_factory=dict)
     track_segment: np.ndarray | None = None
     skin: OneSkin | None = None  # None: the body has no metaballs
 
 
-def find_ready(
+def prepare(
     clouds: Mapping[int, Ply],
     trajectories: Mapping[str, np.ndarray] | None,
     shape: BodyShape | None,
     motion: MotionTable | None,
     settings: SkinSettings,
     monitor: Monitor,
-) -> Ready:
-    """All of it.
+) -> Prepared:
+    """Compute all of it.
 
     Raises:
         Cancelled: the monitor was cancelled.
     """
-    segments, velocity, owner = _Segments(shape, motion), {}, {}
+    segmentation, velocity, segment_of = _Segmentation(shape, motion), {}, {}
     tracks = _Tracks(trajectories)
     for i, (frame, ply) in enumerate(clouds.items()):
         monitor.step(STAGE, i, len(clouds) + 1)
         xyz = ply.xyz_m
-        both = segments.of(frame, np.concatenate([xyz, tracks.of(frame)]))  # one look at the posture for both
-        velocity[frame], owner[frame] = velocity_nearby(frame, xyz, trajectories), both[: len(xyz)]
-        tracks.keep(frame, both[len(xyz) :])
+        both = segmentation.of(frame, np.concatenate([xyz, tracks.of(frame)]))  # one evaluation of the pose for both
+        velocity[frame], segment_of[frame] = velocity_nearby(frame, xyz, trajectories), both[: len(xyz)]
+        tracks.set(frame, both[len(xyz) :])
     for frame in sorted(tracks.rows.keys() - clouds.keys()):
-        tracks.keep(frame, segments.of(frame, tracks.of(frame)))
+        tracks.set(frame, segmentation.of(frame, tracks.of(frame)))
     monitor.step(STAGE, len(clouds), len(clouds) + 1)
-    return Ready(
-        bones=segments.names,
+    return Prepared(
+        bones=segmentation.names,
         velocity_m_s=velocity,
-        segment=owner,
+        segment=segment_of,
         skin=_rest_skin(shape, settings),
         track_segment=None if trajectories is None else tracks.segment,
     )
 
 
 def velocity_nearby(frame: int, xyz_m: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
-    """Velocity (N, 3) of the nearest tracked point of the frame; 0 where none is near."""
+    """Velocity (N, 3) of the nearest tracked point in the frame; 0 where none is within NEAR_M."""
     at = np.flatnonzero(trajectories["frames"] == frame) if trajectories is not None else np.zeros(0, dtype=int)
     if trajectories is None or not len(at) or not len(xyz_m):
         return np.zeros((len(xyz_m), 3))
@@ -84,23 +84,23 @@ def velocity_nearby(frame: int, xyz_m: np.ndarray, trajectories: Mapping[str, np
 
 
 class _Tracks:
-    """The bones (T, N) of trajectories, `NOBODY` where they were not seen, found frame by frame."""
+    """The bones (T, N) of trajectories, filled frame by frame; `NO_BONE` where a point was not visible."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray] | None) -> None:
         self._xyz_m = arrays["xyz_m"] if arrays is not None else np.zeros((0, 0, 3))
-        self._seen = np.isfinite(self._xyz_m).all(axis=-1)
+        self._visible = np.isfinite(self._xyz_m).all(axis=-1)
         self.rows = {int(frame): row for row, frame in enumerate(arrays["frames"])} if arrays is not None else {}
-        self.segment = np.full(self._seen.shape, NOBODY)
+        self.segment = np.full(self._visible.shape, NO_BONE)
 
     def of(self, frame: int) -> np.ndarray:
-        """Places (N', 3) of those that were seen in a frame."""
+        """Positions (N', 3) of the points that are visible in a frame."""
         row = self.rows.get(frame)
-        return np.zeros((0, 3)) if row is None else np.asarray(self._xyz_m[row][self._seen[row]])
+        return np.zeros((0, 3)) if row is None else np.asarray(self._xyz_m[row][self._visible[row]])
 
-    def keep(self, frame: int, bones: np.ndarray) -> None:
-        """Their bones."""
+    def set(self, frame: int, bones: np.ndarray) -> None:
+        """Set the bones of the points that are visible in a frame."""
         if frame in self.rows:
-            self.segment[self.rows[frame], self._seen[self.rows[frame]]] = bones
+            self.segment[self.rows[frame], self._visible[self.rows[frame]]] = bones
 
 
 def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> OneSkin | None:
@@ -110,8 +110,8 @@ def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> OneSkin | Non
         return None
 
 
-class _Segments:
-    """The bones of points in any frame; nobody's where the frame has no posture."""
+class _Segmentation:
+    """Assigns points to bones in any frame; to none where the frame has no pose."""
 
     def __init__(self, shape: BodyShape | None, motion: MotionTable | None) -> None:
         self.names: tuple[str, ...] = ()
@@ -125,8 +125,8 @@ class _Segments:
         self._whole = np.tile([0.0, 1.0], (len(self.names), 1))
 
     def of(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
-        """Numbers (N,) of the bones to which points (N, 3) of a frame belong, `NOBODY` where none is near."""
-        owner = np.full(len(xyz_m), NOBODY)
+        """Numbers (N,) of the bones that points (N, 3) of a frame belong to, `NO_BONE` where none is near."""
+        owner = np.full(len(xyz_m), NO_BONE)
         if frame in self._states and len(xyz_m):
             unknown = np.zeros((len(xyz_m), 3))
             points = CloudPoints(frame=frame, xyz_m=np.asarray(xyz_m, dtype=np.float64), normals=unknown, sigma_m=unknown[:, 0])
