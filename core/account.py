@@ -13,7 +13,7 @@ from .tracking.settings import TrackStatus
 from .tracking.trajectories import Trajectories
 
 
-def new_account(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
+def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
     """An account without stages and warnings."""
     take = footage.take
     return {

@@ -23,7 +23,7 @@ from typing import Any
 from . import pipeline, store
 from .errors import InputError
 from .progress import Monitor
-from .results import check_apart
+from .results import check_separate_folder
 
 FORMAT, VERSION = "tricap-batch", 1
 TOPIC = "tricap"  # under which workers report
@@ -91,7 +91,7 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     if twice is not None:
         raise InputError(f"The take {twice} is named twice, or like another one; rename its folder, or leave it out.")
     for out in (folder, *(folder / name for name in names)):
-        check_apart(out)
+        check_separate_folder(out)
     return [folder / name for name in names]
 
 
@@ -114,7 +114,7 @@ def run_take(take: str, out: str, overrides: pipeline.Overrides, restart: bool) 
 
 def _told(job: pipeline.Run) -> str:
     """The run in a line, with what is doubtful about it: the first doubt, and how many more the report has."""
-    doubts = job.account["warnings"]
+    doubts = job.record["warnings"]
     more = f" ({len(doubts) - 1} more in the report)" if len(doubts) > 1 else ""
     return f"{job}. Doubtful: {doubts[0]}{more}" if doubts else str(job)
 
@@ -129,7 +129,7 @@ def _scene(job: pipeline.Run) -> None:
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     if done.returncode:
         job.warn(f"No body.blend was written: {done.stderr.strip().splitlines()[-1].removeprefix('tricap: ')}")
-        job.results.write_run(job.account)
+        job.results.write_run(job.record)
 
 
 def _reporter(take: str) -> Callable[[str, float, float], None] | None:

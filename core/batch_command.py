@@ -43,5 +43,5 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     states = {o.status for o in outcomes}
     args.exit_code = 1 if states & {BUG, LOST} else 2 if MEND in states else 0
     lines = summary(outcomes)
-    args.told_anyway = [line for line, outcome in zip(lines, outcomes) if outcome.status != DONE]
+    args.always_shown = [line for line, outcome in zip(lines, outcomes) if outcome.status != DONE]
     return [as_json(outcomes)] if args.json else lines

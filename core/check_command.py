@@ -30,7 +30,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """
     checked = check(args.subject, monitor)
     args.exit_code = 1 if checked.findings else 0
-    args.told_anyway = checked.lines() if checked.findings else []
+    args.always_shown = checked.lines() if checked.findings else []
     return [json.dumps(checked.to_table(), indent=1, ensure_ascii=False)] if args.json else checked.lines()
 
 

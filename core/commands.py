@@ -23,13 +23,13 @@ from .calibration.rig_files import read_any
 from .errors import InputError
 from .images.fields import BOTH, INTERLACE
 from .progress import Cancelled, Monitor
-from .results import check_apart
+from .results import check_separate_folder
 from .take import open_take, read_take
 from .take_file import footage_entry, make_take, new_table, take_of_table
 from .threads import one_thread_in_linear_algebra
 
 Adder = Callable[[Any], None]  # adds a sub-command to the parser; the command's `run(args, monitor)` gives the lines to show
-# (and leaves in `args.told_anyway` those that --quiet does not keep back: findings, and what has failed)
+# (and leaves in `args.always_shown` those that --quiet does not keep back: findings, and what has failed)
 
 
 def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
@@ -48,7 +48,7 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     except Cancelled as stop:
         _say(f"tricap: {stop}", sys.stderr)
         return 130
-    told = lines if not args.quiet or getattr(args, "json", False) else getattr(args, "told_anyway", [])
+    told = lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", [])
     for line in told:
         _say(line, sys.stdout)
     return int(getattr(args, "exit_code", 0))
@@ -135,14 +135,14 @@ def _build_scene(job: pipeline.Run, given: argparse.Namespace, monitor: Monitor)
         return [str(line) for line in args.run(args, monitor)]
     except InputError as error:
         job.warn(f"No body.blend was written: {error}")
-        job.results.write_run(job.account)
+        job.results.write_run(job.record)
     return []
 
 
 def _summary(job: pipeline.Run, as_json: bool) -> list[str]:
     if as_json:
         return [json.dumps(job.results.read_run(), indent=1, ensure_ascii=False)]
-    return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in job.account["warnings"])]
+    return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in job.record["warnings"])]
 
 
 def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -153,11 +153,11 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
     where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor, settings["enhance"])
     near, far = where.depth_range_m
-    args.told_anyway = [
+    args.always_shown = [
         f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (from {where.method}), "
         f"{len(footage.take.seeds.joints)} clicked joints, {len(where.planes)} planes of the room left out."
     ]
-    return list(args.told_anyway)
+    return list(args.always_shown)
 
 
 def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -198,7 +198,7 @@ def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from .synthetic.score import score_run
 
     take, out = args.out / "take", args.out
-    check_apart(out)
+    check_separate_folder(out)
     if not (take / "take.toml").exists():
         make_arm_take(take, monitor=monitor)
     job = pipeline.run(take, out, None, monitor)

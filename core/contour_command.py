@@ -84,7 +84,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     _check_views(take, args.view)
     if start.polygon is not None and not read_rig(take.rig_path)[args.view[0]].sees(start.polygon).any():
         raise InputError(f"The polygon {args.polygon} lies outside the image of view {args.view[0]}; write its pixels in the first frame.")
-    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), contours_aside=True) as job:
+    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), ignore_contours=True) as job:
         return write_contours(job, args.view, monitor, start)
 
 
@@ -143,7 +143,7 @@ def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, st
             file.write(contour_rows(frame, contour).encode())
             seen.append(contour.seen.mean())
     job.results.remove(f"cache/{_checkpoints(view)}")
-    job.results.write_run(job.account)
+    job.results.write_run(job.record)
     return f"{path}: the outline in {len(seen)} frames, {100 * float(np.mean(seen)):.0f} % of its vertices on an edge."
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .account import median, new_account, track_figures
+from .account import median, new_record, track_figures
 from .body.ends import shape_for_skin
 from .body.model_file import read_model
 from .body.shape import write_body
@@ -41,9 +41,9 @@ from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
 from .report.pages import check_pictured, write_report
 from .report.silhouettes import Silhouettes, by_view, silhouettes_of
-from .results import KeptFit, Results, check_apart
+from .results import FitCheckpoints, Results, check_separate_folder
 from .settings import current_names, from_table, nearest_name
-from .stages import CONCERNS, DERIVED, STAGES, stage_keys, still_good
+from .stages import STAGE_FILES, STAGE_INPUTS, STAGES, stage_keys, valid_stages
 from .surface.cloud import PointCloud, SurfaceSettings
 from .surface.voxels import as_written
 from .take import Footage, open_take, read_take
@@ -70,13 +70,13 @@ Overrides = Mapping[str, Mapping[str, Any]]
 
 @dataclass(kw_only=True)
 class Run:
-    """A run under way: an opened take, its settings, and the folder for its results. `account` becomes run.json."""
+    """A run under way: an opened take, its settings, and the folder for its results. `record` becomes run.json."""
 
     footage: Footage
     settings: dict[str, Any]
     results: Results
     keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
-    account: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
     measured: MeasuredFrames = field(init=False)
     trajectories: Trajectories | None = None
     body: BodyFit | None = None
@@ -98,14 +98,14 @@ class Run:
 
     def warn(self, *sentences: str) -> None:
         """Note what the user should know."""
-        self.account["warnings"].extend(s for s in dict.fromkeys(sentences) if s not in self.account["warnings"])
+        self.record["warnings"].extend(s for s in dict.fromkeys(sentences) if s not in self.record["warnings"])
 
     def finish_stage(self, stage: str, began: float, **figures: Any) -> None:
         """Note what a stage took and found, and write run.json."""
         key = self.keys.get(stage, self.keys.get("fit", ""))
-        self.account["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
+        self.record["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
         write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.notes, self.trajectories, self.body))
-        self.results.write_run(self.account)
+        self.results.write_run(self.record)
 
     def do_without_surface(self, why: str) -> None:
         """Note that there are no clouds and no trajectories."""
@@ -116,7 +116,7 @@ class Run:
 
     def __str__(self) -> str:
         """One line for a panel."""
-        stages = self.account["stages"]
+        stages = self.record["stages"]
         parts = [f"{len(self.footage.frames)} frames"]
         if "points_per_frame" in stages.get("measure", {}):
             parts.append(f"{stages['measure']['points_per_frame']:.0f} points a frame (sigma {stages['measure']['sigma_mm']:.2f} mm)")
@@ -145,10 +145,10 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
 @contextmanager
 def open_run(
     take_folder: Path, out: Path, overrides: Overrides | None = None, frames: tuple[int, int] | None = None, *,
-    restart: bool = False, contours_aside: bool = False, pictures: Sequence[int] = ()) -> Iterator[Run]:  # fmt: skip
+    restart: bool = False, ignore_contours: bool = False, pictures: Sequence[int] = ()) -> Iterator[Run]:  # fmt: skip
     """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
 
-    What an earlier run of other input left in OUT is removed (with `contours_aside` not for new contours alone); `restart` removes it all.
+    What an earlier run of other input left in OUT is removed (with `ignore_contours` not for new contours alone); `restart` removes it all.
     `pictures`: the frames of the report's, by default a few.
 
     Raises:
@@ -163,18 +163,18 @@ def open_run(
         clicked_depth(footage, name, at)
     if take.body_model is not None:
         read_model(take.body_model)
-    check_apart(out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_separate_folder(out, take.folder, (s.files()[0] for s in footage.sequences))
     check_pictured(footage.frames, pictures)
     keys = stage_keys(footage, settings, Path(out))
     with Results(out).opened() as results:
         if restart:
-            results.remove("clouds", *DERIVED, "cache")  # the cache last: it marks the folder as ours
+            results.remove("clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
         before = {} if restart else results.read_run()
-        account = new_account(footage, settings)
-        account["stages"] = kept = still_good(before, keys, contours_aside=contours_aside)
+        record = new_record(footage, settings)
+        record["stages"] = kept = valid_stages(before, keys, ignore_contours=ignore_contours)
         if before:  # what was made otherwise must not stand beside the new
-            results.remove(*(name for stage, c in CONCERNS.items() if stage not in kept for name in c.files))
-        yield Run(footage=footage, settings=settings, results=results, keys=keys, account=account, pictured=pictures)
+            results.remove(*(name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files))
+        yield Run(footage=footage, settings=settings, results=results, keys=keys, record=record, pictured=pictures)
 
 
 def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:
@@ -198,10 +198,10 @@ def measure(run: Run, monitor: Monitor) -> None:
         Cancelled: the frames measured so far are kept.
     """
     began, s = time.perf_counter(), run.settings
-    run.results.keep_clouds(run.footage.frames)
+    run.results.remove_other_clouds(run.footage.frames)
     done, room = [], None
     if s["timing"].correct and not run.footage.late_images:
-        run.footage, run.account["offsets"] = in_step(run.footage, monitor)
+        run.footage, run.record["offsets"] = in_step(run.footage, monitor)
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
             run.results.write_cloud(as_written(run.corrected(m.cloud), s["surface"]))
@@ -300,7 +300,7 @@ def fit(run: Run, monitor: Monitor) -> None:
     try:
         empty = empty_views(run.footage, run.results, run.clouds, run.settings["fitting"], monitor)
         given = fit_input(run.footage, run.clouds, run.trajectories, run.results, empty)
-        run.body = body = fit_sequence(given, run.settings["fitting"], monitor, KeptFit(run.results, run.keys["fit"]))
+        run.body = body = fit_sequence(given, run.settings["fitting"], monitor, FitCheckpoints(run.results, run.keys["fit"]))
         _write_body(run, body, monitor)
         guided = run.settings["fitting"].track_again and run.measured
         again = _follow(run, monitor, BodyGuide(body, run.footage)) if guided else {}
@@ -342,9 +342,9 @@ def _told_states(run: Run, body: BodyFit) -> dict[str, int]:
 def report(run: Run, monitor: Monitor) -> None:
     """report/report.html with its pictures."""
     began = time.perf_counter()
-    run.account["stages"].pop("report", None)  # a page does not tell of the page before it
+    run.record["stages"].pop("report", None)  # a page does not tell of the page before it
     given = (run.clouds, run.trajectories, run.body, run.silhouettes)
-    write_report(run.results, run.footage, run.account, *given, monitor, run.pictured)
+    write_report(run.results, run.footage, run.record, *given, monitor, run.pictured)
     run.finish_stage("report", began)
 
 
@@ -377,7 +377,7 @@ def all_stages(run: Run, monitor: Monitor) -> None:
 
 def is_complete(run: Run) -> bool:
     """Whether everything was done with the same input before, and still lies in the folder."""
-    done = run.account["stages"]
+    done = run.record["stages"]
     body = () if "not_done" in done.get("fit", {}) else ("body.toml", "joints.csv", "motion.csv")
     surface = () if "not_done" in done.get("measure", {}) else ("clouds", "trajectories.npz")
     files = ("report", *surface, *body)

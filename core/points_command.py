@@ -12,7 +12,7 @@ from .arguments import frame_range, overrides
 from .errors import InputError
 from .following import tracking_view
 from .progress import Monitor
-from .results import Results, check_apart
+from .results import Results, check_separate_folder
 from .take import Footage, open_take, read_take
 from .tracking.key_points import KeyPoints, track_key_points
 from .tracking.point_tables import ChosenPoints, read_points, write_key_points
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     take = read_take(args.take)
     settings = pipeline.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
     footage, frames = open_take(take), frame_range(args.frames)
-    check_apart(args.out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
     footage = footage if frames is None else pipeline.only_frames(footage, frames)
     first = footage.frames.start if args.points_frame is None else args.points_frame
     if first not in footage.frames:

@@ -26,7 +26,7 @@ OURS = (  # what a run replaces
 )  # fmt: skip
 
 
-def check_apart(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
+def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
     """Results are kept apart from what is measured: mixed with it, one could replace the other.
 
     Raises:
@@ -133,7 +133,7 @@ class Results:
                 said = f"Cannot remove {path}: {error.strerror or error}. Close what uses it, or choose another folder."
                 raise InputError(said) from error
 
-    def keep_clouds(self, frames: range) -> None:
+    def remove_other_clouds(self, frames: range) -> None:
         """Remove the clouds of all other frames."""
         for path in self.path("clouds").glob("*.ply"):
             if not path.stem.isdecimal() or int(path.stem) not in frames:
@@ -171,7 +171,7 @@ class Results:
         store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})
 
 
-class KeptFit:
+class FitCheckpoints:
     """The checkpoints of a fit under way (`fitting.way.Kept`): cache/fit."""
 
     def __init__(self, results: Results, key: str) -> None:

@@ -23,7 +23,7 @@ STAGES = ("measure", "track", "fit")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Concern:
+class StageInput:
     """What concerns a stage and no stage before it."""
 
     settings: tuple[str, ...]  # groups of knobs
@@ -59,17 +59,17 @@ def _fitted(footage: Footage) -> Any:
     return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take), ALGORITHM
 
 
-CONCERNS: dict[str, Concern] = {
-    "measure": Concern(settings=("timing", "enhance", "matching", "growing", "surface"), take=_seen, files=()),
-    "track": Concern(settings=("tracking",), take=_followed, files=("trajectories.npz", "trajectories_raw.npz")),
-    "fit": Concern(
+STAGE_INPUTS: dict[str, StageInput] = {
+    "measure": StageInput(settings=("timing", "enhance", "matching", "growing", "surface"), take=_seen, files=()),
+    "track": StageInput(settings=("tracking",), take=_followed, files=("trajectories.npz", "trajectories_raw.npz")),
+    "fit": StageInput(
         settings=("fitting", "skin"),
         take=_fitted,
         files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
     ),
 }
-ASIDE = ("contour",)  # groups of knobs that concern no stage: what `tricap contour` writes concerns the fit by its content
-DERIVED = tuple(name for concern in CONCERNS.values() for name in concern.files)
+WITHOUT_STAGE = ("contour",)  # groups of knobs that concern no stage: what `tricap contour` writes concerns the fit by its content
+STAGE_FILES = tuple(name for concern in STAGE_INPUTS.values() for name in concern.files)
 
 
 def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict[str, str]:
@@ -81,7 +81,7 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict
     """
     keys, before = {}, ""
     try:
-        for stage, concern in CONCERNS.items():
+        for stage, concern in STAGE_INPUTS.items():
             said = [settings[name] for name in concern.settings], concern.take(footage)
             before = keys[stage] = store.digest(before, repr(said))
         contours = sorted((out / "contours").glob("*.csv"))
@@ -105,20 +105,20 @@ def command_of(footage: Footage, settings: Mapping[str, Any]) -> str:
 
 def stage_of(group: str) -> str:
     """The stage that a group of knobs concerns first."""
-    return next(stage for stage, concern in CONCERNS.items() if group in concern.settings)
+    return next(stage for stage, concern in STAGE_INPUTS.items() if group in concern.settings)
 
 
-def still_good(run: Mapping[str, Any], keys: Mapping[str, str], *, contours_aside: bool = False) -> dict[str, Any]:
+def valid_stages(run: Mapping[str, Any], keys: Mapping[str, str], *, ignore_contours: bool = False) -> dict[str, Any]:
     """The stages in a run.json that were done with these keys; the report is as good as the fit, and so are tracks that the body guided.
 
-    `contours_aside`: a body that was fitted with other contours, or none, is good enough.
+    `ignore_contours`: a body that was fitted with other contours, or none, is good enough.
     """
     stages: dict[str, Any] = run.get("stages", {})
     keys = {**keys, "report": keys["fit"]}
 
     def done_so(name: str, entry: Mapping[str, Any]) -> bool:
         key, now = str(entry.get("key", "")), keys.get(name, "")
-        return bool(key) and (key == now or (contours_aside and key.partition(" ")[0] == now.partition(" ")[0]))
+        return bool(key) and (key == now or (ignore_contours and key.partition(" ")[0] == now.partition(" ")[0]))
 
     good = {name: entry for name, entry in stages.items() if done_so(name, entry)}
     if "fit" not in good and "tracked_again" in stages.get("fit", {}):

@@ -33,7 +33,7 @@ from tricap.core.motion.retarget.vrm import read_humanoid
 from tricap.core.pipeline import Run
 from tricap.core.progress import Monitor
 from tricap.core.results import Results
-from tricap.core.stages import still_good
+from tricap.core.stages import valid_stages
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.take import read_take
 from tricap.core.take_file import read_table
@@ -173,9 +173,9 @@ def run_folder(folder: Path) -> list[Path]:
 
 def done(folder: Path) -> None:
     """What a new run keeps of an earlier one, said in a line."""
-    account = {"stages": still_good(Results(folder).read_run(), KEYS)}
+    record = {"stages": valid_stages(Results(folder).read_run(), KEYS)}
     footage = SimpleNamespace(frames=range(2))
-    str(Run(footage=footage, settings={}, results=None, keys=KEYS, account=account))  # type: ignore[arg-type]
+    str(Run(footage=footage, settings={}, results=None, keys=KEYS, record=record))  # type: ignore[arg-type]
 
 
 def tracked(path: Path) -> None:

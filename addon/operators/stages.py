@@ -48,7 +48,7 @@ class StageOperator(JobOperator):
 def report_run(operator: Any, context: bpy.types.Context, run: pipeline.Run) -> None:
     """Show a run's warnings and its summary, and keep the summary for the panel."""
     context.scene.tricap.last = str(run)
-    for sentence in run.account["warnings"]:
+    for sentence in run.record["warnings"]:
         operator.report({"WARNING"}, sentence)
     operator.report({"INFO"}, str(run))
 

@@ -111,7 +111,7 @@ class FollowContours(JobOperator, bpy.types.Operator):
 
 def track_outline(take: Path, out: Path, overrides: pipeline.Overrides, view: str, monitor: Monitor, start: Start) -> list[str]:
     """The computation, without bpy: a sentence for each view."""
-    with pipeline.open_run(take, out, overrides, contours_aside=True) as run:
+    with pipeline.open_run(take, out, overrides, ignore_contours=True) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]
         return write_contours(run, names, monitor, start)
 

@@ -8,7 +8,7 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.images.fields import BOTH
-from ...core.stages import CONCERNS
+from ...core.stages import STAGE_INPUTS
 from .. import project, properties, seeds
 from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
@@ -229,7 +229,7 @@ def _where(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 def _knobs(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
     """All the knobs of a step's groups, made from core's definitions."""
-    for group in CONCERNS[states.STAGE[step]].settings:
+    for group in STAGE_INPUTS[states.STAGE[step]].settings:
         header, inside = layout.panel(f"tricap_group_{group}", default_closed=True)
         header.label(text=group.capitalize())
         if inside is not None:

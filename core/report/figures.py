@@ -16,7 +16,7 @@ Row = dict[str, Any]
 
 
 def figure_rows(
-    account: Mapping[str, Any],
+    record: Mapping[str, Any],
     clouds: Sequence[PointCloud],
     trajectories: Trajectories | None,
     body: BodyFit | None,
@@ -31,7 +31,7 @@ def figure_rows(
     if trajectories is not None:
         per_frame["tracked points a frame", "points"] = trajectories.seen.sum(axis=1).astype(float).tolist()
     rows = [_row(name, float(np.median(v)), float(np.std(v)), unit, FRAME_TO_FRAME) for (name, unit), v in per_frame.items() if v]
-    for view, offset in account.get("offsets", {}).items():
+    for view, offset in record.get("offsets", {}).items():
         if offset["late_frames"] is not None and offset["sigma_frames"] is not None:
             rows.append(_row(f"view {view} is late by", offset["late_frames"], offset["sigma_frames"], "frames", ESTIMATED))
     return rows + _of_silhouettes(silhouettes) + (_of_body(body) if body is not None else [])

@@ -51,7 +51,7 @@ def check_pictured(frames: range, wanted: Sequence[int]) -> None:
 def write_report(
     results: Results,
     footage: Footage,
-    account: Mapping[str, Any],
+    record: Mapping[str, Any],
     clouds: Sequence[PointCloud],
     trajectories: Trajectories | None,
     body: BodyFit | None,
@@ -63,27 +63,27 @@ def write_report(
 
     Cancelling leaves the report of the run before.
     """
-    shown = _pictures(footage, account, clouds, trajectories, body, silhouettes, monitor, pictured)
+    shown = _pictures(footage, record, clouds, trajectories, body, silhouettes, monitor, pictured)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
         monitor.step("report", len(shown) + done, 2 * len(shown))
         files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
-    rows = figure_rows(account, clouds, trajectories, body, silhouettes.fits)
+    rows = figure_rows(record, clouds, trajectories, body, silhouettes.fits)
     small = {name: (caption, picture) for name, (caption, _, picture) in files.items()}
-    page = _page(account, rows, small, _graphs(clouds, trajectories, body) + _silhouette_graphs(silhouettes.fits))
+    page = _page(record, rows, small, _graphs(clouds, trajectories, body) + _silhouette_graphs(silhouettes.fits))
     monitor.step("report", 1, 1)
     results.remove("report")
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
     per_frame = [asdict(f) | {"iou": number(f.iou), "distance_px": number(f.distance_px)} for f in silhouettes.fits]
-    said = {"format": "tricap-report", "version": 1, **account, "figures": rows, "silhouettes": per_frame}
+    said = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
     store.write_json(results.path("report", "report.json"), said)
     store.write_text(results.path("report", "report.html"), page)
 
 
 def _pictures(
     footage: Footage,
-    account: Mapping[str, Any],
+    record: Mapping[str, Any],
     clouds: Sequence[PointCloud],
     trajectories: Trajectories | None,
     body: BodyFit | None,
@@ -94,7 +94,7 @@ def _pictures(
     """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
-    skin = SkinSettings(**account["settings"]["skin"])
+    skin = SkinSettings(**record["settings"]["skin"])
     found: dict[str, tuple[str, np.ndarray]] = {}
     chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or sorted({0, len(clouds) // 2, len(clouds) - 1})
     total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
@@ -110,7 +110,7 @@ def _pictures(
         measured = f"{len(sigma)} measured points, sigma from 0 (blue) to {high:.2f} mm (red)"
         on_image = pictures.points_over_footage(images[ref], cloud.xy_px[:, ref], sigma, 0.0, high)
         add(f"surface_{frame:04d}.png", f"Frame {frame}, view {view}: {measured}", on_image)
-        from_sides = pictures.cloud_views(cloud, camera, account["settings"]["growing"]["spacing_px"])
+        from_sides = pictures.cloud_views(cloud, camera, record["settings"]["growing"]["spacing_px"])
         add(f"cloud_{frame:04d}.png", f"Frame {frame}: the cloud from the front and from its right side", from_sides)
         if trajectories is not None:
             caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
@@ -162,24 +162,24 @@ def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, bod
     return graphs
 
 
-def _page(account: Mapping[str, Any], rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
-    notes = "".join(f'<p class="note">{html.escape(w)}</p>' for w in account["warnings"])
-    stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in account["stages"].items())
+def _page(record: Mapping[str, Any], rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
+    notes = "".join(f'<p class="note">{html.escape(w)}</p>' for w in record["warnings"])
+    stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in record["stages"].items())
     shown = "".join(
         f'<figure><img alt="" src="data:image/jpeg;base64,{base64.b64encode(small).decode()}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
         for caption, small in files.values()
     )
     settings = html.escape(
-        "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in account["settings"].items())
+        "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in record["settings"].items())
     )
-    repeat = html.escape(str(account.get("repeat", "")))
-    take = html.escape(account["take"].rsplit("/", 1)[-1])
+    repeat = html.escape(str(record.get("repeat", "")))
+    take = html.escape(record["take"].rsplit("/", 1)[-1])
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tricap: {take}</title><style>{STYLE}</style><h1>{take}</h1>'
-        f"<p>{len(account['views'])} views ({html.escape(', '.join(account['views']))}), "
-        f"frames {account['frames'][0]} to {account['frames'][1] - 1}, {account['fps']:g} frames/s, "
-        f"interlaced: {account['interlaced']}</p>{notes}<h2>Figures</h2>{_quotable(rows)}<h2>Stages</h2><table>{stages}</table>"
+        f"<p>{len(record['views'])} views ({html.escape(', '.join(record['views']))}), "
+        f"frames {record['frames'][0]} to {record['frames'][1] - 1}, {record['fps']:g} frames/s, "
+        f"interlaced: {record['interlaced']}</p>{notes}<h2>Figures</h2>{_quotable(rows)}<h2>Stages</h2><table>{stages}</table>"
         f"<h2>Over time</h2>{''.join(graphs)}<h2>Pictures</h2>{shown}"
         f"<h2>To repeat it</h2><pre>{repeat}</pre><h2>Settings</h2><pre>{settings}</pre></html>\n"
     )

@@ -115,9 +115,9 @@ def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, thread
 
 
 def test_what_is_doubtful_stands_in_the_summary() -> None:
-    job = SimpleNamespace(account={"warnings": []}, __str__=lambda: "")
+    job = SimpleNamespace(record={"warnings": []}, __str__=lambda: "")
     assert batch._told(job) == str(job)
-    job.account["warnings"] = ["View R stood still.", "Another.", "A third."]
+    job.record["warnings"] = ["View R stood still.", "Another.", "A third."]
     assert batch._told(job).endswith(". Doubtful: View R stood still. (2 more in the report)")
 
 

@@ -11,7 +11,7 @@ import pytest
 from tricap.core import pipeline
 from tricap.core.body.skin import body_skin
 from tricap.core.body_guide import BodyGuide
-from tricap.core.stages import still_good
+from tricap.core.stages import valid_stages
 from tricap.core.synthetic.arm import ArmTakeSettings, arm_motion, arm_rig, arm_shape, make_arm_take
 
 
@@ -55,10 +55,10 @@ def test_a_frame_without_a_body_says_nothing(guide: BodyGuide) -> None:
 def test_tracks_that_a_body_guided_go_with_it() -> None:
     keys = {"measure": "m", "track": "t", "fit": "new"}
     stages = {"measure": {"key": "m"}, "track": {"key": "t"}, "fit": {"key": "old"}}
-    assert set(still_good({"stages": stages}, keys)) == {"measure", "track"}
+    assert set(valid_stages({"stages": stages}, keys)) == {"measure", "track"}
     stages["fit"]["tracked_again"] = {}  # type: ignore[assignment]
-    assert set(still_good({"stages": stages}, keys)) == {"measure"}
-    assert set(still_good({"stages": stages}, keys | {"fit": "old"})) == {"measure", "track", "fit"}
+    assert set(valid_stages({"stages": stages}, keys)) == {"measure"}
+    assert set(valid_stages({"stages": stages}, keys | {"fit": "old"})) == {"measure", "track", "fit"}
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_a_run_that_tracks_again_resumes_with_the_same_bytes(tmp_path: Path) -> 
     make_arm_take(tmp_path / "take", ArmTakeSettings(frames=6, width_px=320, interlaced="none"))
     settings = {"growing": {"spacing_px": 6}, "fitting": {"track_again": True}}
     first = pipeline.run(tmp_path / "take", tmp_path / "out", settings)
-    again = first.account["stages"]["fit"]["tracked_again"]
+    again = first.record["stages"]["fit"]["tracked_again"]
     assert again["trajectories"] == first.trajectories.xyz_m.shape[1] > 0  # type: ignore[union-attr]
     kept = (tmp_path / "out" / "trajectories.npz").read_bytes()
     (tmp_path / "out" / "cache" / "guided" / "0004.npz").unlink()

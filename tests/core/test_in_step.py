@@ -86,8 +86,8 @@ def test_a_view_half_a_frame_late_costs_nothing_once_corrected(tmp_path: Path) -
             pipeline.track(run, Monitor())
         score = score_run(take, tmp_path / name, Monitor())
         error[name] = score.clouds.median_mm
-        assert ("offsets" in run.account) == correct
-    assert abs(run.account["offsets"]["R"]["late_frames"] - 0.5) < 0.05
+        assert ("offsets" in run.record) == correct
+    assert abs(run.record["offsets"]["R"]["late_frames"] - 0.5) < 0.05
     assert error["corrected"] < 1.2 * error["synchronous"] and error["late"] > 2 * error["synchronous"], error
     footage, _ = in_step(open_take(read_take(tmp_path / "take 0.5")), Monitor())
     sound = open_take(read_take(tmp_path / "take 0.0"))

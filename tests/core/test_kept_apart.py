@@ -9,7 +9,7 @@ import pytest
 from tricap.core import commands
 from tricap.core.calibration.rig_files import write_as
 from tricap.core.geometry.rig import read_rig
-from tricap.core.results import check_apart
+from tricap.core.results import check_separate_folder
 
 Capture = pytest.CaptureFixture[str]
 LINKS = pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
@@ -84,8 +84,8 @@ def test_a_folder_of_results_in_the_take_is_fine(take: Path, tmp_path: Path) -> 
     """As the extension's project beside a .blend has it."""
     assert commands.main([*MEASURE, str(take), "--out", str(take / "results")]) == 0
     assert (take / "results" / "clouds" / "0000.ply").exists()
-    check_apart(tmp_path, take)
-    check_apart(take.parent / "kick é_tricap", take, [take / "L" / "0000.png"])
+    check_separate_folder(tmp_path, take)
+    check_separate_folder(take.parent / "kick é_tricap", take, [take / "L" / "0000.png"])
 
 
 def test_a_rig_is_not_written_over_in_another_format(take: Path, capfd: Capture) -> None:

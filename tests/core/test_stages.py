@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tricap.core import pipeline, store
-from tricap.core.stages import ASIDE, CONCERNS, STAGES, stage_keys, stage_of, still_good
+from tricap.core.stages import STAGE_INPUTS, STAGES, WITHOUT_STAGE, stage_keys, stage_of, valid_stages
 from tricap.core.take import Take, open_take
 from tricap.core.take_file import read_table, take_of_table
 
@@ -104,9 +104,9 @@ def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
     now = keys(tmp_path / "take")
     assert [stage for stage in STAGES if now[stage] != before[stage]] == ["fit"]
     stages = {"fit": {"key": before["fit"]}, "report": {"key": before["fit"]}}
-    assert still_good({"stages": stages}, now) == {} and still_good({"stages": stages}, now, contours_aside=True) == stages
+    assert valid_stages({"stages": stages}, now) == {} and valid_stages({"stages": stages}, now, ignore_contours=True) == stages
     other = keys(tmp_path / "take", {"fitting": {"frame_steps": 3}})
-    assert still_good({"stages": stages}, other, contours_aside=True) == {}, "a body of other settings is none to begin with"
+    assert valid_stages({"stages": stages}, other, ignore_contours=True) == {}, "a body of other settings is none to begin with"
 
 
 def test_every_part_of_a_take_concerns_a_stage() -> None:
@@ -128,11 +128,11 @@ def test_keypoints_concern_the_fit(take: Path, tmp_path: Path) -> None:
 
 
 def test_every_group_of_knobs_concerns_one_stage() -> None:
-    groups = [name for concern in CONCERNS.values() for name in concern.settings]
-    assert sorted([*groups, *ASIDE]) == sorted(pipeline.SETTINGS) and stage_of("tracking") == "track"
+    groups = [name for concern in STAGE_INPUTS.values() for name in concern.settings]
+    assert sorted([*groups, *WITHOUT_STAGE]) == sorted(pipeline.SETTINGS) and stage_of("tracking") == "track"
 
 
-@pytest.mark.parametrize("group", ASIDE)
+@pytest.mark.parametrize("group", WITHOUT_STAGE)
 def test_what_stands_aside_makes_nothing_stale(take: Path, group: str) -> None:
     assert stale(take, {group: other_than_default(group)}) == []
 
@@ -140,5 +140,5 @@ def test_what_stands_aside_makes_nothing_stale(take: Path, group: str) -> None:
 def test_a_run_keeps_what_is_still_good_and_removes_what_is_not(take: Path, tmp_path: Path) -> None:
     now = keys(take)
     run = {"stages": {"measure": {"key": now["measure"]}, "track": {"key": "another"}, "fit": {"key": now["fit"]}, "report": {"key": ""}}}
-    assert sorted(still_good(run, now)) == ["fit", "measure"]
-    assert still_good({"stages": {"measure": {"seconds": 1.0}}}, now) == {}, "written by a version that kept no keys"
+    assert sorted(valid_stages(run, now)) == ["fit", "measure"]
+    assert valid_stages({"stages": {"measure": {"seconds": 1.0}}}, now) == {}, "written by a version that kept no keys"

@@ -300,7 +300,7 @@ def test_measuring_it_all_the_same_names_the_cause(make: Callable[[Path], None],
     try:
         with pipeline.open_run(tmp_path / "take", tmp_path / "out", {"growing": {"spacing_px": 8}}, frames=(0, 3)) as run:
             pipeline.measure(run, Monitor())
-            assert any(MEASURED[make] in sentence for sentence in run.account["warnings"]), run.account["warnings"]
+            assert any(MEASURED[make] in sentence for sentence in run.record["warnings"]), run.record["warnings"]
     except InputError as error:
         assert MEASURED[make] in str(error)
 
@@ -326,7 +326,7 @@ def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp
     for name in ("sound", "lost"):
         with pipeline.open_run(take, tmp_path / name, {"growing": {"spacing_px": 8}}) as run:
             pipeline.measure(run, Monitor())
-        said[name] = [s for s in run.account["warnings"] if "a view may have lost" in s]
+        said[name] = [s for s in run.record["warnings"] if "a view may have lost" in s]
         shots = pictures(take, "R")
         for here, there in zip(shots[4:], shots[5:]):
             shutil.copyfile(there, here)

@@ -11,7 +11,7 @@ from tricap.core.fitting import frame_to_frame, sequence, stretches
 from tricap.core.fitting.handed_over import HandedOver
 from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
 from tricap.core.progress import Cancelled, Monitor
-from tricap.core.results import KeptFit, Results
+from tricap.core.results import FitCheckpoints, Results
 
 SETTINGS = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.006, sequence_steps=4)
 CLICK, FRAMES = 3, 9
@@ -60,7 +60,7 @@ def test_a_stopped_fit_goes_on_with_the_same_bytes(given: FitInput, tmp_path: Pa
 
 
 def goes_on(given: FitInput, folder: Path, stopped_at: int, left: int, whole: dict[str, bytes]) -> None:
-    kept = KeptFit(Results(folder), "key")
+    kept = FitCheckpoints(Results(folder), "key")
     with pytest.raises(Cancelled):
         fit_sequence(given, SETTINGS, Stopper(stopped_at), kept)
     monitor = Stopper()
@@ -70,10 +70,10 @@ def goes_on(given: FitInput, folder: Path, stopped_at: int, left: int, whole: di
 
 def test_what_was_kept_of_another_take_is_not_used(given: FitInput, tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
-        fit_sequence(given, SETTINGS, Stopper(6), KeptFit(Results(tmp_path / "out"), "key"))
+        fit_sequence(given, SETTINGS, Stopper(6), FitCheckpoints(Results(tmp_path / "out"), "key"))
     monitor = Stopper(0)
     with pytest.raises(Cancelled):
-        fit_sequence(given, SETTINGS, monitor, KeptFit(Results(tmp_path / "out"), "another"))
+        fit_sequence(given, SETTINGS, monitor, FitCheckpoints(Results(tmp_path / "out"), "another"))
     assert monitor.frames == 0
 
 
@@ -109,7 +109,7 @@ def test_a_fit_in_stretches_goes_on_with_the_next(given: FitInput, tmp_path: Pat
     whole = arrays(fit_sequence(given, settings, monitor := StoppedStretches()))
     assert monitor.begun == ["shape", "1 of 3", "2 of 3", "3 of 3"]
     for stopped_at in (1, 3):
-        kept = KeptFit(Results(tmp_path / str(stopped_at)), "key")
+        kept = FitCheckpoints(Results(tmp_path / str(stopped_at)), "key")
         with pytest.raises(Cancelled):
             fit_sequence(given, settings, StoppedStretches(stopped_at), kept)
         assert arrays(fit_sequence(given, settings, again := StoppedStretches(), kept)) == whole
