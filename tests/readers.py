@@ -28,7 +28,7 @@ from tricap.core.motion import bvh, c3d, keypoints_json, points_csv, tables, trc
 from tricap.core.motion.markers import Markers
 from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
 from tricap.core.motion.retarget.mapping import read_preset
-from tricap.core.motion.retarget.unshown import Unshown, UnshownChain, from_text, to_text
+from tricap.core.motion.retarget.unshown import ResidualChain, ResidualMotion, from_text, to_text
 from tricap.core.motion.retarget.vrm import read_humanoid
 from tricap.core.pipeline import Run
 from tricap.core.progress import Monitor
@@ -81,19 +81,19 @@ def points() -> Markers:
     return Markers(names=("elbow.R", "wrist.R"), fps=50.0, frames=np.arange(12), xyz_m=xyz, sigma_m=np.full((12, 2), 1e-3))
 
 
-def unshown() -> str:
+def residual_motion() -> str:
     one = np.full((1, 2, 3), 0.25)
-    chain = UnshownChain(role="neck", order=(-1,), ends=np.ones(1), along_m=np.ones(3), beside="spine", size=1, turn=one)
+    chain = ResidualChain(role="neck", order=(-1,), ends=np.ones(1), along_m=np.ones(3), parent="spine", size=1, turn=one)
     stands = {state: {"L": np.ones(2, dtype=bool)} for state in ("ankle", "toe", "flat")}
     return to_text(
-        Unshown(
+        ResidualMotion(
             frames=np.arange(2.0),
-            held={"foot.L": one},
-            twisted={},
-            moved_m=one[0],
-            stands=stands,
-            feet={"mode": "auto"},
-            level_m=0.1,
+            planting_turns={"foot.L": one},
+            planting_shift_m=one[0],
+            forearm_twists={},
+            contacts=stands,
+            contact_settings={"mode": "auto"},
+            ankle_level_m=0.1,
             chains=(chain,),
         )
     )
@@ -339,7 +339,7 @@ READERS: dict[str, tuple[Make, Read]] = {
     "body.toml": (written("body.toml", body), lambda f: read_body(f / "body.toml")),
     "own model": (written("own.toml", own_model), lambda f: read_model(f / "own.toml")),
     "mapping": (text("map.json", (HERE.parent / "addon" / "presets" / "mixamo.json").read_text()), lambda f: read_preset(f / "map.json")),
-    "what an action remembers": (text("a.txt", unshown()), lambda f: from_text((f / "a.txt").read_text(errors="replace")).at(np.arange(3))),
+    "residual motion": (text("a.txt", residual_motion()), lambda f: from_text((f / "a.txt").read_text(errors="replace")).at(np.arange(3))),
     "keypoints of OpenPose": (written("a.json", person), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
     "keypoints of COCO": (written("a.json", coco), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
     "vrm": (written("a.vrm", glb), lambda f: read_humanoid(f / "a.vrm")),

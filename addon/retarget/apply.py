@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.errors import InputError
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.mapping import RigMap, apply_preset, find_map, read_preset
+from ...core.motion.retarget.mapping import MappedMotion, MappedRig, RigMap, apply_preset, find_map, read_preset
 from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from ...core.motion.retarget.rig import Motion, Rig
@@ -33,6 +33,11 @@ class Target:
     rig_map: RigMap
     floor_m: float
 
+    @property
+    def mapped(self) -> MappedRig:
+        """The rig with its mapping."""
+        return MappedRig(rig=self.rig, map=self.rig_map)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
@@ -44,15 +49,15 @@ class Outcome:
     notes: tuple[str, ...]
 
 
-def map_of(rig: Rig, map_file: Path | None = None, *, steer: bool = False) -> RigMap:
-    """The mapping from a file, or as found; of a rig with controls, the controls if it is to be steered, else the bones that follow.
+def map_of(rig: Rig, map_file: Path | None = None, *, controls: bool = False) -> RigMap:
+    """The mapping from a file, or as found. Of a control rig: with `controls` its controls, else its deform bones.
 
     Raises:
         InputError: the file is no mapping of this rig, or nothing was recognised.
     """
     if map_file is not None:
         return apply_preset(rig, read_preset(map_file))
-    return find_map(rig, presets(steering=steer))
+    return find_map(rig, presets(controls=controls))
 
 
 def read_target(armature_object: bpy.types.Object, map_file: Path | None = None, edited: RigMap | None = None) -> Target:
@@ -62,11 +67,11 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
         InputError: it is no armature that can be mapped, or the mapping names bones that are not there.
     """
     rig = read_rig(armature_object)
-    rig_map = map_of(rig, map_file, steer=True)
+    rig_map = map_of(rig, map_file, controls=True)
     if edited is not None:
         rig_map = _edited(rig, rig_map, edited)
-    if rig_map.steering is not None:
-        rig = controls_of(rig, rig_map.steering, rig_map.bones)
+    if rig_map.control_rig is not None:
+        rig = controls_of(rig, rig_map.control_rig, rig_map.bones)
     rig = with_soles(rig, armature_object, rig_map)
     low = min([float(points[:, 2].min()) for points in rig.sole_m.values()] or [float(rig.head_m[:, 2].min())])
     origin = float(armature_object.matrix_world.translation.z)
@@ -74,39 +79,36 @@ def read_target(armature_object: bpy.types.Object, map_file: Path | None = None,
 
 
 def _edited(rig: Rig, found: RigMap, edited: RigMap) -> RigMap:
-    """The edited mapping; of a rig with controls it steers them as long as it names nothing else."""
+    """The edited mapping; of a control rig it remains one of controls if it has no other bones."""
     names = [name for chain in (*edited.bones.values(), *edited.twist.values()) for name in chain]
     unknown = [name for name in names if name not in rig.index]
     if unknown:
         raise InputError(f"The target has no bone “{unknown[0]}”; choose another in the mapping.")
-    steering = edited.steering or found.steering
-    return replace(edited, steering=steering and steering.of_controls(edited.bones, edited.twist))
+    control_rig = edited.control_rig or found.control_rig
+    return replace(edited, control_rig=control_rig and control_rig.of_controls(edited.bones, edited.twist))
 
 
-def transfer(
-    source: Motion, source_map: RigMap, target: Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor
-) -> Retargeted:
+def transfer(source: MappedMotion, target: Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor) -> Retargeted:
     """The computation alone; any thread."""
-    return retarget(source, source_map, target.rig, target.rig_map, settings, feet, monitor, target.floor_m)
+    return retarget(source, target.mapped, settings, feet, monitor, target.floor_m)
 
 
 def apply(
     armature_object: bpy.types.Object,
-    source: Motion,
-    source_map: RigMap,
+    source: MappedMotion,
     target: Target,
     result: Retargeted,
     name: str,
     tolerance_deg: float = 0.0,
 ) -> Outcome:
     """Write the action and play some frames of it. Main thread."""
-    steering = target.rig_map.steering
-    written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg, properties=steering.properties if steering else {})
+    controls = target.rig_map.control_rig
+    written = write_action(armature_object, result, name, tolerance_deg=tolerance_deg, properties=controls.properties if controls else {})
     for action in filter(None, [written.action, written.raw]):
-        if result.motion.unshown is not None:
-            store_residual_motion(action, result.motion.unshown)
-    figures = measure(source, source_map, result.travelling, target.rig_map, result.contacts, target.floor_m)
-    notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source_map.missing]
+        if result.motion.residual is not None:
+            store_residual_motion(action, result.motion.residual)
+    figures = measure(source, MappedMotion(motion=result.travelling, map=target.rig_map), result.contacts, target.floor_m)
+    notes = [*target.rig_map.missing, *target.rig_map.notes, *result.notes, *source.map.missing]
     if written.muted:
         notes.append(f"{len(written.muted)} constraints on driven bones were muted: {', '.join(written.muted[:3])} …")
     armature_object.animation_data.action = written.raw or written.action

@@ -55,7 +55,7 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
             roles=(),
             contacts=None,
             notes=(),
-            kept_back_m=0.0 * shift_m,
+            removed_travel_m=0.0 * shift_m,
         ),
         name,
     )

@@ -89,6 +89,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     import bpy
 
     from ...core.motion.retarget.contacts import FeetSettings
+    from ...core.motion.retarget.mapping import MappedMotion
     from ...core.motion.retarget.retarget import RetargetSettings
     from ..scene.build import save_blend
     from . import apply, files
@@ -104,19 +105,19 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
     motion = files.open_motion(args.out, monitor, up=args.up, unit=args.unit)
-    motion_map = apply.map_of(motion.rig)
+    source = MappedMotion(motion=motion, map=apply.map_of(motion.rig))
     files.open_rig(args.rig)
     armature_object = files.the_armature(args.armature, str(args.rig))
     target = apply.read_target(armature_object, args.map)
-    result = apply.transfer(motion, motion_map, target, settings, feet, monitor)
+    result = apply.transfer(source, target, settings, feet, monitor)
     apply.set_range(bpy.context.scene, motion)
-    outcome = apply.apply(armature_object, motion, motion_map, target, result, args.out.stem or "Retargeted", args.simplify)
+    outcome = apply.apply(armature_object, source, target, result, args.out.stem or "Retargeted", args.simplify)
     bpy.context.scene.frame_set(bpy.context.scene.frame_start)
-    table = outcome_table(outcome, motion_map, target.rig_map)
+    table = outcome_table(outcome, source.map, target.rig_map)
     if args.report:
         from .picture import draw
 
-        draw(args.blend.with_suffix(".png"), motion, motion_map, armature_object, result.motion, target.rig_map)
+        draw(args.blend.with_suffix(".png"), motion, source.map, armature_object, result.motion, target.rig_map)
         store.write_json(args.blend.with_suffix(".json"), table)
     save_blend(args.blend)
     if args.json:

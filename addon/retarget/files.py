@@ -10,7 +10,7 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.motion.bvh import read_bvh
-from ...core.motion.retarget.mapping import find_map
+from ...core.motion.retarget.mapping import MappedMotion, find_map
 from ...core.motion.retarget.rest import with_person_like_rest
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.vrm import read_humanoid
@@ -92,7 +92,7 @@ def import_rig(path: Path) -> list[bpy.types.Object]:
 def _rig_of_bvh(path: Path) -> None:
     """A BVH file's skeleton as an armature at rest, by our own reader: in metres, and in a person's pose if its zero pose is none."""
     motion = read_bvh(path)
-    motion, _ = with_person_like_rest(motion, find_map(motion.rig))
+    motion = with_person_like_rest(MappedMotion(motion=motion, map=find_map(motion.rig)))[0].motion
     armature_object = build_armature(replace(motion, frames=motion.frames[:1], R=motion.R[:1], head_m=motion.head_m[:1]), path.stem)
     action = armature_object.animation_data.action
     armature_object.animation_data_clear()

@@ -18,7 +18,7 @@ def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Pat
     props = context.scene.tricap_retarget
     try:
         target = armature_of("", props.target, "target")
-        rig_map = apply.map_of(read_rig(target), file, steer=True)
+        rig_map = apply.map_of(read_rig(target), file, controls=True)
     except InputError as error:
         operator.report({"ERROR"}, str(error))
         return {"CANCELLED"}

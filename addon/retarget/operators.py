@@ -9,7 +9,7 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.mapping import RigMap
+from ...core.motion.retarget.mapping import MappedMotion, MappedRig
 from ...core.motion.retarget.resample import resampled
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings
 from ...core.motion.retarget.rig import Motion
@@ -28,8 +28,7 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 class Made:
     """What the worker hands back."""
 
-    source: Motion
-    source_map: RigMap
+    source: MappedMotion
     result: Retargeted
 
 
@@ -80,7 +79,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         """Write the action."""
         props = context.scene.tricap_retarget
         preview.remove_preview(self._target)
-        outcome = apply.apply(self._target, result.source, result.source_map, self._goal, result.result, self._name, props.tolerance_deg)
+        outcome = apply.apply(self._target, result.source, self._goal, result.result, self._name, props.tolerance_deg)
         if props.strip:
             push_to_strip(self._target, outcome.written.action)
         notes = [*filter(None, [self._unused]), *outcome.notes]
@@ -93,9 +92,9 @@ class Retarget(JobOperator, bpy.types.Operator):
 
 def compute(read: Callable[[], Motion], goal: apply.Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor) -> Made:
     """The computation, free of bpy."""
-    source = read()
-    source_map = apply.map_of(source.rig)
-    return Made(source=source, source_map=source_map, result=apply.transfer(source, source_map, goal, settings, feet, monitor))
+    motion = read()
+    source = MappedMotion(motion=motion, map=apply.map_of(motion.rig))
+    return Made(source=source, result=apply.transfer(source, goal, settings, feet, monitor))
 
 
 def armature_of(name: str, chosen: bpy.types.Object | None, which: str, *, needed: bool = True) -> Any:
@@ -123,8 +122,8 @@ class Preview(bpy.types.Operator):
         try:
             source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
             apply.check_distinct(source, target)
-            source_rig, goal = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
-            count = preview.add_preview(source, source_rig, apply.map_of(source_rig), target, goal.rig, goal.rig_map)
+            rig, goal = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
+            count = preview.add_preview(source, MappedRig(rig=rig, map=apply.map_of(rig)), target, goal.mapped)
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

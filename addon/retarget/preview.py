@@ -12,47 +12,40 @@ import numpy as np
 from mathutils import Matrix
 
 from ...core.errors import InputError
-from ...core.motion.retarget.mapping import RigMap
+from ...core.motion.retarget.mapping import MappedRig, RigMap
 from ...core.motion.retarget.retarget import leg_ratio
-from ...core.motion.retarget.rig import Rig
 from ...core.motion.retarget.roles import part_of
-from ...core.motion.retarget.transfer import alignments, kept
+from ...core.motion.retarget.transfer import alignments, untwisted_bone
 
 NAME = "Tricap preview"
-KEPT = "tricap_before_preview"  # of the target: the properties that steer its controls, as they were
+KEPT = "tricap_before_preview"  # of the target: the earlier values of properties of its controls
 
 
-def add_preview(source: bpy.types.Object, source_rig: Rig, source_map: RigMap, target: bpy.types.Object, rig: Rig, rig_map: RigMap) -> int:
+def add_preview(source: bpy.types.Object, source_rig: MappedRig, target: bpy.types.Object, target_rig: MappedRig) -> int:
     """Constrain the target to the source; the number of bones that follow.
 
     Raises:
         InputError: source and target have no part in common.
     """
     remove_preview(target)
-    aligned = alignments(source_rig, source_map, rig, rig_map)
+    aligned = alignments(source_rig, target_rig)
     if not aligned:
         raise InputError("Source and target have no part of the body in common; check the two mappings.")
     collection = bpy.data.collections.new(NAME)
     bpy.context.scene.collection.children.link(collection)
     count = 0
     for role, A in aligned.items():
-        follows = kept(source_map.bones[role], role)
-        R_s = source_rig.R_rest[source_rig.index[follows]]
-        chain = rig_map.bones[role]
+        follows = untwisted_bone(source_rig.map.bones[role], role)
+        R_s = source_rig.rig.R_rest[source_rig.rig.index[follows]]
+        chain = target_rig.map.bones[role]
         for bone in chain if part_of(role) not in ("hand", "neck", "spine") else chain[-1:]:
-            K = R_s.T @ A @ rig.R_rest[rig.index[bone]]
+            K = R_s.T @ A @ target_rig.rig.R_rest[target_rig.rig.index[bone]]
             _follow(target.pose.bones[bone], _empty(collection, source, follows, K, f"{NAME} {bone}"))
             count += 1
     if "hips" in aligned:
-        _carry(
-            collection,
-            source,
-            source_map.bones["hips"][0],
-            target,
-            rig_map.bones["hips"][0],
-            leg_ratio(source_rig, source_map, rig, rig_map),
-        )
-    _steer(target, rig_map)
+        hips = source_rig.map.bones["hips"][0], target_rig.map.bones["hips"][0]
+        _carry(collection, source, hips[0], target, hips[1], leg_ratio(source_rig, target_rig))
+    _set_control_properties(target, target_rig.map)
     collection.hide_viewport = collection.hide_render = True
     return count
 
@@ -74,10 +67,10 @@ def remove_preview(target: bpy.types.Object) -> int:
     return count
 
 
-def _steer(target: bpy.types.Object, rig_map: RigMap) -> None:
-    """Set what lets the controls steer the rig (FK instead of IK), and keep what it was."""
+def _set_control_properties(target: bpy.types.Object, rig_map: RigMap) -> None:
+    """Set the properties with which the controls drive the rig (FK instead of IK), and store their values."""
     kept: dict[str, dict[str, float]] = {}
-    for name, values in rig_map.steering.properties.items() if rig_map.steering is not None else ():
+    for name, values in rig_map.control_rig.properties.items() if rig_map.control_rig is not None else ():
         bone = target.pose.bones.get(name)
         for key, value in values.items() if bone is not None else ():
             if key in bone:

@@ -35,13 +35,13 @@ PROGRAMS = {
 }
 
 
-def presets(steering: bool = False) -> list[Preset]:
-    """The mappings that come with Tricap; with `steering` also those of rigs with controls.
+def presets(controls: bool = False) -> list[Preset]:
+    """The mappings that come with Tricap; with `controls` also those of control rigs.
 
     Raises:
         InputError: one of them was edited and is damaged.
     """
-    return [preset for preset in map(read_preset, sorted(PRESETS.glob("*.json"))) if steering or preset.steering is None]
+    return [preset for preset in map(read_preset, sorted(PRESETS.glob("*.json"))) if controls or preset.control_rig is None]
 
 
 def bone_names(rig: Rig, program: Program) -> dict[str, str]:

@@ -12,7 +12,7 @@ from ...core.motion.retarget.contacts import FeetSettings
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.retarget.roles import ROLES
-from ...core.motion.retarget.steering import Steering
+from ...core.motion.retarget.steering import ControlRig
 from ..properties import group_class
 
 USUAL = "USUAL"
@@ -100,7 +100,7 @@ def fill_rows(props: Any, rig_map: RigMap, target: bpy.types.Object) -> None:
         row = props.rows.add()
         row.role, row.bones, row.twist = role, ", ".join(chain), ", ".join(rig_map.twist.get(role, ()))
     props.rows_of, props.row = target, 0
-    props.steering = json.dumps(rig_map.steering.table()) if rig_map.steering is not None else ""
+    props.steering = json.dumps(rig_map.control_rig.table()) if rig_map.control_rig is not None else ""
     props.missing = "\n".join((*rig_map.missing, *rig_map.notes))
 
 
@@ -122,8 +122,8 @@ def edited_map(props: Any, target: bpy.types.Object | None) -> RigMap | None:
             raise InputError(f"The mapping has {roles.count(role)} lines for “{role}”; remove all but one.")
     bones = {row.role: names(row.bones) for row in props.rows if names(row.bones)}
     twist = {row.role: names(row.twist) for row in props.rows if names(row.twist)}
-    steering = Steering(**json.loads(props.steering)) if props.steering else None
-    return RigMap(bones=bones, twist=twist, origin="the panel", steering=steering and steering.of_controls(bones, twist))
+    control_rig = ControlRig(**json.loads(props.steering)) if props.steering else None
+    return RigMap(bones=bones, twist=twist, origin="the panel", control_rig=control_rig and control_rig.of_controls(bones, twist))
 
 
 def other_lines(props: Any, target: bpy.types.Object) -> str:

@@ -136,7 +136,7 @@ VRM = {"hips": "hips", "head": "head"} | {
 def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> Rig:
     """The rig with the points under its feet, from the skins that it moves: where they would touch a floor tilted this way and that."""
     wanted = [name for side in "LR" for part in ("foot", "toe") for name in rig_map.bones.get(f"{part}.{side}", ())]
-    instead = rig_map.steering.skin if rig_map.steering is not None else {}
+    instead = rig_map.control_rig.skin if rig_map.control_rig is not None else {}
     meant = {instead.get(name, name): name for name in wanted}
     points: dict[str, list[np.ndarray]] = {}
     for skin in [o for o in bpy.data.objects if o.type == "MESH"]:
@@ -229,7 +229,7 @@ def with_residual_motion(armature_object: bpy.types.Object, motion: Motion) -> M
             "Edit in an NLA layer above it to keep that detail"
         )
         return replace(motion, notes=(*motion.notes, note))
-    return replace(motion, unshown=from_text(stored["motion"]).at(motion.frames))
+    return replace(motion, residual=from_text(stored["motion"]).at(motion.frames))
 
 
 def action_with_residual(armature_object: bpy.types.Object) -> bpy.types.Action | None:

@@ -9,7 +9,7 @@ import numpy as np
 from ...core.motion.retarget.keys import needed_keys
 from ...core.motion.retarget.retarget import Retargeted
 from ...core.motion.retarget.turns import continuous, euler_from_matrix, quaternion_from_matrix, transposed
-from ...core.motion.retarget.unshown import Unshown, to_text
+from ...core.motion.retarget.unshown import ResidualMotion, to_text
 from .read import RESIDUAL_KEY, keys_digest, scale_of, world_matrix
 
 CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_axis_angle", 4)}
@@ -167,7 +167,7 @@ def _mute(target: bpy.types.Object, result: Retargeted) -> tuple[str, ...]:
     return tuple(muted)
 
 
-def store_residual_motion(action: bpy.types.Action, residual: Unshown) -> None:
+def store_residual_motion(action: bpy.types.Action, residual: ResidualMotion) -> None:
     """Store with an action the part of its motion that its rig cannot show; it is valid as long as the keys stay as they are now."""
     action[RESIDUAL_KEY] = {"motion": to_text(residual), "keys": keys_digest(action)}
 

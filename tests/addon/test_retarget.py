@@ -30,7 +30,7 @@ from tricap.core.motion.retarget.turns import angle_of, transposed
 from tricap.core.motion.sources import read_motion_source
 from tricap.core.progress import Monitor
 
-from ..core.motion.persons import flail, person, squat
+from ..core.motion.persons import flail, mapped, mapped_rig, person, squat
 from ..core.motion.test_retarget import recorded
 from .conftest import SmallRun
 
@@ -58,9 +58,9 @@ def played(target: Any, frames: Any) -> Any:
 
 
 def onto(target: Any, source: Any, tolerance_deg: float = 0.0, **feet: Any) -> apply.Outcome:
-    goal, source_map = apply.read_target(target), find_map(source.rig)
-    result = apply.transfer(source, source_map, goal, RetargetSettings(), FeetSettings(**feet), Monitor())
-    return apply.apply(target, source, source_map, goal, result, "Test", tolerance_deg)
+    goal, moving = apply.read_target(target), mapped(source)
+    result = apply.transfer(moving, goal, RetargetSettings(), FeetSettings(**feet), Monitor())
+    return apply.apply(target, moving, goal, result, "Test", tolerance_deg)
 
 
 @pytest.mark.parametrize("mode", ["QUATERNION", "XYZ", "ZYX", "AXIS_ANGLE"])
@@ -219,8 +219,8 @@ def test_the_preview_points_alike_and_goes_away(empty: ModuleType) -> None:
     rigs = read_rig(source), read_rig(target)
     maps = find_map(rigs[0]), find_map(rigs[1])
     target.animation_data_clear()
-    assert add_preview(source, rigs[0], maps[0], target, rigs[1], maps[1]) > 15
-    figures = measure(played(source, range(9)), maps[0], played(target, range(9)), maps[1], None)
+    assert add_preview(source, mapped_rig(rigs[0], maps[0]), target, mapped_rig(rigs[1], maps[1])) > 15
+    figures = measure(mapped(played(source, range(9)), maps[0]), mapped(played(target, range(9)), maps[1]), None)
     assert figures.direction_worst_deg < PLAYED_DEG, figures
     assert remove_preview(target) > 15 and not [c for bone in target.pose.bones for c in bone.constraints]
     assert len(empty.data.objects) == 2
@@ -316,7 +316,7 @@ def test_the_command_with_a_run_a_map_and_a_report(empty: ModuleType, small_run:
     assert (scene.frame_start, scene.frame_end) == (2, 7)
     source = read_motion_source(small_run.out)
     found = played(empty.data.objects["Target"], source.frames)
-    assert measure(source, find_map(source.rig), found, find_map(found.rig), None).direction_worst_deg < PLAYED_DEG
+    assert measure(mapped(source), mapped(found), None).direction_worst_deg < PLAYED_DEG
 
 
 def test_a_run_of_one_frame_moves_the_clavicle(empty: ModuleType, full_run: Path, tmp_path: Path) -> None:

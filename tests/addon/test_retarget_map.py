@@ -52,11 +52,11 @@ def test_a_saved_mapping_keeps_its_steering(blender: ModuleType, props: Any, tmp
     (tmp_path / "a.json").write_text(json.dumps(steered()))
     assert ops.retarget_load_map(filepath=str(tmp_path / "a.json")) == {"FINISHED"}
     assert ops.retarget_save_map(filepath=str(tmp_path / "b.json")) == {"FINISHED"}
-    found = read_preset(tmp_path / "b.json").steering
+    found = read_preset(tmp_path / "b.json").control_rig
     assert found is not None and found.table() == steered()["steering"]
     props.rows[[row.role for row in props.rows].index("head")].bones = "elsewhere"  # no control
     ops.retarget_save_map(filepath=str(tmp_path / "b.json"))
-    assert read_preset(tmp_path / "b.json").steering is None
+    assert read_preset(tmp_path / "b.json").control_rig is None
     assert ops.retarget_find_map() == {"FINISHED"} and not props.steering
     with pytest.raises(RuntimeError, match="Cannot read"):
         ops.retarget_load_map(filepath=str(tmp_path / "nowhere.json"))

@@ -87,9 +87,9 @@ def test_a_file_and_a_strip_keep_the_residual_motion(empty: ModuleType, tmp_path
     few = empty.data.objects["Few"]
     action = few.animation_data.action
     push_to_strip(few, action)
-    assert read.action_with_residual(few) == action and read.with_residual_motion(few, played(few)).unshown is not None
+    assert read.action_with_residual(few) == action and read.with_residual_motion(few, played(few)).residual is not None
     few.animation_data.nla_tracks[0].strips[0].scale = 2.0
-    assert read.with_residual_motion(few, played(few)).unshown is None
+    assert read.with_residual_motion(few, played(few)).residual is None
     few.animation_data_clear()
     with pytest.raises(InputError, match="no action"):
         played(few)

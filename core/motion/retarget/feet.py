@@ -1,18 +1,18 @@
-"""Feet on the floor: the body is carried by the feet that stand, and what is left is taken up by hip and knee.
+"""Foot locking: feet that stand in the source stand on the target's floor; hip and knee take up what the body's path does not.
 
-A walk on legs of other proportions keeps its directions only if the body's path changes. So first the path is solved for: a correction
-c(t) of the root and a place X_k for every contact k, from
+A walk on legs of other proportions has the same limb directions only if the body's path changes. So the path is solved for first: a
+correction c(t) of the root and a place X_k for every contact k, from
 
-    Σ |r(t) + c(t) + ω(t) × h_f(t) + o_f(t) − X_k − s_f(t)|²  +  Σ (τ⁴ |c̈(t)|² + λ τ² |ċ(t)|² + μ |c(t)|²)  +  the like of ω   →  min   (1)
+    Σ |r(t) + c(t) + ω(t) × h_f(t) + o_f(t) − X_k − s_f(t)|²  +  Σ (τ⁴ |c̈(t)|² + λ τ² |ċ(t)|² + μ |c(t)|²)  +  likewise for ω   →  min   (1)
 
-with r the root, ω a small turn of the hips, h_f a hip joint, o_f the ankle seen from the root, and s_f how the ankle moves about the
-standing ball of the foot while the heel lifts: feet and toes keep the directions that they have in the source, as long as they are not in
-the floor. Heights are given: the lowest point of the sole is on the floor. The norm counts angles: a displacement e of the ankle turns a
-leg of length d by e/d across it, but along it, with the knee bent by φ, each of its two bones by e·d/(2 l₁ l₂ sin φ)  (2). What is left is
-taken up by two bones of known length (3), with the knee in its plane, and let go over a while so that nothing pops.
+with r the root, ω a small rotation of the hips, h_f a hip joint, o_f the ankle relative to the root, and s_f the ankle's motion about the
+planted ball of the foot while the heel lifts: feet and toes keep their directions of the source unless they would be in the floor.
+Heights are given: the lowest point of the sole is on the floor. The norm counts angles: a displacement e of the ankle turns a leg of
+length d by e/d across it, but along it, with the knee bent by φ, it turns each of its two bones by e·d/(2 l₁ l₂ sin φ)  (2). The rest is
+taken up by two-bone inverse kinematics (3), with the knee in its plane, and blended out before and after a contact.
 
-Nothing is moved that stands already, so what was retargeted returns from another rig: feet may not turn by more than they must, since a
-foot is short, and 10 mm at the ankle are 4° of it.
+A foot that already stands is not moved, so that a motion survives retargeting to another rig and back: rotations of the foot are kept as
+small as possible, since a foot is short, and 10 mm at the ankle are 4° of it.
 """
 
 from collections.abc import Mapping
@@ -29,21 +29,38 @@ from .rig import Rig
 from .roles import sided
 from .turns import matrix_from_vector, rotate, shortest, unit, vector_from_matrix
 
-SMOOTH_S = 0.05  # τ: the body's path does not follow the feet's noise
-LEVEL = 0.1  # λ: in the air the path keeps the correction that it had on the ground, and does not go on as it began to
-HOLD = 1e-5  # μ: where nothing stands the path stays as it was
-TILT = 0.2  # a turn of the hips counts as much less than one of a leg
-RAISED = 0.006  # a swinging foot that would be in the floor by less than this part of the leg's length is raised, not turned
-BENT = np.radians(8.0)  # a knee is taken to be bent at least as much in (2)
-REACH = 0.9995  # a leg is not stretched beyond this part of its length
-MEDIAN_STEPS = 60
-STRAIGHT = 0.005  # a knee that is out of the line by less of the thigh's length bends forwards
+SMOOTH_S = 0.05  # τ [s]: time constant that keeps the feet's noise out of the body's path
+LEVEL = 0.1  # λ: damps the velocity of the correction, so that it stays in the air what it was on the ground
+HOLD = 1e-5  # μ: pulls the correction to zero where no foot stands
+TILT = 0.2  # weight of a rotation of the hips relative to one of a leg
+RAISED = 0.006  # by leg length: a swinging foot that is in the floor by less is raised, not turned
+BENT = np.radians(8.0)  # [rad] least bend of a knee that (2) assumes
+REACH = 0.9995  # by leg length: a leg is not stretched further
+STRAIGHT = 0.005  # by thigh length: a knee that is out of line by less bends forwards
+UPRIGHT = 0.95  # z of a unit vector: a foot that is steeper has no heading
+FLAT_TOE = 0.5  # z of a unit vector: a toe bone that is steeper does not end at the tip of the toes
+FLOOR_GAP = 0.25  # by height of the rig: a foot that is higher over the floor in the rest pose keeps its own level
+LEVEL_SOLE = 0.2  # z of the sole's mean normal: below it the foot does not stand flat, and its alignment stays
+MEDIAN_STEPS = 60  # Weiszfeld iterations
+BISECTIONS = 12  # of the fraction of a turn: 1/4096 of it
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Limb:
+    """Two segments of a rig, an upper and a lower one of one or more bones each, and the bone at their end; bones by index."""
+
+    rig: Rig
+    upper: tuple[int, ...]
+    lower: tuple[int, ...]
+    end: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Leg:
-    """Bones of one leg of the target, by index, and what of its foot touches the floor."""
+    """One leg of the target on its floor: bones by index, and the points of its foot that touch the floor."""
 
+    rig: Rig
+    floor_m: float  # height of the floor
     side: str
     thigh: tuple[int, ...]
     shin: tuple[int, ...]
@@ -53,6 +70,11 @@ class Leg:
     ankle_m: float  # height of the ankle over the sole in the rest pose
     sole_m: np.ndarray  # (K, 3) points under the foot, rest pose
     tip_m: np.ndarray  # (J, 3) points under the toes, rest pose
+
+    @property
+    def limb(self) -> Limb:
+        """Thigh and shin, down to the foot."""
+        return Limb(rig=self.rig, upper=self.thigh, lower=self.shin, end=self.foot[0])
 
 
 def find_legs(rig: Rig, rig_map: RigMap, floor_m: float) -> dict[str, Leg]:
@@ -69,11 +91,11 @@ def _leg(rig: Rig, side: str, bones: Mapping[str, tuple[int, ...]], floor_m: flo
     foot, toe = bones["foot"][0], bones["toe"]
     ankle = rig.head_m[foot]
     ball = rig.head_m[toe[0]] if toe else rig.tail_m[bones["foot"][-1]]
-    if abs(unit(ball - ankle)[2]) > 0.95:
+    if abs(unit(ball - ankle)[2]) > UPRIGHT:
         ball = ankle.copy()
-    tip = rig.tail_m[toe[-1]] if toe and unit(rig.tail_m[toe[-1]] - rig.head_m[toe[-1]])[2] < 0.5 else ball
+    tip = rig.tail_m[toe[-1]] if toe and unit(rig.tail_m[toe[-1]] - rig.head_m[toe[-1]])[2] < FLAT_TOE else ball
     low = min(ankle[2], ball[2])
-    if 0.0 <= low - floor_m < 0.25 * rig.height_m:
+    if 0.0 <= low - floor_m < FLOOR_GAP * rig.height_m:
         low = floor_m
     skin = [rig.sole_m[rig.names[b]] for b in bones["foot"] if rig.names[b] in rig.sole_m]
     toes = [rig.sole_m[rig.names[b]] for b in toe if rig.names[b] in rig.sole_m]
@@ -81,6 +103,8 @@ def _leg(rig: Rig, side: str, bones: Mapping[str, tuple[int, ...]], floor_m: flo
     sole = np.concatenate(skin) if skin else np.array([ankle * under, ball * under]) + (0, 0, low)
     tips = np.concatenate(toes) if toes else np.array([tip * under + (0, 0, low)])
     return Leg(
+        rig=rig,
+        floor_m=floor_m,
         side=side,
         **{k: tuple(v) for k, v in bones.items()},
         ball_m=ball,
@@ -97,12 +121,12 @@ def level_feet(since_rest: np.ndarray, flat: np.ndarray, A: np.ndarray) -> np.nd
     """
     if not flat.any():
         return A
-    n = unit(_middle(since_rest[flat, 2, :]))
-    return shortest(np.array([0.0, 0.0, 1.0]), n) @ A if n[2] > 0.2 else A
+    n = unit(_geometric_median(since_rest[flat, 2, :]))
+    return shortest(np.array([0.0, 0.0, 1.0]), n) @ A if n[2] > LEVEL_SOLE else A
 
 
-def _middle(points: np.ndarray) -> np.ndarray:
-    """The point with the least sum of distances to the points (n, 3), which turns as they turn (Weiszfeld, 1937)."""
+def _geometric_median(points: np.ndarray) -> np.ndarray:
+    """The point with the least sum of distances to the points (n, 3); it is equivariant to rotations (Weiszfeld 1937)."""
     middle = np.asarray(points.mean(axis=0))
     for _ in range(MEDIAN_STEPS):
         weight = 1.0 / np.maximum(np.linalg.norm(points - middle, axis=1), 1e-9)
@@ -110,31 +134,31 @@ def _middle(points: np.ndarray) -> np.ndarray:
     return middle
 
 
-def lock_flat(R: np.ndarray, legs: Mapping[str, Leg], contacts: Contacts, rig: Rig, settings: FeetSettings, fps: float) -> np.ndarray:
-    """R with feet that do not rock while they stand flat, and toes that lie while the ball stands."""
+def lock_flat(R: np.ndarray, legs: Mapping[str, Leg], contacts: Contacts, settings: FeetSettings, fps: float) -> np.ndarray:
+    """R with feet that do not rock while they stand flat, and toes that lie flat while the ball stands."""
     R = R.copy()
     for side, leg in legs.items():
         if side not in contacts.sides:
             continue
         for bones, on in ((leg.foot, contacts.flat[side]), (leg.toe, contacts.toe[side])):
             for b in bones:
-                R[:, b] = _held(R[:, b], rig.R_rest[b], runs(on), settings.blend_s * fps)
+                R[:, b] = _locked(R[:, b], leg.rig.R_rest[b], runs(on), settings.blend_s * fps)
     return R
 
 
-def _held(R: np.ndarray, R_rest: np.ndarray, spans: list[tuple[int, int]], blend: float) -> np.ndarray:
-    """In every stretch the heading of a level foot as it mostly stands; before and after it what that takes is let go."""
+def _locked(R: np.ndarray, R_rest: np.ndarray, spans: list[tuple[int, int]], blend: float) -> np.ndarray:
+    """R in every contact replaced by its most typical rotation, levelled; the change is blended out before and after."""
     vectors = np.zeros((len(R), 3))
     for k, (a, b) in enumerate(spans):
         middle = R[a + stance(R[a:b])] @ R_rest.T
         level = shortest(middle[:, 2], np.array([0.0, 0.0, 1.0])) @ middle @ R_rest
-        vectors += let_go(vector_from_matrix(level @ np.swapaxes(R[a:b], 1, 2)), spans, k, len(R), blend)
+        vectors += blended_out(vector_from_matrix(level @ np.swapaxes(R[a:b], 1, 2)), spans, k, len(R), blend)
     return matrix_from_vector(vectors) @ R
 
 
-def let_go(values: np.ndarray, spans: list[tuple[int, int]], k: int, frames: int, blend: float) -> np.ndarray:
-    """`values` (n, …) of stretch k of `spans` over all frames (T, …): smoothly nothing from `blend` frames on before and after it, or from
-    where the next one begins."""
+def blended_out(values: np.ndarray, spans: list[tuple[int, int]], k: int, frames: int, blend: float) -> np.ndarray:
+    """`values` (n, …) of span k of `spans` over all frames (T, …): before and after it they fade to zero within `blend` frames, or until
+    the next span begins."""
     a, b = spans[k]
     time, nearest = np.arange(frames), np.clip(np.arange(frames), a, b - 1)
     before = a - spans[k - 1][1] + 1 if k else blend
@@ -149,9 +173,9 @@ def fade(distance: np.ndarray, blend: float | np.ndarray) -> np.ndarray:
     return x * x * (3 - 2 * x)
 
 
-def lowest(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
-    """Height (T,) of the lowest point of foot and toes against the ankle, with R (T, B, 3, 3)."""
-    foot, ankle = leg.foot[0], rig.head_m[leg.foot[0]]
+def lowest(leg: Leg, R: np.ndarray) -> np.ndarray:
+    """Height (T,) of the lowest point of foot and toes relative to the ankle, with R (T, B, 3, 3)."""
+    rig, foot, ankle = leg.rig, leg.foot[0], leg.rig.head_m[leg.foot[0]]
     heights = [(leg.sole_m - ankle) @ rig.R_rest[foot] @ np.swapaxes(R[:, foot], 1, 2)]
     if leg.toe:
         toe = leg.toe[0]
@@ -160,14 +184,14 @@ def lowest(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
     return np.concatenate(heights, axis=1)[..., 2].min(axis=1)
 
 
-def _arm(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
+def _ankle_to_ball(leg: Leg, R: np.ndarray) -> np.ndarray:
     """From the ankle to the ball (T, 3)."""
-    return R[:, leg.foot[0]] @ (rig.R_rest[leg.foot[0]].T @ (leg.ball_m - rig.head_m[leg.foot[0]]))
+    return R[:, leg.foot[0]] @ (leg.rig.R_rest[leg.foot[0]].T @ (leg.ball_m - leg.rig.head_m[leg.foot[0]]))
 
 
-def about_ball(leg: Leg, rig: Rig, R: np.ndarray, toe: np.ndarray, begin: int, end: int) -> np.ndarray:
-    """s_f (end − begin, 3): how the ankle moves in a contact, about the ball where that stands and not at all where only the heel does."""
-    arm = _arm(leg, rig, R)[begin:end]
+def about_ball(leg: Leg, R: np.ndarray, toe: np.ndarray, begin: int, end: int) -> np.ndarray:
+    """s_f (end − begin, 3): the ankle's motion in a contact: about the ball where that stands, none where only the heel does."""
+    arm = _ankle_to_ball(leg, R)[begin:end]
     step = np.zeros_like(arm)
     step[1:] = -np.diff(arm, axis=0) * (toe[begin : end - 1] & toe[begin + 1 : end])[:, None]
     return np.cumsum(step, axis=0)
@@ -175,7 +199,7 @@ def about_ball(leg: Leg, rig: Rig, R: np.ndarray, toe: np.ndarray, begin: int, e
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stand:
-    """One contact of one foot: frames [begin, end), and where the ankle is in it (n, 3), up to its place X_k in the plane."""
+    """One contact of one foot: frames [begin, end), and the ankle's path (n, 3) in it relative to its place X_k."""
 
     side: str
     begin: int
@@ -183,20 +207,21 @@ class Stand:
     path_m: np.ndarray
 
 
-def find_stands(legs: Mapping[str, Leg], contacts: Contacts, rig: Rig, R: np.ndarray, floor_m: float) -> list[Stand]:
-    """All contacts of both feet; heights of the paths are final: the sole's lowest point is on the floor."""
+def find_stands(legs: Mapping[str, Leg], contacts: Contacts, R: np.ndarray) -> list[Stand]:
+    """All contacts of both feet. Heights of the paths are final: the sole's lowest point is on the floor."""
     stands = []
     for side in (s for s in legs if s in contacts.sides):
-        low = lowest(legs[side], rig, R)
+        low = lowest(legs[side], R)
         for begin, end in runs(contacts.ankle[side] | contacts.toe[side]):
-            path = about_ball(legs[side], rig, R, contacts.toe[side], begin, end)
-            path[:, 2] = floor_m - low[begin:end]
+            path = about_ball(legs[side], R, contacts.toe[side], begin, end)
+            path[:, 2] = legs[side].floor_m - low[begin:end]
             stands.append(Stand(side=side, begin=begin, end=end, path_m=path))
     return stands
 
 
-def stiffness(leg: Leg, rig: Rig, R: np.ndarray) -> np.ndarray:
-    """W^½ (T, 3, 3): by how much the leg's directions suffer (rad × leg length) from a displacement of the ankle.  (2)"""
+def stiffness(leg: Leg, R: np.ndarray) -> np.ndarray:
+    """W^½ (T, 3, 3): how much a displacement of the ankle changes the leg's directions (rad × leg length).  (2)"""
+    rig = leg.rig
     upper = R[:, leg.thigh[0]] @ (rig.R_rest[leg.thigh[0]].T @ (rig.head_m[leg.shin[0]] - rig.head_m[leg.thigh[0]]))
     lower = R[:, leg.shin[0]] @ (rig.R_rest[leg.shin[0]].T @ (rig.head_m[leg.foot[0]] - rig.head_m[leg.shin[0]]))
     area = np.linalg.norm(np.cross(upper, lower), axis=1)  # l₁ l₂ sin φ
@@ -214,9 +239,9 @@ def carry_root(
     fps: float,
     leg_m: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corrections of the root: shift c (T, 3), turn ω (T, 3) [rad], and the contacts' places X (K, 3; z is 0).  (1)
+    """Corrections of the root: shift c (T, 3), rotation ω (T, 3) [rad], and the contacts' places X (K, 3; z is 0).  (1)
 
-    By side: ankles (T, 3), hip joints against the middle of the hips (T, 3), and W^½ (T, 3, 3).
+    By side: ankles (T, 3), hip joints relative to the middle of the hips (T, 3), and W^½ (T, 3, 3).
     """
     t, k = len(next(iter(ankles.values()))), len(stands)
     if not stands:
@@ -250,38 +275,39 @@ def _placed(blocks: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_m
 
 
 def _roughness(t: int, order: int) -> sparse.csr_matrix:
-    """(t, t): xᵀ M x is the sum of the squared first or second differences of x; nothing bends in fewer than three frames."""
+    """M (t, t): xᵀ M x is the sum of the squared differences of first or second order of x; zero for too few frames."""
     if t < order + 1:
         return sparse.csr_matrix((t, t))
     bend = sparse.diags([[-1.0, 1.0], [1.0, -2.0, 1.0]][order - 1], list(range(order + 1)), shape=(t - order, t))
     return (bend.T @ bend).tocsr()
 
 
-def step_over(leg: Leg, rig: Rig, R: np.ndarray, ankle: np.ndarray, floor_m: float, swinging: np.ndarray) -> np.ndarray:
-    """R with a swinging foot's toes held straighter, then the foot more level, where they would go through the floor, by no more than
+def step_over(leg: Leg, R: np.ndarray, ankle: np.ndarray, least_m: float, swinging: np.ndarray) -> np.ndarray:
+    """R with a swinging foot's toes straightened, then the foot levelled, where its sole would be lower than `least_m`, by no more than
     it takes."""
-    foot = leg.foot[0]
+    rig, foot = leg.rig, leg.foot[0]
     if leg.toe:
         toe = leg.toe[0]
         straight = R[:, foot] @ (rig.R_rest[foot].T @ rig.R_rest[toe]) @ np.swapaxes(R[:, toe], 1, 2)
-        R = _eased(leg, rig, R, leg.toe, vector_from_matrix(straight), ankle, floor_m, swinging)
+        R = _raised(leg, R, leg.toe, vector_from_matrix(straight), ankle, least_m, swinging)
     level = shortest((R[:, foot] @ rig.R_rest[foot].T)[:, :, 2], np.array([0.0, 0.0, 1.0]))
-    return _eased(leg, rig, R, (*leg.foot, *leg.toe), vector_from_matrix(level), ankle, floor_m, swinging)
+    return _raised(leg, R, (*leg.foot, *leg.toe), vector_from_matrix(level), ankle, least_m, swinging)
 
 
-def _eased(
-    leg: Leg, rig: Rig, R: np.ndarray, bones: tuple[int, ...], turn: np.ndarray, ankle: np.ndarray, floor_m: float, swinging: np.ndarray
+def _raised(
+    leg: Leg, R: np.ndarray, bones: tuple[int, ...], turn: np.ndarray, ankle: np.ndarray, least_m: float, swinging: np.ndarray
 ) -> np.ndarray:
-    """R with `bones` turned by the least part of the Rodrigues vectors `turn` (T, 3) that clears the floor; not if that is no help."""
-    before = ankle[:, 2] + lowest(leg, rig, R) - floor_m
+    """R with `bones` turned by the least fraction of the Rodrigues vectors `turn` (T, 3) that raises the sole to `least_m`, found by
+    bisection; unchanged in frames where the turn lowers the sole."""
+    before = ankle[:, 2] + lowest(leg, R) - least_m
     some = np.flatnonzero(swinging & (before < 0.0))
-    some = some[(ankle[:, 2] + lowest(leg, rig, _turned(R, bones, turn)) - floor_m)[some] > before[some]]
+    some = some[(ankle[:, 2] + lowest(leg, _turned(R, bones, turn)) - least_m)[some] > before[some]]
     if not len(some):
         return R
     little, much = np.zeros(len(some)), np.ones(len(some))
-    for _ in range(12):
+    for _ in range(BISECTIONS):
         part = (little + much) / 2
-        clear = ankle[some, 2] + lowest(leg, rig, _turned(R[some], bones, turn[some] * part[:, None])) >= floor_m
+        clear = ankle[some, 2] + lowest(leg, _turned(R[some], bones, turn[some] * part[:, None])) >= least_m
         little, much = np.where(clear, little, part), np.where(clear, part, much)
     R = R.copy()
     R[some] = _turned(R[some], bones, turn[some] * much[:, None])
@@ -296,54 +322,46 @@ def _turned(R: np.ndarray, bones: tuple[int, ...], vector: np.ndarray) -> np.nda
 
 
 def ankle_goals(
-    leg: Leg, rig: Rig, R: np.ndarray, stands: list[Stand], places: np.ndarray, ankle: np.ndarray, floor_m: float, blend: float
+    leg: Leg, R: np.ndarray, stands: list[Stand], places: np.ndarray, ankle: np.ndarray, blend: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the ankle shall be (T, 3), and R with swinging feet turned where they must: planted in contacts, let go over `blend` frames,
-    and never so low that the sole is in the floor. `ankle` (T, 3): where the leg has it."""
+    """The ankle's goal (T, 3), and R with swinging feet turned where they must be. The goal is planted in contacts, returns to `ankle`
+    (T, 3) over `blend` frames, and is never so low that the sole is in the floor."""
     own = [(stand, place) for stand, place in zip(stands, places) if stand.side == leg.side]
     goal, swinging = ankle.copy(), np.ones(len(ankle), dtype=bool)
     for k, (stand, place) in enumerate(own):
         pull = stand.path_m + place - ankle[stand.begin : stand.end]
-        goal += let_go(pull, [(s.begin, s.end) for s, _ in own], k, len(ankle), blend)
+        goal += blended_out(pull, [(s.begin, s.end) for s, _ in own], k, len(ankle), blend)
         swinging[stand.begin : stand.end] = False
-    leg_m = float(np.linalg.norm(rig.head_m[leg.thigh[0]] - rig.head_m[leg.foot[0]]))
-    R = step_over(leg, rig, R, goal, floor_m - RAISED * leg_m, swinging)
-    goal[:, 2] += np.maximum(floor_m - goal[:, 2] - lowest(leg, rig, R), 0.0)
+    leg_m = float(np.linalg.norm(leg.rig.head_m[leg.thigh[0]] - leg.rig.head_m[leg.foot[0]]))
+    R = step_over(leg, R, goal, leg.floor_m - RAISED * leg_m, swinging)
+    goal[:, 2] += np.maximum(leg.floor_m - goal[:, 2] - lowest(leg, R), 0.0)
     return goal, R
 
 
-def bend_limb(
-    rig: Rig,
-    R: np.ndarray,
-    thigh: tuple[int, ...],
-    shin: tuple[int, ...],
-    foot: int,
-    hip_m: np.ndarray,
-    goal_m: np.ndarray,
-    forward: np.ndarray,
-) -> np.ndarray:
-    """R with thigh and shin (or the bones of an arm) turned so that the ankle is at goal (T, 3), the hip staying at (T, 3).  (3)
+def bend_limb(limb: Limb, R: np.ndarray, root_m: np.ndarray, goal_m: np.ndarray, bend_towards: np.ndarray) -> np.ndarray:
+    """R with a leg's or an arm's two segments turned so that its end is at goal (T, 3), its root staying at (T, 3).  (3)
 
-    `forward` (T, 3): where a straight knee would bend to. A goal out of reach is approached as far as the leg is long.
+    `bend_towards` (T, 3): the direction in which a straight knee or elbow would bend. A goal out of reach is approached as far as the limb
+    is long.
     """
-    R = R.copy()
-    a, b = thigh[0], shin[0]
+    R, rig = R.copy(), limb.rig
+    a, b = limb.upper[0], limb.lower[0]
     upper = R[:, a] @ (rig.R_rest[a].T @ (rig.head_m[b] - rig.head_m[a]))
-    lower = R[:, b] @ (rig.R_rest[b].T @ (rig.head_m[foot] - rig.head_m[b]))
+    lower = R[:, b] @ (rig.R_rest[b].T @ (rig.head_m[limb.end] - rig.head_m[b]))
     l1, l2 = np.linalg.norm(upper[0]), np.linalg.norm(lower[0])
-    now, then = upper + lower, goal_m - hip_m
+    now, then = upper + lower, goal_m - root_m
     d = np.linalg.norm(then, axis=1)
     d = np.clip(d, abs(l1 - l2) + 1e-6, np.maximum((l1 + l2) * REACH, np.minimum(np.linalg.norm(now, axis=1), l1 + l2)))
     along, before = unit(then), unit(now)
     out = upper - before * np.sum(upper * before, axis=1, keepdims=True)
-    ahead = forward - before * np.sum(forward * before, axis=1, keepdims=True)
+    ahead = bend_towards - before * np.sum(bend_towards * before, axis=1, keepdims=True)
     lack = np.maximum(STRAIGHT * l1 - np.linalg.norm(out, axis=1), 0.0)
     pole = rotate(shortest(before, along), unit(out + lack[:, None] * unit(ahead)))
     x = (l1**2 - l2**2 + d**2) / (2 * d)
     y = np.sqrt(np.maximum(l1**2 - x**2, 0.0))
-    knee = along * x[:, None] + pole * y[:, None]  # (3)
-    moved = np.linalg.norm(goal_m - hip_m - now, axis=1) > 1e-9
-    for bones, old, new in ((thigh, upper, knee), (shin, lower, along * d[:, None] - knee)):
+    joint = along * x[:, None] + pole * y[:, None]  # (3)
+    moved = np.linalg.norm(goal_m - root_m - now, axis=1) > 1e-9
+    for bones, old, new in ((limb.upper, upper, joint), (limb.lower, lower, along * d[:, None] - joint)):
         turn = shortest(old, new)
         for bone in bones:
             R[moved, bone] = turn[moved] @ R[moved, bone]

@@ -1,7 +1,7 @@
-"""Which bones of a rig are which parts of a body: found by names, completed by the way the bones hang together, or read from a file.
+"""The mapping of a rig's bones to the parts of a body: found by names, completed by the hierarchy, or read from a file.
 
-The spine and the neck need no names: they are what lies between hips, arms and head. What could not be mapped is listed in `missing`
-with the reason, never guessed silently; `notes` say what was found by shape alone.
+The spine and the neck need no names: they are the bones between hips, arms and head. Parts that could not be mapped are listed in
+`missing` with the reason; `notes` name what was found by shape alone.
 """
 
 from collections.abc import Mapping as Map
@@ -14,45 +14,75 @@ from ... import store
 from ...errors import InputError
 from ...settings import nearest_name
 from .names import Reading, read_name
-from .rig import Rig
+from .rig import Motion, Rig
 from .roles import ARM, FINGERS, LEG, ROLES, SIDES, sided
-from .steering import Steering
+from .shape import ShapeMatch, by_shape
+from .steering import ControlRig
 
-FITS = 0.9  # a family's names are taken if a rig has more than this part of them
+FITS = 0.9  # fraction of a preset's bones that a rig must have for the preset to be chosen
+LIMB_ROLES = 8  # a rig with whole limbs but at most so many parts is a limb or half a body, not an unrecognised person
+HEAD_OFF_AXIS = 0.02  # by the rig's height: the bones of neck and head are not farther from the chest's vertical
+MOST_ON_NECK = 3  # a bone with more children is not part of a neck
 NEEDED = ("hips", *(sided(part, side) for side in SIDES for part in ("upper_arm", "forearm", "thigh", "shin")))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RigMap:
-    """`bones`: by role, a chain of bone names from the body outwards. `twist`: by role, bones that share its twist. `hung`: roles that the
-    rig has not, and of which it is only remembered how they turned."""
+    """`bones`: by role, a chain of bone names from the body outwards. `twist`: by role, the twist bones. `restored`: roles that the rig
+    lacks, whose rotations come from the residual motion."""
 
     bones: Map[str, tuple[str, ...]]
     twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     origin: str = "names"
-    steering: Steering | None = None  # of a rig whose mapped bones are controls
-    hung: frozenset[str] = frozenset()
+    control_rig: ControlRig | None = None  # of a rig whose mapped bones are controls
+    restored: frozenset[str] = frozenset()
 
     def first(self, role: str) -> str | None:
         """The bone at whose head the part begins."""
         return self.bones[role][0] if role in self.bones else None
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MappedRig:
+    """A rig with its mapping."""
+
+    rig: Rig
+    map: RigMap
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MappedMotion:
+    """A motion with the mapping of its rig."""
+
+    motion: Motion
+    map: RigMap
+
+    @property
+    def rig(self) -> Rig:
+        """The rig that moves."""
+        return self.motion.rig
+
+    @property
+    def mapped_rig(self) -> MappedRig:
+        """The rig alone, with its mapping."""
+        return MappedRig(rig=self.rig, map=self.map)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """A family of rigs: the bones' names by role. `prefixes` may stand before every name."""
+    """A mapping for a family of rigs: the bones' names by role, each preceded by one of `prefixes`."""
 
     name: str
     bones: Map[str, tuple[str, ...]]
     twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
     prefixes: tuple[str, ...] = ("",)
-    steering: Steering | None = None
+    control_rig: ControlRig | None = None
 
 
 def read_preset(path: Path) -> Preset:
-    """A preset from a JSON file; "{s}" in a role or name stands for both sides, written as `sides` says.
+    """A preset from a JSON file; "{s}" in a role or name stands for both sides, spelled as in `sides`.
 
     Raises:
         InputError: the file cannot be read, or is no mapping.
@@ -63,16 +93,16 @@ def read_preset(path: Path) -> Preset:
     sides = table.get("sides", {"L": "L", "R": "R"})
     prefixes = table.get("prefixes", [""])
     if not isinstance(sides, dict) or set(sides) != {"L", "R"} or not all(isinstance(x, str) for x in [*sides.values(), *prefixes]):
-        raise InputError(f'{path} has odd “sides” or “prefixes”; write {{"L": "Left", "R": "Right"}} and a list of texts.')
+        raise InputError(f'{path} has invalid “sides” or “prefixes”; write {{"L": "Left", "R": "Right"}} and a list of texts.')
     parts = {key: _by_role(table.get(key, {}), sides, key, path) for key in ("bones", "twist")}
-    steering = _steering(table["steering"], sides, path) if "steering" in table else None
-    return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), steering=steering, **parts)
+    control_rig = _control_rig(table["steering"], sides, path) if "steering" in table else None
+    return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), control_rig=control_rig, **parts)
 
 
-def _steering(table: Any, sides: Map[str, str], path: Path) -> Steering:
+def _control_rig(table: Any, sides: Map[str, str], path: Path) -> ControlRig:
     """The part “steering” of a preset; "{s}" in a bone's name stands for both sides."""
     if not isinstance(table, dict) or not isinstance(table.get("follows"), dict):
-        raise InputError(f"{path} says nothing of how controls follow each other; “steering” needs a table “follows” with a name by name.")
+        raise InputError(f"{path} has no hierarchy of its controls; “steering” needs a table “follows” with a name by name.")
 
     def both(part: Any) -> dict[str, Any]:
         return {
@@ -83,17 +113,17 @@ def _steering(table: Any, sides: Map[str, str], path: Path) -> Steering:
 
     follows, skin, properties = (both(table.get(key)) for key in ("follows", "skin", "properties"))
     if not all(isinstance(name, str) for name in [*follows.values(), *skin.values()]):
-        raise InputError(f"{path} has something else than names of bones in “follows” or “skin” of “steering”.")
+        raise InputError(f"{path} must have names of bones in “follows” and “skin” of “steering”.")
     for name in follows:
         line = [name]
         while (above := follows.get(line[-1])) is not None:
             if above in line:
-                raise InputError(f"{path} lets “{name}” follow itself; mend “follows” of “steering”.")
+                raise InputError(f"{path} lets “{name}” follow itself; correct “follows” of “steering”.")
             line.append(above)
     for values in properties.values():
         if not isinstance(values, dict) or not all(isinstance(v, (int, float)) for v in values.values()):
             raise InputError(f"{path} needs numbers by name in “properties” of “steering”.")
-    return Steering(follows=follows, properties=properties, skin=skin)
+    return ControlRig(follows=follows, properties=properties, skin=skin)
 
 
 def _by_role(table: Any, sides: Map[str, str], key: str, path: Path) -> dict[str, tuple[str, ...]]:
@@ -116,11 +146,11 @@ def write_map(path: Path, rig_map: RigMap, name: str) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    steering = rig_map.steering
+    control_rig = rig_map.control_rig
     store.write_json(
         path,
         {"name": name, "bones": {r: list(c) for r, c in rig_map.bones.items()}, "twist": {r: list(c) for r, c in rig_map.twist.items()}}
-        | ({"steering": steering.table()} if steering is not None else {}),
+        | ({"steering": control_rig.table()} if control_rig is not None else {}),
     )
 
 
@@ -135,49 +165,47 @@ def apply_preset(rig: Rig, preset: Preset) -> RigMap:
     twist = {role: tuple(best + name for name in chain if best + name in rig.index) for role, chain in preset.twist.items()}
     bones = {role: chain for role, chain in found.items() if chain}
     if not bones:
-        raise InputError(f"None of the bones of the mapping “{preset.name}” are in this rig; choose another or let it be found.")
+        raise InputError(f"None of the bones of the mapping “{preset.name}” are in this rig; choose another mapping, or Recognise.")
     missing = tuple(f"{role}: no bone “{preset.bones[role][0]}”" for role in preset.bones if role not in bones)
     return RigMap(
         bones=bones,
         twist={role: chain for role, chain in twist.items() if chain and role in bones},
         missing=missing,
         origin=f"mapping “{preset.name}”",
-        steering=preset.steering,
+        control_rig=preset.control_rig,
     )
 
 
 def fit_of(rig: Rig, preset: Preset) -> tuple[float, int]:
-    """How much of a preset (0…1) a rig has under exactly these names, and how many bones that are."""
+    """The fraction (0…1) and the number of a preset's bones that a rig has under exactly these names."""
     names = [name for chain in preset.bones.values() for name in chain]
     count = max(sum(prefix + name in rig.index for name in names) for prefix in preset.prefixes)
     return count / max(len(names), 1), count
 
 
-def _family(rig: Rig, presets: Sequence[Preset]) -> Preset | None:
-    """The preset that fits: of several the one that steers the rig, then the one that says most of it (a mannequin of five spine bones also
-    has the three of its forerunner)."""
+def best_preset(rig: Rig, presets: Sequence[Preset]) -> Preset | None:
+    """The preset that fits; of several, one of controls, then the one with the most bones (a mannequin of five spine bones also has the
+    three of its predecessor)."""
     fitting = [preset for preset in presets if fit_of(rig, preset)[0] > FITS]
-    return max(fitting, key=lambda preset: (preset.steering is not None, fit_of(rig, preset)[1]), default=None)
+    return max(fitting, key=lambda preset: (preset.control_rig is not None, fit_of(rig, preset)[1]), default=None)
 
 
 def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
-    """Recognise a rig: by what its file says, by a family's names, by single names, and by its shape, in that order of trust.
+    """Recognise a rig: by its file's own roles, a preset's names, single names, and its shape, in that order of trust.
 
     Raises:
-        InputError: nothing of a body could be recognised.
+        InputError: no part of a body could be recognised.
     """
-    from .shape import by_shape
-
-    best = _family(rig, presets)
+    best = best_preset(rig, presets)
     if best is not None:
         found = apply_preset(rig, best)
-        return found if found.steering is not None else _completed(rig, found)
+        return found if found.control_rig is not None else _completed(rig, found)
     named = by_names(rig)
     if all(role in named.bones for role in NEEDED) or _is_limb(named):
         return named
     shaped = by_shape(rig)
     if shaped is not None and len(shaped.bones) > len(named.bones):
-        return shaped
+        return _shape_map(rig, shaped)
     if named.bones:
         return named
     raise InputError(
@@ -186,14 +214,21 @@ def find_map(rig: Rig, presets: Sequence[Preset] = ()) -> RigMap:
     )
 
 
+def _shape_map(rig: Rig, shaped: ShapeMatch) -> RigMap:
+    notes = ("recognised by its shape, not by names: check it",) + (
+        () if shaped.sides_known else ("left and right are a guess: the feet do not show which way is forward",)
+    )
+    return _completed(rig, RigMap(bones=shaped.bones, notes=notes, origin="shape"))
+
+
 def _is_limb(named: RigMap) -> bool:
     """A measured limb, or half a body: whole limbs, but not all of them."""
     whole = [all(sided(part, side) in named.bones for part in parts) for side in SIDES for parts in (ARM[1:3], LEG[:2])]
-    return any(whole) and len(named.bones) <= 8
+    return any(whole) and len(named.bones) <= LIMB_ROLES
 
 
 def by_names(rig: Rig) -> RigMap:
-    """What the names say, with the spine and neck from what lies between."""
+    """The parts by the names of their bones; spine and neck are the bones between."""
     readings = {name: read_name(name) for name in rig.names}
     bones: dict[str, tuple[str, ...]] = {role: (bone,) for role, bone in rig.roles.items() if role in ROLES and bone in rig.index}
     for side in SIDES:
@@ -205,22 +240,22 @@ def by_names(rig: Rig) -> RigMap:
 
 
 def _limb(rig: Rig, readings: Map[str, Reading], side: str, parts: Sequence[str], bones: dict[str, tuple[str, ...]]) -> None:
-    """Fill in one limb from the body outwards: each part's bones must hang on those of the part before."""
+    """Fill in one limb from the body outwards: each part's bones must descend from those of the part before."""
     sure = {part: [n for n, r in readings.items() if r.side == side and r.part == part and not r.twist] for part in parts}
     _guess(rig, readings, side, parts, sure)
     above: str | None = None
     for part in parts:
         role = sided(part, side)
         if role not in bones:
-            chain = _chain(rig, [n for n in sure[part] if above is None or _hangs_on(rig, n, above)])
+            chain = _chain(rig, [n for n in sure[part] if above is None or _descends(rig, n, above)])
             if chain:
                 bones[role] = chain
         above = bones[role][-1] if role in bones else above
 
 
 def _guess(rig: Rig, readings: Map[str, Reading], side: str, parts: Sequence[str], sure: dict[str, list[str]]) -> None:
-    """Fill parts that nothing is surely called, from names with several meanings: the deepest bone for the outermost part that can be
-    one, but a thigh and an upper arm come first if there is not enough for both."""
+    """Fill parts without an unambiguous name from names with several meanings: the deepest bone is the outermost possible part, but thigh
+    and upper arm come first if there are too few bones."""
     taken = {n for names in sure.values() for n in names}
     free = [n for n, r in readings.items() if r.side == side and r.perhaps and not r.twist and n not in taken]
     order = [part for part in ("upper_arm", "clavicle", "shin", "thigh") if part in parts and not sure[part]]
@@ -234,12 +269,12 @@ def _guess(rig: Rig, readings: Map[str, Reading], side: str, parts: Sequence[str
             free.remove(deepest)
 
 
-def _hangs_on(rig: Rig, name: str, above: str) -> bool:
+def _descends(rig: Rig, name: str, above: str) -> bool:
     return rig.index[above] in rig.ancestors(rig.index[name])[1:]
 
 
 def _chain(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
-    """Of bones with the same meaning, those on one line from the body outwards, the longest such line."""
+    """The longest chain, from the body outwards, of bones with the same meaning."""
     lines = []
     for bottom in names:
         line = [rig.names[b] for b in reversed(rig.ancestors(rig.index[bottom])) if rig.names[b] in names]
@@ -253,7 +288,7 @@ def _fingers(rig: Rig, readings: Map[str, Reading], side: str, bones: dict[str, 
         found = sorted(
             (int(r.finger.split(".")[1]), n)
             for n, r in readings.items()
-            if r.side == side and r.finger.startswith(finger) and hand and _hangs_on(rig, n, hand[-1])
+            if r.side == side and r.finger.startswith(finger) and hand and _descends(rig, n, hand[-1])
         )
         numbers = [n for k, n in found if k > 0]
         if len({k for k, _ in found if k > 0}) == len(numbers):
@@ -293,7 +328,7 @@ def _torso(rig: Rig, readings: Map[str, Reading], bones: dict[str, tuple[str, ..
 
 
 def _fork(rig: Rig, arms: Sequence[int], head: int | None, hips: int | None, spine: Sequence[int]) -> int | None:
-    """The chest: where the arms (and the head) part."""
+    """The chest: the bone where the arms (and the head) fork."""
     ends = [rig.ancestors(b)[1] for b in arms if len(rig.ancestors(b)) > 1]
     chest: int | None = ends[0] if ends else None
     for end in ends[1:]:
@@ -307,11 +342,11 @@ def _fork(rig: Rig, arms: Sequence[int], head: int | None, hips: int | None, spi
 
 
 def _central_end(rig: Rig, top: int, arms: Sequence[int], necks: Sequence[int]) -> int | None:
-    """A head that is not called so: the last bone of the line that goes on upwards from the chest, between the arms."""
+    """A head without a name: the last bone of the chain that leads upwards from the chest, between the arms."""
     on_arms = {b for arm in arms for b in rig.ancestors(arm)}
     bone, found = top, None
     while True:
-        width = rig.height_m * 0.02
+        width = rig.height_m * HEAD_OFF_AXIS
         ahead = [
             c
             for c in rig.children[bone]
@@ -320,13 +355,13 @@ def _central_end(rig: Rig, top: int, arms: Sequence[int], necks: Sequence[int]) 
             and rig.head_m[c][2] > rig.head_m[bone][2] - width
             and rig.tail_m[c][2] > rig.head_m[c][2]
         ]
-        if not ahead or len(rig.children[bone]) > 3 and bone != top:
+        if not ahead or len(rig.children[bone]) > MOST_ON_NECK and bone != top:
             return found
         bone = found = max(ahead, key=lambda c: rig.tail_m[c][2])
 
 
 def _completed(rig: Rig, found: RigMap) -> RigMap:
-    """Add the in-between bones of limbs and trunk, and twist bones, and list what is missing."""
+    """Add the intermediate bones of limbs and trunk, and twist bones, and list the missing parts."""
     bones, twist = dict(found.bones), dict(found.twist)
     used = {name for chain in bones.values() for name in chain} | {name for names in twist.values() for name in names}
     for side in SIDES:
@@ -363,7 +398,7 @@ def _completed(rig: Rig, found: RigMap) -> RigMap:
 
 
 def _up_to_the_head(rig: Rig, bones: Map[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Spine and neck with the bones that follow up to the arms and the head, where a family's names stop earlier."""
+    """Spine and neck, extended up to the arms and the head where a preset's names stop earlier."""
     longer = {}
     arms = [bones[role][0] for part in ("clavicle", "upper_arm") for role in (sided(part, "L"), sided(part, "R")) if role in bones]
     for role, ends in (("spine", [*arms[:2], *bones.get("neck", bones.get("head", ()))[:1]]), ("neck", bones.get("head", ()))):

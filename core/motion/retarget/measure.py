@@ -1,4 +1,4 @@
-"""Figures of a retargeted motion: how well directions agree, whether feet stand, and whether anything flips."""
+"""Figures of a retargeted motion: agreement of directions, sliding and sinking feet, and the largest rotation between frames."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from .contacts import Contacts, runs
 from .feet import find_legs, lowest
-from .mapping import RigMap
+from .mapping import MappedMotion
 from .rig import Motion
 from .transfer import directions
 from .turns import angle_of, transposed
@@ -34,13 +34,11 @@ class Figures:
         )
 
 
-def measure(
-    source: Motion, source_map: RigMap, target: Motion, target_map: RigMap, contacts: Contacts | None, floor_m: float = 0.0
-) -> Figures:
+def measure(source: MappedMotion, target: MappedMotion, contacts: Contacts | None, floor_m: float = 0.0) -> Figures:
     """Compare a target's motion with its source's, frame by frame (both have the same frames)."""
-    ours, theirs = directions(target, target_map), directions(source, source_map)
+    ours, theirs = directions(target.motion, target.map), directions(source.motion, source.map)
     error = {role: _angle_deg(ours[role], theirs[role]) for role in ours if role in theirs}
-    slides, sunk, floating = _feet(target, target_map, contacts, floor_m)
+    slides, sunk, floating = _feet(target, contacts, floor_m)
     worst = max((float(e.max()) for e in error.values()), default=0.0)
     return Figures(
         direction_rms_deg=_rms(list(error.values())),
@@ -49,9 +47,9 @@ def measure(
         slide_mm=1e3 * max(slides, default=0.0),
         penetration_mm=1e3 * sunk,
         float_mm=1e3 * floating,
-        largest_step_deg=_largest_step_deg(target),
+        largest_step_deg=_largest_step_deg(target.motion),
         contacts=len(slides),
-        frames=len(target.frames),
+        frames=len(target.motion.frames),
     )
 
 
@@ -69,15 +67,16 @@ def _largest_step_deg(motion: Motion) -> float:
     return float(np.degrees(angle_of(transposed(motion.R[:-1]) @ motion.R[1:]).max()))
 
 
-def _feet(motion: Motion, rig_map: RigMap, contacts: Contacts | None, floor_m: float) -> tuple[list[float], float, float]:
-    """How far [m] each standing joint goes from where it came to stand; how deep the sole is in the floor, and how high over it while
-    it stands."""
+def _feet(target: MappedMotion, contacts: Contacts | None, floor_m: float) -> tuple[list[float], float, float]:
+    """The slide [m] of each joint in contact from its first position; the sole's greatest depth in the floor, and its greatest height over
+    the floor in contacts."""
     slides, sunk, floating = [], 0.0, 0.0
-    for side, leg in find_legs(motion.rig, rig_map, floor_m).items():
+    motion = target.motion
+    for side, leg in find_legs(motion.rig, target.map, floor_m).items():
         foot = leg.foot[0]
         ankle = motion.head_m[:, foot]
         ball = ankle + motion.R[:, foot] @ (motion.rig.R_rest[foot].T @ (leg.ball_m - motion.rig.head_m[foot]))
-        height = ankle[:, 2] + lowest(leg, motion.rig, motion.R) - floor_m
+        height = ankle[:, 2] + lowest(leg, motion.R) - floor_m
         sunk = max(sunk, float(-height.min()))
         if contacts is None or side not in contacts.sides:
             continue
@@ -89,5 +88,5 @@ def _feet(motion: Motion, rig_map: RigMap, contacts: Contacts | None, floor_m: f
 
 
 def _rolling(contacts: Contacts, side: str) -> np.ndarray:
-    """Frames in which the ankle turns about the standing ball: not its own stand."""
+    """Frames in which the ankle moves about the standing ball of the foot: not a contact of its own."""
     return contacts.toe[side] & ~contacts.ankle[side]

@@ -9,7 +9,7 @@ from .turns import between
 
 
 def resampled(motion: Motion, fps: float, first_frame: float) -> Motion:
-    """The motion at `fps` frames per second beginning at `first_frame`: rotations on the shortest way, places on straight lines."""
+    """The motion at `fps` frames per second beginning at `first_frame`: rotations by the shortest path, positions linearly."""
     frames = motion.frames
     time = (frames - frames[0]) / motion.fps
     count = max(int(np.floor(time[-1] * fps + 1e-6)) + 1, 1)
@@ -20,4 +20,4 @@ def resampled(motion: Motion, fps: float, first_frame: float) -> Motion:
     part = np.clip((wanted - time[before]) / span, 0.0, 1.0)
     head = motion.head_m[before] + part[:, None, None] * (motion.head_m[after] - motion.head_m[before])
     R = between(motion.R[before], motion.R[after], np.broadcast_to(part[:, None], head.shape[:2]))
-    return replace(motion, fps=fps, frames=first_frame + np.arange(count), R=R, head_m=head, unshown=None)
+    return replace(motion, fps=fps, frames=first_frame + np.arange(count), R=R, head_m=head, residual=None)

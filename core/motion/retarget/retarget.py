@@ -3,7 +3,7 @@
 mapping (both) → contacts (source) → rotations (transfer) → root, scaled by the legs → feet → pose channels
 """
 
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -13,68 +13,83 @@ from ...progress import Monitor
 from ...settings import knob
 from . import feet
 from .contacts import Contacts, FeetSettings, find_contacts
-from .hands import hold_hands
-from .mapping import RigMap
-from .places import heads_of, hip_centre, loose_parts
+from .hands import keep_hand_distances
+from .mapping import MappedMotion, MappedRig, RigMap
+from .places import TargetPose, hip_centre, loose_parts
 from .rest import with_person_like_rest
-from .restore import held_turns, lacking, restored, turned_by
+from .restore import lacking, planting_turns, turned_by, with_residual
 from .rig import Motion, Rig, channels, head_of
 from .roles import SEGMENTS, SIDES, sided
-from .transfer import alignments, body_axes, follow, share_twist, turn
+from .transfer import alignments, body_axes, share_twist, turn
 from .turns import matrix_from_vector, unit
-from .unshown import STATES, Unshown
+from .unshown import STATES, ResidualMotion
 
 SHORTEST_LIMB_M = 1e-4
-LYING = 0.3  # height of the head over the hips, per distance
+LYING = 0.3  # height of the head over the hips by their distance: a lower median means that the source lies
+STEPS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class RetargetSettings:
-    """What of the motion is taken over."""
+    """What is transferred of the motion."""
 
-    root: str = knob(
-        "travel", "how the body moves through the room: as the source, on the spot, or not at all", choices=("travel", "in place", "still")
-    )
-    scale: float = knob(0.0, "size of the target's steps against the source's; 0: by the length of the legs", low=0.0, high=1000.0)
+    root: str = knob("travel", "how the body travels: like the source, on the spot, or not at all", choices=("travel", "in place", "still"))
+    scale: float = knob(0.0, "size of the target's steps relative to the source's; 0: by the length of the legs", low=0.0, high=1000.0)
     hands: str = knob(
         "free",
-        "hands follow their arms, or keep their distance from each other, head, hips and thighs where they are near",
+        "hands follow their arms, or keep their distances from each other, head, hips and thighs when near",
         choices=("free", "keep"),
     )
     twist: str = knob(
         "bones",
-        "spread the twist of the limbs over twist bones, or half of a hand's also over a forearm that has none",
+        "spread the twist of limbs over twist bones; “forearms”: a forearm without any takes half of its hand's",
         choices=("off", "bones", "forearms"),
     )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Retargeted:
-    """The target's motion, with what it does not show of the source's; its pose channels, and how it came about."""
+    """The target's motion with its residual, its pose channels, and how it was computed."""
 
     motion: Motion
     basis: np.ndarray  # (T, B, 3, 3) pose channels
-    shift_m: np.ndarray  # (T, 3) of the carrier's head against where its parent leaves it, in the world
+    shift_m: np.ndarray  # (T, 3) of the carrier's head relative to its parent's motion, in the world
     carrier: int  # the bone whose location channels carry the body; −1 for none
-    loose_m: Mapping[int, np.ndarray]  # by bone, the like (T, 3) of parts that do not hang on the body
+    loose_m: Mapping[int, np.ndarray]  # by bone, the same (T, 3) for parts that do not descend from the body
     driven: np.ndarray  # (B,) bones that get keys
     scale: float
     roles: tuple[str, ...]
     contacts: Contacts | None
     notes: tuple[str, ...]
-    kept_back_m: np.ndarray  # (T, 3) of the body's path, when it moves on the spot
+    removed_travel_m: np.ndarray  # (T, 3) of the body's path, when it moves on the spot
 
     @property
     def travelling(self) -> Motion:
-        """The target's motion as it would go through the room."""
-        return replace(self.motion, head_m=self.motion.head_m + self.kept_back_m[:, None])
+        """The target's motion with the travel that was removed."""
+        return replace(self.motion, head_m=self.motion.head_m + self.removed_travel_m[:, None])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Match:
+    """Source and target, and what connects them."""
+
+    source: MappedMotion
+    target: MappedRig
+    aligned: Mapping[str, np.ndarray]  # A (3, 3) by role
+    scale: float  # size of the target relative to the source
+    contacts: Contacts | None  # of the source's feet
+    legs: Mapping[str, feet.Leg]  # of the target, by side
+    floor_m: float  # under the target
+
+    @property
+    def ankle_level_m(self) -> float:
+        """Height of the ankles of a target that stands."""
+        return self.floor_m + (float(np.mean([leg.ankle_m for leg in self.legs.values()])) if self.legs else 0.0)
 
 
 def retarget(
-    source: Motion,
-    source_map: RigMap,
-    target: Rig,
-    target_map: RigMap,
+    source: MappedMotion,
+    target: MappedRig,
     settings: RetargetSettings | None = None,
     feet_settings: FeetSettings | None = None,
     monitor: Monitor | None = None,
@@ -83,100 +98,117 @@ def retarget(
     """The motion of `source` on the rig `target`; `floor_m` is the floor's height under the target.
 
     Raises:
-        InputError: nothing is common to both, or limbs have no length.
+        InputError: source and target have no part in common, or limbs have no length.
         Cancelled: the monitor was cancelled.
     """
     settings, feet_settings, monitor = settings or RetargetSettings(), feet_settings or FeetSettings(), monitor or Monitor()
-    monitor.step("retargeting", 0, 4)
-    source, source_map, known = restored(source, source_map, feet_settings)
-    source, rest_note = with_person_like_rest(source, source_map)
-    for rig, rig_map, which in ((source.rig, source_map, "source"), (target, target_map, "target")):
-        _check_lengths(rig, rig_map, which)
-    aligned = alignments(source.rig, source_map, target, target_map)
+    monitor.step("retargeting", 0, STEPS)
+    source, contacts = with_residual(source, feet_settings)
+    source, rest_note = with_person_like_rest(source)
+    match = _matched(source, target, contacts, settings.scale, feet_settings, floor_m)
+    monitor.step("retargeting", 1, STEPS)
+    untwisted = turned = turn(source, target, match.aligned)
+    if settings.twist != "off":
+        turned = share_twist(target, turned, lone_forearms=settings.twist == "forearms")
+    carrier = _carrier(target) if "hips" in match.aligned and settings.root != "still" else -1
+    free = TargetPose(target=target, R=turned.R, driven=turned.driven, carrier=carrier, shift_m=np.zeros((len(turned.R), 3)))
+    monitor.step("retargeting", 2, STEPS)
+    pose, planting_shift_m = _grounded(match, free, feet_settings)
+    in_place = settings.root == "in place"
+    residual = _residual(match, free, pose, planting_shift_m * (0.0, 0.0, 1.0) if in_place else planting_shift_m, feet_settings)
+    if settings.twist == "forearms":
+        residual = replace(residual, forearm_twists=_lone_forearm_twists(target, untwisted.R, free.R))
+    monitor.step("retargeting", 3, STEPS)
+    removed_m = (pose.shift_m - pose.shift_m[0]) * (1.0 if in_place else 0.0, 1.0 if in_place else 0.0, 0.0)
+    pose = pose.moved(pose.shift_m - removed_m)
+    if settings.hands == "keep":
+        pose = pose.turned(keep_hand_distances(source, MappedMotion(motion=_motion(source.motion, pose), map=target.map), match.scale))
+    notes = (*source.motion.notes, *filter(None, [rest_note, lying_note(source)]), *_notes(match))
+    monitor.step("retargeting", STEPS, STEPS)
+    return _result(match, pose, removed_m, residual, notes)
+
+
+def _matched(
+    source: MappedMotion, target: MappedRig, contacts: Contacts | None, scale: float, settings: FeetSettings, floor_m: float
+) -> _Match:
+    """What connects source and target; contacts are found unless they are known, the scale unless it is given."""
+    for mapped, which in ((source.mapped_rig, "source"), (target, "target")):
+        _check_lengths(mapped, which)
+    aligned = alignments(source.mapped_rig, target)
     if not aligned:
         raise InputError("Source and target have no part of the body in common; check the two mappings.")
-    scale = settings.scale or leg_ratio(source.rig, source_map, target, target_map)
-    contacts = known or find_contacts(source, source_map, feet_settings, _leg_m(source.rig, source_map) or source.rig.height_m / 2)
-    legs = feet.find_legs(target, target_map, floor_m) if "hips" in aligned else {}
+    scale = scale or leg_ratio(source.mapped_rig, target)
+    leg_m = _leg_m(source.rig, source.map) or source.rig.height_m / 2
+    contacts = contacts or find_contacts(source.motion, source.map, settings, leg_m)
+    legs = feet.find_legs(target.rig, target.map, floor_m) if "hips" in aligned else {}
     if contacts is not None:
-        aligned = aligned | _level(source, source_map, aligned, contacts)
-    untwisted = turned = turn(source, source_map, target, target_map, aligned)
-    monitor.step("retargeting", 1, 4)
-    if settings.twist != "off":
-        turned = share_twist(target, target_map, turned, lone_forearms=settings.twist == "forearms")
-    free, driven = turned.R, turned.driven
-    travels, carrier = settings.root != "in place", _carrier(target, target_map) if "hips" in aligned and settings.root != "still" else -1
-    monitor.step("retargeting", 2, 4)
-    R, shift, moved_m = _grounded(
-        source, source_map, target, target_map, free, driven, carrier, scale, legs, contacts, feet_settings, floor_m
+        aligned = aligned | _level(source, aligned, contacts)
+    return _Match(source=source, target=target, aligned=aligned, scale=scale, contacts=contacts, legs=legs, floor_m=floor_m)
+
+
+def _motion(source: Motion, pose: TargetPose, residual: ResidualMotion | None = None) -> Motion:
+    return Motion(rig=pose.target.rig, fps=source.fps, frames=source.frames, R=pose.R, head_m=pose.head_m, residual=residual)
+
+
+def _residual(match: _Match, free: TargetPose, planted: TargetPose, planting_shift_m: np.ndarray, settings: FeetSettings) -> ResidualMotion:
+    """What the target cannot show of the source's motion; `free` and `planted` are its poses without and with foot contacts."""
+    known = match.contacts is not None and match.legs
+    return ResidualMotion(
+        frames=match.source.motion.frames,
+        planting_turns=planting_turns(match.target, free.R, planted.R),
+        planting_shift_m=planting_shift_m,
+        forearm_twists={},
+        contact_settings=asdict(settings),
+        contacts={state: getattr(match.contacts, state) if known else {} for state in STATES},
+        ankle_level_m=match.ankle_level_m,
+        chains=lacking(match.source, match.target, match.aligned, free.R),
     )
-    unshown = Unshown(
-        frames=source.frames,
-        held=held_turns(target, target_map, free, R),
-        moved_m=moved_m if travels else moved_m * (0.0, 0.0, 1.0),
-        twisted=_twisted(target, target_map, untwisted.R, free) if settings.twist == "forearms" else {},
-        feet=asdict(feet_settings),
-        stands={state: getattr(contacts, state) if contacts is not None and legs else {} for state in STATES},
-        level_m=floor_m + _ankle_level(legs),
-        chains=lacking(source, source_map, target, target_map, aligned, free),
-    )
-    monitor.step("retargeting", 3, 4)
-    kept_back_m = (shift - shift[0]) * (0.0 if travels else 1.0, 0.0 if travels else 1.0, 0.0)
-    shift = shift - kept_back_m
-    head = heads_of(target, R, carrier, shift, target_map)
-    if settings.hands == "keep":
-        held = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head)
-        R = follow(target, hold_hands(source, source_map, held, target_map, scale), driven)
-        head = heads_of(target, R, carrier, shift, target_map)
-    moved = Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=head, unshown=unshown)
-    notes = (*source.notes, *filter(None, [rest_note, lies(source, source_map)]), *_notes(source_map, target_map, aligned))
-    monitor.step("retargeting", 4, 4)
-    loose = {b: head[:, b] - head_of(target, R, head, b) for b in loose_parts(target, target_map) if driven[b] and b != carrier}
+
+
+def _result(match: _Match, pose: TargetPose, removed_m: np.ndarray, residual: ResidualMotion, notes: tuple[str, ...]) -> Retargeted:
+    target, motion = match.target, _motion(match.source.motion, pose, residual)
+    loose = [b for b in loose_parts(target.rig, target.map) if pose.driven[b] and b != pose.carrier]
     return Retargeted(
-        motion=moved,
-        basis=channels(target, R),
-        shift_m=shift,
-        carrier=carrier,
-        loose_m=loose,
-        driven=driven,
-        scale=scale,
-        roles=tuple(aligned),
-        contacts=contacts,
+        motion=motion,
+        basis=channels(target.rig, pose.R),
+        shift_m=pose.shift_m,
+        carrier=pose.carrier,
+        loose_m={b: motion.head_m[:, b] - head_of(target.rig, pose.R, motion.head_m, b) for b in loose},
+        driven=pose.driven,
+        scale=match.scale,
+        roles=tuple(match.aligned),
+        contacts=match.contacts,
         notes=notes,
-        kept_back_m=kept_back_m,
+        removed_travel_m=removed_m,
     )
 
 
-def _twisted(target: Rig, target_map: RigMap, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
-    """By role how lone forearms were twisted, which cannot be read from them."""
+def _lone_forearm_twists(target: MappedRig, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
+    """By role the twist of forearms without twist bones, which cannot be recovered from the rig."""
     return {
-        role: turned_by(role, target, target_map, before, after)
+        role: turned_by(role, target, before, after)
         for role in (sided("forearm", side) for side in SIDES)
-        if len(target_map.bones.get(role, ())) == 1 and role not in target_map.twist
+        if len(target.map.bones.get(role, ())) == 1 and role not in target.map.twist
     }
 
 
-def _ankle_level(legs: Mapping[str, feet.Leg]) -> float:
-    """Height of the ankles over the soles in the rest pose."""
-    return float(np.mean([leg.ankle_m for leg in legs.values()])) if legs else 0.0
+def _notes(match: _Match) -> tuple[str, ...]:
+    lost = [role for role in match.source.map.bones if role not in match.target.map.bones and "." not in role[:-2]]
+    notes = [f"the target has no {', '.join(lost)}: their parents take up the motion"] if lost else []
+    return (*notes, *([] if "hips" in match.aligned else ["the body does not travel: source and target have no hips in common"]))
 
 
-def _notes(source_map: RigMap, target_map: RigMap, common: Container[str]) -> tuple[str, ...]:
-    lost = [role for role in source_map.bones if role not in target_map.bones and "." not in role[:-2]]
-    notes = [f"the target has no {', '.join(lost)}: their parents take it up"] if lost else []
-    return (*notes, *([] if "hips" in common else ["the body does not travel: no hips in common"]))
-
-
-def lies(motion: Motion, rig_map: RigMap) -> str:
-    """A sentence if the trunk lies in most frames: a file with another axis up than was taken does so."""
-    low, high = (rig_map.first(role) for role in ("hips", "head"))
+def lying_note(source: MappedMotion) -> str:
+    """A sentence if the trunk lies in most frames: so does a file whose up axis was misread."""
+    rig, head_m = source.rig, source.motion.head_m
+    low, high = (source.map.first(role) for role in ("hips", "head"))
     if low is None or high is None:
         return ""
-    up = unit(motion.head_m[:, motion.rig.index[high]] - motion.head_m[:, motion.rig.index[low]])[:, 2]
-    return "" if np.median(up) > LYING else "the source lies, or stands on its head; if it should not, say which axis is up"
+    up = unit(head_m[:, rig.index[high]] - head_m[:, rig.index[low]])[:, 2]
+    return "" if np.median(up) > LYING else "the source lies, or stands on its head; if it should not, choose which axis is up"
 
 
-def _place(rig: Rig, rig_map: RigMap, part: str, side: str) -> np.ndarray | None:
+def _head(rig: Rig, rig_map: RigMap, part: str, side: str) -> np.ndarray | None:
     name = rig_map.first(sided(part, side))
     return rig.head_m[rig.index[name]] if name else None
 
@@ -185,171 +217,117 @@ def _leg_m(rig: Rig, rig_map: RigMap) -> float:
     """Mean length of thigh and shin; 0 without legs."""
     lengths = []
     for side in SIDES:
-        a, b, c = (_place(rig, rig_map, part, side) for part in ("thigh", "shin", "foot"))
+        a, b, c = (_head(rig, rig_map, part, side) for part in ("thigh", "shin", "foot"))
         if a is not None and b is not None and c is not None:
             lengths.append(np.linalg.norm(b - a) + np.linalg.norm(c - b))
     return float(np.mean(lengths)) if lengths else 0.0
 
 
-def leg_ratio(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap) -> float:
-    """The target's size against the source's: of the legs if both have some, else of the heights.
+def leg_ratio(source: MappedRig, target: MappedRig) -> float:
+    """The target's size relative to the source's: of the legs if both have some, else of the heights.
 
     Raises:
         InputError: the legs have no length.
     """
-    own, other = _leg_m(source, source_map), _leg_m(target, target_map)
+    own, other = _leg_m(source.rig, source.map), _leg_m(target.rig, target.map)
     if own > SHORTEST_LIMB_M and other > SHORTEST_LIMB_M:
         return other / own
-    if {"thigh.L", "thigh.R"} & set(source_map.bones) & set(target_map.bones) and min(own, other) <= SHORTEST_LIMB_M:
-        raise InputError("The legs of the source or the target have no length; mend the rig's rest pose, or set the scale.")
-    return target.height_m / source.height_m if min(source.height_m, target.height_m) > SHORTEST_LIMB_M else 1.0
+    if {"thigh.L", "thigh.R"} & set(source.map.bones) & set(target.map.bones) and min(own, other) <= SHORTEST_LIMB_M:
+        raise InputError("The legs of the source or the target have no length; correct the rig's rest pose, or set the scale.")
+    heights = source.rig.height_m, target.rig.height_m
+    return heights[1] / heights[0] if min(heights) > SHORTEST_LIMB_M else 1.0
 
 
-def _level(source: Motion, source_map: RigMap, aligned: Mapping[str, np.ndarray], contacts: Contacts) -> dict[str, np.ndarray]:
-    """Alignments of the feet and toes that stand level when the source's do."""
-    level = {}
+def _level(source: MappedMotion, aligned: Mapping[str, np.ndarray], contacts: Contacts) -> dict[str, np.ndarray]:
+    """Alignments of the feet and toes that are level when the source's are."""
+    level, motion, rig = {}, source.motion, source.rig
     for side in contacts.sides:
         for part in ("foot", "toe"):
             role = sided(part, side)
             if role in aligned:
-                b = source.rig.index[source_map.bones[role][-1]]
-                level[role] = feet.level_feet(source.R[:, b] @ source.rig.R_rest[b].T, contacts.flat[side], aligned[role])
+                b = rig.index[source.map.bones[role][-1]]
+                level[role] = feet.level_feet(motion.R[:, b] @ rig.R_rest[b].T, contacts.flat[side], aligned[role])
     return level
 
 
-def _carrier(target: Rig, target_map: RigMap) -> int:
-    """The bone that can carry the body: the hips, or what they hang on if they are connected to it."""
-    bone = target.index[target_map.bones["hips"][0]]
-    while target.connected[bone] and target.parents[bone] >= 0:
-        bone = int(target.parents[bone])
+def _carrier(target: MappedRig) -> int:
+    """The bone that can carry the body: the hips, or the first ancestor that is not connected to its parent."""
+    rig = target.rig
+    bone = rig.index[target.map.bones["hips"][0]]
+    while rig.connected[bone] and rig.parents[bone] >= 0:
+        bone = int(rig.parents[bone])
     return bone
 
 
-def _check_lengths(rig: Rig, rig_map: RigMap, which: str) -> None:
+def _check_lengths(mapped: MappedRig, which: str) -> None:
+    rig = mapped.rig
     for side in SIDES:
         for part, after in SEGMENTS:
-            a, b = _place(rig, rig_map, part, side), _place(rig, rig_map, after, side)
+            a, b = _head(rig, mapped.map, part, side), _head(rig, mapped.map, after, side)
             if a is not None and b is not None and np.linalg.norm(b - a) < SHORTEST_LIMB_M * max(rig.height_m, 1e-9):
-                name = rig_map.first(sided(part, side))
-                raise InputError(f"The bone “{name}” of the {which} has no length; mend the rig's rest pose or map another bone.")
+                name = mapped.map.first(sided(part, side))
+                raise InputError(f"The bone “{name}” of the {which} has no length; correct the rig's rest pose or map another bone.")
 
 
-def _grounded(
-    source: Motion,
-    source_map: RigMap,
-    target: Rig,
-    target_map: RigMap,
-    R: np.ndarray,
-    driven: np.ndarray,
-    carrier: int,
-    scale: float,
-    legs: Mapping[str, feet.Leg],
-    contacts: Contacts | None,
-    settings: FeetSettings,
-    floor_m: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R with feet on the floor, the carrier's shift (T, 3), and what of it is for the feet's standing (T, 3)."""
-    shift = unmoved = np.zeros((len(R), 3))
-    if carrier < 0:
-        return R, shift, unmoved
-    pinning = contacts is not None and settings.mode != "off" and bool(legs)
-    if pinning and contacts is not None:
-        R = follow(target, feet.lock_flat(R, legs, contacts, target, settings, source.fps), driven)
-    heads = heads_of(target, R, carrier, shift, target_map)
-    middle = hip_centre(Motion(rig=target, fps=source.fps, frames=source.frames, R=R, head_m=heads), target_map)
-    path = _travel(source, source_map, target, target_map, contacts, scale, legs, floor_m)
-    shift = path - middle
-    if not pinning or contacts is None:
-        return R, shift, unmoved
-    heads = heads_of(target, R, carrier, shift, target_map)
-    stands = feet.find_stands(legs, contacts, target, R, floor_m)
+def _grounded(match: _Match, pose: TargetPose, settings: FeetSettings) -> tuple[TargetPose, np.ndarray]:
+    """The pose with feet on the floor, and the part of the carrier's shift that plants them (T, 3)."""
+    contacts, legs, fps = match.contacts, match.legs, match.source.motion.fps
+    if pose.carrier < 0:
+        return pose, pose.shift_m
+    planting = contacts is not None and settings.mode != "off" and bool(legs)
+    if planting and contacts is not None:
+        pose = pose.turned(feet.lock_flat(pose.R, legs, contacts, settings, fps))
+    path = _travel(match)
+    unplanted_m = np.zeros((len(pose.R), 3))
+    pose = pose.moved(path - pose.hips_m)
+    if not planting or contacts is None:
+        return pose, unplanted_m
+    heads, R = pose.head_m, pose.R
+    stands = feet.find_stands(legs, contacts, R)
     moved, tilt, places = feet.carry_root(
         stands,
         {side: heads[:, leg.foot[0]] for side, leg in legs.items()},
-        {s: heads[:, leg.thigh[0]] - path for s, leg in legs.items()},
-        {side: feet.stiffness(leg, target, R) for side, leg in legs.items()},
-        source.fps,
-        _leg_m(target, target_map),
+        {side: heads[:, leg.thigh[0]] - path for side, leg in legs.items()},
+        {side: feet.stiffness(leg, R) for side, leg in legs.items()},
+        fps,
+        _leg_m(match.target.rig, match.target.map),
     )
-    R, shift = _tilted(target, target_map, R, driven, carrier, shift, tilt, path + moved)
-    return (
-        _pinned(
-            target,
-            target_map,
-            R,
-            driven,
-            heads_of(target, R, carrier, shift, target_map),
-            legs,
-            stands,
-            places,
-            floor_m,
-            settings.blend_s * source.fps,
-        ),
-        shift,
-        moved,
-    )
+    pose = _tilted(pose, tilt, path + moved)
+    return _planted(pose, legs, stands, places, settings.blend_s * fps), moved
 
 
-def _tilted(
-    target: Rig,
-    target_map: RigMap,
-    R: np.ndarray,
-    driven: np.ndarray,
-    carrier: int,
-    shift: np.ndarray,
-    tilt: np.ndarray,
-    middle: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The hips turned by the Rodrigues vectors `tilt` (T, 3), the middle between the hip joints being at `middle` (T, 3)."""
-    R = R.copy()
-    for name in target_map.bones["hips"]:
-        R[:, target.index[name]] = matrix_from_vector(tilt) @ R[:, target.index[name]]
-    R = follow(target, R, driven)
-    now = Motion(rig=target, fps=1.0, frames=np.arange(len(R)), R=R, head_m=heads_of(target, R, carrier, shift, target_map))
-    return R, shift + middle - hip_centre(now, target_map)
+def _tilted(pose: TargetPose, tilt: np.ndarray, middle: np.ndarray) -> TargetPose:
+    """The hips turned by the Rodrigues vectors `tilt` (T, 3), the middle between the hip joints at `middle` (T, 3)."""
+    R, target = pose.R.copy(), pose.target
+    for name in target.map.bones["hips"]:
+        R[:, target.rig.index[name]] = matrix_from_vector(tilt) @ R[:, target.rig.index[name]]
+    pose = pose.turned(R)
+    return pose.moved(pose.shift_m + middle - pose.hips_m)
 
 
-def _travel(
-    source: Motion,
-    source_map: RigMap,
-    target: Rig,
-    target_map: RigMap,
-    contacts: Contacts | None,
-    scale: float,
-    legs: Mapping[str, feet.Leg],
-    floor_m: float,
-) -> np.ndarray:
-    """Where the middle of the hips goes (T, 3): as the source's, scaled, with the ankles' levels on the floor as the origin of height."""
-    path = hip_centre(source, source_map)
-    if contacts is None or not legs:
-        rest_s = source.rig.head_m[source.rig.index[source_map.bones["hips"][0]]]
-        rest_t = target.head_m[target.index[target_map.bones["hips"][0]]]
+def _travel(match: _Match) -> np.ndarray:
+    """The path of the middle of the hips (T, 3): the source's, scaled, with the ankles' levels on the floor as the origin of height."""
+    source, target, scale = match.source, match.target, match.scale
+    path = hip_centre(source.motion, source.map)
+    if match.contacts is None or not match.legs:
+        rest_s = source.rig.head_m[source.rig.index[source.map.bones["hips"][0]]]
+        rest_t = target.rig.head_m[target.rig.index[target.map.bones["hips"][0]]]
         return rest_t + scale * (path - rest_s)
-    return scale * (path - (0.0, 0.0, contacts.ankle_level_m)) + (0.0, 0.0, floor_m + _ankle_level(legs))
+    return scale * (path - (0.0, 0.0, match.contacts.ankle_level_m)) + (0.0, 0.0, match.ankle_level_m)
 
 
-def _pinned(
-    target: Rig,
-    target_map: RigMap,
-    R: np.ndarray,
-    driven: np.ndarray,
-    heads: np.ndarray,
-    legs: Mapping[str, feet.Leg],
-    stands: list[feet.Stand],
-    places: np.ndarray,
-    floor_m: float,
-    blend: float,
-) -> np.ndarray:
-    """R with the legs bent so that standing feet stand."""
-    front = -body_axes(target, target_map)[:, 1]
+def _planted(pose: TargetPose, legs: Mapping[str, feet.Leg], stands: list[feet.Stand], places: np.ndarray, blend: float) -> TargetPose:
+    """The pose with the legs bent so that feet in contact are at their places."""
+    rig, R, heads = pose.target.rig, pose.R, pose.head_m
+    front = -body_axes(rig, pose.target.map)[:, 1]
     for leg in legs.values():
         thigh = leg.thigh[0]
-        goal, R = feet.ankle_goals(leg, target, R, stands, places, heads[:, leg.foot[0]], floor_m, blend)
-        forward = R[:, thigh] @ (target.R_rest[thigh].T @ front)
-        R = feet.bend_limb(target, R, leg.thigh, leg.shin, leg.foot[0], heads[:, thigh], goal, forward)
-    return follow(target, R, driven)
+        goal, R = feet.ankle_goals(leg, R, stands, places, heads[:, leg.foot[0]], blend)
+        forward = R[:, thigh] @ (rig.R_rest[thigh].T @ front)
+        R = feet.bend_limb(leg.limb, R, heads[:, thigh], goal, forward)
+    return pose.turned(R)
 
 
 def restarted(motion: Motion, first_frame: float) -> Motion:
     """The same motion, beginning at another frame."""
-    return replace(motion, frames=motion.frames - motion.frames[0] + first_frame, unshown=None)
+    return replace(motion, frames=motion.frames - motion.frames[0] + first_frame, residual=None)

@@ -1,8 +1,8 @@
-"""A rig and a motion as plain values, wherever they came from: an armature, a BVH file, a measured body.
+"""A rig and a motion as plain values, whatever their origin: an armature, a BVH file, a measured body.
 
-Everything is in the world (metres, Z up) with the rest pose given as frames and places:
+Everything is in the world (metres, Z up); the rest pose is given as rotations and positions:
 
-    R_b = R_parent · R_rest,parentᵀ · R_rest,b · B_b                the pose of a bone; B_b is its pose channel          (1)
+    R_b = R_parent · R_rest,parentᵀ · R_rest,b · B_b                the rotation of a bone; B_b is its pose channel      (1)
     head_b = head_parent + R_parent · R_rest,parentᵀ · (head_rest,b − head_rest,parent) + shift                         (2)
 
 A bone that does not inherit rotation has R_b = R_rest,b · B_b.
@@ -17,7 +17,7 @@ import numpy as np
 from ...errors import InputError
 from ...values import frozen
 from .turns import transposed
-from .unshown import Unshown
+from .unshown import ResidualMotion
 
 SHORTEST_BONE_M = 1e-6
 
@@ -26,7 +26,7 @@ SHORTEST_BONE_M = 1e-6
 class Rig:
     """Bones, parents first, in their rest pose in the world.
 
-    `roles`: what the file itself says its bones are (VRM's humanoid). `sole_m`: by bone, points (K, 3) under the foot in the rest
+    `roles`: bones by role where the file itself has them (VRM's humanoid). `sole_m`: by bone, points (K, 3) under the foot in the rest
     pose, where the skin touches the floor.
     """
 
@@ -54,15 +54,15 @@ class Rig:
         if n == 0:
             raise InputError("The rig has no bones; choose an armature with bones.")
         if len(set(self.names)) < n:
-            raise InputError("Two bones of the rig have the same name; give each a name of its own.")
+            raise InputError("Two bones of the rig have the same name; rename one of them.")
         if not (self.parents < np.arange(n)).all():
-            raise InputError("The rig's bones are not in order, or go round in a circle; a parent must come before its children.")
+            raise InputError("The rig's bones are out of order or form a loop; a parent must come before its children.")
         if not all(np.isfinite(a).all() for a in (self.R_rest, self.head_m, self.tail_m)):
-            raise InputError("The rig has bones at places that are no numbers; mend its rest pose.")
+            raise InputError("The rest pose of the rig has positions that are not numbers; repair it.")
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """Where a bone stands, by its name."""
+        """A bone's index, by its name."""
         return {name: i for i, name in enumerate(self.names)}
 
     @cached_property
@@ -81,34 +81,34 @@ class Rig:
         return float(np.ptp(ends[:, 2]))
 
     def ancestors(self, bone: int) -> list[int]:
-        """The bone itself and what it hangs on, upwards."""
+        """The bone itself, its parent, its parent's parent, and so on."""
         line = [bone]
         while self.parents[line[-1]] >= 0:
             line.append(int(self.parents[line[-1]]))
         return line
 
     def path(self, top: int, bottom: int) -> list[int]:
-        """The bones from `top` down to `bottom`, both included; empty if bottom does not hang on top."""
+        """The bones from `top` down to `bottom`, both included; empty if bottom does not descend from top."""
         line = self.ancestors(bottom)
         return line[: line.index(top) + 1][::-1] if top in line else []
 
     def common(self, a: int, b: int) -> int | None:
-        """The lowest bone on which both hang (or that is one of them)."""
+        """The lowest common ancestor of both (it may be one of them)."""
         line = set(self.ancestors(b))
         return next((bone for bone in self.ancestors(a) if bone in line), None)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Motion:
-    """A rig that moves: R (T, B, 3, 3) and heads (T, B, 3) [m] in the world, at frames (T,) of `fps` frames per second. `unshown`: what is
-    known of the motion beyond what the rig can show, at the same frames; `notes`: sentences on where it comes from."""
+    """A rig in motion: R (T, B, 3, 3) and heads (T, B, 3) [m] in the world, at frames (T,) of `fps` frames per second. `residual`: the
+    motion that the rig cannot show, at the same frames; `notes`: sentences about its origin."""
 
     rig: Rig
     fps: float
     frames: np.ndarray  # (T,) frame numbers of the scene
     R: np.ndarray  # (T, B, 3, 3)
     head_m: np.ndarray  # (T, B, 3)
-    unshown: Unshown | None = None
+    residual: ResidualMotion | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -119,7 +119,7 @@ class Motion:
         if t == 0:
             raise InputError("The motion has no frames; choose one with frames.")
         if not (np.isfinite(self.R).all() and np.isfinite(self.head_m).all()):
-            raise InputError("The motion holds places or rotations that are no numbers; fill its gaps first.")
+            raise InputError("The motion has positions or rotations that are not numbers; fill its gaps first.")
         if not (np.isfinite(self.fps) and self.fps > 0):
             raise InputError(f"The motion has {self.fps} frames per second; that must be a positive number.")
 
@@ -138,8 +138,17 @@ def posed(rig: Rig, basis: np.ndarray, shift_m: Mapping[int, np.ndarray] | None 
     return R, head
 
 
+def following(rig: Rig, R: np.ndarray, driven: np.ndarray) -> np.ndarray:
+    """R (T, B, 3, 3) with the bones that are not `driven` (B,) in their rest pose relative to their parents."""
+    R = R.copy()
+    for b in np.flatnonzero(~driven):
+        p = rig.parents[b]
+        R[:, b] = rig.R_rest[b] if p < 0 or not rig.inherits_rotation[b] else R[:, p] @ (rig.R_rest[p].T @ rig.R_rest[b])
+    return R
+
+
 def head_of(rig: Rig, R: np.ndarray, head: np.ndarray, b: int) -> np.ndarray:
-    """Where the head (T, 3) of bone b is when its parent stands as in R (T, B, 3, 3), head (T, B, 3).  (2)"""
+    """The head (T, 3) of bone b without a shift of its own, its parent posed as in R (T, B, 3, 3), head (T, B, 3).  (2)"""
     p = rig.parents[b]
     if p < 0:
         return np.broadcast_to(rig.head_m[b], (len(R), 3))
@@ -155,7 +164,7 @@ def channels(rig: Rig, R: np.ndarray) -> np.ndarray:
 
 
 def _carried(rig: Rig, R: np.ndarray, b: int) -> np.ndarray:
-    """The frame (T, 3, 3) of bone b when its own channel is at rest."""
+    """The rotation (T, 3, 3) of bone b with its own channel at rest."""
     p = rig.parents[b]
     if p < 0 or not rig.inherits_rotation[b]:
         return np.broadcast_to(rig.R_rest[b], (len(R), 3, 3))

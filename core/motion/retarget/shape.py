@@ -1,36 +1,58 @@
-"""Recognising a rig that has no telling names: by the way its bones hang together, by lengths and by symmetry.
+"""Recognising a rig without meaningful names: from its hierarchy, its lengths and its symmetry.
 
-A body is a tree with two pairs of alike branches: the pair that ends lowest are the legs, the pair that reaches out farthest of those
-that part above are the arms. Of a branch the two longest bones that follow each other are the limb; what comes before is the collar
-bone or hip, what comes after the hand or foot. Left and right follow from the feet, which point forward.
+A body is a tree with two pairs of similar branches: the pair that ends lowest are the legs; of the pairs that fork above, the one that
+reaches out farthest are the arms. The two longest consecutive bones of a branch are the limb; the bone before it is the collar bone or
+hip, the bones after it are hand or foot. Left and right follow from the feet, which point forward.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from .mapping import RigMap, _completed
 from .names import marks_an_end
 from .rig import Rig
 from .roles import sided
 
-ALIKE = 0.15  # mirrored branches may differ in length by this part
-SHORTEST_LIMB = 0.1  # of the rig's height
+# By the rig's height
+SHORTEST_LIMB = 0.1  # shorter branches are no limbs
+LOW_END = 0.2  # the legs end below this height
+ARMS_OVER_HIPS = 0.15  # the arms fork at least so far above the legs
+NECK_OFF_AXIS = 0.06  # neck and head are not farther from the chest's vertical
+# By the length of the longer of two mirrored branches
+ALIKE = 0.15  # their lengths differ by less …
+LEVEL_ENDS = 0.05  # … and the heights of their ends
+APART = 0.1  # their ends are farther apart
+SPREAD_OUT = 0.3  # each end is farther from the fork
+OFF_CENTRE = (0.6, 0.25)  # their middle is off the fork by less than so much of their distance and so much of their length
+LONG_CLAVICLE = 0.6  # by the bone after it: a first bone that is shorter is a collar bone, not an upper arm
+FEET_FORWARD = 0.05  # by leg length: shorter feet do not define forward
+MOST_NECK_BONES = 6
+ON_A_LEVEL_M = 1e-6  # tolerance for bones on one height
+LEVEL_TOLERANCE_M = 1e-9  # of branches without length
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ShapeMatch:
+    """Chains of bone names by role. `sides_known`: the feet define which way is forward, thus left and right."""
+
+    bones: Mapping[str, tuple[str, ...]]
+    sides_known: bool
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Branch:
-    """From a fork outwards: bones, and where the farthest one ends."""
+    """Bones from a fork outwards, and their length up to the end of the last one."""
 
     line: tuple[int, ...]
     length_m: float
 
 
-def by_shape(rig: Rig) -> RigMap | None:
-    """A mapping by shape alone, or None if the rig is not shaped like a person who stands upright."""
+def by_shape(rig: Rig) -> ShapeMatch | None:
+    """The parts of the body by shape alone, or None if the rig is not shaped like a person who stands upright."""
     pairs = _pairs(rig)
     legs = min(pairs, key=lambda pair: (round(_end(rig, pair[0])[2], 3), len(rig.ancestors(pair[0].line[0]))), default=None)
-    if legs is None or _end(rig, legs[0])[2] > rig.head_m[:, 2].min() + 0.2 * rig.height_m:
+    if legs is None or _end(rig, legs[0])[2] > rig.head_m[:, 2].min() + LOW_END * rig.height_m:
         return None
     fork = rig.common(legs[0].line[0], legs[1].line[0])
     arms = [
@@ -38,13 +60,13 @@ def by_shape(rig: Rig) -> RigMap | None:
         for pair in pairs
         if fork is not None
         and not set(pair[0].line) & {*legs[0].line, *legs[1].line}
-        and rig.head_m[pair[0].line[0]][2] > rig.head_m[fork][2] + 0.15 * rig.height_m
+        and rig.head_m[pair[0].line[0]][2] > rig.head_m[fork][2] + ARMS_OVER_HIPS * rig.height_m
         and fork in rig.ancestors(pair[0].line[0])
     ]
     arm = max(arms, key=lambda pair: pair[0].length_m, default=None)
     if fork is None or arm is None:
         return None
-    bones, told = _sides(rig, legs, arm)
+    bones, sides_known = _sides(rig, legs, arm)
     chest = rig.common(arm[0].line[0], arm[1].line[0])
     if chest is None or fork not in rig.ancestors(chest):
         return None
@@ -57,10 +79,7 @@ def by_shape(rig: Rig) -> RigMap | None:
         bones["head"] = (rig.names[top[-1]],)
         if top[:-1]:
             bones["neck"] = tuple(rig.names[b] for b in top[:-1])
-    notes = ("recognised by its shape, not by names: look it over",) + (
-        () if told else ("left and right are a guess: the feet do not say which way is forward",)
-    )
-    return _completed(rig, RigMap(bones=bones, notes=notes, origin="shape"))
+    return ShapeMatch(bones=bones, sides_known=sides_known)
 
 
 def _pairs(rig: Rig) -> list[tuple[_Branch, _Branch]]:
@@ -76,9 +95,9 @@ def _pairs(rig: Rig) -> list[tuple[_Branch, _Branch]]:
 
 
 def _branch(rig: Rig, start: int) -> _Branch:
-    """The longest line from `start` outwards; among fingers the one in the middle does as well as another."""
+    """The longest chain from `start` outwards; any finger continues an arm as well as another."""
     best = _Branch(line=(start,), length_m=float(np.linalg.norm(rig.tail_m[start] - rig.head_m[start])))
-    for child in _parts_of_it(rig, start):
+    for child in _proper_children(rig, start):
         tail = _branch(rig, child)
         length = tail.length_m + float(np.linalg.norm(rig.head_m[child] - rig.head_m[start]))
         if length > best.length_m or len(best.line) == 1:
@@ -86,8 +105,8 @@ def _branch(rig: Rig, start: int) -> _Branch:
     return best
 
 
-def _parts_of_it(rig: Rig, bone: int) -> list[int]:
-    """The children of a bone, but not those that only tell where it ends."""
+def _proper_children(rig: Rig, bone: int) -> list[int]:
+    """The children of a bone, without those that only mark its end."""
     return [child for child in rig.children[bone] if rig.children[child] or not marks_an_end(rig.names[child])]
 
 
@@ -99,10 +118,10 @@ def _mirrored(rig: Rig, fork: int, a: _Branch, b: _Branch) -> bool:
     size = max(a.length_m, b.length_m)
     end_a, end_b = _end(rig, a) - rig.head_m[fork], _end(rig, b) - rig.head_m[fork]
     apart = float(np.linalg.norm(end_a[:2] - end_b[:2]))
-    level = abs(end_a[2] - end_b[2]) < 0.05 * size + 1e-9
+    level = abs(end_a[2] - end_b[2]) < LEVEL_ENDS * size + LEVEL_TOLERANCE_M
     middle = np.linalg.norm((end_a + end_b)[:2]) / 2
-    alike = abs(a.length_m - b.length_m) < ALIKE * size and level and apart > 0.1 * size
-    return bool(alike and np.linalg.norm(end_a) > 0.3 * size and middle < 0.6 * apart + 0.25 * size)
+    alike = abs(a.length_m - b.length_m) < ALIKE * size and level and apart > APART * size
+    return bool(alike and np.linalg.norm(end_a) > SPREAD_OUT * size and middle < OFF_CENTRE[0] * apart + OFF_CENTRE[1] * size)
 
 
 def _sides(rig: Rig, legs: tuple[_Branch, _Branch], arms: tuple[_Branch, _Branch]) -> tuple[dict[str, tuple[str, ...]], bool]:
@@ -115,15 +134,15 @@ def _sides(rig: Rig, legs: tuple[_Branch, _Branch], arms: tuple[_Branch, _Branch
             last = line[-1]
             end = rig.tail_m[last] if len(line) == 1 else rig.head_m[last]
             forward += (end - rig.head_m[line[0]]) * (1, 1, 0)
-    told = bool(np.linalg.norm(forward) > 0.05 * legs[0].length_m)
-    left = np.cross((0.0, 0.0, 1.0), forward if told else (0.0, -1.0, 0.0))
+    sides_known = bool(np.linalg.norm(forward) > FEET_FORWARD * legs[0].length_m)
+    left = np.cross((0.0, 0.0, 1.0), forward if sides_known else (0.0, -1.0, 0.0))
     bones: dict[str, tuple[str, ...]] = {}
     for pair, names in ((legs, (("thigh", "shin"), ("foot", "toe"), "")), (arms, (("upper_arm", "forearm"), ("hand",), "clavicle"))):
         first_is_left = float((_end(rig, pair[0]) - _end(rig, pair[1])) @ left) > 0
         for branch, side in zip(pair, ("L", "R") if first_is_left else ("R", "L")):
             for part, chain in _parts(rig, branch, *names).items():
                 bones[sided(part, side)] = tuple(rig.names[b] for b in chain)
-    return bones, told
+    return bones, sides_known
 
 
 def _parts(rig: Rig, branch: _Branch, limb: tuple[str, str], after: tuple[str, ...], before: str) -> dict[str, tuple[int, ...]]:
@@ -131,7 +150,7 @@ def _parts(rig: Rig, branch: _Branch, limb: tuple[str, str], after: tuple[str, .
     ends = [rig.head_m[b] for b in line[1:]] + [rig.tail_m[line[-1]]]
     length = np.array([np.linalg.norm(end - rig.head_m[b]) for b, end in zip(line, ends)])
     k = int(np.argmax(length[:-1] + length[1:])) if len(line) > 1 else 0
-    if len(line) > k + 3 and not after[1:] and length[k] < 0.6 * length[k + 1]:  # a long collar bone
+    if len(line) > k + 3 and not after[1:] and length[k] < LONG_CLAVICLE * length[k + 1]:
         k += 1
     parts: dict[str, tuple[int, ...]] = {limb[0]: (line[k],)}
     if len(line) > k + 1:
@@ -144,18 +163,18 @@ def _parts(rig: Rig, branch: _Branch, limb: tuple[str, str], after: tuple[str, .
 
 
 def _upwards(rig: Rig, chest: int, taken: set[int]) -> list[int]:
-    """The line that goes on from the chest between the arms: neck and head."""
+    """The chain from the chest upwards between the arms: neck and head."""
     line: list[int] = []
     bone = chest
     while True:
         ahead = [
             c
-            for c in _parts_of_it(rig, bone)
+            for c in _proper_children(rig, bone)
             if c not in taken
-            and rig.head_m[c][2] >= rig.head_m[bone][2] - 1e-6
-            and np.linalg.norm((rig.head_m[c] - rig.head_m[chest])[:2]) < 0.06 * rig.height_m
+            and rig.head_m[c][2] >= rig.head_m[bone][2] - ON_A_LEVEL_M
+            and np.linalg.norm((rig.head_m[c] - rig.head_m[chest])[:2]) < NECK_OFF_AXIS * rig.height_m
         ]
-        if not ahead or len(line) > 6:
+        if not ahead or len(line) > MOST_NECK_BONES:
             return line
         bone = max(ahead, key=lambda c: _branch(rig, c).length_m)
         line.append(bone)

@@ -1,7 +1,7 @@
-"""Rigs that are steered by controls: the bones that deform follow helpers and constraints, and keys belong on the controls.
+"""Control rigs: rigs whose deforming bones follow helpers and constraints, so that keys belong on the controls.
 
-In the state that a preset names (`properties`, such as FK instead of IK) every control of the body follows another one rigidly, whatever
-helpers lie between them in the rig. Those controls alone, hung on each other as they follow each other, are a rig like any other.
+In the state that a preset defines (`properties`, such as FK instead of IK) every control of the body follows another one rigidly, whatever
+helpers lie between them in the rig. The controls alone, with these as parents, are a rig like any other.
 """
 
 from collections.abc import Mapping
@@ -14,35 +14,35 @@ from .rig import Rig
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Steering:
-    """How a family of control rigs is steered."""
+class ControlRig:
+    """The controls of a family of rigs."""
 
-    follows: Mapping[str, str]  # by control, the one that it follows; a control that is not named follows nothing
+    follows: Mapping[str, str]  # by control, the one that it follows; a control that is not named follows none
     properties: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by bone: custom properties and their values
-    skin: Mapping[str, str] = field(default_factory=dict)  # by control, the bone whose weights the skin has in its place
+    skin: Mapping[str, str] = field(default_factory=dict)  # by control, the bone that has the skin's weights instead
 
     def table(self) -> dict[str, dict[str, Any]]:
-        """As plain values, in the form of a mapping's file."""
+        """As plain values, as in a mapping file."""
         return {
             "follows": dict(self.follows),
             "skin": dict(self.skin),
             "properties": {bone: dict(values) for bone, values in self.properties.items()},
         }
 
-    def of_controls(self, *chains: Mapping[str, tuple[str, ...]]) -> "Steering | None":
-        """This, as long as `chains` (bones by role) name nothing else than its controls."""
+    def of_controls(self, *chains: Mapping[str, tuple[str, ...]]) -> "ControlRig | None":
+        """This control rig if all bones of `chains` (by role) are its controls, else None."""
         named = {name for table in chains for chain in table.values() for name in chain}
         return self if {*self.follows, *self.follows.values()} >= named else None
 
 
-def controls_of(rig: Rig, steering: Steering, chains: Mapping[str, tuple[str, ...]]) -> Rig:
-    """The controls among `chains` (bones by role) of a control rig, as a rig of their own."""
+def controls_of(rig: Rig, control_rig: ControlRig, chains: Mapping[str, tuple[str, ...]]) -> Rig:
+    """The controls in `chains` (bones by role) as a rig of their own."""
     wanted = {name for chain in chains.values() for name in chain}
 
     def above(name: str) -> str | None:
-        parent = steering.follows.get(name)
+        parent = control_rig.follows.get(name)
         while parent is not None and parent not in wanted:
-            parent = steering.follows.get(parent)
+            parent = control_rig.follows.get(parent)
         return parent
 
     def depth(name: str) -> int:
@@ -51,8 +51,8 @@ def controls_of(rig: Rig, steering: Steering, chains: Mapping[str, tuple[str, ..
 
     names = sorted((name for name in rig.names if name in wanted), key=depth)
     rows = [rig.index[name] for name in names]
-    place = {name: i for i, name in enumerate(names)}
-    parents = [place[parent] if (parent := above(name)) is not None else -1 for name in names]
+    order = {name: i for i, name in enumerate(names)}
+    parents = [order[parent] if (parent := above(name)) is not None else -1 for name in names]
     return Rig(
         names=tuple(names),
         parents=np.array(parents),

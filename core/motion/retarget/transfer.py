@@ -1,14 +1,14 @@
-"""The transfer of rotations: every part of the target points where the source's part points, and turns as it turns.
+"""The transfer of rotations: every part of the target has the direction and the twist of the source's part.
 
-    D_s(t) = R_s(t) · R_s,restᵀ                      how a part of the source has turned since its rest pose, in the world    (1)
+    D_s(t) = R_s(t) · R_s,restᵀ                      rotation of a part of the source since its rest pose, in the world       (1)
     R_t(t) = D_s(t) · A · R_t,rest                   the target's part turns likewise, from a rest pose like the source's     (2)
     A_body = F_s · F_tᵀ                              F: the body's own axes (left, back, up) in the rest pose                 (3)
     A_child = shortest(A_parent · d_t → d_s) · A_parent        d: direction of the part in the rest pose, head to next head   (4)
 
-(2) with A = 1 is the rule q_t = R_rest,t⁻¹ R_rest,s q_s R_rest,s⁻¹ R_rest,t of equal rest poses; A makes it hold for any two. By (4) the
-directions of limbs agree exactly; feet get A by their heading only, since what matters of a foot is that its sole is level. Torso
-parts keep their rest posture: A = A_body. Of chains that bend, the bones of the shorter one go to the bones of the longer one that end
-nearest to theirs, so that they return; what lies between gets D interpolated along the length.
+(2) with A = 1 is the rule q_t = R_rest,t⁻¹ R_rest,s q_s R_rest,s⁻¹ R_rest,t of equal rest poses; the alignment A extends it to any two. By
+(4) the directions of limbs agree exactly; feet are aligned by their heading only, so that their soles stay level. Parts of the torso keep
+their rest pose: A = A_body. In chains that bend, each bone of the shorter chain is paired with the bone of the longer one whose end is
+nearest to its own, so that a round trip is exact; the bones between get D interpolated along the length.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,30 +17,32 @@ from typing import Any
 
 import numpy as np
 
-from .mapping import RigMap
-from .rig import Motion, Rig
+from .mapping import MappedMotion, MappedRig, RigMap
+from .rig import Motion, Rig, following
 from .roles import ROLES, SEGMENTS, SIDES, SPREAD, above, part_of, side_of, sided
 from .turns import about, between, rotate, shortest, transposed, twist_about, unit
 
-UPRIGHT = np.cos(np.radians(35.0))  # a rest pose that leans less is taken as upright
-LEVEL = 0.35  # a foot whose direction has a smaller horizontal part has no heading
+UPRIGHT = np.cos(np.radians(35.0))  # a rest pose that leans by less counts as upright
+LEVEL = 0.35  # a foot whose direction has a smaller horizontal component has no heading
+LONE_FOREARM = 0.5  # fraction of the hand's twist that a forearm without twist bones takes
+SHORTEST_M = 1e-9  # bones below this length count as equally long
 
 Nodes = tuple[np.ndarray, np.ndarray]  # fractions (N,) along a chain, and rotations since rest (N, T, 3, 3)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Turned:
-    """Rotations of the target's bones in the world; `driven` says which bones follow the source, the others keep to their parents."""
+    """Rotations of the target's bones in the world. Bones that are not driven keep their rest pose relative to their parents."""
 
     R: np.ndarray  # (T, B, 3, 3)
-    driven: np.ndarray  # (B,) bool
+    driven: np.ndarray  # (B,) bool: bones that follow the source
 
 
 def body_axes(rig: Rig, rig_map: RigMap) -> np.ndarray:
     """The body's left, back and up (columns, in the world) in the rest pose; the world's axes for a person who faces −Y."""
 
     def place(role: str) -> np.ndarray | None:
-        name = rig_map.first(role) if role not in rig_map.hung else None
+        name = rig_map.first(role) if role not in rig_map.restored else None
         return rig.head_m[rig.index[name]] if name else None
 
     pairs = [(place(sided(part, "L")), place(sided(part, "R"))) for part in ("thigh", "upper_arm", "clavicle", "shin", "forearm")]
@@ -59,7 +61,7 @@ def body_axes(rig: Rig, rig_map: RigMap) -> np.ndarray:
 
 
 def direction(rig: Rig, rig_map: RigMap, role: str) -> np.ndarray | None:
-    """Where a limb's part points in the rest pose (unit vector in the world): from its head to the next part's, or to its tail."""
+    """A part's direction in the rest pose (unit vector in the world): from its head to the next part's, or to its tail."""
     name = rig_map.first(role)
     if name is None:
         return None
@@ -73,32 +75,32 @@ def direction(rig: Rig, rig_map: RigMap, role: str) -> np.ndarray | None:
     return along if along.any() else None
 
 
-def alignments(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap) -> dict[str, np.ndarray]:
+def alignments(source: MappedRig, target: MappedRig) -> dict[str, np.ndarray]:
     """A (3, 3) of every role that both have.  (3), (4)"""
-    body = body_axes(source, source_map) @ body_axes(target, target_map).T
+    body = body_axes(source.rig, source.map) @ body_axes(target.rig, target.map).T
     aligned: dict[str, np.ndarray] = {}
     for role in ROLES:
-        if role not in source_map.bones or role not in target_map.bones:
+        if role not in source.map.bones or role not in target.map.bones:
             continue
         part = part_of(role)
         A = aligned.get(above(role, aligned), body)
         if part in ("upper_arm", "forearm", "thigh", "shin") or "." in part:
-            d_s, d_t = direction(source, source_map, role), direction(target, target_map, role)
+            d_s, d_t = direction(source.rig, source.map, role), direction(target.rig, target.map, role)
             if d_s is not None and d_t is not None:
                 A = shortest(A @ d_t, d_s) @ A
         elif part in ("foot", "toe"):
-            A = _heading(source, source_map, target, target_map, role, body)
+            A = _heading(source, target, role, body)
         elif part not in ("hand",):
             A = body
         aligned[role] = A
     return aligned
 
 
-def _heading(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap, role: str, body: np.ndarray) -> np.ndarray:
+def _heading(source: MappedRig, target: MappedRig, role: str, body: np.ndarray) -> np.ndarray:
     """A foot is aligned about the body's up axis alone."""
-    up = body_axes(source, source_map)[:, 2]
+    up = body_axes(source.rig, source.map)[:, 2]
     foot = sided("foot", side_of(role))
-    d_s, d_t = direction(source, source_map, foot), direction(target, target_map, foot)
+    d_s, d_t = direction(source.rig, source.map, foot), direction(target.rig, target.map, foot)
     if d_s is None or d_t is None:
         return body
     flat_s, flat_t = d_s - up * (d_s @ up), body @ d_t - up * (body @ d_t @ up)
@@ -107,54 +109,56 @@ def _heading(source: Rig, source_map: RigMap, target: Rig, target_map: RigMap, r
     return shortest(flat_t, flat_s) @ body
 
 
-def turn(motion: Motion, source_map: RigMap, target: Rig, target_map: RigMap, aligned: Mapping[str, np.ndarray]) -> Turned:
+def turn(source: MappedMotion, target: MappedRig, aligned: Mapping[str, np.ndarray]) -> Turned:
     """Rotations (T, B, 3, 3) of all the target's bones in the world.  (2)"""
+    motion, rig = source.motion, target.rig
     since_rest = motion.R @ transposed(motion.rig.R_rest)  # (1)
     wanted: dict[int, np.ndarray] = {}
     for role, A in aligned.items():
-        nodes = _nodes(motion.rig, source_map, role, since_rest)
-        chain = [target.index[name] for name in target_map.bones[role]]
-        fractions = _spread_over(nodes[0][1:], fractions_of(target, chain)) if part_of(role) in SPREAD else np.ones(len(chain))
+        nodes = _nodes(source.mapped_rig, role, since_rest)
+        chain = [rig.index[name] for name in target.map.bones[role]]
+        fractions = _spread_over(nodes[0][1:], fractions_of(rig, chain)) if part_of(role) in SPREAD else np.ones(len(chain))
         for bone, fraction in zip(chain, fractions):
-            wanted[bone] = _at(nodes, fraction) @ A @ target.R_rest[bone]
-    _point(motion, source_map, target, target_map, wanted)
-    R = np.zeros((len(motion.frames), len(target.names), 3, 3))
+            wanted[bone] = _at(nodes, fraction) @ A @ rig.R_rest[bone]
+    _point(source, target, wanted)
+    R = np.zeros((len(motion.frames), len(rig.names), 3, 3))
     for bone, rotation in wanted.items():
         R[:, bone] = rotation
-    driven = np.isin(np.arange(len(target.names)), list(wanted))
-    R = follow(target, R, driven)
-    for side in SIDES:  # toes that only the target has go with their foot, until they stand
+    driven = np.isin(np.arange(len(rig.names)), list(wanted))
+    R = following(rig, R, driven)
+    for side in SIDES:  # toes that only the target has follow their foot until the ball of the foot stands
         if sided("foot", side) in aligned:
-            driven[[target.index[name] for name in target_map.bones.get(sided("toe", side), ())]] = True
+            driven[[rig.index[name] for name in target.map.bones.get(sided("toe", side), ())]] = True
     return Turned(R=R, driven=driven)
 
 
-def kept(chain: Sequence[Any], role: str) -> Any:
-    """Which of a part's bones, from the body outwards, has the part's own rotation, without what `share_twist` has spread."""
+def untwisted_bone(chain: Sequence[Any], role: str) -> Any:
+    """The bone of a part, given from the body outwards, that keeps the part's own rotation when `share_twist` spreads the twist."""
     return chain[0] if part_of(role) in ("forearm", "shin") else chain[-1]
 
 
-def _nodes(rig: Rig, rig_map: RigMap, role: str, since_rest: np.ndarray) -> Nodes:
-    """The source's rotations along a chain: at 0 that of what the chain hangs on, then after each of its bones."""
+def _nodes(source: MappedRig, role: str, since_rest: np.ndarray) -> Nodes:
+    """The source's rotations along a chain: at 0 that of the part above, then at the end of each of its bones."""
+    rig, rig_map = source.rig, source.map
     chain = [rig.index[name] for name in rig_map.bones[role]]
     before = above(role, rig_map.bones)
     if part_of(role) not in SPREAD:
-        return np.array([0.0, 1.0]), np.stack([since_rest[:, kept(chain, role)]] * 2)
+        return np.array([0.0, 1.0]), np.stack([since_rest[:, untwisted_bone(chain, role)]] * 2)
     start = since_rest[:, rig.index[rig_map.bones[before][-1]]] if before else since_rest[:, chain[0]]
     return np.concatenate([[0.0], fractions_of(rig, chain)]), np.stack([start, *(since_rest[:, b] for b in chain)])
 
 
 def fractions_of(rig: Rig, chain: list[int]) -> np.ndarray:
-    """Where each bone of a chain ends, as a part (0…1] of its length."""
+    """Where each bone of a chain ends, as a fraction (0…1] of the chain's length."""
     ends = [rig.head_m[b] for b in chain[1:]] + [rig.tail_m[chain[-1]]]
     length = np.array([np.linalg.norm(end - rig.head_m[b]) for b, end in zip(chain, ends)])
-    if length.sum() < 1e-9 or (length < 1e-9).any():
+    if length.sum() < SHORTEST_M or (length < SHORTEST_M).any():
         length = np.ones(len(chain))
     return np.cumsum(length) / length.sum()
 
 
 def _spread_over(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Where on the source's chain each of the target's bones has its rotation from; both by where their bones end (0…1]."""
+    """The fractions of the source's chain from which the target's bones take their rotations; both given by their bones' ends (0…1]."""
     if len(target) < len(source):
         return source[partners_of(target, source)]
     partners = partners_of(source, target)
@@ -162,7 +166,7 @@ def _spread_over(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def partners_of(few: np.ndarray, many: np.ndarray) -> list[int]:
-    """Which of `many` rising numbers goes with each of `few`: the nearest, each once, in order; the last with the last."""
+    """The index in `many` (ascending) of the partner of each of `few`: the nearest, each once, in order; the last with the last."""
     partners: list[int] = []
     for i, place in enumerate(few):
         first, stop = partners[-1] + 1 if partners else 0, len(many) - (len(few) - 1 - i)
@@ -180,7 +184,7 @@ def _at(nodes: Nodes, fraction: float) -> np.ndarray:
 
 
 def directions(motion: Motion, rig_map: RigMap) -> dict[str, np.ndarray]:
-    """Where the limbs' parts point in every frame (T, 3): from joint to joint, by role."""
+    """Directions of the limbs' parts in every frame (T, 3): from joint to joint, by role."""
     found = {}
     for side in SIDES:
         for part, after in SEGMENTS:
@@ -191,73 +195,83 @@ def directions(motion: Motion, rig_map: RigMap) -> dict[str, np.ndarray]:
     return found
 
 
-def _point(motion: Motion, source_map: RigMap, target: Rig, target_map: RigMap, wanted: dict[int, np.ndarray]) -> None:
-    """The last bit for sources whose joints also shift: the limbs' directions agree with the joints', not only with the rotations."""
-    for role, along in directions(motion, source_map).items():
-        d_t = direction(target, target_map, role)
-        chain = [target.index[name] for name in target_map.bones.get(role, ())]
+def _point(source: MappedMotion, target: MappedRig, wanted: dict[int, np.ndarray]) -> None:
+    """Correct `wanted` for sources whose joints also shift: the limbs' directions agree with the joints', not only with the rotations."""
+    for role, along in directions(source.motion, source.map).items():
+        d_t = direction(target.rig, target.map, role)
+        chain = [target.rig.index[name] for name in target.map.bones.get(role, ())]
         if d_t is None or not along.any(axis=-1).all():
             continue
         for bone in chain:
-            now = rotate(wanted[bone] @ target.R_rest[bone].T, d_t)
+            now = rotate(wanted[bone] @ target.rig.R_rest[bone].T, d_t)
             wanted[bone] = shortest(now, along) @ wanted[bone]
 
 
-def share_twist(target: Rig, target_map: RigMap, turned: Turned, *, lone_forearms: bool = False) -> Turned:
-    """Spread the twist of hands, feet and upper limbs over the bones that are there for it: turning a bone about its own axis moves no
-    joint.
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _TwistChain:
+    """A part along which a twist is spread: its bones and its twist bones from the body outwards, and its direction in the rest pose.
 
-    The hand's twist runs down the forearm, the foot's down the shin, from the first of their bones, which keeps the part's own rotation;
-    the twist bones of an upper arm or thigh turn back towards the shoulder or hip, from the last, which keeps it. So what was spread can
-    be read back (`kept`). With `lone_forearms` a forearm of one bone without twist bones takes half of the hand's twist; that cannot be
-    read back.
+    The twist comes from the hand or foot at the part's `end`; without one, it is the part's own against its parent.
+    """
+
+    rig: Rig
+    chain: list[int]
+    twist_bones: list[int]
+    direction: np.ndarray
+    end: int | None
+
+    def twist(self, R: np.ndarray) -> np.ndarray | None:
+        """Twist (T,) [rad] about the part's own axis in R (T, B, 3, 3); None without a parent."""
+        bone = self.chain[0]
+        a, b = (bone, self.end) if self.end is not None else (int(self.rig.parents[bone]), bone)
+        if a < 0:
+            return None
+        relative = transposed(R[:, a]) @ R[:, b] @ (self.rig.R_rest[b].T @ self.rig.R_rest[a])
+        return np.unwrap(twist_about(relative, self.rig.R_rest[a].T @ self.direction))
+
+    def spread(self, R: np.ndarray, twist: np.ndarray, *, lone: bool) -> None:
+        """Write into R; `lone`: a single bone without twist bones takes a part of the twist of its end."""
+        before, n, m, outwards = R.copy(), len(self.chain), len(self.twist_bones), self.end is not None
+        rest, d = self.rig.R_rest, self.direction
+        if outwards:
+            parts = [LONE_FOREARM] if lone and n == 1 else [k / n for k in range(n)]
+        else:
+            parts = [(k + 1) / n - 1.0 for k in range(n)]
+        for b, part in zip(self.chain, parts):
+            R[:, b] = before[:, b] @ about(rest[b].T @ d, part * twist)
+        for k, b in enumerate(self.twist_bones):
+            p, part = self.rig.parents[b], (k + 1) / (m + 1) - (0.0 if outwards else 1.0)
+            R[:, b] = before[:, p] @ (rest[p].T @ rest[b]) @ about(rest[b].T @ d, part * twist)
+
+
+def share_twist(target: MappedRig, turned: Turned, *, lone_forearms: bool = False) -> Turned:
+    """Spread the twist of hands, feet and upper limbs over twist bones: turning a bone about its own axis moves no joint.
+
+    The hand's twist is spread down the forearm, the foot's down the shin, from the first of their bones, which keeps the part's own
+    rotation; the twist bones of an upper arm or thigh turn back towards the shoulder or hip, from the last, which keeps it. So the part's
+    own rotation can be recovered (`untwisted_bone`). With `lone_forearms` a forearm of one bone without twist bones takes half of the
+    hand's twist; that cannot be recovered from the rig.
     """
     R, driven = turned.R.copy(), turned.driven.copy()
     for side in SIDES:
         for part, after in (("forearm", "hand"), ("shin", "foot"), ("upper_arm", ""), ("thigh", "")):
-            role, end = sided(part, side), target_map.first(sided(after, side)) if after else None
-            chain = [target.index[name] for name in target_map.bones.get(role, ())]
-            beside = [target.index[name] for name in target_map.twist.get(role, ()) if target.parents[target.index[name]] in chain]
-            d = direction(target, target_map, role)
-            beside.sort(key=lambda b: float((target.head_m[b] - target.head_m[chain[0]]) @ (d if d is not None else np.zeros(3))))
-            if d is None or not driven[chain[0]] or (after and (end is None or not driven[target.index[end]])):
+            found = _twist_chain(target, sided(part, side), sided(after, side) if after else "")
+            if found is None or not driven[found.chain[0]] or (found.end is not None and not driven[found.end]):
                 continue
-            twist = _twist(target, turned.R, chain[0], d, target.index[end] if end else None)
+            twist = found.twist(turned.R)
             if twist is not None:
-                _spread(target, R, chain, beside, d, twist, outwards=bool(after), alone=lone_forearms and part == "forearm" and not beside)
-                driven[beside] = True
-    return Turned(R=follow(target, R, driven), driven=driven)
+                found.spread(R, twist, lone=lone_forearms and part == "forearm" and not found.twist_bones)
+                driven[found.twist_bones] = True
+    return Turned(R=following(target.rig, R, driven), driven=driven)
 
 
-def _twist(target: Rig, R: np.ndarray, bone: int, d: np.ndarray, end: int | None) -> np.ndarray | None:
-    """Twist (T,) [rad] about the part's own axis: of what hangs at its end, or of itself against what it hangs on."""
-    a, b = (bone, end) if end is not None else (int(target.parents[bone]), bone)
-    if a < 0:
+def _twist_chain(target: MappedRig, role: str, after: str) -> _TwistChain | None:
+    """A part's bones with the hand or foot `after` it; None if the rig lacks one of them, or the part has no direction."""
+    rig, names = target.rig, target.map
+    end, d = names.first(after) if after else None, direction(rig, names, role)
+    if d is None or (after and end is None):
         return None
-    relative = transposed(R[:, a]) @ R[:, b] @ (target.R_rest[b].T @ target.R_rest[a])
-    return np.unwrap(twist_about(relative, target.R_rest[a].T @ d))
-
-
-def _spread(
-    target: Rig, R: np.ndarray, chain: list[int], beside: list[int], d: np.ndarray, twist: np.ndarray, *, outwards: bool, alone: bool
-) -> None:
-    """Write into R; `alone`: a lone bone takes half of the twist that comes from its end."""
-    before, n, m = R.copy(), len(chain), len(beside)
-    if outwards:
-        parts = [0.5] if alone and n == 1 else [k / n for k in range(n)]
-    else:
-        parts = [(k + 1) / n - 1.0 for k in range(n)]
-    for b, part in zip(chain, parts):
-        R[:, b] = before[:, b] @ about(target.R_rest[b].T @ d, part * twist)
-    for k, b in enumerate(beside):
-        p, part = target.parents[b], (k + 1) / (m + 1) - (0.0 if outwards else 1.0)
-        R[:, b] = before[:, p] @ (target.R_rest[p].T @ target.R_rest[b]) @ about(target.R_rest[b].T @ d, part * twist)
-
-
-def follow(target: Rig, R: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """R (T, B, 3, 3) with the bones that are not driven at rest against their parents."""
-    R = R.copy()
-    for b in np.flatnonzero(~driven):
-        p = target.parents[b]
-        R[:, b] = target.R_rest[b] if p < 0 or not target.inherits_rotation[b] else R[:, p] @ (target.R_rest[p].T @ target.R_rest[b])
-    return R
+    chain = [rig.index[name] for name in names.bones[role]]
+    twist_bones = [rig.index[name] for name in names.twist.get(role, ()) if rig.parents[rig.index[name]] in chain]
+    twist_bones.sort(key=lambda b: float((rig.head_m[b] - rig.head_m[chain[0]]) @ d))
+    return _TwistChain(rig=rig, chain=chain, twist_bones=twist_bones, direction=d, end=rig.index[end] if end else None)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from tricap.core.motion.retarget.mapping import MappedMotion, MappedRig, RigMap, find_map
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
 from tricap.core.motion.retarget.roles import SIDES, sided
 from tricap.core.motion.retarget.turns import about, matrix_from_vector, shortest
@@ -65,6 +66,16 @@ def person(
         connected=np.zeros(len(rows), dtype=bool),
         inherits_rotation=np.ones(len(rows), dtype=bool),
     )
+
+
+def mapped(motion: Motion, rig_map: RigMap | None = None) -> MappedMotion:
+    """A motion with a mapping, or with the one that is found."""
+    return MappedMotion(motion=motion, map=rig_map or find_map(motion.rig))
+
+
+def mapped_rig(rig: Rig, rig_map: RigMap | None = None) -> MappedRig:
+    """A rig with a mapping, or with the one that is found."""
+    return MappedRig(rig=rig, map=rig_map or find_map(rig))
 
 
 def _shaped(role: str, side: str, X: np.ndarray, arms_down_deg: float, legs_apart_deg: float, thigh_part: float) -> np.ndarray:

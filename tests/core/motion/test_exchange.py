@@ -16,13 +16,13 @@ from tricap.core.motion.markers import Markers
 from tricap.core.motion.points_csv import read_points_csv, write_points_csv
 from tricap.core.motion.retarget.mapping import find_map
 from tricap.core.motion.retarget.points import joint_of, joint_of_bone, motion_from_points
-from tricap.core.motion.retarget.retarget import lies, retarget
+from tricap.core.motion.retarget.retarget import lying_note, retarget
 from tricap.core.motion.retarget.transfer import directions
 from tricap.core.motion.retarget.turns import angle_of, transposed
 from tricap.core.motion.sources import read_motion_source
 from tricap.core.motion.trc import read_trc, write_trc
 
-from .persons import flail, person, squat
+from .persons import flail, mapped, mapped_rig, person, squat
 
 PLACE_M = 2e-6  # text has 1e-6 of the unit, C3D float32 of millimetres
 MOCAP = Path(__file__).resolve().parents[4] / "shared" / "mocap"
@@ -120,9 +120,9 @@ def test_up_and_unit_are_said(tmp_path: Path, kind: str, axes: str) -> None:
     flat, up = read_motion_source(file), read_motion_source(file, up=axes[0], unit="dm")
     target = person()
     maps = find_map(flat.rig), find_map(up.rig), find_map(target)
-    assert "axis is up" in lies(flat, maps[0]) and not lies(up, maps[1])
+    assert "axis is up" in lying_note(mapped(flat, maps[0])) and not lying_note(mapped(up, maps[1]))
     assert abs(np.ptp(up.head_m[0, :, 2]) - 0.1 * np.ptp(standing.head_m[0, :, 2])) < 0.02
-    assert any("axis is up" in note for note in retarget(flat, maps[0], target, maps[2]).notes)
+    assert any("axis is up" in note for note in retarget(mapped(flat, maps[0]), mapped_rig(target, maps[2])).notes)
     write_bvh(tmp_path / "a.bvh", standing)
     with pytest.raises(InputError, match="fathom"):
         read_motion_source(tmp_path / "a.bvh", unit="fathom")

@@ -32,7 +32,7 @@ from tricap.core.motion.retarget.turns import (
 )
 from tricap.core.motion.sources import body_motion, read_motion_source
 
-from .persons import flail, person, squat
+from .persons import flail, mapped, mapped_rig, person, squat
 
 OFF = FeetSettings(mode="off")
 MOCAP = Path(__file__).resolve().parents[4] / "shared" / "mocap" / "cmu"
@@ -60,8 +60,8 @@ BACK_DEG = 1e-4  # promised: 1°; the transfer is exact but for what the chains'
 def test_limbs_point_where_the_sources_do(change: dict[str, object]) -> None:
     source, target = flail(person(roll_seed=1)), person(**change)  # type: ignore[arg-type]
     source_map, target_map = find_map(source.rig), find_map(target)
-    result = retarget(source, source_map, target, target_map, feet_settings=OFF)
-    figures = measure(source, source_map, result.motion, target_map, None)
+    result = retarget(mapped(source, source_map), mapped_rig(target, target_map), feet_settings=OFF)
+    figures = measure(mapped(source, source_map), mapped(result.motion, target_map), None)
     assert len(figures.by_part_deg) == 8 and figures.direction_worst_deg < EXACT_DEG, figures
 
 
@@ -73,8 +73,8 @@ def test_there_and_back_again(other: str) -> None:
     if other != "plain":
         rig, maps = split_limbs(rig, beside="beside" in other), (maps[0], find_map(split_limbs(rig, beside="beside" in other)))
         assert maps[1].twist if "beside" in other else len(maps[1].bones["shin.R"]) == 2, maps[1]
-    there = retarget(source, maps[0], rig, maps[1], feet_settings=OFF)
-    back = retarget(replace(there.motion, unshown=None), maps[1], source.rig, maps[0], feet_settings=OFF)
+    there = retarget(mapped(source, maps[0]), mapped_rig(rig, maps[1]), feet_settings=OFF)
+    back = retarget(mapped(replace(there.motion, residual=None), maps[1]), mapped_rig(source.rig, maps[0]), feet_settings=OFF)
     turned = np.degrees(angle_of(transposed(source.R) @ back.motion.R))
     assert turned.max() < BACK_DEG
     rise = back.motion.head_m - source.head_m  # the floor is found anew: all one height
@@ -88,8 +88,8 @@ def test_spines_return_from_one_of_as_many_bones_or_more(own: int) -> None:
     source, rig = flail(mine), in_three(person(size=0.7), 0.4, 0.9)
     maps = find_map(source.rig), find_map(rig)
     assert (len(maps[0].bones["spine"]), len(maps[1].bones["spine"])) == (own, 3)
-    there = retarget(source, maps[0], rig, maps[1], feet_settings=OFF)
-    back = retarget(replace(there.motion, unshown=None), maps[1], source.rig, maps[0], feet_settings=OFF)
+    there = retarget(mapped(source, maps[0]), mapped_rig(rig, maps[1]), feet_settings=OFF)
+    back = retarget(mapped(replace(there.motion, residual=None), maps[1]), mapped_rig(source.rig, maps[0]), feet_settings=OFF)
     assert np.degrees(angle_of(transposed(source.R) @ back.motion.R)).max() < BACK_DEG
 
 
@@ -144,13 +144,13 @@ def test_every_bone_returns_from_a_rig_on_which_feet_were_held(name: str) -> Non
     """Promised: 1°. Feet are held on both ways, on legs of other proportions; measured for single bones 0.5° RMS (walk) and 0.1° (jump)."""
     own, other = person(roll_seed=1), person(arms_down_deg=45.0, heading_deg=180.0, roll_seed=2, size=0.6, thigh_part=0.55)
     source = on_our_own(name).motion
-    there = retarget(replace(source, unshown=None), find_map(own), other, find_map(other))
-    back = retarget(replace(there.motion, unshown=None), find_map(other), own, find_map(own))  # as through a file
+    there = retarget(mapped(replace(source, residual=None), find_map(own)), mapped_rig(other))
+    back = retarget(mapped(replace(there.motion, residual=None), find_map(other)), mapped_rig(own))  # as through a file
     turned = np.degrees(angle_of(transposed(source.R) @ back.motion.R))
     rms = dict(zip(own.names, np.sqrt(np.mean(turned**2, axis=0))))
     assert max(rms.values()) < 1.0, rms
     for motion, rig, result in ((there.motion, other, there), (back.motion, own, back)):
-        figures = measure(source, find_map(own), motion, find_map(rig), result.contacts)
+        figures = measure(mapped(source, find_map(own)), mapped(motion, find_map(rig)), result.contacts)
         assert max(figures.slide_mm, figures.penetration_mm) < 5.0 and figures.largest_step_deg < 90.0, figures
 
 
@@ -159,7 +159,7 @@ def test_feet_that_were_held_are_left_alone(name: str) -> None:
     """Once more onto the same rig: the contacts are found again as they are, and nothing is to do. Measured 0.4° and 1e-3°."""
     own = person(roll_seed=1)
     once = on_our_own(name)
-    twice = retarget(replace(once.motion, unshown=None), find_map(own), own, find_map(own))
+    twice = retarget(mapped(replace(once.motion, residual=None), find_map(own)), mapped_rig(own))
     turned = np.degrees(angle_of(transposed(once.motion.R) @ twice.motion.R))
     assert np.sqrt(np.mean(turned**2, axis=0)).max() < 0.6
     assert once.contacts is not None and twice.contacts is not None
@@ -171,7 +171,7 @@ def test_feet_that_were_held_are_left_alone(name: str) -> None:
 def on_our_own(name: str) -> Retargeted:
     """The motion on a stick person, feet held."""
     source, own = recorded(name), person(roll_seed=1)
-    return retarget(source, find_map(source.rig), own, find_map(own))
+    return retarget(mapped(source), mapped_rig(own))
 
 
 @lru_cache
@@ -200,7 +200,7 @@ def test_a_heel_that_lifts_stands_no_more() -> None:
 
 def test_the_channels_give_the_motion_again() -> None:
     target = person(roll_seed=4, arms_down_deg=30.0)
-    result = retarget(flail(person()), find_map(person()), target, find_map(target))
+    result = retarget(mapped(flail(person()), find_map(person())), mapped_rig(target))
     R, head = posed(target, result.basis, {result.carrier: result.shift_m})
     np.testing.assert_allclose(R, result.motion.R, atol=1e-9)
     np.testing.assert_allclose(head, result.motion.head_m, atol=1e-9)
@@ -209,7 +209,10 @@ def test_the_channels_give_the_motion_again() -> None:
 def test_twist_is_shared_and_moves_no_joint() -> None:
     source, target = flail(person()), person(roll_seed=3)
     maps = find_map(source.rig), find_map(target)
-    plain, shared = (retarget(source, maps[0], target, maps[1], RetargetSettings(twist=twist), OFF).motion for twist in ("off", "forearms"))
+    plain, shared = (
+        retarget(mapped(source, maps[0]), mapped_rig(target, maps[1]), RetargetSettings(twist=twist), OFF).motion
+        for twist in ("off", "forearms")
+    )
     np.testing.assert_allclose(shared.head_m, plain.head_m, atol=1e-9)
     b, hand = target.index["forearm.L"], target.index["hand.L"]
     np.testing.assert_allclose(shared.R[:, hand], plain.R[:, hand], atol=1e-12)
@@ -229,7 +232,7 @@ def test_twist_bones_take_their_share_by_place_not_by_name() -> None:
         connected=np.zeros(len(rig.names) + 2, dtype=bool),
         inherits_rotation=np.ones(len(rig.names) + 2, dtype=bool),
     )
-    R = retarget(flail(person(), frames=12), find_map(person()), more, find_map(more), feet_settings=OFF).motion.R
+    R = retarget(mapped(flail(person(), frames=12), find_map(person())), mapped_rig(more), feet_settings=OFF).motion.R
     outer, inner = (angle_of(transposed(R[:, b]) @ R[:, k]).max() for k in (-2, -1))
     assert outer > 1.5 * inner > 0.01
 
@@ -237,10 +240,12 @@ def test_twist_bones_take_their_share_by_place_not_by_name() -> None:
 def test_feet_that_stand_stay_on_legs_of_other_proportions() -> None:
     source, target = squat(person()), person(thigh_part=0.58, size=0.8, roll_seed=6)
     maps = find_map(source.rig), find_map(target)
-    loose, firm = (retarget(source, maps[0], target, maps[1], feet_settings=FeetSettings(mode=mode)) for mode in ("off", "auto"))
+    loose, firm = (
+        retarget(mapped(source, maps[0]), mapped_rig(target, maps[1]), feet_settings=FeetSettings(mode=mode)) for mode in ("off", "auto")
+    )
     assert firm.contacts is not None and all(on.all() for on in firm.contacts.ankle.values())
-    figures = measure(source, maps[0], firm.motion, maps[1], firm.contacts)
-    assert measure(source, maps[0], loose.motion, maps[1], firm.contacts).slide_mm > 20.0
+    figures = measure(mapped(source, maps[0]), mapped(firm.motion, maps[1]), firm.contacts)
+    assert measure(mapped(source, maps[0]), mapped(loose.motion, maps[1]), firm.contacts).slide_mm > 20.0
     assert figures.slide_mm < 0.1 and figures.penetration_mm < 0.1 and figures.float_mm < 0.1, figures
     assert figures.direction_rms_deg < 1.0, figures
 
@@ -258,10 +263,10 @@ def test_a_body_in_the_air_does_not_go_on_as_its_feet_had_it_move() -> None:
 def test_a_motion_of_one_frame(frames: int, tmp_path: Path) -> None:
     write_bvh(tmp_path / "one.bvh", squat(person(), frames=frames))
     source, target = read_motion_source(tmp_path / "one.bvh"), person(thigh_part=0.55)
-    result = retarget(source, find_map(source.rig), target, find_map(target))
+    result = retarget(mapped(source), mapped_rig(target))
     assert (
         len(result.motion.frames) == frames
-        and measure(source, find_map(source.rig), result.motion, find_map(target), result.contacts).direction_rms_deg < 1.0
+        and measure(mapped(source), mapped(result.motion, find_map(target)), result.contacts).direction_rms_deg < 1.0
     )
     assert len(resampled(result.motion, 60.0, 1.0).frames) == 2 * frames - 1
 
@@ -275,7 +280,7 @@ def test_the_full_models_clavicle_moves_the_targets(part: str) -> None:
     source = body_motion(shape, values, np.arange(2), 25.0)
     found, bone = find_map(source.rig), target.index[{"shoulder": "clavicle.R", "thigh": "thigh.R"}[part]]
     assert found.bones["clavicle.R"] == ("shoulder.R",) and found.bones["spine"] == ("spine", "chest") and not found.missing
-    R = retarget(source, found, target, find_map(target), feet_settings=OFF).motion.R[:, bone]
+    R = retarget(mapped(source, found), mapped_rig(target), feet_settings=OFF).motion.R[:, bone]
     assert abs(np.degrees(angle_of(R[0].T @ R[1])) - 30.0) < 1e-6
 
 
@@ -283,7 +288,8 @@ def test_root_modes() -> None:
     source, target = flail(person()), person(size=2.0)
     maps = find_map(source.rig), find_map(target)
     travel, spot, still = (
-        retarget(source, maps[0], target, maps[1], RetargetSettings(root=root), OFF) for root in ("travel", "in place", "still")
+        retarget(mapped(source, maps[0]), mapped_rig(target, maps[1]), RetargetSettings(root=root), OFF)
+        for root in ("travel", "in place", "still")
     )
     went = travel.motion.head_m[:, 0] - travel.motion.head_m[0, 0]
     np.testing.assert_allclose(went[-1], 2.0 * (source.head_m[-1, 0] - source.head_m[0, 0]), atol=1e-6)
@@ -306,10 +312,10 @@ def test_a_measured_arm_alone_moves_an_arm_alone() -> None:
     )
     source = Motion(rig=rig, fps=30.0, frames=whole.frames, R=whole.R[:, keep], head_m=whole.head_m[:, keep])
     target = person(arms_down_deg=45.0)
-    result = retarget(source, find_map(rig), target, find_map(target))
+    result = retarget(mapped(source, find_map(rig)), mapped_rig(target))
     assert {target.names[b] for b in np.flatnonzero(result.driven)} == {"upper_arm.R", "forearm.R"}
     assert result.carrier == -1 and any("travel" in note for note in result.notes)
-    still = retarget(flail(person()), find_map(person()), target, find_map(target), RetargetSettings(root="still"), OFF)
+    still = retarget(mapped(flail(person()), find_map(person())), mapped_rig(target), RetargetSettings(root="still"), OFF)
     assert still.carrier == -1 and not any("travel" in note for note in still.notes)
 
 
@@ -319,7 +325,7 @@ def test_parts_that_hang_elsewhere_are_carried() -> None:
     cut = np.array([-1 if name.startswith(("clavicle", "thigh", "shin")) else p for name, p in zip(whole.names, whole.parents)])
     target = Rig(**{f: getattr(whole, f) for f in whole.__dataclass_fields__ if f != "parents"}, parents=cut)
     names = find_map(whole)
-    one, other = (retarget(source, find_map(source.rig), rig, names, feet_settings=OFF) for rig in (whole, target))
+    one, other = (retarget(mapped(source), mapped_rig(rig, names), feet_settings=OFF) for rig in (whole, target))
     np.testing.assert_allclose(other.motion.head_m, one.motion.head_m, atol=1e-9)
     shifts = dict(other.loose_m) | {other.carrier: other.shift_m}
     assert {target.names[b][:-2] for b in other.loose_m} == {"clavicle", "thigh", "shin"}
@@ -345,8 +351,8 @@ def test_zero_pose_that_is_no_pose() -> None:
     )
     source = Motion(rig=broken, fps=30.0, frames=true.frames, R=true.R, head_m=true.head_m)
     target = person(arms_down_deg=45.0)
-    result = retarget(source, find_map(rig), target, find_map(target), feet_settings=OFF)
-    assert measure(source, find_map(rig), result.motion, find_map(target), None).direction_worst_deg < EXACT_DEG
+    result = retarget(mapped(source, find_map(rig)), mapped_rig(target), feet_settings=OFF)
+    assert measure(mapped(source, find_map(rig)), mapped(result.motion, find_map(target)), None).direction_worst_deg < EXACT_DEG
     assert any("rest pose" in note for note in result.notes)
 
 
@@ -354,7 +360,7 @@ def test_bad_input_is_said() -> None:
     source, target = flail(person()), person()
     source_map = find_map(source.rig)
     with pytest.raises(InputError, match="in common"):
-        retarget(source, source_map, target, RigMap(bones={}))
+        retarget(mapped(source, source_map), mapped_rig(target, RigMap(bones={})))
     head = target.head_m.copy()
     head[target.index["shin.L"]] = head[target.index["thigh.L"]]
     with pytest.raises(InputError, match="thigh.L.*no length"):
@@ -367,15 +373,15 @@ def test_bad_input_is_said() -> None:
             connected=target.connected,
             inherits_rotation=target.inherits_rotation,
         )
-        retarget(source, source_map, flat, find_map(target))
-    with pytest.raises(InputError, match="no numbers"):
+        retarget(mapped(source, source_map), mapped_rig(flat, find_map(target)))
+    with pytest.raises(InputError, match="not numbers"):
         Motion(rig=target, fps=30.0, frames=source.frames, R=source.R * np.nan, head_m=source.head_m)
 
 
 def test_a_thousand_frames_take_seconds() -> None:
     source, target = squat(person(), frames=1000), person(thigh_part=0.55)
     began = time.perf_counter()
-    retarget(source, find_map(source.rig), target, find_map(target))
+    retarget(mapped(source), mapped_rig(target))
     assert time.perf_counter() - began < 10.0  # measured 1 s alone on one slow core
 
 

@@ -12,7 +12,7 @@ from tricap.core.motion.retarget.mapping import find_map
 from tricap.core.motion.retarget.retarget import RetargetSettings, retarget
 from tricap.core.motion.retarget.rig import Motion, Rig, channels, posed
 
-from .persons import flail, person
+from .persons import flail, mapped, mapped_rig, person
 
 OFF = FeetSettings(mode="off")
 
@@ -34,10 +34,10 @@ def reaching(rig: Rig, goals: dict[str, tuple[float, float, float]], frames: int
     head = np.broadcast_to(rig.head_m, (frames, *rig.head_m.shape))
     part = np.sin(np.linspace(0, np.pi, frames))[:, None]
     for side, arm in find_arms(rig, find_map(rig)).items():
-        start = rig.head_m[arm.hand]
+        start = rig.head_m[arm.end]
         goal = start + part * (np.array(goals[side]) - start)
         back = np.broadcast_to([0.0, 1.0, 0.0], goal.shape)
-        R = bend_limb(rig, R, arm.upper, arm.fore, arm.hand, head[:, arm.upper[0]], goal, back)
+        R = bend_limb(arm, R, head[:, arm.upper[0]], goal, back)
     basis = channels(rig, R)
     for side in "LR":
         basis[:, rig.index[f"hand.{side}"]] = np.eye(3)
@@ -51,7 +51,7 @@ def palms(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moved(source: Motion, target: Rig, hands: str) -> Motion:
-    return retarget(source, find_map(source.rig), target, find_map(target), RetargetSettings(hands=hands), OFF).motion
+    return retarget(mapped(source), mapped_rig(target), RetargetSettings(hands=hands), OFF).motion
 
 
 @pytest.mark.parametrize("size", [1.0, 1.4])

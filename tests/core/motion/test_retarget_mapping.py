@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tricap.core.errors import InputError
-from tricap.core.motion.retarget.mapping import NEEDED, _family, apply_preset, by_names, find_map, fit_of, read_preset, write_map
+from tricap.core.motion.retarget.mapping import NEEDED, apply_preset, best_preset, by_names, find_map, fit_of, read_preset, write_map
 from tricap.core.motion.retarget.names import read_name
 from tricap.core.motion.retarget.rig import Rig
 from tricap.core.motion.retarget.roles import ROLES, parent_role, part_of, side_of, sided
@@ -170,9 +170,9 @@ def test_of_several_families_the_one_that_says_most(tmp_path: Path) -> None:
     presets = [read_preset(path) for path in sorted(PRESETS)]
     older, newer = (next(p for p in presets if mark in p.name) for mark in ("UE4", "UE5"))
     bones = {name: i for i, name in enumerate(name for chain in newer.bones.values() for name in chain)}
-    assert _family(SimpleNamespace(index=bones), presets) is newer  # type: ignore[arg-type]
+    assert best_preset(SimpleNamespace(index=bones), presets) is newer  # type: ignore[arg-type]
     del bones["spine_05"], bones["spine_04"], bones["neck_02"]
-    assert _family(SimpleNamespace(index=bones), presets) is older  # type: ignore[arg-type]
+    assert best_preset(SimpleNamespace(index=bones), presets) is older  # type: ignore[arg-type]
     write_map(tmp_path / "one.json", by_names(person()), "of one spine bone")
     assert find_map(in_three(person(), 0.3, 0.6), [read_preset(tmp_path / "one.json")]).bones["spine"] == ("spine", "spine_2", "spine_3")
 

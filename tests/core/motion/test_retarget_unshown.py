@@ -9,14 +9,13 @@ import pytest
 
 from tricap.core.errors import InputError
 from tricap.core.motion.retarget.contacts import FeetSettings
-from tricap.core.motion.retarget.mapping import find_map
 from tricap.core.motion.retarget.measure import measure
 from tricap.core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
 from tricap.core.motion.retarget.rig import Motion, Rig
 from tricap.core.motion.retarget.turns import angle_of, transposed
-from tricap.core.motion.retarget.unshown import Unshown, from_text, to_text
+from tricap.core.motion.retarget.unshown import ResidualMotion, from_text, to_text
 
-from .persons import flail, person, squat
+from .persons import flail, mapped, mapped_rig, person, squat
 from .test_retarget import in_three
 
 OFF = FeetSettings(mode="off")
@@ -24,7 +23,7 @@ BACK_DEG = 0.1  # promised: 1°; measured 0.03° with feet held, 1e-5° without
 
 
 def onto(motion: Motion, rig: Rig, feet: FeetSettings | None = None, twist: str = "bones") -> Retargeted:
-    return retarget(motion, find_map(motion.rig), rig, find_map(rig), RetargetSettings(twist=twist), feet)
+    return retarget(mapped(motion), mapped_rig(rig), RetargetSettings(twist=twist), feet)
 
 
 def off_deg(a: Motion, b: Motion) -> np.ndarray:
@@ -51,7 +50,7 @@ def test_all_bones_return_from_a_rig_that_lacks_some(feet: str) -> None:
     there = onto(source, simple(), settings).motion
     assert len(there.rig.names) < len(source.rig.names) - 6
     assert off_deg(source, onto(there, source.rig, settings).motion).max() < BACK_DEG
-    forgotten = onto(replace(there, unshown=None), source.rig, settings).motion
+    forgotten = onto(replace(there, residual=None), source.rig, settings).motion
     assert off_deg(source, forgotten).max() > 10.0
 
 
@@ -79,17 +78,17 @@ def test_what_was_corrected_on_the_way_is_kept() -> None:
     np.testing.assert_allclose(back.R[:, b], turn @ plain.R[:, b], atol=1e-9)
     assert np.delete(off_deg(back, plain), b).max() < 1e-6
     loose = onto(there, person(roll_seed=3), OFF)
-    assert measure(there, find_map(there.rig), loose.motion, find_map(loose.motion.rig), None).direction_worst_deg < 1e-5
+    assert measure(mapped(there), mapped(loose.motion), None).direction_worst_deg < 1e-5
 
 
 def test_it_is_written_as_text_and_read_again() -> None:
     there = onto(squat(person(), frames=20), simple()).motion
-    assert there.unshown is not None and {chain.role for chain in there.unshown.chains} >= {"neck", "clavicle.L", "toe.R", "spine"}
-    again = from_text(to_text(there.unshown)).at(there.frames)
-    assert off_deg(onto(replace(there, unshown=again), person()).motion, onto(there, person()).motion).max() < 0.03
+    assert there.residual is not None and {chain.role for chain in there.residual.chains} >= {"neck", "clavicle.L", "toe.R", "spine"}
+    again = from_text(to_text(there.residual)).at(there.frames)
+    assert off_deg(onto(replace(there, residual=again), person()).motion, onto(there, person()).motion).max() < 0.03
     later = again.at(np.array([-3.0, 2.5, 99.0]))
-    a, b = again.moved_m[2:4]
-    np.testing.assert_allclose(later.moved_m, [again.moved_m[0], (a + b) / 2, again.moved_m[-1]], atol=1e-12)
+    a, b = again.planting_shift_m[2:4]
+    np.testing.assert_allclose(later.planting_shift_m, [again.planting_shift_m[0], (a + b) / 2, again.planting_shift_m[-1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -108,6 +107,6 @@ def test_it_is_written_as_text_and_read_again() -> None:
 )
 def test_damage_is_said(damage: object) -> None:
     there = onto(squat(person(), frames=4), simple()).motion
-    assert isinstance(there.unshown, Unshown) and callable(damage)
-    with pytest.raises(InputError, match="retarget it anew"):
-        from_text(damage(to_text(there.unshown)))
+    assert isinstance(there.residual, ResidualMotion) and callable(damage)
+    with pytest.raises(InputError, match="retarget it again"):
+        from_text(damage(to_text(there.residual)))
