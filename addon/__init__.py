@@ -4,7 +4,7 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import command, jobs, operators, properties
+    from . import command, jobs, operators, properties, session
     from .calibrate import registration as calibrate
     from .clicking import registration as clicking
     from .correcting import registration as correcting
@@ -12,7 +12,7 @@ def _modules() -> tuple[ModuleType, ...]:
     from .retarget import registration as retarget
     from .steps import registration as steps
 
-    return jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, command
+    return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, command
 
 
 def register() -> None:

@@ -17,8 +17,6 @@ from ..core.body.one_skin import DETAIL
 from ..core.errors import InputError
 from ..core.progress import Monitor
 
-_handles: list[Any] = []
-
 
 def add_commands(subparsers: Any) -> None:
     """Add the sub-command `scene` to an argparse sub-parsers object; its `run(args, monitor)` returns lines to print."""
@@ -146,13 +144,15 @@ def register() -> None:
     import bpy
 
     from ..__main__ import main
+    from .session import get_session
 
-    _handles.append(bpy.utils.register_cli_command("tricap", main))
+    get_session().cli_command = bpy.utils.register_cli_command("tricap", main)
 
 
 def unregister() -> None:
     """Forget it again."""
     import bpy
 
-    while _handles:
-        bpy.utils.unregister_cli_command(_handles.pop())
+    from .session import get_session
+
+    bpy.utils.unregister_cli_command(get_session().cli_command)

@@ -24,6 +24,7 @@ from ..core.errors import InputError
 from ..core.progress import Cancelled, Monitor
 from ..core.threads import one_thread_in_linear_algebra
 from . import status
+from .session import get_session
 
 log = logging.getLogger(__name__)
 
@@ -134,40 +135,39 @@ def time_words(seconds: float) -> str:
 class JobState(bpy.types.PropertyGroup):
     """What the panel shows of the running job. Only read: setting a property would draw the whole window again, the 3-D view with it."""
 
-    running: bpy.props.BoolProperty(name="Running", get=lambda _: bool(_watched))  # type: ignore[valid-type]
+    running: bpy.props.BoolProperty(name="Running", get=lambda _: _watched() is not None)  # type: ignore[valid-type]
     progress: bpy.props.FloatProperty(
         name="Progress",
         min=0.0,
         max=1.0,  # type: ignore[valid-type]
-        get=lambda _: _watched[0].fraction if _watched else 0.0,
+        get=lambda _: job.fraction if (job := _watched()) else 0.0,
     )
-    stage: bpy.props.StringProperty(name="Stage", get=lambda _: _watched[0].stage_words if _watched else "")  # type: ignore[valid-type]
-    left: bpy.props.StringProperty(name="Time Left", get=lambda _: _watched[0].left_words if _watched else "")  # type: ignore[valid-type]
-    step: bpy.props.StringProperty(name="Step", get=lambda _: _watched[0].step if _watched else "")  # type: ignore[valid-type]
+    stage: bpy.props.StringProperty(name="Stage", get=lambda _: job.stage_words if (job := _watched()) else "")  # type: ignore[valid-type]
+    left: bpy.props.StringProperty(name="Time Left", get=lambda _: job.left_words if (job := _watched()) else "")  # type: ignore[valid-type]
+    step: bpy.props.StringProperty(name="Step", get=lambda _: job.step if (job := _watched()) else "")  # type: ignore[valid-type]
 
 
-_current: list[Job] = []  # the one job that runs, or nothing
-_watching: list["JobOperator"] = []  # the modal operator that watches it
-_watched: list[Job] = []  # the job that it watches
-Ended = Callable[[bpy.types.Context, str, str, str], None]
-ENDED: list[Ended] = []  # told of the end of every job: its step, what went wrong or "", and what was kept when it was stopped or ""
+JobEnded = Callable[[bpy.types.Context, str, str, str], None]  # the step, the error or "", and what was kept when it was stopped or ""
 
 
-def current() -> Job | None:
-    """The job that runs on the worker thread, if any."""
-    return _current[0] if _current else None
+def _watched() -> Job | None:
+    """The job that a modal operator watches."""
+    operator = get_session().job_operator
+    return operator.job if operator is not None else None
 
 
 def stop_current(*_: Any) -> None:
-    """Cancel the running job and wait for it; the watching operator then ends by itself."""
-    for job in list(_current):
-        job.cancel_and_join()
-    _current.clear()
+    """Cancel the running job and wait for it; the operator that watches it then ends."""
+    session = get_session()
+    if session.job is not None:
+        session.job.cancel_and_join()
+    session.job = None
 
 
 def stop_watching() -> None:
-    """Take away the timer and the progress of an operator that Blender is about to forget (its class is unregistered)."""
-    for operator in list(_watching):
+    """Remove the timer and the progress of an operator whose class is about to be unregistered."""
+    operator = get_session().job_operator
+    if operator is not None:
         operator.clear(bpy.context)
 
 
@@ -208,14 +208,15 @@ class JobOperator:
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Modal driver: starts the thread and watches it."""
-        if current() is not None:
+        session = get_session()
+        if session.job is not None:
             self.report({"ERROR"}, "Another Tricap job is running; wait for it or press Esc.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         job = self._prepare(context)
         if job is None:
             return {"CANCELLED"}
         self.job = job
-        _current[:], _watching[:], _watched[:] = [job], [self], [job]
+        session.job, session.job_operator = job, self
         wm = context.window_manager
         self.timer = wm.event_timer_add(TICK_S, window=context.window)
         wm.modal_handler_add(self)
@@ -259,7 +260,7 @@ class JobOperator:
             self._tell(job, error)
         stopped = str(error) if isinstance(error, Cancelled) else ""
         failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else _sentence(error)
-        for listener in ENDED:
+        for listener in get_session().on_job_end:
             listener(context, job.step, failed, stopped)
         return ended
 
@@ -283,14 +284,14 @@ class JobOperator:
 
     def clear(self, context: bpy.types.Context) -> None:
         """The watching is over: no timer, no progress."""
-        _watching.clear()
-        _watched.clear()
+        session = get_session()
+        session.job_operator = None
         wm = context.window_manager
         if self.timer is not None:
             wm.event_timer_remove(self.timer)
             self.timer = None
-        if self.job in _current:
-            _current.remove(self.job)
+        if session.job is self.job:
+            session.job = None
         status.tell(context, None)
         redraw(context)
 

@@ -5,7 +5,7 @@ command give the same numbers.
     TAKE/take.toml                       ── open_take ──▶  scene
 
 A scene is bound to a take once it has views of its own. Without views, a take that is merely named is run as its file stands.
-Other parts of the add-on that keep something of take.toml in the scene add a function to `WRITERS` (scene → table) and `READERS`.
+Other parts of the add-on that keep something of take.toml in the scene add a function to `Session.take_writers` and `take_readers`.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -24,12 +24,10 @@ from ..core.take import Take
 from ..core.take_file import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import folders, properties, seeds
 from .scene import clips
+from .session import get_session
 
 ENDING, RESULTS, VIEW_KEY = "_tricap", "results", "tricap_view"
 OTHER_LINES = "The footage is shown in other frames than Lines now asks for; press Reload Footage to show it so."
-WRITERS: list[Callable[[bpy.types.Scene, Table], None]] = []
-READERS: list[Callable[[bpy.types.Scene, Table], None]] = []
-_seen: set[str] = set()  # digests of what this session read from or wrote into take.toml
 
 
 def bound(scene: bpy.types.Scene) -> bool:
@@ -191,13 +189,13 @@ def existing_folder(scene: bpy.types.Scene) -> Path:
 def changed_outside(scene: bpy.types.Scene) -> bool:
     """Whether take.toml says something that this scene neither read nor wrote."""
     path = folder_of(scene) / "take.toml"
-    return path.exists() and store.digest(path) not in {scene.tricap.take_digest, *_seen}
+    return path.exists() and store.digest(path) not in {scene.tricap.take_digest, *get_session().take_digests}
 
 
 def remember(scene: bpy.types.Scene, folder: Path) -> None:
     """The file is now what the scene says."""
     digest = store.digest(folder / "take.toml")
-    _seen.add(digest)
+    get_session().take_digests.add(digest)
     scene.tricap.take_digest = digest
 
 
@@ -218,7 +216,7 @@ def table(scene: bpy.types.Scene) -> Table:
     _put(made, "body", {**old.get("body", {}), "model": model_of(scene)} if model_of(scene) else None)
     _put_clicks(scene, made)
     _put(made, "settings", properties.overrides(scene))
-    for writer in WRITERS:
+    for writer in get_session().take_writers:
         writer(scene, made)
     return _kept_alike(made, old)
 
@@ -247,7 +245,7 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
     props.seed_frame = opened.seeds.frame
     show_clicks(scene, said, [view.name for view in opened.views])
     properties.show_settings(scene, opened.settings)
-    for reader in READERS:
+    for reader in get_session().take_readers:
         reader(scene, said)
     remember(scene, folder)
 

@@ -14,9 +14,9 @@ import numpy as np
 from ..core import pipeline
 from ..core import settings as knobs
 from . import take_properties
+from .session import get_session
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
-GROUPS: list[type] = []  # the PropertyGroup classes, in order of registration
 
 
 def property_of(field: "dataclasses.Field[Any]") -> Any:
@@ -129,8 +129,8 @@ def register() -> None:
     annotations |= {name: bpy.props.PointerProperty(type=group) for name, group in groups.items()}
     body = {"__annotations__": annotations, "__doc__": "Tricap's part of the scene."}
     scene_group = type("Tricap_scene", (bpy.types.PropertyGroup,), body)
-    GROUPS[:] = [take_properties.View, *groups.values(), scene_group]
-    for group in GROUPS:
+    classes = get_session().property_groups = [take_properties.View, *groups.values(), scene_group]
+    for group in classes:
         bpy.utils.register_class(group)
     bpy.types.Scene.tricap = bpy.props.PointerProperty(type=scene_group)
 
@@ -138,6 +138,5 @@ def register() -> None:
 def unregister() -> None:
     """Take the properties away again."""
     del bpy.types.Scene.tricap
-    for group in reversed(GROUPS):
+    for group in reversed(get_session().property_groups):
         bpy.utils.unregister_class(group)
-    GROUPS.clear()

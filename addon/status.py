@@ -2,21 +2,22 @@
 
 import bpy
 
-_told: set[str] = set()  # names of workspaces: Blender keeps the words with each
+from .session import get_session
 
 
 def tell(context: bpy.types.Context, words: str | None) -> None:
     """Show these words in the workspace that is shown and nowhere else; None: none of ours any more."""
     here = context.window.workspace if context.window is not None else context.workspace  # the context's may be the one before
-    for name in _told:
+    shown = get_session().status_workspaces  # Blender keeps a text with each workspace
+    for name in shown:
         there = bpy.data.workspaces.get(name)
         if there is not None and there != here:
             _set(context, there, None)
-    _told.clear()
+    shown.clear()
     if here is not None:
         _set(context, here, words)
         if words:
-            _told.add(here.name)
+            shown.add(here.name)
 
 
 def _set(context: bpy.types.Context, workspace: bpy.types.WorkSpace, words: str | None) -> None:

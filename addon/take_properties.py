@@ -1,14 +1,13 @@
 """What the scene keeps of a take besides its clips and clicks: the views in their order, and what take.toml says of the whole recording."""
 
-from collections.abc import Callable
 from typing import Any
 
 import bpy
 
 from ..core.images.fields import BOTH, INTERLACE
 from .scene.clips import frames_per_image
+from .session import get_session
 
-TOUCHED: list[Callable[[], None]] = []  # told when a value of the panel was changed
 MODELS = (
     ("none", "No Body", "Clouds and trajectories only"),
     ("full", "Whole Body", "All limbs"),
@@ -33,7 +32,7 @@ FIELDS = (
 
 def tell_touched(_: Any, __: Any) -> None:
     """Somebody changed a value; Blender does not tell of changes by scripts otherwise."""
-    for listener in TOUCHED:
+    for listener in get_session().on_value_change:
         listener()
 
 

@@ -26,6 +26,8 @@ OPTIONAL = {"core/batch.py": {"dask", "distributed"}}  # the extra [batch]; impo
 NETWORK = {"socket", "ssl", "http", "urllib", "ftplib", "smtplib", "xmlrpc", "requests", "asyncio"}
 SERIALIZERS = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "joblib"}
 LONGEST_FILE = 450
+CONTAINERS = set("list dict set deque defaultdict OrderedDict Counter".split())
+CHANGING = set("append appendleft extend insert remove pop popleft popitem clear add discard update setdefault".split())
 
 Imported = tuple[int, bool, tuple[str, ...]]  # line, relative or not, the module's dotted name (relative ones from the root)
 
@@ -130,6 +132,49 @@ def no_silent_except(name: str, source: str) -> list[str]:
     ]
 
 
+def state_is_in_the_session(name: str, source: str) -> list[str]:
+    """The add-on's state is in addon/session.py: elsewhere a module has constants, which are named in capitals and never changed."""
+    if not name.startswith("addon/") or name == "addon/session.py":
+        return []
+    tree = ast.parse(source)
+    bodies = [("", tree.body), *((f"{node.name}.", node.body) for node in tree.body if isinstance(node, ast.ClassDef))]
+    bound = [
+        (line, f"{owner}{target}") for owner, body in bodies for line, target in containers(body) if not target.startswith(("bl_", "__"))
+    ]
+    changed = [(line, target) for line, target in changes(tree) if in_capitals(target)]
+    changed += [(node.lineno, ", ".join(node.names)) for node in ast.walk(tree) if isinstance(node, ast.Global)]
+    return [f"{name}:{line} has state of its own: {target}" for line, target in bound + changed]
+
+
+def in_capitals(dotted: str) -> bool:
+    """Whether the last part of a dotted name is that of a constant."""
+    last = dotted.rpartition(".")[2].lstrip("_")
+    return last.isidentifier() and last.isupper()
+
+
+def containers(body: list[ast.stmt]) -> Iterator[tuple[int, str]]:
+    """Lists, dicts and sets bound by these statements that can only be meant to change: empty ones, and those not named in capitals."""
+    shown = (ast.List, ast.Dict, ast.Set, ast.ListComp, ast.DictComp, ast.SetComp)
+    for node in body:
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+            called = ast.unparse(node.value.func).rpartition(".")[2] if isinstance(node.value, ast.Call) else ""
+            empty = ast.unparse(node.value) in ("[]", "{}", f"{called}()")
+            if isinstance(node.value, shown) or called in CONTAINERS:
+                targets = [ast.unparse(target) for target in (node.targets if isinstance(node, ast.Assign) else [node.target])]
+                yield from ((node.lineno, target) for target in targets if empty or not in_capitals(target))
+
+
+def changes(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """What is changed in place, by line: "jobs.ENDED" of `jobs.ENDED.append(f)`, of `jobs.ENDED[:] = []` and of `jobs.ENDED += [f]`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING:
+            yield node.lineno, ast.unparse(node.func.value)
+        if isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load):
+            yield node.lineno, ast.unparse(node.value)
+        if isinstance(node, ast.AugAssign):
+            yield node.lineno, ast.unparse(node.target)
+
+
 def files_stay_small(name: str, source: str) -> list[str]:
     """A file that outgrows 450 lines holds two subjects."""
     length = len(source.splitlines())
@@ -163,6 +208,14 @@ REJECTED: list[tuple[Rule, str, str]] = [
     (no_network, "core/commands.py", "from urllib.request import urlopen"),
     (no_silent_except, "core/store.py", "try:\n    f()\nexcept OSError:\n    pass"),
     (no_silent_except, "core/store.py", "try:\n    f()\nexcept:\n    g()"),
+    (state_is_in_the_session, "addon/jobs.py", "_current: list[Job] = []"),
+    (state_is_in_the_session, "addon/jobs.py", "LISTENERS = []"),
+    (state_is_in_the_session, "addon/jobs.py", "known = {'L': 1}"),
+    (state_is_in_the_session, "addon/jobs.py", "_opened = OrderedDict()"),
+    (state_is_in_the_session, "addon/jobs.py", "NAMES = ['L']\ndef f():\n    NAMES.append('R')"),
+    (state_is_in_the_session, "addon/steps/watch.py", "from .. import jobs\njobs.ENDED['x'] = 1"),
+    (state_is_in_the_session, "addon/jobs.py", "COUNT = 0\ndef f():\n    global COUNT\n    COUNT = 1"),
+    (state_is_in_the_session, "addon/clicking/operators.py", "class ClickOperator:\n    running: ClassVar[list[int]] = []"),
     (files_stay_small, "core/take.py", "x = 1\n" * (LONGEST_FILE + 1)),
 ]
 ACCEPTED: list[tuple[Rule, str, str]] = [
@@ -177,6 +230,9 @@ ACCEPTED: list[tuple[Rule, str, str]] = [
     (files_carry_no_code, "core/store.py", "np.load(path, allow_pickle=False)"),
     (no_network, "core/commands.py", "import json"),
     (no_silent_except, "core/store.py", "try:\n    f()\nexcept OSError as error:\n    raise InputError('x') from error"),
+    (state_is_in_the_session, "addon/session.py", "known = []"),
+    (state_is_in_the_session, "addon/jobs.py", "NAMES = ['L']\ndef f():\n    found = []\n    found.append(NAMES[0])"),
+    (state_is_in_the_session, "addon/jobs.py", "class Run:\n    bl_options = {'UNDO'}\n    def f(self):\n        self.found = []"),
     (files_stay_small, "core/take.py", "x = 1\n" * LONGEST_FILE),
 ]
 RULES = tuple(dict.fromkeys(rule for rule, _, _ in REJECTED))

@@ -1,22 +1,23 @@
 """How many whole bars each camera has seen so far, while the job runs: written by the job, drawn by the panel."""
 
+from ..session import get_session
+
 GOOD, FAIR = 100, 30  # whole bars in a view
-_counts: dict[str, tuple[int, int]] = {}
 
 
 def begin() -> None:
     """Forget what was counted before."""
-    _counts.clear()
+    get_session().file.bar_counts.clear()
 
 
 def note(view: str, frames: int, whole: int) -> None:
     """`whole` of the first `frames` images of a view show both targets."""
-    _counts[view] = (frames, whole)
+    get_session().file.bar_counts[view] = (frames, whole)
 
 
 def counts() -> dict[str, tuple[int, int]]:
     """Frames looked at and whole bars seen, by view."""
-    return dict(_counts)
+    return dict(get_session().file.bar_counts)
 
 
 def light(whole: int) -> str:

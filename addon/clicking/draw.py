@@ -1,5 +1,6 @@
 """What is drawn over the footage while clicking: the name at the cursor, the figure, epipolar lines, and proposals."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import bpy
@@ -7,6 +8,7 @@ import numpy as np
 
 from ..overlay import canvas
 from ..overlay.canvas import Canvas, Colour
+from ..session import get_session
 from .figure import figure
 from .labels import MARK, place_labels
 from .session import ClickSession
@@ -22,35 +24,44 @@ FIGURE_PX, MARGIN_PX, TIMELINE_PX = 190.0, 12.0, 22.0
 OFFER_PX = 11.0
 NAME_PX, UNDER_MOUSE_PX = 11.0, 12.0
 
-_handle: list[Any] = []
-_shown: dict[str, Any] = {"session": None, "mouse": (-1, -1)}
+
+@dataclass(eq=False, kw_only=True)
+class Drawing:
+    """What is drawn: the clicks of a session, with the name at the mouse (in window pixels)."""
+
+    clicks: ClickSession
+    handle: Any = None  # Blender's
+    mouse: tuple[int, int] = (-1, -1)
 
 
-def begin(session: ClickSession) -> None:
-    """Draw for this session from now on."""
+def begin(clicks: ClickSession) -> None:
+    """Draw these clicks from now on."""
     end()
-    _shown["session"] = session
-    _handle.append(bpy.types.SpaceClipEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
+    drawing = get_session().click_drawing = Drawing(clicks=clicks)
+    drawing.handle = bpy.types.SpaceClipEditor.draw_handler_add(_draw, (drawing,), "WINDOW", "POST_PIXEL")
 
 
 def end() -> None:
     """Draw nothing more."""
-    _shown["session"] = None
-    while _handle:
-        bpy.types.SpaceClipEditor.draw_handler_remove(_handle.pop(), "WINDOW")
+    session = get_session()
+    if session.click_drawing is not None:
+        bpy.types.SpaceClipEditor.draw_handler_remove(session.click_drawing.handle, "WINDOW")
+    session.click_drawing = None
 
 
 def move_mouse(x: int, y: int) -> None:
-    """Where the mouse is, in window pixels."""
-    _shown["mouse"] = (x, y)
+    """Draw the name at the mouse, in window pixels."""
+    drawing = get_session().click_drawing
+    if drawing is not None:
+        drawing.mouse = (x, y)
 
 
-def _draw() -> None:
-    session, context = _shown["session"], bpy.context
+def _draw(drawing: Drawing) -> None:
+    clicks, context = drawing.clicks, bpy.context
     clip = canvas.clip_of(context.area)
-    view = session.view_of(clip) if session is not None and session.whole else None
+    view = clicks.view_of(clip) if clicks.whole else None
     if view is not None and clip is not None:
-        draw_session(session, view, Canvas(context.region, tuple(clip.size)), _shown["mouse"])
+        draw_session(clicks, view, Canvas(context.region, tuple(clip.size)), drawing.mouse)
 
 
 def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[int, int]) -> None:

@@ -14,6 +14,7 @@ from ...core.images.sampling import SplineImage
 from ...core.matching.least_squares import MatchingSettings
 from ...core.matching.proposals import Proposal, propose
 from ...core.take import Footage
+from ..session import get_session
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +41,6 @@ class Answer:
     problem: str = ""
 
 
-_open: list["Finder"] = []
-
-
 class Finder:
     """One question at a time; the latest replaces those that still wait."""
 
@@ -51,7 +49,7 @@ class Finder:
         self._images: dict[int, list[SplineImage]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="tricap proposals")
         self._pending: Future[Answer] | None = None
-        _open.append(self)
+        get_session().finders.append(self)
 
     @property
     def cameras(self) -> Sequence[Camera]:
@@ -84,8 +82,8 @@ class Finder:
     def close(self) -> None:
         """End the thread; what it is doing is finished first (well below a second)."""
         self._pool.shutdown(wait=True, cancel_futures=True)
-        if self in _open:
-            _open.remove(self)
+        if self in (open_finders := get_session().finders):
+            open_finders.remove(self)
 
     def _answer(self, question: Question) -> Answer:
         nothing: tuple[Any, ...] = (None,) * len(self.cameras)
@@ -111,5 +109,5 @@ class Finder:
 
 def close_all(*_: Any) -> None:
     """End all threads (another file is loaded, Blender quits, the add-on is disabled)."""
-    for finder in list(_open):
+    for finder in list(get_session().finders):
         finder.close()

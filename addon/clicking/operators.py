@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
@@ -12,6 +12,7 @@ from ...core.errors import InputError
 from ...core.take import JOINTS, Seeds, open_take
 from .. import project, properties, seeds, status
 from ..overlay import canvas
+from ..session import get_session
 from . import draw
 from .finder import Finder
 from .session import ClickSession, free_seed_names, joints_of
@@ -27,7 +28,6 @@ class ClickOperator:
     session: ClickSession
     timer: Any = None
     seen = False  # whether views have been on show
-    running: ClassVar[list["ClickOperator"]] = []
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
         """What is clicked, one after the other."""
@@ -39,7 +39,7 @@ class ClickOperator:
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Begin; opens the views where no Clip Editor shows one."""
-        if self.running:
+        if get_session().click_operator is not None:
             self.report({"WARNING"}, "You are clicking already; press Esc in a view to end that.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         try:
@@ -53,7 +53,7 @@ class ClickOperator:
             bpy.ops.tricap.open_views()
         draw.begin(self.session)
         draw.move_mouse(event.mouse_x, event.mouse_y)
-        self.running[:] = [self]
+        get_session().click_operator = self
         self.timer = context.window_manager.event_timer_add(TICK_S, window=context.window)
         context.window_manager.modal_handler_add(self)
         self._show(context)
@@ -87,7 +87,7 @@ class ClickOperator:
     def clear(self, context: bpy.types.Context) -> None:
         """Nothing is watched or drawn any more."""
         draw.end()
-        self.running.clear()
+        get_session().click_operator = None
         if self.session.finder is not None:
             self.session.finder.close()
         if self.timer is not None:
@@ -339,7 +339,8 @@ def show_view(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
 
 def stop_clicking() -> None:
     """End a running session (its class is unregistered)."""
-    for operator in list(ClickOperator.running):
+    operator = get_session().click_operator
+    if operator is not None:
         operator.clear(bpy.context)
 
 

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import project
+from ..session import get_session
 from . import operators, panel, properties, tables
 
 CLASSES = (*properties.CLASSES, *operators.CLASSES, *panel.CLASSES)
@@ -13,15 +13,17 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.tricap_correcting = bpy.props.PointerProperty(type=properties.TricapCorrecting)
-    project.WRITERS.append(tables.write)
-    project.READERS.append(tables.read)
+    session = get_session()
+    session.take_writers.append(tables.write)
+    session.take_readers.append(tables.read)
 
 
 def unregister() -> None:
     """Take everything away again, in reverse order."""
     operators.stop_correcting()
-    project.READERS.remove(tables.read)
-    project.WRITERS.remove(tables.write)
+    session = get_session()
+    session.take_readers.remove(tables.read)
+    session.take_writers.remove(tables.write)
     del bpy.types.Scene.tricap_correcting
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import jobs
+from ..session import get_session
 
 
 class Cancel(bpy.types.Operator):
@@ -14,11 +14,11 @@ class Cancel(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only while a job runs."""
-        return jobs.current() is not None
+        return get_session().job is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Ask the job to stop; the operator that watches it ends it."""
-        job = jobs.current()
+        job = get_session().job
         if job is not None:
             job.monitor.cancel()
         return {"FINISHED"}

@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 
 from ...core.frame_table import FrameTable
+from ..session import get_session
 from . import canvas, layers, results
 from .canvas import Canvas, Colour
 from .layers import Inspection
@@ -33,36 +34,31 @@ CURVES: tuple[tuple[str, str, Colour], ...] = (
     ("fit_sigma0", "fit sigma0", (1.0, 0.55, 0.9, 1.0)),
 )
 
-_handle: list[Any] = []
-_inspection: dict[str, Any] = {"frame": -1, "found": None}
-_region: dict[str, Any] = {"view": "", "corners": []}
-
 
 def show_inspection(frame: int, found: Inspection | None) -> None:
     """Show what is under the pointer, for as long as the scene stays in this frame."""
-    _inspection.update(frame=frame, found=found)
+    get_session().file.inspection = (frame, found)
 
 
 def shown_inspection(frame: int) -> Inspection | None:
     """What is inspected in a frame, if anything."""
-    found: Inspection | None = _inspection["found"]
-    return found if _inspection["frame"] == frame else None
+    inspected, found = get_session().file.inspection
+    return found if inspected == frame else None
 
 
 def show_region(view: str, corners: Sequence[tuple[float, float]]) -> None:
     """Show the corners of the region that is being clicked in a view."""
-    _region.update(view=view, corners=list(corners))
+    get_session().file.region_corners = (view, list(corners))
 
 
 def begin() -> None:
     """Add the draw handler."""
-    _handle.append(bpy.types.SpaceClipEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
+    get_session().overlay_handle = bpy.types.SpaceClipEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
 
 
 def end() -> None:
     """Remove the draw handler."""
-    while _handle:
-        bpy.types.SpaceClipEditor.draw_handler_remove(_handle.pop(), "WINDOW")
+    bpy.types.SpaceClipEditor.draw_handler_remove(get_session().overlay_handle, "WINDOW")
 
 
 def _draw() -> None:
@@ -260,7 +256,8 @@ def draw_corrections(correcting: Any, view: str, frame: int, sheet: Canvas) -> N
         corners = sheet.to_region(np.array([(c.x, c.y) for c in correction.corners]))
         segments = canvas.chain(corners, closed=True) if correction.kind == "region" else canvas.cross(corners[0], 8.0)
         canvas.draw_lines(canvas.line_batch(segments), 2.0, ACTIVE_CORRECTION if i == correcting.active else CORRECTION)
-    if _region["view"] == view and _region["corners"]:
-        corners = sheet.to_region(np.array(_region["corners"]))
+    region_view, clicked = get_session().file.region_corners
+    if region_view == view and clicked:
+        corners = sheet.to_region(np.array(clicked))
         dots = [canvas.ring(corner, 4.0, 8) for corner in corners]
         canvas.draw_lines(canvas.line_batch(np.concatenate([canvas.chain(corners), *dots])), 2.0, ACTIVE_CORRECTION)

@@ -2,15 +2,9 @@
 
 import bpy
 
-from . import draw, operators, panel, properties, results
+from . import draw, operators, panel, properties
 
 CLASSES = (*properties.CLASSES, *operators.CLASSES, *panel.CLASSES)
-
-
-@bpy.app.handlers.persistent
-def _clear(*_: object) -> None:
-    results.clear()
-    draw.show_inspection(-1, None)
 
 
 def register() -> None:
@@ -18,15 +12,12 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.tricap_overlay = bpy.props.PointerProperty(type=properties.TricapOverlay)
-    bpy.app.handlers.load_pre.append(_clear)
     draw.begin()
 
 
 def unregister() -> None:
     """Take everything away again, in reverse order."""
     draw.end()
-    _clear()
-    bpy.app.handlers.load_pre.remove(_clear)
     del bpy.types.Scene.tricap_overlay
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

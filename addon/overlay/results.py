@@ -21,6 +21,7 @@ from ...core.settings import from_table
 from ...core.take import open_take, read_take
 from ...core.tracking.contour import Contour
 from .. import folders, project
+from ..session import OpenResults, get_session
 
 CACHED_FRAMES = 48  # things of single frames that are cached at most
 
@@ -86,35 +87,32 @@ class RunResults:
         return self._read[key]
 
 
-_current: dict[str, Any] = {"key": None, "recording": None, "problem": ""}
-
-
 def current(scene: bpy.types.Scene) -> RunResults | None:
     """The results of a scene's project; None where there are none (`problem` has the reason)."""
+    file = get_session().file
     try:
         key = _key(scene)
     except InputError as error:
-        _current.update(key=None, recording=None, problem=str(error))
+        file.open_results = OpenResults(problem=str(error))
         return None
-    if key != _current["key"]:
-        _current.update(key=key, recording=None, problem="")
+    if key != file.open_results.key:
+        file.open_results = OpenResults(key=key)
         try:
-            _current["recording"] = _open(scene)
+            file.open_results.results = _open(scene)
         except InputError as error:
-            _current["problem"] = str(error)
-    found: RunResults | None = _current["recording"]
-    return found
+            file.open_results.problem = str(error)
+    return file.open_results.results
 
 
 def problem() -> str:
     """Why there is nothing to show, or which file could not be read."""
-    found = _current["recording"]
-    return str(_current["problem"] or (found.problem if found is not None else ""))
+    now = get_session().file.open_results
+    return now.problem or (now.results.problem if now.results is not None else "")
 
 
 def clear() -> None:
     """Empty the cache: everything is read again when it is needed."""
-    _current.update(key=None, recording=None, problem="")
+    get_session().file.open_results = OpenResults()
 
 
 def view_of(clip: bpy.types.MovieClip) -> str:

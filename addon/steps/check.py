@@ -10,11 +10,11 @@ from ...core.checking.take_check import check_take
 from ...core.progress import Monitor
 from .. import project
 from ..jobs import JobOperator
+from ..session import get_session
 from . import watch
 from .footage import Told
 
 GOOD = "Nothing to complain about."
-_late: dict[str, dict[str, int]] = {}  # by the key of what was checked: by how many whole frames each view is late
 
 
 class Check(JobOperator, bpy.types.Operator):
@@ -36,7 +36,8 @@ class Check(JobOperator, bpy.types.Operator):
         props.check_said = "\n".join(str(finding) for finding in result.findings) or GOOD
         props.check_key = watch.refresh(context.scene).keys.get("measure", "")
         offsets = result.figures.get("offsets", {})
-        _late[props.check_key] = {view: round(o["late_frames"]) for view, o in offsets.items() if o["late_frames"] is not None}  # type: ignore
+        late = {view: round(o["late_frames"]) for view, o in offsets.items() if o["late_frames"] is not None}  # type: ignore
+        get_session().file.late_frames[props.check_key] = late
         for line in props.check_said.splitlines():
             self.report({"INFO" if line == GOOD else "WARNING"}, line)
         return {"FINISHED"}
@@ -52,11 +53,11 @@ class MendOffsets(Told, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Only with a check of this session that found something to set."""
-        return any(_late.get(context.scene.tricap.check_key, {}).values())
+        return any(get_session().file.late_frames.get(context.scene.tricap.check_key, {}).values())
 
     def do(self, context: bpy.types.Context) -> str:
         """Set them."""
-        late = _late[context.scene.tricap.check_key]
+        late = get_session().file.late_frames[context.scene.tricap.check_key]
         for view in context.scene.tricap.views:
             view.offset_frames -= late.get(view.name, 0)
         return "Offsets: " + ", ".join(f"{view.name} {view.offset_frames}" for view in context.scene.tricap.views)

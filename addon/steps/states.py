@@ -24,6 +24,7 @@ from ...core.take import Footage, Take, footage_frames, open_take
 from .. import folders, project
 from ..clicking import session
 from ..scene.build import KEYS_KEY, OUT_KEY
+from ..session import get_session
 
 STEPS = ("footage", "cameras", "seeds", "surface", "tracks", "body", "rig", "retarget")
 TITLES = ("Footage", "Cameras", "Seeds (Joint Clicks)", "Surface", "Tracks", "Body", "Rig", "Retarget and Export")
@@ -33,6 +34,7 @@ FIND = "Find Footage"
 SAVE_FIRST = "Save this file first: the project lies in a folder beside it. Then add the films of your cameras."
 NEEDED_JOINTS = 2  # the fit's own least number
 MOST_REMEMBERED = 500  # joints
+MOST_SEQUENCES = 50  # kept open
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,11 +72,6 @@ class _Found:
     run: Mapping[str, Any] | None = None
     problem: str = ""  # why there is no `run` though there is a run.json
     out: Path | None = None
-
-
-_opened: dict[tuple[Any, ...], Sequence] = {}
-_joints: dict[str, tuple[str, ...]] = {}
-_met: dict[tuple[Any, ...], str] = {}  # joint, its clicks and cameras -> what is wrong with them, or ""
 
 
 def compute(scene: bpy.types.Scene) -> Look:
@@ -185,19 +182,20 @@ def _check_clicks(footage: Footage) -> None:
         InputError: those of a joint do not.
     """
     take, rig = footage.take, footage.take.rig_path.stat()
+    problems = get_session().file.click_problems
     for name, at in take.seeds.joints.items():
         clicks = tuple((view, *xy.tolist()) for view, xy in sorted(at.items()))
         key = (take.rig_path, rig.st_mtime_ns, rig.st_size, take.reference, name, clicks)
-        if key not in _met:
-            if len(_met) > MOST_REMEMBERED:
-                _met.clear()
+        if key not in problems:
+            if len(problems) > MOST_REMEMBERED:
+                problems.clear()
             try:
                 clicked_depth(footage, name, at)
-                _met[key] = ""
+                problems[key] = ""
             except InputError as error:
-                _met[key] = str(error)
-        if _met[key]:
-            raise InputError(_met[key])
+                problems[key] = str(error)
+        if problems[key]:
+            raise InputError(problems[key])
 
 
 def _stage(step: str, states: Mapping[str, State], found: _Found) -> State:
@@ -280,9 +278,10 @@ def joints_of(model: str) -> tuple[str, ...]:
     Raises:
         InputError: there is no such model.
     """
-    if model not in _joints or model.endswith(".toml"):  # a file may change
-        _joints[model] = tuple(session.joints_of(read_model(model).skeleton.joint_names))
-    return _joints[model]
+    known = get_session().file.joints
+    if model not in known or model.endswith(".toml"):  # a file may change
+        known[model] = tuple(session.joints_of(read_model(model).skeleton.joint_names))
+    return known[model]
 
 
 def _keys(found: _Found) -> Mapping[str, str] | None:
@@ -307,7 +306,9 @@ def _sequence(folder: Path, view: Any) -> Sequence:
     except OSError as error:
         raise InputError(f"The footage of view {view.name} is not at {where.resolve()} any more; move it back, or press {FIND}.") from error
     key = (str(where), view.images, view.movie, state.st_mtime_ns, state.st_size)
-    if key not in _opened:
-        _opened.clear() if len(_opened) > 50 else None
-        _opened[key] = open_sequence(folder, images=view.images, movie=view.movie, view=view.name)
-    return _opened[key]
+    opened = get_session().file.sequences
+    if key not in opened:
+        if len(opened) > MOST_SEQUENCES:
+            opened.clear()
+        opened[key] = open_sequence(folder, images=view.images, movie=view.movie, view=view.name)
+    return opened[key]

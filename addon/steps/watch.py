@@ -3,20 +3,27 @@ at once when a job or an operator of ours ends, and when a file is loaded.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import bpy
 
 from ...core.errors import InputError
-from .. import folders, jobs, project, take_properties
+from .. import folders, jobs, project
+from ..session import get_session
 from . import states
 from .states import STEPS, Look, State
 
 TICK_S = 1.0
-_looks: dict[str, Look] = {}  # by scene
-_stamps: dict[str, Any] = {}
-_ends: dict[tuple[str, str], tuple[str, str, str]] = {}  # (scene, step) -> the input with which it failed or was stopped, the word, why
-_changed: set[str] = {"scene"}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StepEnd:
+    """A step that failed or was stopped: the key of its input, whether it failed, and the sentence to show as long as the input stays."""
+
+    key: str
+    failed: bool
+    why: str
 
 
 class OpenSteps(bpy.types.PropertyGroup):
@@ -29,14 +36,14 @@ class OpenSteps(bpy.types.PropertyGroup):
 
 def look(scene: bpy.types.Scene) -> Look:
     """The states as they were found last; nothing is computed but the first time."""
-    return _looks.get(scene.name_full) or refresh(scene)
+    return get_session().file.looks.get(scene.name_full) or refresh(scene)
 
 
 def refresh(scene: bpy.types.Scene) -> Look:
     """Look at everything now. The next step is unfolded when it becomes another one, and what is done is folded, but the last."""
-    before, now = _looks.get(scene.name_full), _with_ends(scene, states.compute(scene))
-    _looks[scene.name_full], _stamps[scene.name_full] = now, _stamp(scene)
-    _changed.clear()
+    file, name = get_session().file, scene.name_full
+    before, now = file.looks.get(name), _with_ends(scene, states.compute(scene))
+    file.looks[name], file.stamps[name], file.changed = now, _stamp(scene), False
     if before is None or before.next != now.next:
         _unfold(before, now)
     return now
@@ -44,7 +51,7 @@ def refresh(scene: bpy.types.Scene) -> Look:
 
 def mark(*_: Any) -> None:
     """Something changed; look again soon."""
-    _changed.add("scene")
+    get_session().file.changed = True
 
 
 def state_of(context: bpy.types.Context, step: str) -> State:
@@ -55,13 +62,14 @@ def state_of(context: bpy.types.Context, step: str) -> State:
 
 def _with_ends(scene: bpy.types.Scene, now: Look) -> Look:
     """A step that failed with the input that it still has stays failed, and one that was stopped says what was kept."""
-    found = dict(now.states)
-    for (name, step), (given, word, sentence) in list(_ends.items()):
+    found, ends = dict(now.states), get_session().file.step_ends
+    for (name, step), end in list(ends.items()):
         if name == scene.name_full and step in found:
-            if given == _input(step, now) and found[step].word in ("ready", "stale"):
-                found[step] = State(word=word or found[step].word, why=sentence)
-            elif given != _input(step, now) or found[step].word == "done":
-                del _ends[name, step]
+            same = end.key == _input(step, now)
+            if same and found[step].word in ("ready", "stale"):
+                found[step] = State(word="failed" if end.failed else found[step].word, why=end.why)
+            elif not same or found[step].word == "done":
+                del ends[name, step]
     return Look(states=found, keys=now.keys)
 
 
@@ -70,11 +78,11 @@ def _input(step: str, now: Look) -> str:
 
 
 def _ended(context: bpy.types.Context, step: str, failed: str, stopped: str) -> None:
-    scene = context.scene
-    _ends.pop((scene.name_full, step), None)
+    scene, ends = context.scene, get_session().file.step_ends
+    ends.pop((scene.name_full, step), None)
     now = refresh(scene)
     if (failed or stopped) and step in STEPS:
-        _ends[scene.name_full, step] = _input(step, now), "failed" if failed else "", failed or stopped
+        ends[scene.name_full, step] = StepEnd(key=_input(step, now), failed=bool(failed), why=failed or stopped)
         refresh(scene)
 
 
@@ -107,9 +115,11 @@ def _tick() -> float:
     context = bpy.context
     scene, runs = context.scene, context.window_manager.tricap.running
     if scene is not None:
-        name = scene.name_full
-        if (_changed and not runs) or name not in _looks or _stamps.get(name) != _stamp(scene):  # a run finishes step after step
-            before = _looks.get(name)
+        file, name = get_session().file, scene.name_full
+        if (
+            (file.changed and not runs) or name not in file.looks or file.stamps.get(name) != _stamp(scene)
+        ):  # a run finishes step after step
+            before = file.looks.get(name)
             if refresh(scene) != before:
                 jobs.redraw(context)
     return TICK_S
@@ -120,34 +130,28 @@ def _scene_changed(*_: Any) -> None:
     mark()
 
 
-@bpy.app.handlers.persistent
-def _file_loaded(*_: Any) -> None:
-    for known in (_looks, _stamps, _ends):
-        known.clear()
-    mark()
-
-
-HANDLERS = {"depsgraph_update_post": _scene_changed, "undo_post": _scene_changed, "redo_post": _scene_changed, "load_post": _file_loaded}
+HANDLERS = ("depsgraph_update_post", "undo_post", "redo_post")
 
 
 def register() -> None:
     """Begin to watch."""
     bpy.utils.register_class(OpenSteps)
     bpy.types.WindowManager.tricap_steps = bpy.props.PointerProperty(type=OpenSteps)
-    for name, handler in HANDLERS.items():
-        getattr(bpy.app.handlers, name).append(handler)
-    jobs.ENDED.append(_ended)
-    take_properties.TOUCHED.append(mark)
+    for name in HANDLERS:
+        getattr(bpy.app.handlers, name).append(_scene_changed)
+    session = get_session()
+    session.on_job_end.append(_ended)
+    session.on_value_change.append(mark)
     bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
 
 
 def unregister() -> None:
     """Watch no longer."""
     bpy.app.timers.unregister(_tick)
-    jobs.ENDED.remove(_ended)
-    take_properties.TOUCHED.remove(mark)
-    for name, handler in HANDLERS.items():
-        getattr(bpy.app.handlers, name).remove(handler)
+    session = get_session()
+    session.on_job_end.remove(_ended)
+    session.on_value_change.remove(mark)
+    for name in HANDLERS:
+        getattr(bpy.app.handlers, name).remove(_scene_changed)
     del bpy.types.WindowManager.tricap_steps
     bpy.utils.unregister_class(OpenSteps)
-    _file_loaded()

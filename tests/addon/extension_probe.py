@@ -103,14 +103,14 @@ def reloaded(before: dict[str, list[str]], package: str) -> list[dict[str, objec
         bpy.ops.preferences.addon_enable(module=EXTENSION)
         if way == "install":
             bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True, overwrite=True)
-        jobs, watch = (importlib.import_module(f"{EXTENSION}.addon.{name}") for name in ("jobs", "steps.watch"))
+        session, watch = (importlib.import_module(f"{EXTENSION}.addon.{name}") for name in ("session", "steps.watch"))
         states = watch.refresh(bpy.context.scene).states
         found.append(
             {
                 "way": way,
                 "added": counts(difference(traces(), before)),
                 "classes": registered_classes(),
-                "listeners": len(jobs.ENDED),
+                "listeners": len(session.get_session().on_job_end),
                 "footage": states["footage"].word,
             }
         )

@@ -7,6 +7,7 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -29,10 +30,15 @@ def endless(monitor: object) -> None:
         time.sleep(0.01)
 
 
+def session_of(jobs: ModuleType) -> Any:
+    """The session of the add-on to which this module belongs."""
+    return importlib.import_module(f"{jobs.__package__}.session").get_session()
+
+
 def running(jobs: ModuleType) -> object:
     """An endless job on its thread, known to the module as the present one."""
     job = jobs.Job(endless)
-    jobs._current[:] = [job]
+    session_of(jobs).job = job
     job.start()
     deadline = time.monotonic() + STOP_S
     while not job.stage and time.monotonic() < deadline:
@@ -129,7 +135,7 @@ def test_cancelling_joins_within_a_second(jobs: ModuleType) -> None:
 def test_another_file_stops_the_job(jobs: ModuleType, blender: ModuleType) -> None:
     job = running(jobs)
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    assert not job.alive and jobs.current() is None
+    assert not job.alive and session_of(jobs).job is None
 
 
 def test_the_cancel_operator_is_there_only_while_a_job_runs(jobs: ModuleType, blender: ModuleType) -> None:
@@ -183,12 +189,12 @@ def test_a_bug_in_the_scene_is_told_too_and_the_panel_hears_of_the_end(
     heard: list[tuple[str, str]] = []
     listener = lambda context, step, failed, stopped: heard.append((step, failed))  # noqa: E731
     blender.utils.register_class(BrokenEnd)
-    jobs.ENDED.append(listener)
+    session_of(jobs).on_job_end.append(listener)
     try:
         with pytest.raises(RuntimeError, match="Tricap made a mistake .KeyError"):
             blender.ops.tricap.broken_end()
     finally:
-        jobs.ENDED.remove(listener)
+        session_of(jobs).on_job_end.remove(listener)
         blender.utils.unregister_class(BrokenEnd)
     assert 'result["nothing"]' in caplog.text and [step for step, _ in heard] == ["surface"]
     assert heard[0][1].startswith("Tricap made a mistake (KeyError")

@@ -320,7 +320,7 @@ def test_clicks_are_intersected_once(
 ) -> None:
     """Not whenever something in the scene changes; again for other clicks and another calibration, and a fault is not forgotten."""
     scene, asked, real = opened(blender, sample, tmp_path), list[str](), states.clicked_depth
-    monkeypatch.setattr(states, "_met", {})
+    importlib.import_module(f"{NAME}.session").get_session().file.click_problems.clear()
     monkeypatch.setattr(states, "clicked_depth", lambda footage, name, at: asked.append(name) or real(footage, name, at))
     for _ in range(2):
         assert states.compute(scene).states["seeds"].word == "done" and sorted(asked) == ["elbow.R", "shoulder.R", "wrist.R"]
@@ -485,9 +485,9 @@ def test_moved_footage_is_found_again(blender: ModuleType, words: Words, why: An
 
 def test_while_a_run_goes_on_its_finished_steps_are_seen(blender: ModuleType, words: Words, sample: Path, tmp_path: Path,
                                                          monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    watch, jobs = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.watch", "jobs"))
+    watch, jobs, session = (importlib.import_module(f"{NAME}.{name}") for name in ("steps.watch", "jobs", "session"))
     scene = opened(blender, sample, tmp_path)
-    monkeypatch.setattr(jobs, "_watched", [jobs.Job(lambda monitor: None)])
+    monkeypatch.setattr(session.get_session(), "job_operator", SimpleNamespace(job=jobs.Job(lambda monitor: None)))
     known = watch.refresh(scene)
     watch.mark()
     watch._tick()
@@ -541,10 +541,11 @@ def test_the_check_is_kept_until_its_input_changes(blender: ModuleType, words: W
     said = scene.tricap.check_said.splitlines()
     words()
     assert said and said[0].split()[0] in " ".join(layout.draw(panel.TRICAP_PT_main, blender.context).texts)
-    check._late[scene.tricap.check_key] = {"L": 0, "C": 0, "R": 1}
+    late = importlib.import_module(f"{NAME}.session").get_session().file.late_frames
+    late[scene.tricap.check_key] = {"L": 0, "C": 0, "R": 1}
     assert blender.ops.tricap.mend_offsets() == {"FINISHED"}
     assert [view.offset_frames for view in scene.tricap.views] == [0, 0, -1]
-    assert not blender.ops.tricap.mend_offsets.poll() or scene.tricap.check_key in check._late
+    assert not blender.ops.tricap.mend_offsets.poll() or scene.tricap.check_key in late
 
 
 @pytest.mark.parametrize("step", ["surface", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tracks", "fit"))])

@@ -39,7 +39,7 @@ def scene(blender: ModuleType, recording: Path) -> Iterator[ModuleType]:
     results = str(recording.with_name("out"))
     assert blender.ops.tricap.build_scene(out=results) == {"FINISHED"}
     yield blender
-    assert importlib.import_module(f"{ADDON}.jobs").current() is None
+    assert importlib.import_module(f"{ADDON}.session").get_session().job is None
     assert blender.ops.tricap.build_scene(out=results) == {"FINISHED"}
     ours = [o for o in blender.context.scene.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action]
     assert len(ours) == 1

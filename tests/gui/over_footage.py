@@ -64,9 +64,9 @@ def clicked(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
     """Click each joint in one view and take the proposals; drag one by G."""
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
     yield from drive.press(area, "tricap.click_joints")
-    running = module("addon.clicking.operators").ClickOperator.running
-    yield from drive.wait_for(lambda: running, 5, "clicking began")
-    session = running[0].session
+    running = module("addon.session").get_session()
+    yield from drive.wait_for(lambda: running.click_operator, 5, "clicking began")
+    session = running.click_operator.session
     for name, at in joints.items():
         drive.check(session.name == name, f"it is the turn of {name}")
         yield from drive.click(*display.image_place(views()["L"], *at["L"]))
@@ -78,8 +78,8 @@ def clicked(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
             yield from drive.shot("1_proposed")
             yield from dragged(session, at)
         yield from drive.key("RET")
-        yield from drive.wait_for(lambda name=name: not running or session.name != name, 10, "Return goes on")
-    drive.check(not running, "after the last joint it ends by itself")
+        yield from drive.wait_for(lambda name=name: not running.click_operator or session.name != name, 10, "Return goes on")
+    drive.check(not running.click_operator, "after the last joint it ends by itself")
     said = module("addon.project").table(bpy.context.scene)["seeds"]["joints"]
     drive.check({n: set(at) for n, at in said.items()} == {n: {"L", "C", "R"} for n in joints}, "take.toml gets all clicks")
 
@@ -99,14 +99,14 @@ def dragged(session: Any, at: dict[str, list[float]]) -> drive.Steps:
 
 def a_keyframe(joints: dict[str, dict[str, list[float]]]) -> drive.Steps:
     """A click in another frame is a keyframe; Esc ends, wherever the pointer is; one undo takes it back."""
-    project, running = module("addon.project"), module("addon.clicking.operators").ClickOperator.running
+    project, running = module("addon.project"), module("addon.session").get_session()
     bpy.context.scene.frame_set(2)
     area = yield from drive.sidebar("CLIP_EDITOR", "Tricap")
     yield from drive.press(area, "tricap.click_joints")
     for view in "LR":
         yield from drive.click(*display.image_place(views()[view], *joints["shoulder.R"][view]))
     yield from drive.key("ESC")
-    yield from drive.wait_for(lambda: not running, 10, "Esc ends clicking")
+    yield from drive.wait_for(lambda: not running.click_operator, 10, "Esc ends clicking")
     said = project.table(bpy.context.scene)
     drive.check([k["frame"] for k in said["keyframes"]] == [2], "frame 2 became a keyframe")
     yield from drive.key("Z", ctrl=True)
