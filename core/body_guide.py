@@ -51,7 +51,7 @@ class BodyGuide:
             return np.full((len(bone), 3), np.nan)
         return np.einsum("nij,nj->ni", self._R[i, bone], own_m) + self._head[i, bone]
 
-    def sees(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
+    def visible(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
         """Which points (N,) of a frame the body leaves in sight of the reference camera."""
         if frame not in self._row:
             return np.zeros(len(xyz_m), dtype=bool)

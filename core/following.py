@@ -1,7 +1,7 @@
-"""Tracking of a whole take: the points of each frame followed into the next, in the order of time, with a checkpoint per frame.
+"""Tracking of a whole take: the points of each frame tracked into the next, in the order of time, with a checkpoint per frame.
 
-A frame in which next to nothing is found, black in one view or lost by the recorder, is left out: the points go on from the frame before it
-into the one after.
+A frame in which next to no point is found, because one view is black or the recorder lost it, is left out: the points are tracked from
+the frame before it into the one after.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,16 +17,38 @@ from .progress import Monitor
 from .results import Results
 from .take import Footage
 from .tracking.published import STEPS
-from .tracking.relief import Relief
+from .tracking.relief import CurvatureCorrection
 from .tracking.settings import TrackingSettings
 from .tracking.step import FramePair, TrackingView
 from .tracking.surface import on_surface, regenerate, start_tracks
 from .tracking.templates import Templates, Tiles, cut_tiles, no_templates
 from .tracking.tracked import TrackedFrame, joined, nothing
-from .tracking.waiting import Guide, Waiting, nobody
+from .tracking.waiting import Guide, LostPoints, none_lost
 
-ALGORITHM = "tracking 13"  # part of every key: raise it when the same input gives other numbers
-DROPOUT = 0.1  # of the points: where fewer are found in a frame, it is the frame that is missing
+ALGORITHM = "tracking 14"  # part of every key: raise it when the same input gives other numbers
+MIN_PART_FOUND = 0.1  # of the points: where fewer are found in a frame, the frame is missing, and not the points
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrackingRules:
+    """How the points of a recording are tracked: the settings concerned, and what its calibration allows."""
+
+    matching: MatchingSettings
+    tracking: TrackingSettings
+    enhance: EnhanceSettings | None = None
+    limit_px: float = 0.0  # rays were allowed to miss by as much when the surface was measured
+
+    def view(self, footage: Footage) -> TrackingView:
+        """What a tracking step needs to know of the recording."""
+        return TrackingView(
+            cameras=footage.rig.cameras,
+            reference=footage.take.reference,
+            instants=footage.take.instants,
+            matching=self.matching,
+            tracking=self.tracking,
+            limit_px=max(self.tracking.max_residual_px, self.limit_px),
+            dt_s=1 / footage.take.fps,
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -36,111 +58,108 @@ class _State:
     before: TrackedFrame | None
     current: TrackedFrame | None
     templates: Templates
-    waiting: Waiting
-    born: int  # the next identity
+    lost: LostPoints
+    next_identity: int
 
     def after(self, tracked: TrackedFrame, cut: Tiles, view: TrackingView, guide: Guide | None) -> "_State":
         """The state after a frame, with the templates that were cut in it; a frame that was left out changes nothing."""
         if self.current is not None and not len(tracked.identity) and not len(tracked.ended):
             return self
-        waiting = self.waiting if self.current is None else self.waiting.after(self.current, tracked, view.tracking, guide)
-        wanted = np.concatenate([tracked.identity, waiting.points.identity])
+        lost = self.lost if self.current is None else self.lost.after(self.current, tracked, view.tracking, guide)
+        wanted = np.concatenate([tracked.identity, lost.points.identity])
         return _State(
             before=self.current,
             current=tracked,
             templates=self.templates.only(wanted).with_tiles(cut, view.matching, view.rows.step),
-            waiting=waiting,
-            born=max([self.born, *(tracked.identity[-1:] + 1)]),
+            lost=lost,
+            next_identity=max([self.next_identity, *(tracked.identity[-1:] + 1)]),
         )
 
 
 def track_frames(
     footage: Footage,
     measured: Sequence[MeasuredFrame],
-    limit_px: float,
-    matching: MatchingSettings,
-    tracking: TrackingSettings,
+    rules: TrackingRules,
     results: Results,
     monitor: Monitor,
-    enhance: EnhanceSettings | None = None,
     guide: Guide | None = None,
 ) -> Iterator[TrackedFrame]:
-    """Follow the surface through the frames (in the order of time), in which rays were allowed to miss by `limit_px`.
+    """Track points of the surface through the measured frames, in the order of time.
 
-    Frames that were tracked before are not tracked again for other knobs of the filters. Lost points can have a `guide`; what is tracked
-    with one has checkpoints of its own.
+    Frames with a valid checkpoint are not tracked again; the settings of the filters do not invalidate it. With a `guide` for lost points
+    the checkpoints are separate.
     """
-    tracking = tracking.of_the_step
-    view = tracking_view(footage, matching, tracking, limit_px)
-    none = no_templates(view.matching, view.rows.step)
-    state = _State(before=None, current=None, templates=none, waiting=nobody(len(view.cameras)), born=0)
-    key = store.digest(ALGORITHM, repr((matching, tracking, limit_px, enhance)), *([guide.key] if guide else []))
+    rules = replace(rules, tracking=rules.tracking.of_the_step)
+    view = rules.view(footage)
+    no_template = no_templates(view.matching, view.rows.step)
+    state = _State(before=None, current=None, templates=no_template, lost=none_lost(len(view.cameras)), next_identity=0)
+    key = store.digest(ALGORITHM, repr((rules.matching, rules.tracking, rules.limit_px, rules.enhance)), *([guide.key] if guide else []))
     group = "guided" if guide else "tracks"
     images: FrameImages | None = None
-    for i, m in enumerate(measured):
+    for i, surface in enumerate(measured):
         monitor.step("tracks", i, len(measured))
-        key = store.digest(key, m.key)
-        done = _from_checkpoint(results, group, m.frame, key)
+        key = store.digest(key, surface.key)
+        done = _from_checkpoint(results, group, surface.frame, key)
         if done is None:
             if state.current is not None and images is None:
-                images = load_images(footage, state.current.frame, enhance)
-            following = load_images(footage, m.frame, enhance)
-            tracked = _advance(view.at(m.frame), state, images, following, m, i, monitor, guide)
-            done = tracked, _cut(view, tracked, following)
+                images = load_images(footage, state.current.frame, rules.enhance)
+            next_images = load_images(footage, surface.frame, rules.enhance)
+            start_new = bool(view.tracking.regenerate_every) and i % view.tracking.regenerate_every == 0
+            tracked = _advance(view.at(surface.frame), state, _pair(images, next_images), surface, monitor, guide, start_new)
+            done = tracked, _cut(view, tracked, next_images)
             _checkpoint(results, group, *done, key)
         else:
-            following = None
+            next_images = None
         after = state.after(*done, view, guide)
-        images = images if after is state else following
+        images = images if after is state else next_images
         state = after
         yield done[0]
 
 
-def tracking_view(footage: Footage, matching: MatchingSettings, tracking: TrackingSettings, limit_px: float) -> TrackingView:
-    """What tracking needs to know of a recording whose rays were allowed to miss by `limit_px`."""
-    return TrackingView(
-        cameras=footage.rig.cameras,
-        reference=footage.take.reference,
-        instants=footage.take.instants,
-        matching=matching,
-        tracking=tracking,
-        limit_px=max(tracking.max_residual_px, limit_px),
-        dt_s=1 / footage.take.fps,
-    )
+def _pair(images: FrameImages | None, after: FrameImages) -> FramePair | None:
+    if images is None:
+        return None
+    return FramePair(grey=images.grey, spline=images.spline, next_grey=after.grey, next_spline=after.spline)
 
 
 def _advance(
     view: TrackingView,
     state: _State,
-    images: FrameImages | None,
-    following: FrameImages,
-    m: MeasuredFrame,
-    index: int,
+    images: FramePair | None,
+    surface: MeasuredFrame,
     monitor: Monitor,
     guide: Guide | None,
+    start_new: bool,
 ) -> TrackedFrame:
-    if view.tracking.scheme == "space":
-        view = replace(view, relief=_relief(view, m))
+    """The tracked points in the frame of the view, whose surface is given; with `start_new` new ones where it has none."""
+    in_space = view.tracking.scheme == "space"
+    if in_space:
+        view = replace(view, curvature=_curvature(view, surface))
     if state.current is None or images is None:
-        return start_tracks(m.field, m.cloud, view)
-    pair = FramePair(grey=images.grey, spline=images.spline, next_grey=following.grey, next_spline=following.spline)
-    tracked = STEPS[view.tracking.scheme](view, state.before, state.current, state.templates, pair, m.frame, monitor)
-    if len(tracked.identity) < DROPOUT * len(state.current.identity) and m.frame - state.current.frame <= view.tracking.bridge_frames:
-        return nothing(m.frame, len(view.cameras))
-    if view.tracking.scheme == "space":
-        waiting = state.waiting.carried(state.current, tracked, view.tracking, guide).in_sight(guide)
-        regained = on_surface(waiting.retaken(view, state.templates, following.spline), m.field, m.cloud, view)
-        tracked = joined(on_surface(tracked, m.field, m.cloud, view), regained)
-    every = view.tracking.regenerate_every
-    return regenerate(tracked, m.field, m.cloud, view, state.born) if every and index % every == 0 else tracked
+        return start_tracks(surface.field, surface.cloud, view)
+    tracked = STEPS[view.tracking.scheme](view, state.before, state.current, state.templates, images, surface.frame, monitor)
+    few = len(tracked.identity) < MIN_PART_FOUND * len(state.current.identity)
+    if few and surface.frame - state.current.frame <= view.tracking.bridge_frames:
+        return nothing(surface.frame, len(view.cameras))
+    if in_space:
+        lost = state.lost.carried(state.current, tracked, view.tracking, guide).in_sight(guide)
+        reacquired = on_surface(lost.reacquired(view, state.templates, images.next_spline), surface.field, surface.cloud, view)
+        tracked = joined(on_surface(tracked, surface.field, surface.cloud, view), reacquired)
+    return regenerate(tracked, surface.field, surface.cloud, view, state.next_identity) if start_new else tracked
 
 
-def _relief(view: TrackingView, m: MeasuredFrame) -> Relief:
-    return Relief(field=m.field, cloud=m.cloud, camera=view.cameras[view.reference], reference=view.reference, half_patch=view.half_patch)
+def _curvature(view: TrackingView, surface: MeasuredFrame) -> CurvatureCorrection:
+    return CurvatureCorrection(
+        field=surface.field,
+        cloud=surface.cloud,
+        camera=view.cameras[view.reference],
+        reference=view.reference,
+        half_patch=view.half_patch,
+    )
 
 
 def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Tiles:
-    """The tiles of the key templates that begin in this frame: of new points, and of those that outgrew theirs."""
+    """The tiles of the key templates that are cut in this frame: of new points, and of those that no longer match theirs."""
     new = tracked.renewed
     return cut_tiles(images.spline[view.reference], tracked.identity[new], tracked.xy[new, view.reference], view.matching, view.rows.step)
 

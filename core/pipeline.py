@@ -28,7 +28,7 @@ from .fit_sources import check_body, clicks_left_out, fit_input, missing_for_fit
 from .fitting.body_motion import BodyFit
 from .fitting.sequence import fit_sequence
 from .fitting.settings import FitSettings
-from .following import track_frames
+from .following import TrackingRules, track_frames
 from .frame_table import frame_table, write_frame_table
 from .images.enhance import EnhanceSettings
 from .images.retime import TimingSettings
@@ -263,8 +263,8 @@ def _follow(run: Run, monitor: Monitor, guide: Guide | None = None) -> dict[str,
         return filtered, np.array([*clicked.values()], dtype=np.int64)
 
     try:
-        limit_px = run.measured.limit_px
-        steps = track_frames(run.footage, run.measured, limit_px, s["matching"], s["tracking"], run.results, monitor, s["enhance"], guide)
+        rules = TrackingRules(matching=s["matching"], tracking=s["tracking"], enhance=s["enhance"], limit_px=run.measured.limit_px)
+        steps = track_frames(run.footage, run.measured, rules, run.results, monitor, guide)
         filtered, reasons = trajectories_of(steps, take.fps, s["tracking"], decide)
     except Cancelled as stop:
         raise Cancelled("Stopped: the surface of all frames is kept, and the tracks as far as they are; run it again to go on.") from stop

@@ -10,7 +10,7 @@ import numpy as np
 from . import pipeline
 from .arguments import frame_range, overrides
 from .errors import InputError
-from .following import tracking_view
+from .following import TrackingRules
 from .progress import Monitor
 from .results import Results, check_separate_folder
 from .take import Footage, open_take, read_take
@@ -56,7 +56,7 @@ def follow_points(
     Raises:
         InputError: a point has no place in space, or the images cannot be read.
     """
-    view = tracking_view(footage, settings["matching"], settings["tracking"], 0.0)
+    view = TrackingRules(matching=settings["matching"], tracking=settings["tracking"]).view(footage)
 
     def read(frame: int) -> list[np.ndarray]:
         return [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]

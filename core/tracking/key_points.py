@@ -23,14 +23,13 @@ from ..progress import Monitor
 from .published import STEPS
 from .search import search_box
 from .settings import TrackStatus
-from .step import MODEL_SIGMA_PX, TEMPLATE_SIGMA_PX, FramePair, TrackingView, intersect, match_spatially
-from .templates import Templates, Tiles, atlas, cut_tiles, no_templates
+from .step import MODEL_SIGMA_PX, FramePair, TrackingView, intersect, measured_at
+from .templates import REACQUIRE_CORRELATION, Templates, Tiles, atlas, cut_tiles, no_templates
 from .tracked import TrackedFrame, born, joined, nothing, rows_of
 
 CLICK_SIGMA_PX, CLICK_REACH_PX = 2.0, 6.0
 SLOPES = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))  # of the surface about a point: up to 35° either way
 LARGEST_MISFIT_PX, MISFITS = 4.0, 2.5  # rays may miss by so much, and by so many of their median in the frame
-RETAKEN_CORRELATION = 0.9  # of a lost point with its template: more than in tracking, for nothing else speaks for it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -126,29 +125,27 @@ class _Lost:
         keep = ~np.isin(points.identity, tracked.identity) & (abs(tracked.frame - last) < wait_frames)
         return _Lost(points=points.select(keep), velocity_m=velocity[keep], last=last[keep])
 
-    def retaken(self, view: TrackingView, templates: Templates, grey: Sequence[np.ndarray], spline: Sequence[SplineImage]) -> TrackedFrame:
+    def reacquired(
+        self, view: TrackingView, templates: Templates, grey: Sequence[np.ndarray], spline: Sequence[SplineImage]
+    ) -> TrackedFrame:
         """Those that are seen again in the frame of the view, about where their motion takes them."""
         ahead = np.abs(view.frame - self.last)[:, None]
         p, ref = replace(self.points, xyz_m=self.points.xyz_m + ahead * self.velocity_m), view.reference
         if not len(p.identity):
             return p
-        centre = np.stack([view.rows.from_frame(camera.project(p.xyz_m)) for camera in view.cameras], axis=1)
+        centre = view.projected(p.xyz_m)
         picture, tiles = atlas(templates.only(p.identity).tiles)
         box = np.full(len(p.identity), 2.0 * view.tracking.box_px)
         start, best = search_box(picture, grey[ref], tiles, centre[:, ref], box, view.matching.patch_px, view.rows.step)
         start = np.where((best >= view.tracking.min_correlation)[:, None], start, np.nan)
         key = templates.match(p.identity, spline[ref], start, p.key_shape)
         status = np.full(p.xy.shape[:2], TrackStatus.MEASURED, dtype=np.int8)
-        least = max(RETAKEN_CORRELATION, view.tracking.drift_correlation)
+        least = max(REACQUIRE_CORRELATION, view.tracking.drift_correlation)
         status[~(key.ok & (key.correlation >= least)), ref] = TrackStatus.NOT_FOUND
         shift = np.nan_to_num(key.xy - centre[:, ref])
         at = [centre[:, k] + np.einsum("nij,nj->ni", p.shape[:, k], shift) for k in range(len(view.cameras))]
         at = [key.xy if k == ref else _searched(spline[ref], grey[k], key.xy, at[k], p.shape[:, k], view) for k in range(len(at))]
-        spatial = match_spatially(view, p, at, spline, status)
-        xy, covariance, shape = np.stack(at, axis=1), np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2, (*status.shape, 1, 1)), p.shape.copy()
-        for k, s in zip(view.others, spatial):
-            xy[:, k], covariance[:, k], shape[:, k] = s.xy, s.covariance, s.shape
-        found, verdict = intersect(view, replace(p, key_shape=key.shape, drift=key.covariance), xy, covariance, shape, status)
+        found, verdict = measured_at(view, replace(p, key_shape=key.shape, drift=key.covariance), at, spline, status)
         return replace(found.select(verdict == TrackStatus.MEASURED), frame=view.frame)
 
 
@@ -169,7 +166,7 @@ def _follow(
         next_grey, next_spline = _prepared(read(frame))
         pair = FramePair(grey=grey, spline=spline, next_grey=next_grey, next_spline=next_spline)
         tracked = STEPS[view.tracking.scheme](loose, before, current, templates, pair, frame, monitor)
-        regained = lost.retaken(loose.at(frame), templates, next_grey, next_spline)
+        regained = lost.reacquired(loose.at(frame), templates, next_grey, next_spline)
         tracked = _meeting(joined(tracked, regained), view.at(frame))
         yield tracked
         if len(current.identity) and not len(tracked.identity) and abs(frame - current.frame) <= view.tracking.bridge_frames:

@@ -1,67 +1,121 @@
-"""The 2-D mode: points followed in the images of one camera (D'Apuzzo et al. 2000, §4).
+"""The 2-D mode: points tracked in the images of one camera (D'Apuzzo et al. 2000, §4).
 
-There is no second view to verify a step, so each is done forwards and backwards: the patch found in frame i + 1 is matched back in
-frame i, and must come back to where it was,
+There is no second view to verify a step, so each is done forwards and backwards: the patch matched in frame i + 1 is matched back in
+frame i, and must return to where it started,
 
     |p − bwd(fwd(p))| ≤ max(0.5 px, 3 σ)                                                                  (1)
 
-Else the point is lost. A lost point waits where it was last seen, and its key template is looked for there in the frames that follow, as
-many as it may wait for.
+Otherwise the point is lost. Its key template is then searched for at its last place in the following frames, for at most
+`tracking.wait_frames` of them.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ..images.fields import RowGrid
 from ..images.sampling import SplineImage
-from ..matching.least_squares import MatchingSettings, match_patches
+from ..matching.least_squares import Matches, MatchingSettings, match_patches
 from ..progress import Monitor
-from .control import hold
+from .control import TemplateState, control_drift
 from .search import search_box
 from .settings import TrackingSettings, TrackStatus
-from .templates import Templates, atlas, cut_tiles, no_templates
+from .templates import REACQUIRE_CORRELATION, Templates, atlas, cut_tiles, no_templates
 
-FRAME = RowGrid()  # all rows
-RETURN_PX, RETURN_SIGMAS = 0.5, 3.0
-KNOWN_BOX, UNKNOWN_BOX = (0.0, 0.4, 2.0), (0.0, 1.0, 2.0)  # of the box in each attempt, for points whose motion is known or not
-RETAKEN_CORRELATION = 0.9  # of a lost point with its template: more than in tracking, for nothing else speaks for it
+ALL_ROWS = RowGrid()
+RETURN_PX = 0.5  # of (1) (D'Apuzzo et al. 2000, §4)
+RETURN_SIGMAS = 3.0  # of (1)
+ATTEMPT_BOX = (0.0, 0.4, 2.0)  # in units of `tracking.box_px`, by attempt, for points with a predicted motion
+ATTEMPT_BOX_NEW = (0.0, 1.0, 2.0)  # the same for points without
+LAST_ATTEMPT = len(ATTEMPT_BOX) - 1
+MIN_DETERMINANT = 0.05  # of a shape; a flatter one has no usable inverse
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PlanarTracks:
-    """N points over T frames of one camera, full-frame pixels. A point that is not seen has NaN, and a status that says why."""
+    """N points over T frames of one camera, full-frame pixels. A point that is not visible has NaN, and the reason as its status."""
 
     frames: np.ndarray  # (T,)
     xy_px: np.ndarray  # (T, N, 2)
-    sigma_px: np.ndarray  # (T, N) of the place on what is shown, over both directions
+    sigma_px: np.ndarray  # (T, N) of the place on the imaged object, x and y combined
     correlation: np.ndarray  # (T, N) with the patch of the frame before
     status: np.ndarray  # (T, N) TrackStatus
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Found:
+    """New places of M points in a frame."""
+
+    xy: np.ndarray  # (M, 2)
+    state: TemplateState
+    correlation: np.ndarray  # (M,)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Points:
     """The state of N points at a frame."""
 
-    xy: np.ndarray
-    speed: np.ndarray  # (N, 2) px per frame; NaN when not known
-    key_shape: np.ndarray
-    drift: np.ndarray
-    key_drift: np.ndarray
-    seen: np.ndarray  # (N,) else it waits
-    since: np.ndarray  # (N,) frames since it was seen
-    correlation: np.ndarray
-    reason: np.ndarray
+    xy: np.ndarray  # (N, 2) rows' pixels; of a lost point its last place
+    speed: np.ndarray  # (N, 2) px per frame; NaN where unknown
+    key_shape: np.ndarray  # (N, 2, 2) as in TemplateState
+    drift: np.ndarray  # (N, 2, 2) the same
+    key_drift: np.ndarray  # (N, 2, 2) the same
+    visible: np.ndarray  # (N,) otherwise it is lost
+    lost_frames: np.ndarray  # (N,) frames since it was last visible
+    correlation: np.ndarray  # (N,)
+    reason: np.ndarray  # (N,) TrackStatus, why a point was lost
+
+    def state(self, rows: np.ndarray) -> TemplateState:
+        """Of these rows."""
+        return TemplateState(shape=self.key_shape[rows], drift=self.drift[rows], key_drift=self.key_drift[rows])
+
+    def updated(self, before: "_Points", rows: np.ndarray, good: np.ndarray, found: _Found, reason: np.ndarray) -> "_Points":
+        """These points with the good ones of `rows` at their new places; the others of `rows` are given the reason (M,)."""
+        names = ("xy", "key_shape", "drift", "key_drift", "correlation", "visible", "reason", "speed")
+        values = {name: getattr(self, name).copy() for name in names}
+        at, state = rows[good], found.state
+        new = dict(xy=found.xy, key_shape=state.shape, drift=state.drift, key_drift=state.key_drift, correlation=found.correlation)
+        for name, array in (new | {"speed": found.xy - before.xy[rows]}).items():
+            values[name][at] = array[good]
+        values["speed"][at[~before.visible[at]]] = np.nan
+        values["visible"][at] = True
+        values["reason"][rows[~good]] = reason[~good]
+        return replace(self, **values)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Picture:
+    """The rows of one frame, prepared for matching."""
+
+    grey: np.ndarray  # (h', w) float32
+    spline: SplineImage
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _How:
-    """By which rules points are followed."""
+class _Rules:
+    """How points are tracked."""
 
     matching: MatchingSettings
     tracking: TrackingSettings
     row_step: int  # 2 for a field
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Step:
+    """What is matched from one frame to the next, and how."""
+
+    now: _Picture
+    after: _Picture
+    templates: Templates
+    rules: _Rules
+
+    def search(self, xy: np.ndarray, centre: np.ndarray, box: np.ndarray, grey: np.ndarray | None = None) -> np.ndarray:
+        """Where (N, 2) in the next frame the patches about `xy` of this frame (or of `grey`) correlate best; NaN where too little."""
+        grey = self.now.grey if grey is None else grey
+        start, best = search_box(grey, self.after.grey, xy, centre, box, self.rules.matching.patch_px, self.rules.row_step)
+        return np.where((best >= self.rules.tracking.min_correlation)[:, None], start, np.nan)
 
 
 def track_planar(
@@ -71,143 +125,119 @@ def track_planar(
     matching: MatchingSettings,
     tracking: TrackingSettings,
     monitor: Monitor,
-    grid: RowGrid = FRAME,
+    grid: RowGrid = ALL_ROWS,
 ) -> PlanarTracks:
-    """Follow points (N, 2) of the first of `frames` through the others. `read(i)` gives the grey image (h, w) of a frame, of which the rows
-    of `grid` are looked at: of interlaced video one field.
+    """Track points (N, 2) of the first of `frames` through the others. `read(i)` gives the grey image (h, w) of a frame, of which only
+    the rows of `grid` are used: one field of interlaced video.
 
     The frames may run backwards. Memory does not grow with their number.
     """
-    how = _How(matching=matching, tracking=tracking, row_step=grid.step)
-    steps = list(_follow(lambda i: grid.rows(read(i)), frames, grid.from_frame(xy_px), how, monitor))
-    seen = np.array([s.seen for s in steps])
-    spread = np.array([np.trace(grid.covariance_to_frame(s.drift + s.key_drift), axis1=1, axis2=2) for s in steps])
+    rules = _Rules(matching=matching, tracking=tracking, row_step=grid.step)
+
+    def picture(frame: int) -> _Picture:
+        grey = grid.rows(read(frame))
+        return _Picture(grey=grey, spline=SplineImage(grey))
+
+    steps = list(_follow(picture, frames, grid.from_frame(xy_px), rules, monitor))
+    visible = np.array([s.visible for s in steps])
+    variance = np.array([np.trace(grid.covariance_to_frame(s.drift + s.key_drift), axis1=1, axis2=2) for s in steps])
     return PlanarTracks(
         frames=np.array(frames),
-        xy_px=np.where(seen[..., None], [grid.to_frame(s.xy) for s in steps], np.nan),
-        sigma_px=np.where(seen, np.sqrt(spread), np.nan),
-        correlation=np.where(seen, [s.correlation for s in steps], np.nan),
-        status=np.where(seen, TrackStatus.MEASURED, [s.reason for s in steps]).astype(np.int8),
+        xy_px=np.where(visible[..., None], [grid.to_frame(s.xy) for s in steps], np.nan),
+        sigma_px=np.where(visible, np.sqrt(variance), np.nan),
+        correlation=np.where(visible, [s.correlation for s in steps], np.nan),
+        status=np.where(visible, TrackStatus.MEASURED, [s.reason for s in steps]).astype(np.int8),
     )
 
 
-def _follow(
-    read: Callable[[int], np.ndarray],
-    frames: range,
-    xy: np.ndarray,
-    how: _How,
-    monitor: Monitor,
-) -> Iterator[_Points]:
-    matching, step = how.matching, how.row_step
-    grey = read(frames[0])
-    image, n = SplineImage(grey), len(xy)
-    templates = no_templates(matching, step).with_tiles(cut_tiles(image, np.arange(n), xy, matching, step), matching, step)
-    none = np.zeros((n, 2, 2))
-    points = _Points(
-        xy=xy,
-        speed=np.full((n, 2), np.nan),
-        key_shape=np.tile(np.eye(2), (n, 1, 1)),
-        drift=none,
-        key_drift=none,
-        seen=image.inside(xy, 0.0),
-        since=np.zeros(n, dtype=np.int64),
-        correlation=np.ones(n),
-        reason=np.full(n, TrackStatus.LEFT_IMAGE, dtype=np.int8),
-    )
+def _follow(picture: Callable[[int], _Picture], frames: range, xy: np.ndarray, rules: _Rules, monitor: Monitor) -> Iterator[_Points]:
+    now, matching, step = picture(frames[0]), rules.matching, rules.row_step
+    templates = no_templates(matching, step).with_tiles(cut_tiles(now.spline, np.arange(len(xy)), xy, matching, step), matching, step)
+    points = _first(xy, now.spline)
     yield points
     for i, frame in enumerate(frames[1:]):
         monitor.step("tracks", i, len(frames) - 1)
-        next_grey = read(frame)
-        following = SplineImage(next_grey)
-        points, fresh = _step(points, templates, (grey, image), (next_grey, following), how)
-        templates = templates.with_tiles(cut_tiles(following, fresh, points.xy[fresh], matching, step), matching, step)
-        grey, image = next_grey, following
+        after = picture(frame)
+        points, renewed = _next(points, _Step(now=now, after=after, templates=templates, rules=rules))
+        templates = templates.with_tiles(cut_tiles(after.spline, renewed, points.xy[renewed], matching, step), matching, step)
+        now = after
         yield points
 
 
-def _step(
-    points: _Points,
-    templates: Templates,
-    now: tuple[np.ndarray, SplineImage],
-    after: tuple[np.ndarray, SplineImage],
-    how: _How,
-) -> tuple[_Points, np.ndarray]:
-    """One frame on; and which points need their present patch as a new template."""
-    matching, tracking = how.matching, how.tracking
-    rows = np.arange(len(points.xy))
-    known = np.isfinite(points.speed).all(axis=1)
-    result, fresh = replace(points, seen=np.zeros(len(rows), dtype=bool), speed=np.full((len(rows), 2), np.nan)), []
-    centre = np.where(known[:, None], points.xy + np.nan_to_num(points.speed), points.xy)
-    for attempt in range(3):
-        rest = np.flatnonzero(points.seen & ~result.seen & (known | (attempt > 0)))
+def _first(xy: np.ndarray, image: SplineImage) -> _Points:
+    n = len(xy)
+    zero = np.zeros((n, 2, 2))
+    return _Points(
+        xy=xy,
+        speed=np.full((n, 2), np.nan),
+        key_shape=np.tile(np.eye(2), (n, 1, 1)),
+        drift=zero,
+        key_drift=zero,
+        visible=image.inside(xy, 0.0),
+        lost_frames=np.zeros(n, dtype=np.int64),
+        correlation=np.ones(n),
+        reason=np.full(n, TrackStatus.LEFT_IMAGE, dtype=np.int8),
+    )
+
+
+def _next(points: _Points, step: _Step) -> tuple[_Points, np.ndarray]:
+    """The points in the next frame, and the rows of those whose present patch is to become their key template."""
+    n, box_px = len(points.xy), step.rules.tracking.box_px
+    predicted = np.isfinite(points.speed).all(axis=1)
+    centre = np.where(predicted[:, None], points.xy + np.nan_to_num(points.speed), points.xy)
+    result, replaced = replace(points, visible=np.zeros(n, dtype=bool), speed=np.full((n, 2), np.nan)), [np.zeros(0, dtype=np.int64)]
+    for attempt in range(LAST_ATTEMPT + 1):
+        rest = np.flatnonzero(points.visible & ~result.visible & (predicted | (attempt > 0)))
         if len(rest):
-            box = tracking.box_px * np.where(known[rest], KNOWN_BOX[attempt], UNKNOWN_BOX[attempt])
-            start, best = search_box(now[0], after[0], points.xy[rest], centre[rest], box, matching.patch_px, how.row_step)
-            eye = np.tile(np.eye(2), (len(rest), 1, 1))
-            start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)
-            there = match_patches(now[1], points.xy[rest], [after[1]], [start], [eye], matching, row_step=how.row_step,
-                                  of_texture=False)[0]  # fmt: skip
-            good = there.ok & _returns(now[1], after[1], points.xy[rest], there.xy, there.shape, there.covariance, how)
-            held = hold(there, good, points.key_shape[rest], points.drift[rest], templates, rest, after[1],
-                        tracking.drift_correlation)  # fmt: skip
-            if attempt == 2:  # far from where it was expected: the template must agree
-                good &= ~held.renewed | (there.correlation >= RETAKEN_CORRELATION)
-            why = np.where(best < tracking.min_correlation, TrackStatus.NOT_FOUND, TrackStatus.NOT_MATCHED)
-            why = np.where(there.ok, TrackStatus.NOT_VERIFIED, why)
-            renewed = held.renewed[:, None, None]
-            key_drift = points.key_drift[rest] + np.where(renewed, held.drift, 0.0)
-            result = _with(result, rest, good, points, there.xy + held.shift, held.key_shape, np.where(renewed, 0.0, held.drift),
-                           key_drift, there.correlation, why)  # fmt: skip
-            fresh.extend(rest[held.renewed & good])
-    waiting = np.flatnonzero(~points.seen & (points.reason != TrackStatus.LEFT_IMAGE) & (points.since < tracking.wait_frames))
-    if len(waiting):
-        box = np.full(len(waiting), float(tracking.box_px))
-        grey, tiles = atlas(templates.tiles.select(waiting))
-        start, best = search_box(grey, after[0], tiles, points.xy[waiting], box, matching.patch_px, how.row_step)
-        start = np.where((best >= tracking.min_correlation)[:, None], start, np.nan)
-        key = templates.match(waiting, after[1], start, points.key_shape[waiting])
-        good = key.ok & (key.correlation >= max(RETAKEN_CORRELATION, tracking.drift_correlation))
-        result = _with(result, waiting, good, points, key.xy, key.shape, key.covariance, points.key_drift[waiting], key.correlation,
-                       points.reason[waiting])  # fmt: skip
-    return replace(result, since=np.where(result.seen, 0, points.since + 1)), np.array(fresh, dtype=np.int64)
+            box = box_px * np.where(predicted[rest], ATTEMPT_BOX[attempt], ATTEMPT_BOX_NEW[attempt])
+            least = REACQUIRE_CORRELATION if attempt == LAST_ATTEMPT else -np.inf  # far from the predicted place
+            found, status, renewed = _attempt(points, rest, step.search(points.xy[rest], centre[rest], box), step, least)
+            good = status == TrackStatus.MEASURED
+            result = result.updated(points, rest, good, found, status)
+            replaced.append(rest[renewed & good])
+    result = _reacquired(result, points, step)
+    return replace(result, lost_frames=np.where(result.visible, 0, points.lost_frames + 1)), np.concatenate(replaced)
 
 
-def _returns(
-    now: SplineImage,
-    after: SplineImage,
-    xy: np.ndarray,
-    found: np.ndarray,
-    shape: np.ndarray,
-    covariance: np.ndarray,
-    how: _How,
-) -> np.ndarray:
-    """Which points come back to where they were.  (1)"""
-    inverse = np.linalg.inv(np.where(np.abs(np.linalg.det(shape)) > 0.05, 1.0, np.nan)[:, None, None] * shape)
+def _attempt(
+    points: _Points, rows: np.ndarray, start: np.ndarray, step: _Step, min_correlation_renewed: float
+) -> tuple[_Found, np.ndarray, np.ndarray]:
+    """New places of the points of `rows`, a status each, and which of them no longer match their key template.
+
+    `start` is NaN where the box search failed. A point that no longer matches its key template needs the given correlation.
+    """
+    matching, tracking, row_step = step.rules.matching, step.rules.tracking, step.rules.row_step
+    xy, eye = points.xy[rows], np.tile(np.eye(2), (len(rows), 1, 1))
+    match = match_patches(step.now.spline, xy, [step.after.spline], [start], [eye], matching, row_step=row_step, of_texture=False)[0]
+    good = match.ok & _returns(match, xy, step)
+    key_match = partial(step.templates.match, rows, step.after.spline)
+    controlled = control_drift(match, good, points.state(rows), key_match, tracking.drift_correlation)
+    good &= ~controlled.renewed | (match.correlation >= min_correlation_renewed)
+    status = np.where(np.isnan(start).any(axis=1), TrackStatus.NOT_FOUND, TrackStatus.NOT_MATCHED)
+    status = np.where(match.ok, TrackStatus.NOT_VERIFIED, status)
+    found = _Found(xy=match.xy + controlled.shift, state=controlled.state, correlation=match.correlation)
+    return found, np.where(good, TrackStatus.MEASURED, status), controlled.renewed
+
+
+def _returns(match: Matches, xy: np.ndarray, step: _Step) -> np.ndarray:
+    """Which points the match back returns to `xy`, where they started.  (1)"""
+    inverse = np.linalg.inv(np.where(np.abs(np.linalg.det(match.shape)) > MIN_DETERMINANT, 1.0, np.nan)[:, None, None] * match.shape)
     inverse = np.where(np.isfinite(inverse), inverse, np.eye(2))
-    back = match_patches(after, found, [now], [xy], [inverse], how.matching, row_step=how.row_step, of_texture=False)[0]
-    sigma = np.sqrt(np.maximum(np.trace(covariance + back.covariance, axis1=1, axis2=2), 0.0))
+    matching, row_step = step.rules.matching, step.rules.row_step
+    back = match_patches(step.after.spline, match.xy, [step.now.spline], [xy], [inverse], matching, row_step=row_step, of_texture=False)[0]
+    sigma = np.sqrt(np.maximum(np.trace(match.covariance + back.covariance, axis1=1, axis2=2), 0.0))
     return back.ok & (np.linalg.norm(back.xy - xy, axis=1) <= np.maximum(RETURN_PX, RETURN_SIGMAS * sigma))
 
 
-def _with(
-    result: _Points,
-    rows: np.ndarray,
-    good: np.ndarray,
-    before: _Points,
-    xy: np.ndarray,
-    key_shape: np.ndarray,
-    drift: np.ndarray,
-    key_drift: np.ndarray,
-    correlation: np.ndarray,
-    why: np.ndarray,
-) -> _Points:
-    """The result with the good ones of `rows`; the others carry the reason."""
-    at = rows[good]
-    values = {n: getattr(result, n).copy() for n in ("xy", "key_shape", "drift", "key_drift", "correlation", "seen", "reason", "speed")}
-    new = dict(xy=xy, key_shape=key_shape, drift=drift, key_drift=key_drift, correlation=correlation, speed=xy - before.xy[rows])
-    for name, array in new.items():
-        values[name][at] = array[good]
-    values["speed"][at[~before.seen[at]]] = np.nan
-    values["seen"][at] = True
-    values["reason"][rows[~good]] = why[~good]
-    return replace(result, **values)
+def _reacquired(result: _Points, points: _Points, step: _Step) -> _Points:
+    """The result with those of the lost points whose key template reappears at their last place."""
+    tracking = step.rules.tracking
+    lost = np.flatnonzero(~points.visible & (points.reason != TrackStatus.LEFT_IMAGE) & (points.lost_frames < tracking.wait_frames))
+    if not len(lost):
+        return result
+    grey, tiles = atlas(step.templates.tiles.select(lost))
+    start = step.search(tiles, points.xy[lost], np.full(len(lost), float(tracking.box_px)), grey)
+    key = step.templates.match(lost, step.after.spline, start, points.key_shape[lost])
+    good = key.ok & (key.correlation >= max(REACQUIRE_CORRELATION, tracking.drift_correlation))
+    state = TemplateState(shape=key.shape, drift=key.covariance, key_drift=points.key_drift[lost])
+    return result.updated(points, lost, good, _Found(xy=key.xy, state=state, correlation=key.correlation), points.reason[lost])

@@ -19,7 +19,6 @@ drift over the body.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -31,9 +30,9 @@ from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches
 from ..matching.patch_pixels import patch_offsets
 from ..progress import Monitor
-from .control import hold, not_below
+from .control import REGULARISATION_PX2, TemplateState, at_least_best, control_drift
 from .neighbours import common_motion, nearest_neighbours
-from .relief import Relief
+from .relief import CurvatureCorrection
 from .search import search_box
 from .settings import TrackingSettings, TrackStatus
 from .templates import Templates
@@ -59,7 +58,7 @@ class TrackingView:
     limit_px: float  # by which rays may miss
     frame: int = 0  # that is looked at
     dt_s: float = 0.04  # from one frame to the next
-    relief: Relief | None = None  # the surface measured in that frame
+    curvature: CurvatureCorrection | None = None  # from the surface measured in that frame
 
     def at(self, frame: int) -> "TrackingView":
         """The same, to look at this frame."""
@@ -77,8 +76,12 @@ class TrackingView:
 
     @property
     def others(self) -> list[int]:
-        """The views beside the reference."""
+        """The views other than the reference."""
         return [k for k in range(len(self.cameras)) if k != self.reference]
+
+    def projected(self, xyz_m: np.ndarray) -> np.ndarray:
+        """Points (N, 3) in every view (N, K, 2), rows' pixels of that frame."""
+        return np.stack([self.rows.from_frame(camera.project(xyz_m)) for camera in self.cameras], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -219,26 +222,21 @@ def control(
     image: SplineImage,
     status: np.ndarray,
 ) -> tuple[TrackedFrame, list[Matches]]:
-    """The points with their drift, and the temporal matches shifted to where the key templates say.  (4)"""
-    raw = temporal[view.reference]
-    reference = raw if view.relief is None else view.relief.corrected(raw, points.relief)
-    held = hold(
-        reference,
-        status == TrackStatus.MEASURED,
-        points.key_shape,
-        points.drift,
-        templates,
-        points.identity,
-        image,
-        view.tracking.drift_correlation,
-        None if view.relief is None else partial(view.relief.corrected, template=points.key_relief),
-    )
-    shift = held.shift + np.nan_to_num(reference.xy - raw.xy)
+    """The points with their drift, and the temporal matches shifted to agree with the key templates.  (4)"""
+    raw, curvature = temporal[view.reference], view.curvature
+    reference = raw if curvature is None else curvature.corrected(raw, points.local_surface)
+
+    def match_templates(start: np.ndarray, shape: np.ndarray) -> Matches:
+        key = templates.match(points.identity, image, start, shape)
+        return key if curvature is None else curvature.corrected(key, points.key_local_surface)
+
+    state = TemplateState(shape=points.key_shape, drift=points.drift, key_drift=points.key_drift)
+    good = status == TrackStatus.MEASURED
+    controlled = control_drift(reference, good, state, match_templates, view.tracking.drift_correlation)
+    shift, state = controlled.shift + np.nan_to_num(reference.xy - raw.xy), controlled.state
     moved = [replace(m, xy=m.xy + np.einsum("nij,nj->ni", points.shape[:, k], shift)) for k, m in enumerate(temporal)]
-    moved[view.reference] = replace(reference, xy=reference.xy + held.shift)
-    renewed = held.renewed[:, None, None]
-    key_drift = points.key_drift + np.where(renewed, held.drift, 0.0)
-    return replace(points, key_shape=held.key_shape, key_drift=key_drift, drift=np.where(renewed, 0.0, held.drift)), moved
+    moved[view.reference] = replace(reference, xy=reference.xy + controlled.shift)
+    return replace(points, key_shape=state.shape, key_drift=state.key_drift, drift=state.drift), moved
 
 
 def match_spatially(
@@ -299,9 +297,9 @@ def _verify(
 def weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) and covariances of both weighted by their covariances for these rows (a mask), of `a` alone for the others."""
     xy, K = a.xy.copy(), a.covariance.copy()
-    gain = K[rows] @ invert_spd(K[rows] + b.covariance[rows] + np.eye(2) * 1e-8)
+    gain = K[rows] @ invert_spd(K[rows] + b.covariance[rows] + np.eye(2) * REGULARISATION_PX2)
     xy[rows] += np.einsum("nij,nj->ni", gain, (b.xy - a.xy)[rows])
-    K[rows] = not_below(K[rows] - gain @ K[rows], K[rows], b.covariance[rows])
+    K[rows] = at_least_best(K[rows] - gain @ K[rows], K[rows], b.covariance[rows])
     return xy, K
 
 
@@ -318,6 +316,18 @@ def intersect(
         mark(verdict, ~(point.rms_residual_px <= view.limit_px), TrackStatus.RAYS_MISS)
     K = point.covariance_m2 + over_the_body(view, point.xyz_m, points.key_drift + points.drift)
     return replace(points, xy=xy, shape=shape, xyz_m=point.xyz_m, covariance_m2=K), verdict
+
+
+def measured_at(
+    view: TrackingView, points: TrackedFrame, at: Sequence[np.ndarray], images: Sequence[SplineImage], status: np.ndarray
+) -> tuple[TrackedFrame, np.ndarray]:
+    """The points measured by spatial matching alone, from positions (N, 2) in every view, and one status (N,) each."""
+    spatial = match_spatially(view, points, at, images, status)
+    xy, covariance = np.stack(at, axis=1), np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2, (*status.shape, 1, 1))
+    shape = points.shape.copy()
+    for k, s in zip(view.others, spatial):
+        xy[:, k], covariance[:, k], shape[:, k] = s.xy, s.covariance, s.shape
+    return intersect(view, points, xy, covariance, shape, status)
 
 
 def _verdict(view: TrackingView, status: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..matching.growing import TripletField
 from ..surface.cloud import PointCloud
-from .relief import NEAREST
+from .relief import NEAREST_POINTS
 from .settings import TrackStatus
 from .step import TrackingView, over_the_body
 from .tracked import TrackedFrame, born, joined
@@ -52,7 +52,7 @@ def on_surface(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, vi
     camera, to_frame = view.cameras[view.reference], field.grid.rows.to_frame
     at = to_frame(tracked.xy[:, view.reference])
     ray, depth = camera.rays(at), camera.to_camera(tracked.xyz_m)[:, 2]
-    distance, near = cKDTree(to_frame(field.xy[:, view.reference])).query(at, k=min(NEAREST, len(field.cell)))
+    distance, near = cKDTree(to_frame(field.xy[:, view.reference])).query(at, k=min(NEAREST_POINTS, len(field.cell)))
     distance, near = distance.reshape(len(at), -1), near.reshape(len(at), -1)
     slope = np.einsum("nki,ni->nk", cloud.normals[near], ray)  # negative: towards the camera
     facing = -slope[:, 0] / np.linalg.norm(ray, axis=1)
@@ -67,7 +67,7 @@ def on_surface(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, vi
     reason[(reason == TrackStatus.MEASURED) & far] = TrackStatus.OFF_SURFACE
     strayed = over_the_body(view, tracked.xyz_m, tracked.key_drift + tracked.drift)
     placed = replace(tracked, xyz_m=camera.centre_m + ray * found[:, None], covariance_m2=cloud.covariance_m2[near[:, 0]] + strayed)
-    return _with_relief(placed, view).without(reason != TrackStatus.MEASURED, reason)
+    return _with_local_surface(placed, view).without(reason != TrackStatus.MEASURED, reason)
 
 
 def _well_inside(field: TripletField, cloud: PointCloud, rows: np.ndarray, view: TrackingView) -> np.ndarray:
@@ -99,15 +99,17 @@ def _coverage(field: TripletField, xy: np.ndarray, depth: np.ndarray, view: Trac
 
 def _born(field: TripletField, cloud: PointCloud, rows: np.ndarray, first: int, view: TrackingView) -> TrackedFrame:
     identity = np.arange(first, first + len(rows))
-    return _with_relief(born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows]), view)
+    return _with_local_surface(
+        born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows]), view
+    )
 
 
-def _with_relief(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
-    """The points with the frame's relief under them, which is that of the key templates cut in it."""
-    if view.relief is None:
+def _with_local_surface(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
+    """The points with the frame's local surface under them, which is also that of the key templates cut in this frame."""
+    if view.curvature is None:
         return points
-    here = view.relief.at(points.xy[:, view.reference])
-    return replace(points, relief=here, key_relief=np.where(points.renewed[:, None], here, points.key_relief))
+    here = view.curvature.local_surface(points.xy[:, view.reference])
+    return replace(points, local_surface=here, key_local_surface=np.where(points.renewed[:, None], here, points.key_local_surface))
 
 
 def _thinned(field: TripletField, spacing_px: int) -> np.ndarray:

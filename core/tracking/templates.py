@@ -25,6 +25,7 @@ from .tracked import rows_of
 
 BORDER = 5  # pixels about a patch: gradients, and where the spline still feels the tile's border
 MAX_WIDTH_PX = 8000  # of an atlas, a limit of the look-up
+REACQUIRE_CORRELATION = 0.9  # of a lost point with its key template: more than in tracking, for nothing else supports the match
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -1,4 +1,4 @@
-"""The points that are followed, at one frame."""
+"""The tracked points of one frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -8,16 +8,17 @@ import numpy as np
 
 from .settings import TrackStatus
 
-ROWS = ("identity", "xy", "shape", "xyz_m", "covariance_m2", "key_shape", "key_drift", "drift", "relief", "key_relief")
+ROWS = ("identity", "xy", "shape", "xyz_m", "covariance_m2", "key_shape", "key_drift", "drift", "local_surface", "key_local_surface")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TrackedFrame:
     """N points of one frame, by ascending identity. Rows' pixels, metres.
 
-    A point is held to its key template (templates.py), a patch of an earlier frame: `key_drift` is the covariance of that template's
-    place on the body, `drift` that of the point against the template; their sum is how far the point may have strayed since its birth.
-    What the surface is like under the point, now and where its key template was cut, is its relief (relief.py).
+    A point has a key template (templates.py), its patch in an earlier frame: `key_drift` is the covariance of that template's place on the
+    body, `drift` that of the point against the template; their sum is the covariance of the point's drift since its first frame.
+    `local_surface` has the slopes and the sag of the surface under the point (relief.py), `key_local_surface` those where its key
+    template was cut.
     """
 
     frame: int
@@ -29,23 +30,23 @@ class TrackedFrame:
     key_shape: np.ndarray  # (N, 2, 2) from the key template to the reference view
     key_drift: np.ndarray  # (N, 2, 2) px²
     drift: np.ndarray  # (N, 2, 2) px²
-    relief: np.ndarray  # (N, 3)
-    key_relief: np.ndarray  # (N, 3)
-    ended: np.ndarray  # (M,) identities that were lost on the way to this frame
+    local_surface: np.ndarray  # (N, 3)
+    key_local_surface: np.ndarray  # (N, 3)
+    ended: np.ndarray  # (M,) identities of the points that were lost in this frame
     reason: np.ndarray  # (M,) TrackStatus
 
     @property
     def renewed(self) -> np.ndarray:
-        """(N,) whose key template is the patch of this frame."""
+        """(N,) the points whose key template is their patch in this frame."""
         return np.asarray((self.key_shape == np.eye(2)).all(axis=(1, 2)))
 
     def select(self, rows: np.ndarray) -> "TrackedFrame":
-        """Only these rows (a mask or indices); the ended ones stay."""
+        """Only these rows (a mask or indices), with all that ended."""
         values: dict[str, Any] = {n: getattr(self, n)[rows] for n in ROWS}
         return replace(self, **values)
 
     def without(self, gone: np.ndarray, why: np.ndarray | TrackStatus) -> "TrackedFrame":
-        """The frame after some rows (a mask) ended for a reason, one for all or one each (N,)."""
+        """The frame after the points of some rows (a mask) ended, for one reason or one each (N,)."""
         reason = np.broadcast_to(np.asarray(why, dtype=np.int8), gone.shape)[gone]
         left = self.select(~gone)
         return replace(
@@ -65,7 +66,7 @@ class TrackedFrame:
 
 
 def joined(first: TrackedFrame, second: TrackedFrame) -> TrackedFrame:
-    """The points of two frames of the same time, by ascending identity; what ended in the first stays ended unless the second has it."""
+    """The points of both, which are of one frame, by ascending identity; what ended in the first stays ended unless the second has it."""
     order = np.argsort(np.concatenate([first.identity, second.identity]), kind="stable")
     both: dict[str, Any] = {n: np.concatenate([getattr(first, n), getattr(second, n)])[order] for n in ROWS}
     still = ~np.isin(first.ended, second.identity)
@@ -73,7 +74,7 @@ def joined(first: TrackedFrame, second: TrackedFrame) -> TrackedFrame:
 
 
 def born(frame: int, identity: np.ndarray, xy: np.ndarray, shape: np.ndarray, xyz_m: np.ndarray, covariance_m2: np.ndarray) -> TrackedFrame:
-    """New points: their key template is the patch in which they are born."""
+    """New points: their key template is their patch in this frame."""
     n = len(identity)
     none = np.zeros((n, 2, 2))
     return TrackedFrame(
@@ -86,8 +87,8 @@ def born(frame: int, identity: np.ndarray, xy: np.ndarray, shape: np.ndarray, xy
         key_shape=np.tile(np.eye(2), (n, 1, 1)),
         key_drift=none,
         drift=none,
-        relief=np.zeros((n, 3)),
-        key_relief=np.zeros((n, 3)),
+        local_surface=np.zeros((n, 3)),
+        key_local_surface=np.zeros((n, 3)),
         ended=np.zeros(0, dtype=np.int64),
         reason=np.zeros(0, dtype=np.int8),
     )
@@ -100,7 +101,7 @@ def nothing(frame: int, views: int) -> TrackedFrame:
 
 
 def rows_of(identity: np.ndarray, wanted: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Rows of ascending identities at which the wanted ones stand, −1 where there is none."""
+    """The rows of the wanted identities among ascending ones, −1 where there is none."""
     wanted = np.asarray(wanted, dtype=np.int64)
     if not len(identity):
         return np.full(len(wanted), -1, dtype=np.int64)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tricap.core import pipeline
-from tricap.core.following import track_frames
+from tricap.core.following import TrackingRules, track_frames
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.measuring import MeasuredFrame, measure_frames
@@ -140,8 +140,8 @@ def track(
     footage = open_take(read_take(folder))
     s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
     limit_px = float(np.median([m.field.limit_px for m in measured]))
-    results, monitor = Results(out), monitor or Monitor()
-    return list(track_frames(footage, measured, limit_px, s["matching"], s["tracking"], results, monitor, s["enhance"], guide))
+    rules = TrackingRules(matching=s["matching"], tracking=s["tracking"], enhance=s["enhance"], limit_px=limit_px)
+    return list(track_frames(footage, measured, rules, Results(out), monitor or Monitor(), guide))
 
 
 @dataclass(frozen=True)

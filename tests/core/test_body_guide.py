@@ -41,15 +41,15 @@ def test_the_body_hides_its_back(guide: BodyGuide) -> None:
     towards = camera.centre_m - skin.vertices_m
     facing = np.einsum("ni,ni->n", skin.normals, towards) / np.linalg.norm(towards, axis=1)
     inside = camera.sees(camera.project(skin.vertices_m))
-    seen = guide.sees(3, skin.vertices_m)
+    seen = guide.visible(3, skin.vertices_m)
     assert seen[(facing > 0.3) & inside].mean() > 0.99 and seen[(facing < -0.7) & inside].mean() < 0.05
-    assert not guide.sees(3, np.array([[50.0, 0.0, 0.0]])).any()
+    assert not guide.visible(3, np.array([[50.0, 0.0, 0.0]])).any()
 
 
 def test_a_frame_without_a_body_says_nothing(guide: BodyGuide) -> None:
     point = np.zeros((1, 3))
     bone, own = guide.bind(9, point)
-    assert bone.tolist() == [-1] and np.isnan(guide.places(9, np.array([0]), own)).all() and not guide.sees(9, point).any()
+    assert bone.tolist() == [-1] and np.isnan(guide.places(9, np.array([0]), own)).all() and not guide.visible(9, point).any()
 
 
 def test_tracks_that_a_body_guided_go_with_it() -> None:

@@ -1,4 +1,4 @@
-"""What the turning of a round body does to patches: the formula against an exact fit, the surface's relief, and a limb that turns."""
+"""The bias of patches on a round body that turns: the formula against an exact fit, and points on a limb that turns."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ import pytest
 
 from tricap.core import following
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.tracking.relief import sideways
+from tricap.core.tracking.relief import turning_bias
 from tricap.core.tracking.trajectories import assemble
 
 TURN = np.radians(13.0)  # per frame
@@ -24,9 +24,11 @@ def test_what_an_affine_fit_to_a_turning_quadric_leaves() -> None:
         points = np.column_stack([u, v, g[0] * u + g[1] * v + 0.5 * Q[0] * u * u + Q[1] * u * v + 0.5 * Q[2] * v * v])
         fit = np.linalg.lstsq(np.column_stack([np.ones_like(u), u, v]), scale * points @ R[:2].T, rcond=None)[0]
         n = R @ [-g[0], -g[1], 1.0]
-        b = sideways(fit[1:].T[None], np.array([[*g, 7 * (Q[0] + Q[2])]]), (-n[:2] / n[2])[None])[0]  # ½ of 14 px², the pixels' variance
+        b = turning_bias(fit[1:].T[None], np.array([[*g, 7 * (Q[0] + Q[2])]]), (-n[:2] / n[2])[None])[
+            0
+        ]  # ½ of 14 px², the pixels' variance
         np.testing.assert_allclose(b, fit[0], atol=1e-9)
-    assert not sideways(fit[1:].T[None], np.array([[*g, 0.0]]), g[None]).any()  # a plane
+    assert not turning_bias(fit[1:].T[None], np.array([[*g, 0.0]]), g[None]).any()  # a plane
 
 
 def turned_points(body: list[Any], tracks: Any) -> np.ndarray:
@@ -47,7 +49,7 @@ def test_points_stay_on_a_limb_that_turns(tmp_path: Path, scenes: Any, monkeypat
     slid = {}
     for corrected in (True, False):
         if not corrected:
-            monkeypatch.setattr(following, "_relief", lambda *_: None)
+            monkeypatch.setattr(following, "_curvature", lambda *_: None)
         tracks = assemble(scenes.track(take, tmp_path / f"{corrected}", measured, {"tracking": {"regenerate_every": 0}}), 25.0)
         last = turned_points(body, tracks)[-1]
         slid[corrected] = last[np.isfinite(last)] / scenes.pixel_m

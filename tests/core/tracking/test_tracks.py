@@ -156,7 +156,7 @@ class Traveller:
         self.asked += len(bone)
         return own_m + self.bodies[frame].t
 
-    def sees(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
+    def visible(self, frame: int, xyz_m: np.ndarray) -> np.ndarray:
         return np.full(len(xyz_m), self.in_sight)
 
 
