@@ -96,7 +96,7 @@ class CurvatureCorrection:
 
 
 def turning_bias(A: np.ndarray, template: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """b (N, 2) of (2) [px], for shapes A (N, 2, 2), the templates' local surfaces (N, 3) and present slopes (N, 2); zero where undefined."""
+    """b (N, 2) of (2) [px], for shapes A (N, 2, 2), the templates' local surfaces (N, 3) and present slopes (N, 2); zero if undefined."""
     g, f, h = template[:, :2], template[:, 2], slopes
     tangents = np.concatenate([A, np.einsum("ni,nij->nj", h, A)[:, None]], axis=1)  # (N, 3, 2), those of the patch's axes
     area = np.linalg.norm(np.cross(tangents[:, :, 0], tangents[:, :, 1]), axis=1)
