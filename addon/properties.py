@@ -86,8 +86,9 @@ def check_settings(tables: Mapping[str, Mapping[str, Any]], where: str) -> None:
 
 def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]]) -> None:
     """Show a take's [settings] as what was touched, and nothing else."""
+    current = knobs.current_tables(tables, stages(), "")
     for name, settings in stages().items():
-        group, table = getattr(scene.tricap, name), tables.get(name, {})
+        group, table = getattr(scene.tricap, name), current[name]
         for field in dataclasses.fields(settings):
             if field.name in table:
                 setattr(group, field.name, type(field.default)(table[field.name]))

@@ -42,14 +42,14 @@ from .progress import Cancelled, Monitor
 from .report.pages import check_pictured, write_report
 from .report.silhouettes import Silhouettes, by_view, silhouettes_of
 from .results import FitCheckpoints, Results, check_separate_folder
-from .settings import current_names, from_table, nearest_name
+from .settings import current_tables, from_table
 from .stages import STAGE_FILES, STAGE_INPUTS, STAGES, stage_keys, valid_stages
 from .surface.cloud import PointCloud, SurfaceSettings
 from .surface.voxels import as_written
 from .take import Footage, open_take, read_take
 from .tracking.contour import ContourSettings
 from .tracking.long_tracks import trajectories_of
-from .tracking.settings import TrackingSettings
+from .tracking.settings import KeyPointSettings, TrackingSettings
 from .tracking.trajectories import Filtered, Trajectories
 from .tracking.waiting import Guide
 from .without_surface import can_do_without, empty_clouds, empty_views, known_silhouettes
@@ -61,6 +61,7 @@ SETTINGS: dict[str, type] = {
     "growing": GrowingSettings,
     "surface": SurfaceSettings,
     "tracking": TrackingSettings,
+    "key_points": KeyPointSettings,
     "contour": ContourSettings,
     "fitting": FitSettings,
     "skin": SkinSettings,
@@ -135,10 +136,8 @@ def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> d
     """
     groups: dict[str, dict[str, Any]] = {name: {} for name in SETTINGS}
     for source, place in ((take_settings, f" in {where}"), (overrides, "")):
-        for name, table in source.items():
-            if name not in SETTINGS:
-                raise InputError(f"There is no group of settings “{name}”{place}.{nearest_name(name, list(SETTINGS))}")
-            groups[name].update(current_names(SETTINGS[name], table, f"[{name}]{place}"))
+        for name, table in current_tables(source, SETTINGS, place).items():
+            groups[name].update(table)
     return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
 
 

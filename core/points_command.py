@@ -61,10 +61,10 @@ def follow_points(
     def read(frame: int) -> list[np.ndarray]:
         return [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
 
-    ahead = track_key_points(read, range(first, footage.frames.stop), points, view, monitor)
+    ahead = track_key_points(read, range(first, footage.frames.stop), points, view, monitor, settings["key_points"])
     if first == footage.frames.start:
         return ahead
-    back = track_key_points(read, range(first, footage.frames.start - 1, -1), points, view, monitor)
+    back = track_key_points(read, range(first, footage.frames.start - 1, -1), points, view, monitor, settings["key_points"])
     names = KeyPoints.__dataclass_fields__
     return KeyPoints(**{name: np.concatenate([getattr(back, name)[:0:-1], getattr(ahead, name)]) for name in names})
 

@@ -27,7 +27,8 @@ def knob(
 ) -> Any:
     """A dataclass field that describes itself: `about` is one sentence, `low`/`high` are inclusive limits in `unit`.
 
-    `was` are earlier names of the knob, under which files and commands of earlier versions may still set it.
+    `was` are earlier names of the knob, under which files and commands of earlier versions may still set it; one in another group has the
+    form "group.name".
     """
     return dataclasses.field(default=default, metadata=dict(about=about, unit=unit, low=low, high=high, choices=choices, was=was))
 
@@ -69,6 +70,26 @@ def current_names(cls: type, table: Mapping[str, Any], where: str) -> dict[str, 
             raise InputError(f"{where} sets “{name}” twice, also under its earlier name; remove one of them.")
         renamed[name] = value
     return renamed
+
+
+def current_tables(tables: Mapping[str, Mapping[str, Any]], groups: Mapping[str, type], place: str) -> dict[str, dict[str, Any]]:
+    """Tables of settings by group, with each knob in the group and under the name that it has today. `place` ends the names of tables.
+
+    Raises:
+        InputError: an unknown group, or a knob that is set under two of its names.
+    """
+    knobs = [(name, f) for name, cls in groups.items() for f in dataclasses.fields(cls)]
+    moved = {earlier: (name, f.name) for name, f in knobs for earlier in f.metadata.get("was", ())}
+    current: dict[str, dict[str, Any]] = {name: {} for name in groups}
+    for name, table in tables.items():
+        if name not in groups:
+            raise InputError(f"There is no group of settings “{name}”{place}.{nearest_name(name, list(groups))}")
+        for given, value in current_names(groups[name], table, f"[{name}]{place}").items():
+            group, today = moved.get(f"{name}.{given}", (name, given))
+            if today in current[group]:
+                raise InputError(f"[{group}]{place} sets “{today}” twice, also under its earlier name; remove one of them.")
+            current[group][today] = value
+    return current
 
 
 def _checked(value: Any, field: "dataclasses.Field[Any]", where: str) -> Any:

@@ -68,7 +68,8 @@ STAGE_INPUTS: dict[str, StageInput] = {
         files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
     ),
 }
-WITHOUT_STAGE = ("contour",)  # groups of knobs that concern no stage: what `tricap contour` writes concerns the fit by its content
+# Groups of knobs that concern no stage: what `tricap contour` writes concerns the fit by its content, the tracks of chosen points nothing.
+WITHOUT_STAGE = ("contour", "key_points")
 STAGE_FILES = tuple(name for concern in STAGE_INPUTS.values() for name in concern.files)
 
 

@@ -22,11 +22,12 @@ from ..matching.patch_pixels import patch_offsets
 from ..progress import Monitor
 from .published import STEPS
 from .search import search_box
-from .settings import TrackStatus
+from .settings import KeyPointSettings, TrackStatus
 from .step import MODEL_SIGMA_PX, FramePair, TrackingView, intersect, measured_at
 from .templates import REACQUIRE_CORRELATION, Templates, Tiles, atlas, cut_tiles, no_templates
 from .tracked import TrackedFrame, born, joined, nothing, rows_of
 
+DEFAULT_SETTINGS = KeyPointSettings()
 CLICK_SIGMA_PX, CLICK_REACH_PX = 2.0, 6.0
 SLOPES = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))  # of the surface about a point: up to 35° either way
 LARGEST_MISFIT_PX, MISFITS = 4.0, 2.5  # rays may miss by so much, and by so many of their median in the frame
@@ -44,9 +45,13 @@ class KeyPoints:
 
 
 def track_key_points(
-    read: Callable[[int], Sequence[np.ndarray]], frames: range, points: Mapping[str, Mapping[str, np.ndarray]], view: TrackingView,
+    read: Callable[[int], Sequence[np.ndarray]],
+    frames: range,
+    points: Mapping[str, Mapping[str, np.ndarray]],
+    view: TrackingView,
     monitor: Monitor,
-) -> KeyPoints:  # fmt: skip
+    settings: KeyPointSettings = DEFAULT_SETTINGS,
+) -> KeyPoints:
     """Follow points, clicked in the first of `frames` in two views or more (name → view → full-frame pixel), through the others.
 
     `read(frame)` gives the rows (h', w) of all views. In the reference view a point stays where it was clicked, or where its other clicks
@@ -56,7 +61,7 @@ def track_key_points(
         InputError: a point is clicked in fewer than two views, or has no marker where it must have one.
     """
     clicks = _clicked(points, view.at(frames[0]))
-    if view.tracking.markers:
+    if settings.markers:
         clicks = _on_markers(read(frames[0]), clicks, tuple(points), view)
     steps = list(_follow(read, frames, clicks, view, monitor))
     T, N, K = len(steps), len(points), len(view.cameras)

@@ -58,7 +58,6 @@ class TrackingSettings:
         low=0,
         high=100,
     )
-    markers: bool = knob(False, "Points that you choose are bright round markers, and their middles are meant.")
     max_speed: float = knob(10.0, "Trajectories faster than this are cut.", unit="m/s", low=0.1, high=100.0)
     max_acceleration: float = knob(150.0, "Trajectories that accelerate more than this are cut.", unit="m/s²", low=1.0, high=10_000.0)
     uniformity: str = knob(
@@ -81,8 +80,17 @@ class TrackingSettings:
     @property
     def of_the_step(self) -> "TrackingSettings":
         """The same but for the knobs that no step of the surface's points asks, which have their defaults: what a checkpoint depends on."""
-        defaults: dict[str, Any] = {f.name: f.default for f in fields(self) if f.name in (*AFTERWARDS, "markers")}
+        defaults: dict[str, Any] = {f.name: f.default for f in fields(self) if f.name in AFTERWARDS}
         return replace(self, **defaults)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class KeyPointSettings:
+    """How points that the user chose are tracked in space, besides the settings of tracking."""
+
+    markers: bool = knob(
+        False, "The chosen points are bright round markers; each click means the middle of the nearest one.", was=("tracking.markers",)
+    )
 
 
 class TrackStatus(IntEnum):

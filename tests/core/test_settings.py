@@ -1,11 +1,16 @@
 """Settings: defaults, limits, and every kind of value that is refused, with the sentence that helps."""
 
+import ast
 import dataclasses
 import json
+import re
+from functools import cache
+from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from tricap.core import pipeline
+from tricap.core import contour_command, pipeline, points_command
 from tricap.core.errors import InputError
 from tricap.core.settings import from_table, knob, nearest_name, to_table
 
@@ -90,3 +95,61 @@ def test_the_commands_settings_overrule_the_takes() -> None:
 def test_the_nearest_name() -> None:
     assert nearest_name("elbow.r", ("elbow.R", "wrist.R")) == " Did you mean “elbow.R”?"
     assert nearest_name("q", ("elbow.R", "wrist.R")) == " Known are: elbow.R, wrist.R."
+
+
+def test_a_knob_that_moved_to_another_group() -> None:
+    """`tracking.markers` of earlier versions is `key_points.markers`."""
+    old, new = {"tracking": {"markers": True, "box_px": 9}}, {"key_points": {"markers": True}}
+    for tables in ((old, {}), ({}, old), ({}, new)):
+        assert pipeline.settings_of(*tables, "take.toml")["key_points"].markers
+    with pytest.raises(InputError, match=r"\[key_points\] sets “markers” twice, also under its earlier name"):
+        pipeline.settings_of({}, {"tracking": {"markers": True}, "key_points": {"markers": False}}, "take.toml")
+
+
+Reads = set[tuple[str, str]]  # an expression, and an attribute of it that is read
+
+
+@cache
+def reads_of(module: ModuleType) -> Reads:
+    """What is read in a module and in all that it imports from core, directly or not."""
+    seen, rest, reads = set[Path](), [Path(str(module.__file__))], Reads()
+    while rest:
+        path = rest.pop()
+        if path in seen or not path.is_file():
+            continue
+        seen.add(path)
+        source = path.read_text(encoding="utf-8")
+        reads |= reads_in(source)
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+                for imported in (base, *(base / alias.name for alias in node.names)):
+                    rest += [imported.with_suffix(".py"), imported / "__init__.py"]
+    return reads
+
+
+def reads_in(source: str) -> Reads:
+    nodes = ast.walk(ast.parse(source))
+    return {(ast.unparse(n.value), n.attr) for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Load)}
+
+
+def unread_knobs(group: str, cls: type, reads: Reads) -> list[str]:
+    """The knobs of a group that are not read as attributes of a value named for settings or for the group."""
+    owner = re.compile(rf"(^|[._])(settings|s|{group})$|\[.{group}.\]$")
+    read = {attribute for value, attribute in reads if owner.search(value)}
+    return [f.name for f in dataclasses.fields(cls) if f.name not in read]
+
+
+READ_BY = {"contour": contour_command, "key_points": points_command}  # the others by the run
+
+
+@pytest.mark.parametrize("group", sorted(pipeline.SETTINGS))
+def test_every_knob_is_read_by_what_it_belongs_to(group: str) -> None:
+    assert not unread_knobs(group, pipeline.SETTINGS[group], reads_of(READ_BY.get(group, pipeline)))
+
+
+def test_a_knob_that_nothing_reads_is_reported() -> None:
+    """One that is only defined, set, or read from something else; and one that the run does not read, though a command does."""
+    source = "def f(settings, sample, link):\n    settings.sigma = link.text = 1\n    return settings.patch_px, sample.way, link.correct"
+    assert unread_knobs("sample", Sample, reads_in(source)) == ["sigma", "free", "correct", "text"]
+    assert unread_knobs("key_points", pipeline.SETTINGS["key_points"], reads_of(pipeline)) == ["markers"]

@@ -70,6 +70,9 @@ def other_than_default(group: str) -> dict[str, Any]:
         high = knob.metadata["high"]
         if not isinstance(knob.default, (str, bool)) and high is not None and high > knob.default:
             return {name: high}
+    for name, knob in pipeline.SETTINGS[group].__dataclass_fields__.items():
+        if isinstance(knob.default, bool):
+            return {name: not knob.default}
     raise AssertionError(group)
 
 

@@ -15,7 +15,7 @@ from tricap.core.images.fields import Instants
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
 from tricap.core.tracking.key_points import KeyPoints, distances, track_key_points
-from tricap.core.tracking.settings import TrackingSettings, TrackStatus
+from tricap.core.tracking.settings import KeyPointSettings, TrackingSettings, TrackStatus
 from tricap.core.tracking.step import TrackingView
 
 FRAMES = 8
@@ -112,17 +112,19 @@ def test_retroreflective_markers(scenes: Any) -> None:
         return np.asarray(np.minimum(30 + light, 255) + noise, dtype=np.float32)
 
     clicks = {name: {c.name: c.project(truth[0, n]) + (1.0, -0.8) for c in rig.cameras} for n, name in enumerate(("wrist", "elbow"))}
-    settings = TrackingSettings(markers=True)
-    view = TrackingView(cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=settings, limit_px=0.7)
+    markers = KeyPointSettings(markers=True)
+    tracking = TrackingSettings()
+    view = TrackingView(cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=tracking, limit_px=0.7)
     read = lambda i: [picture(c, i) for c in rig.cameras]  # noqa: E731
-    points = track_key_points(read, range(10), clicks, view, Monitor())
+    points = track_key_points(read, range(10), clicks, view, Monitor(), markers)
     assert (points.status == TrackStatus.MEASURED).all()
     error = np.abs(points.xyz_m - truth)
     assert error[..., :2].max() < 1e-4 and error[..., 2].max() < 5e-4
     z = np.linalg.norm(points.xyz_m - truth, axis=2) / points.sigma_m
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.8  # twenty points
     with pytest.raises(InputError, match="No bright round marker.*“knee” in view C"):
-        track_key_points(read, range(10), {"knee": {c.name: c.project(np.array([0.1, 0.1, 2.1])) for c in rig.cameras}}, view, Monitor())
+        knee = {c.name: c.project(np.array([0.1, 0.1, 2.1])) for c in rig.cameras}
+        track_key_points(read, range(10), {"knee": knee}, view, Monitor(), markers)
 
 
 def test_one_click_is_not_enough(scenes: Any) -> None:
