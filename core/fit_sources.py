@@ -56,7 +56,7 @@ def fit_input(
         model=str(take.body_model),
         clouds=clouds,  # type: ignore[arg-type]
         frames=frames,
-        time_s=np.array(frames) / take.fps,
+        time_s=take.time_s(np.array(frames)),
         clicks=clicks_in(footage),
         click_frame=take.seeds.frame,
         trajectories=trajectories,  # type: ignore[arg-type]

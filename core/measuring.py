@@ -13,6 +13,7 @@ from . import store
 from .clicked_points import clicked_depth, with_clicked
 from .errors import InputError
 from .images.enhance import EnhanceSettings, enhanced
+from .images.fields import frame_time_s
 from .images.retime import retimed
 from .images.sampling import SplineImage
 from .images.sequence import IMAGE_ENDINGS
@@ -279,7 +280,7 @@ def _first_foreground(
     if clicks and frame == take.seeds.frame:
         where = fg.around_clicks(depth)
     elif clicks:
-        where = fg.since_clicks(depth, abs(frame - take.seeds.frame) / take.fps, moving)
+        where = fg.since_clicks(depth, frame_time_s(abs(frame - take.seeds.frame), take.fps), moving)
     elif len(moving):
         where = fg.nearest_surface(moving)
     else:

@@ -14,7 +14,7 @@ import numpy as np
 
 from .errors import InputError
 from .geometry.rig import Rig, read_rig
-from .images.fields import BOTH, INTERLACE, Instants, RowGrid, instants
+from .images.fields import BOTH, INTERLACE, Instants, RowGrid, frame_time_s, instants
 from .images.sequence import Sequence, open_sequence
 from .keypoint_sources import KeypointSource, keypoint_sources
 from .person_sources import PERSON_SOURCES, person_source
@@ -119,6 +119,10 @@ class Take:
     def instants(self) -> Instants:
         """Where in the images the take's frames are."""
         return instants(self.interlaced, self.first_field)
+
+    def time_s(self, frames: np.ndarray) -> np.ndarray:
+        """When frames (T,) of the take were taken, in seconds after frame 0."""
+        return frame_time_s(frames, self.fps)
 
     def rows_at(self, frame: int) -> RowGrid:
         """The rows of the image that show a frame of the take."""

@@ -5,6 +5,7 @@ Matching works on the rows of one field; every coordinate that leaves this packa
 """
 
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 
@@ -80,3 +81,12 @@ def instants(interlaced: str, first_field: str = "odd") -> Instants:
 def row_grid(interlaced: str) -> RowGrid:
     """The grid of rows to keep: "odd" keeps the 1st, 3rd, … line (rows 0, 2, …), "even" the others, "none" all."""
     return {"none": RowGrid(1, 0), "odd": RowGrid(2, 0), "even": RowGrid(2, 1)}[interlaced]
+
+
+@overload
+def frame_time_s(frame: float, fps: float) -> float: ...
+@overload
+def frame_time_s(frame: np.ndarray, fps: float) -> np.ndarray: ...
+def frame_time_s(frame: float | np.ndarray, fps: float) -> float | np.ndarray:
+    """When a frame of a recording (or each of several) was taken, in seconds after its frame 0; `fps` frames per second, fields counted."""
+    return frame / fps

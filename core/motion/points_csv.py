@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import store
 from ..errors import InputError
+from ..images.fields import frame_time_s
 from .markers import Markers, axes_of, check_size, metres_per
 from .tables import read_joints
 
@@ -31,7 +32,7 @@ def write_points_csv(path: Path, markers: Markers, *, axes: str = "Z up", unit: 
                 text = io.StringIO()
                 csv.writer(text, lineterminator="").writerow([name])
                 rows.append(
-                    f"{frame},{frame / markers.fps:.6f},{text.getvalue()},{X[0]:.6f},{X[1]:.6f},{X[2]:.6f},"
+                    f"{frame},{frame_time_s(frame, markers.fps):.6f},{text.getvalue()},{X[0]:.6f},{X[1]:.6f},{X[2]:.6f},"
                     f"{'nan' if np.isnan(sigma) else format(sigma, '.6f')}"
                 )
     store.write_text(Path(path), "\n".join(rows) + "\n")

@@ -6,6 +6,7 @@ import numpy as np
 
 from .. import store
 from ..errors import InputError
+from ..images.fields import frame_time_s
 from .markers import Markers, axes_of, check_size, metres_per
 
 HEADINGS = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames".split()
@@ -29,7 +30,7 @@ def write_trc(path: Path, markers: Markers, *, axes: str = "OpenSim", unit: str 
         "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, n + 1) for axis in "XYZ"),
         "",
     ]
-    time = (markers.frames - markers.frames[0]) / markers.fps
+    time = frame_time_s(markers.frames - markers.frames[0], markers.fps)
     for frame, second, row in zip(markers.frames, time, xyz.reshape(t, -1)):
         lines.append("\t".join([str(frame), f"{second:.6f}", *("" if np.isnan(v) else f"{v:.6f}" for v in row)]))
     store.write_text(Path(path), "\n".join(lines) + "\n")

@@ -26,7 +26,7 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
-from ..images.fields import BOTH, INTERLACE, instants
+from ..images.fields import BOTH, INTERLACE, frame_time_s, instants
 from ..progress import Monitor
 from ..settings import knob
 from .figure import Part, arm_parts, joined, torso_parts, wall
@@ -200,7 +200,7 @@ def _clear(folder: Path) -> None:
 def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> np.ndarray:
     """Write one image of all views; return which vertices (V,) all of them see, a row for each instant that is kept."""
     settings, kept = studio.settings, instants(studio.settings.interlaced).first
-    moments = [frame / settings.fps] + ([(frame + 0.5) / settings.fps] if kept.step == 2 else [])
+    moments = [frame_time_s(frame, settings.fps)] + ([frame_time_s(frame + 0.5, settings.fps)] if kept.step == 2 else [])
     bodies = [studio.body(time) for time in moments]
     late = [studio.body(time + settings.late_frames / settings.fps) for time in moments] if settings.late_frames else bodies
     scenes = [joined(body) for body in bodies[: instants(settings.interlaced).per_image]]
@@ -225,7 +225,7 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
 
 def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
     shape, per = studio.shape, instants(studio.settings.interlaced).per_image
-    time = np.arange(per * studio.settings.frames) / (per * studio.settings.fps)
+    time = frame_time_s(np.arange(per * studio.settings.frames), per * studio.settings.fps)
     motion, bodies = arm_motion(time), [studio.body(moment) for moment in time]
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     textured = np.concatenate([np.full(len(p.vertices_m), p.material.textured) for p in bodies[0]])

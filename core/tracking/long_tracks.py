@@ -19,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 
 from ..errors import InputError
+from ..images.fields import frame_time_s
 from .kinematics import Kinematics, differences, smoothed
 from .settings import TrackingSettings, TrackStatus
 from .tracked import TrackedFrame
@@ -184,9 +185,19 @@ class _Cells:
                 tables[n].append(rows)
         xyz, sigma, status, track = (r.mapped() for r in tables.values())
         raw, smooth = _kinematics(xyz, sigma, fps, frames, smooth_frames)
-        return Trajectories(frames=frames, time_s=frames / fps, xyz_m=xyz, velocity_m_s=raw.velocity_m_s, sigma_m=sigma, status=status,
-                            acceleration_m_s2=raw.acceleration_m_s2, raw=raw, smooth=smooth, omitted=int((column < 0).sum()),
-                            track=track if shared else None)  # fmt: skip
+        return Trajectories(
+            frames=frames,
+            time_s=frame_time_s(frames, fps),
+            xyz_m=xyz,
+            velocity_m_s=raw.velocity_m_s,
+            acceleration_m_s2=raw.acceleration_m_s2,
+            sigma_m=sigma,
+            status=status,
+            raw=raw,
+            smooth=smooth,
+            track=track if shared else None,
+            omitted=int((column < 0).sum()),
+        )
 
     def _parts(self) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
         """The rows (first, end) and cells of each stretch."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import store
 from ..errors import InputError
+from ..images.fields import frame_time_s
 from ..settings import nearest_name
 from ..values import check_sparse
 from .key_points import KeyPoints
@@ -129,7 +130,7 @@ def write_key_points(space: Path, images: Path, names: tuple[str, ...], views: t
         for n, name in enumerate(map(_quoted, names)):
             cells = [f"{v:.6f}" if np.isfinite(v) else "" for v in (*points.xyz_m[t, n], points.sigma_m[t, n])]
             status = TrackStatus(int(points.status[t, n])).name.lower()
-            lines.append(",".join([str(frame), f"{frame / fps:.6f}", name, *cells, status]))
+            lines.append(",".join([str(frame), f"{frame_time_s(frame, fps):.6f}", name, *cells, status]))
             seen = [(view, *xy) for view, xy in zip(views, points.xy_px[t, n]) if np.isfinite(xy).all()]
             pixels.extend(f"{frame},{_quoted(view)},{name},{x:.4f},{y:.4f}" for view, x, y in seen)
     for path, text in ((space, lines), (images, pixels)):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..images.fields import frame_time_s
 from ..progress import Monitor
 from ..values import frozen
 from .filters import against_neighbours, against_voxels, cut, over_thresholds
@@ -76,7 +77,7 @@ def assembled(seen: Sequence[Seen], fps: float, smooth_frames: int) -> tuple[Tra
         xyz[t, here], sigma[t, here], status[t, here] = place, uncertainty, TrackStatus.MEASURED
         status[t, gone[gone >= 0]] = reason[gone >= 0]
     frames = np.array([frame for frame, *_ in seen], dtype=np.int32)
-    return with_kinematics(frames, frames / fps, xyz, sigma, status, smooth_frames), identities
+    return with_kinematics(frames, frame_time_s(frames, fps), xyz, sigma, status, smooth_frames), identities
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
