@@ -39,7 +39,7 @@ from .measuring import NothingMeasured, measure_frames
 from .motion.ply import write_mesh
 from .motion.tables import write_joints, write_motion
 from .progress import Cancelled, Monitor
-from .report.pages import check_pictured, write_report
+from .report.pages import Report, check_pictured, write_report
 from .report.silhouettes import Silhouettes, by_view, silhouettes_of
 from .results import FitCheckpoints, Results, check_separate_folder
 from .settings import current_tables, from_table
@@ -342,8 +342,15 @@ def report(run: Run, monitor: Monitor) -> None:
     """report/report.html with its pictures."""
     began = time.perf_counter()
     run.record["stages"].pop("report", None)  # a page does not tell of the page before it
-    given = (run.clouds, run.trajectories, run.body, run.silhouettes)
-    write_report(run.results, run.footage, run.record, *given, monitor, run.pictured)
+    shown = Report(
+        footage=run.footage,
+        record=run.record,
+        clouds=run.clouds,
+        trajectories=run.trajectories,
+        body=run.body,
+        silhouettes=run.silhouettes,
+    )
+    write_report(run.results, shown, monitor, run.pictured)
     run.finish_stage("report", began)
 
 

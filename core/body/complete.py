@@ -18,7 +18,7 @@ from .bone_profile import BoneProfile, bone_profiles, chain_neighbours
 from .metaballs import VISIBLE, Metaballs, field
 from .shape import BodyShape
 from .skeleton import bone_frames
-from .trunk_profile import with_radii_for
+from .trunk_profile import FieldSamples, root_of, with_radii_for
 
 ALONG, AROUND = 9, 12  # points of the simplified surface, per bone
 OUTSIDE, OUTSIDE_WEIGHT = 1.25, 0.2  # points outside: so many radii from the axis; what they count there
@@ -38,18 +38,8 @@ def complete_shape(shape: BodyShape) -> BodyShape:
     X, bone = np.concatenate(list(places.values())), np.repeat(list(places), 2 * ALONG * AROUND)
     F = np.maximum(field(simple, lengths, R, head, X, counted[bone][:, simple.bone_index]), LEAST_F)
     weight = np.tile(np.repeat([1.0, OUTSIDE_WEIGHT], ALONG * AROUND), len(places))
-    balls = with_radii_for(
-        start,
-        np.arange(len(start.weight)),
-        lengths,
-        R,
-        head,
-        X,
-        counted[bone][:, start.bone_index],
-        np.sqrt(np.maximum(-0.5 * np.log(np.minimum(F, 0.99)), 0.03)),
-        weight,
-        FREE,
-    )
+    samples = FieldSamples(xyz_m=X, active=counted[bone][:, start.bone_index], root=root_of(F), weight=weight)
+    balls = with_radii_for(start, np.arange(len(start.weight)), lengths, R, head, samples, FREE)
     return replace(shape, metaballs=balls, radius_sigma_m=np.full(balls.radii_m.shape, np.nan), weight_sigma=None)
 
 

@@ -46,6 +46,10 @@ class Rays:
     bone: np.ndarray  # (V,)
     station: np.ndarray  # (V,) how far from its bone's head the contour of a vertex meets the bone [m]
 
+    def rows(self, which: np.ndarray) -> "Rays":
+        """The rays `which` (N,) alone."""
+        return Rays(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Segment:

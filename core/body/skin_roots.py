@@ -32,6 +32,7 @@ from .skin_rays import SHARPEST_COS, Rays, smooth
 
 OWN_SHARE = 0.4  # τ of (2): below ½, or two that reach T together would both stay below it
 PASSING = 0.5  # h of (1b) over the shorter bone
+FADE_FROM = 0.5  # fraction of a junction's last bone from which on other parts fade
 STEP = 0.05  # march, in units of the reach
 FINE_STEP = 0.02  # … outwards, where a gap between two parts must not be stepped over
 SECANT_STEPS = 7
@@ -65,9 +66,10 @@ def part_root(
     for bone in parts[index].bones:
         own = np.flatnonzero(rays.bone == bone)
         if len(own):
-            near = _joined_field(shape, parts, index, bone, R, head, rays, own)
-            rho[own] = _connected_root(near, rays.reach[own])
-            normals[own] = near.normals(rays.origin[own] + rho[own, None] * rays.direction[own])
+            mine = rays.rows(own)
+            near = _joined_field(shape, parts, index, bone, R, head, mine)
+            rho[own] = _connected_root(near, mine.reach)
+            normals[own] = near.normals(mine.origin + rho[own, None] * mine.direction)
     return rho, normals
 
 
@@ -199,8 +201,9 @@ def _log(F: np.ndarray) -> np.ndarray:
 
 
 def _joined_field(
-    shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays, own: np.ndarray
+    shape: BodyShape, parts: tuple[Part, ...], index: int, bone: int, R: np.ndarray, head: np.ndarray, rays: Rays
 ) -> _JoinedField:
+    """The fields near one bone of part `index`, on the rays of that bone."""
     neighbours, balls, part = shape.skeleton.neighbours, shape.metaballs, parts[index]
     k = part.bones.index(bone)
     chains = [part.bones[max(k - 1, 0) : k + 2], *_adjacent(parts, index, bone)]
@@ -212,9 +215,9 @@ def _joined_field(
     of, radii = balls.bone_index[used], balls.radii_m[used]
     frame = R[of] / radii[:, None, :]
     return _JoinedField(
-        origin=rays.origin[own],
-        direction=rays.direction[own],
-        fade=_fade(part, bone, rays, own, shape.lengths_m, head),
+        origin=rays.origin,
+        direction=rays.direction,
+        fade=_fade(part, bone, rays, shape.lengths_m, head),
         weight=balls.weight[used],
         frame=frame,
         of_part=np.isin(of, part.bones).astype(np.float64),
@@ -243,9 +246,9 @@ def _near(part: Part, attachment: int | None, bone: int) -> bool:
     return attachment in part.bones and abs(part.bones.index(bone) - part.bones.index(attachment)) <= 1
 
 
-def _fade(part: Part, bone: int, rays: Rays, own: np.ndarray, lengths_m: np.ndarray, head: np.ndarray) -> np.ndarray:
-    """How much other parts count (N,): from 1 to 0 towards the end of the junction, where the contour is the limb's own."""
+def _fade(part: Part, bone: int, rays: Rays, lengths_m: np.ndarray, head: np.ndarray) -> np.ndarray:
+    """The weight of other parts (N,): from 1 to 0 over the outer half of the junction, at whose end the contour is the limb's own."""
     if part.parent is None or bone != part.junction[-1] or bone == part.bones[-1]:
-        return np.ones(len(own))
-    along = np.linalg.norm(rays.origin[own] - head[bone], axis=1) / lengths_m[bone]
-    return 1 - smooth((along - 0.5) / 0.5)
+        return np.ones(len(rays.bone))
+    along = np.linalg.norm(rays.origin - head[bone], axis=1) / lengths_m[bone]
+    return 1 - smooth((along - FADE_FROM) / (1 - FADE_FROM))

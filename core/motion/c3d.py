@@ -44,9 +44,8 @@ def write_c3d(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "
     data = np.concatenate([np.where(known[..., None], xyz, 0.0), np.where(known, steps, -1.0)[..., None]], axis=2).astype("<f4")
     first = int(markers.frames[0]) if 1 <= markers.frames[0] and markers.frames[-1] <= MOST_WORD else 1
     last = first + t - 1
-    parameters = _parameters(markers, t, n, scale, unit, first, last)
-    start = 2 + len(parameters) // BLOCK
-    parameters = _parameters(markers, t, n, scale, unit, first, last, start)
+    start = 2 + len(_parameters(markers, scale, unit, first)) // BLOCK
+    parameters = _parameters(markers, scale, unit, first, start)
     header = struct.pack("<BB5HfHHf", 2, 0x50, n, 0, first, min(last, MOST_WORD), 0, -scale, start, 0, markers.fps)
     store.write_bytes(Path(path), header.ljust(BLOCK, b"\0") + parameters + _padded(data.tobytes()))
 
@@ -76,7 +75,10 @@ def _padded(data: bytes) -> bytes:
     return data + b"\0" * (-len(data) % BLOCK)
 
 
-def _parameters(markers: Markers, t: int, n: int, scale: float, unit: str, first: int, last: int, start: int = 0) -> bytes:
+def _parameters(markers: Markers, scale: float, unit: str, first: int, start: int = 0) -> bytes:
+    """The parameters of points without gaps, the first frame having the number `first`, the data beginning in block `start`."""
+    t, n = len(markers.frames), len(markers.names)
+    last = first + t - 1
     point: list[tuple[str, Any]] = [
         ("USED", np.uint16(n)),
         ("FRAMES", np.uint16(min(t, MOST_WORD))),

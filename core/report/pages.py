@@ -3,7 +3,7 @@
 import base64
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -48,50 +48,46 @@ def check_pictured(frames: range, wanted: Sequence[int]) -> None:
             raise InputError(f"--pictures {frame} is not among the frames {frames.start} to {frames.stop - 1}; choose others.")
 
 
-def write_report(
-    results: Results,
-    footage: Footage,
-    record: Mapping[str, Any],
-    clouds: Sequence[PointCloud],
-    trajectories: Trajectories | None,
-    body: BodyFit | None,
-    silhouettes: Silhouettes,
-    monitor: Monitor,
-    pictured: Sequence[int] = (),
-) -> None:
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Report:
+    """A run as its report shows it: the record of the run, and its results."""
+
+    footage: Footage
+    record: Mapping[str, Any]
+    clouds: Sequence[PointCloud]
+    trajectories: Trajectories | None
+    body: BodyFit | None
+    silhouettes: Silhouettes
+
+
+def write_report(results: Results, report: Report, monitor: Monitor, pictured: Sequence[int] = ()) -> None:
     """Write the page and its pictures, of the frames `pictured` (none: the first, a middle and the last).
 
     Cancelling leaves the report of the run before.
     """
-    shown = _pictures(footage, record, clouds, trajectories, body, silhouettes, monitor, pictured)
+    record, fits = report.record, report.silhouettes.fits
+    shown = _pictures(report, monitor, pictured)
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
         monitor.step("report", len(shown) + done, 2 * len(shown))
         files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
-    rows = figure_rows(record, clouds, trajectories, body, silhouettes.fits)
+    rows = figure_rows(record, report.clouds, report.trajectories, report.body, fits)
     small = {name: (caption, picture) for name, (caption, _, picture) in files.items()}
-    page = _page(record, rows, small, _graphs(clouds, trajectories, body) + _silhouette_graphs(silhouettes.fits))
+    page = _page(record, rows, small, _graphs(report) + _silhouette_graphs(fits))
     monitor.step("report", 1, 1)
     results.remove("report")
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
-    per_frame = [asdict(f) | {"iou": number(f.iou), "distance_px": number(f.distance_px)} for f in silhouettes.fits]
+    per_frame = [asdict(f) | {"iou": number(f.iou), "distance_px": number(f.distance_px)} for f in fits]
     said = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
     store.write_json(results.path("report", "report.json"), said)
     store.write_text(results.path("report", "report.html"), page)
 
 
-def _pictures(
-    footage: Footage,
-    record: Mapping[str, Any],
-    clouds: Sequence[PointCloud],
-    trajectories: Trajectories | None,
-    body: BodyFit | None,
-    silhouettes: Silhouettes,
-    monitor: Monitor,
-    pictured: Sequence[int],
-) -> dict[str, tuple[str, np.ndarray]]:
+def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int]) -> dict[str, tuple[str, np.ndarray]]:
     """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
+    footage, record, clouds, trajectories = report.footage, report.record, report.clouds, report.trajectories
+    body, silhouettes = report.body, report.silhouettes
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
     skin = SkinSettings(**record["settings"]["skin"])
@@ -140,7 +136,8 @@ def _silhouette_graphs(fits: Sequence[SilhouetteFit]) -> list[str]:
     return [curve_graph(f"IoU of the silhouette, view {view}", "", t[:, 0].astype(int), {view: t[:, 1]}) for view, t in tables.items()]
 
 
-def _graphs(clouds: Sequence[PointCloud], trajectories: Trajectories | None, body: BodyFit | None) -> list[str]:
+def _graphs(report: Report) -> list[str]:
+    clouds, trajectories, body = report.clouds, report.trajectories, report.body
     rows = [(c.frame, len(c.xyz_m), _median(c.residual_px), 1e3 * _median(c.sigma_m)) for c in clouds]
     frames, points, residual, sigma = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     graphs = [
