@@ -1,4 +1,4 @@
-"""What run.json says: what is run, with which settings and inputs, how to repeat it; and figures of what was found."""
+"""The content of run.json: the take, settings and inputs of a run, the command that repeats it, and figures of its results."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from .tracking.trajectories import Trajectories
 
 
 def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """An account without stages and warnings."""
+    """The record of a run, without stages and warnings yet."""
     take = footage.take
     return {
         "take": str(take.folder),
@@ -34,18 +34,18 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[str, Any], list[str]]:
-    """How many trajectories were kept, how long and sure they are, and how often which TrackStatus was the reason; and what to warn of."""
+    """Figures of the kept trajectories: number, length, sigma, counts of the reasons for removals; and warnings."""
     seen, started = kept.seen, sum(reasons.values())
     count = int(seen.shape[1] if kept.track is None else len(np.unique(kept.track[seen])))
     why = {TrackStatus(r).words: n for r, n in sorted(reasons.items(), key=lambda found: -found[1])}
     warnings = []
     if kept.omitted:
         warnings.append(
-            f"The {kept.omitted} shortest of {count + kept.omitted} trajectories are left out: they have no room in one table of so many "
-            "frames; run the take in pieces (--frames) to have all."
+            f"The {kept.omitted} shortest of {count + kept.omitted} trajectories are left out: the table of so many frames would be too "
+            "large; run the take in pieces (--frames) to get all."
         )
     if not count and started:
-        warnings.append(f"No trajectory was kept of {started}: most were removed as “{next(iter(why))}”.")
+        warnings.append(f"All {started} trajectories were removed, most of them as “{next(iter(why))}”.")
     figures = {
         "started": started,
         "trajectories": count,
@@ -58,7 +58,7 @@ def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[
 
 
 def median(values: Sequence[float] | np.ndarray) -> float:
-    """The median of what is finite, 0 where nothing is."""
+    """The median of the finite values, 0 if there are none."""
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     return float(np.median(finite)) if len(finite) else 0.0

@@ -1,4 +1,4 @@
-"""Arguments that several commands share."""
+"""Arguments shared by several commands."""
 
 import argparse
 import os
@@ -40,34 +40,34 @@ def frame_range(text: str | None) -> tuple[int, int] | None:
         return None
     first, colon, last = text.partition(":")
     if not colon or not first.isdecimal() or not last.isdecimal():
-        raise InputError(f"--frames {text} cannot be read; write the first frame and one after the last, such as 0:40.")
+        raise InputError(f"--frames {text} cannot be read; write the first frame and the one after the last, such as 0:40.")
     return int(first), int(last)
 
 
 def named_path(text: str) -> Path:
-    """A file or folder that an argument names; an empty one would mean the working folder.
+    """A file or folder; an empty argument would mean the working folder and is refused.
 
     Raises:
-        argparse.ArgumentTypeError: it names none.
+        argparse.ArgumentTypeError: it is empty.
     """
     if not text.strip():
         raise argparse.ArgumentTypeError("is empty; name a file or a folder")
     return Path(text)
 
 
-def joined(argv: list[str]) -> list[str]:
-    """The arguments with a negative first frame as part of its flag: argparse takes `--frames -5:3` for two flags."""
+def with_joined_frames(argv: list[str]) -> list[str]:
+    """The arguments with `--frames -5:3` joined by "=", because argparse takes a negative first frame for a flag."""
     frames = [i for i, flag in enumerate(argv[:-1]) if flag == "--frames" and re.match(r"-\d", argv[i + 1])]
     merged = [f"{word}={argv[i + 1]}" if i in frames else word for i, word in enumerate(argv)]
     return [word for i, word in enumerate(merged) if i - 1 not in frames]
 
 
 def check_not_read(flag: str, out: Path, *read: Path | None) -> None:
-    """A file or folder that a command is to write is none that it reads: that would be lost.
+    """Refuse to write over a file or folder that the command reads.
 
     Raises:
-        InputError: it is.
+        InputError: the two are the same.
     """
     for path in read:
         if path is not None and path.exists() and out.exists() and os.path.samefile(path, out):
-            raise InputError(f"{flag} {out} is what is read; give another name, so that it is not lost.")
+            raise InputError(f"{flag} {out} is also an input; choose another name, so that it is not overwritten.")

@@ -1,10 +1,10 @@
-"""Many takes, each a run of its own, on a Dask cluster: processes on this machine, or any scheduler by its address.
+"""Many takes on a Dask cluster: worker processes on this machine, or any scheduler by its address.
 
-A take is one task. Within a take nothing is handed to other workers: every frame is measured from the depths of the frame before it and
-tracked from its points, and the fit looks at all of them, so the frames of one take cannot be done side by side with the same result.
+A take is one task. A take is not divided among workers: each frame is measured from the depths of the previous frame and tracked from its
+points, and the fit uses all frames, so the frames of a take cannot run in parallel with the same result.
 
-A worker that is lost in mid-take is replaced and the take goes on from its checkpoints, in the same bytes. A take whose input needs mending
-does not stop the others; neither does a bug of ours, whose traceback is kept in a file.
+A worker that dies during a take is replaced, and the take resumes from its checkpoints with the same bytes. A take with invalid input does
+not stop the others; neither does a bug, whose traceback is written to a file.
 """
 
 import importlib.util
@@ -17,6 +17,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -26,101 +27,115 @@ from .progress import Monitor
 from .results import check_separate_folder
 
 FORMAT, VERSION = "tricap-batch", 1
-TOPIC = "tricap"  # under which workers report
-DONE, MEND, BUG, LOST = "done", "needs mending", "bug", "lost"  # what can become of a take
-WAIT_S, REPORT_S, CONNECT_S = 0.3, 0.5, 10.0
+TOPIC = "tricap"  # of the workers' progress reports
+WAIT_S = 0.3  # interval at which the tasks are polled
+REPORT_S = 0.5  # between two progress reports of a worker
+CONNECT_S = 10.0  # timeout of the connection to a scheduler
+THREADS_PER_WORKER = 2  # at most: a run gains little from more
+RETRIES = 3  # a worker that dies more often than this probably lacks memory
 MISSING = '`tricap batch` needs Dask, which this Python does not have; install it with: pip install "tricap[batch]".'
+
+Progress = tuple[str, float, float]  # stage, done, total
+
+
+class Status(StrEnum):
+    """How a take ended. The values are those of batch.json."""
+
+    DONE = "done"
+    INVALID_INPUT = "needs mending"
+    BUG = "bug"
+    LOST = "lost"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Outcome:
-    """What became of one take. `said`: the run in a line, or the sentence of its error."""
+    """How one take ended. `said`: the run in one line, or the sentence of its error."""
 
     take: str
     out: str
-    status: str
+    status: Status
     said: str
     seconds: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Engine:
-    """Where the takes run: at `scheduler`, or in so many processes here; a take that loses its worker is tried `retries` times more."""
+    """Where the takes run: at `scheduler`, or in `workers` local processes. A take whose worker dies is retried `retries` times."""
 
     scheduler: str | None = None
     workers: int = 1
-    retries: int = 3
+    retries: int = RETRIES
 
 
 def run_batch(
     takes: Sequence[Path], folder: Path, engine: Engine, overrides: pipeline.Overrides, monitor: Monitor, *, restart: bool = False
 ) -> list[Outcome]:
-    """Run all takes; FOLDER/NAME holds the results of the take NAME, FOLDER/batch.json what became of each.
+    """Run all takes. FOLDER/NAME gets the results of the take NAME, FOLDER/batch.json the outcome of each.
 
     Raises:
         InputError: Dask is not installed, the scheduler cannot be reached, two takes have one name, or the folder cannot be written to.
-        Cancelled: what is done is kept; the same command goes on from there.
+        Cancelled: finished work is saved; the same command resumes.
     """
     outs = out_folders(takes, folder)
     outcomes: dict[int, Outcome] = {}
     _write(folder, engine, takes, outs, outcomes)
-    shown: dict[str, tuple[str, float, float]] = {}
+    progress: dict[str, Progress] = {}
     with _client(engine) as client:
-        client.subscribe_topic(TOPIC, lambda event: _note(event, shown))
+        client.subscribe_topic(TOPIC, lambda event: _store_progress(event, progress))
         plain = {group: dict(table) for group, table in overrides.items()}
         futures = [
             client.submit(run_take, str(take.resolve()), str(out), plain, restart, pure=False, retries=engine.retries)
             for take, out in zip(takes, outs)
         ]
-        for i, outcome in _as_they_end(client, futures, takes, outs, shown, monitor):
+        for i, outcome in _as_completed(futures, takes, outs, progress, monitor):
             outcomes[i] = outcome
             _write(folder, engine, takes, outs, outcomes)
     return [outcomes[i] for i in range(len(takes))]
 
 
 def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
-    """The folder of each take's results: named after the take, or after the folder that holds it too where two have the same name.
+    """The folder of each take's results: named after the take, with its parent folder's name in front where two takes have the same name.
 
     Raises:
-        InputError: that does not tell them apart, or results would go into a take.
+        InputError: two names are still the same, or results would go into a take.
     """
     folder, takes = Path(folder).resolve(), [Path(take).resolve() for take in takes]
     names = [take.name for take in takes]
     names = [f"{take.parent.name}_{take.name}" if names.count(take.name) > 1 else take.name for take in takes]
     twice = next((take for take, name in zip(takes, names) if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"The take {twice} is named twice, or like another one; rename its folder, or leave it out.")
+        raise InputError(f"The take {twice} is listed twice, or has the name of another one; rename its folder, or leave it out.")
     for out in (folder, *(folder / name for name in names)):
         check_separate_folder(out)
     return [folder / name for name in names]
 
 
 def run_take(take: str, out: str, overrides: pipeline.Overrides, restart: bool) -> dict[str, Any]:
-    """The task of a worker: one take, as `tricap run` does it. Gives an Outcome as a table; only a lost worker is a failed task."""
+    """The task of a worker: run one take like `tricap run`. Returns an Outcome as a table; the task fails only if the worker dies."""
     began = time.perf_counter()
     try:
         with pipeline.open_run(Path(take), Path(out), overrides, restart=restart) as job:
             pipeline.all_stages(job, Monitor(_reporter(take)))
             _scene(job)
-        status, said = DONE, _told(job)
+        status, said = Status.DONE, _summary_of(job)
     except InputError as error:
-        status, said = MEND, str(error)
-    except Exception as error:  # the edge of the worker: whatever happens is told in the summary
+        status, said = Status.INVALID_INPUT, str(error)
+    except Exception as error:  # the edge of the worker: every error goes into the summary
         path = Path(out).with_name(f"{Path(out).name}_error.txt")
         store.write_text(path, traceback.format_exc())
-        status, said = BUG, f"Tricap made a mistake ({type(error).__name__}); please report it with {path}."
+        status, said = Status.BUG, f"Tricap made a mistake ({type(error).__name__}); please report it with {path}."
     return asdict(Outcome(take=take, out=out, status=status, said=said, seconds=round(time.perf_counter() - began, 1)))
 
 
-def _told(job: pipeline.Run) -> str:
-    """The run in a line, with what is doubtful about it: the first doubt, and how many more the report has."""
-    doubts = job.record["warnings"]
-    more = f" ({len(doubts) - 1} more in the report)" if len(doubts) > 1 else ""
-    return f"{job}. Doubtful: {doubts[0]}{more}" if doubts else str(job)
+def _summary_of(job: pipeline.Run) -> str:
+    """The run in one line, with its first warning and the number of further ones."""
+    warnings = job.record["warnings"]
+    more = f" ({len(warnings) - 1} more in the report)" if len(warnings) > 1 else ""
+    return f"{job}. Warning: {warnings[0]}{more}" if warnings else str(job)
 
 
 def _scene(job: pipeline.Run) -> None:
-    """body.blend, by a process of its own, for Blender wants to be in the main thread; without Blender there is none."""
+    """Build body.blend in a process of its own, because Blender needs the main thread; nothing without Blender."""
     if importlib.util.find_spec("bpy") is None:
         return
     package = __name__.rpartition(".core.")[0]
@@ -133,7 +148,7 @@ def _scene(job: pipeline.Run) -> None:
 
 
 def _reporter(take: str) -> Callable[[str, float, float], None] | None:
-    """Tell the client how far a take is, about twice a second; None outside of a Dask worker."""
+    """Report the progress of a take to the client every REPORT_S; None outside of a Dask worker."""
     from distributed import get_worker
 
     try:
@@ -149,14 +164,14 @@ def _reporter(take: str) -> Callable[[str, float, float], None] | None:
     return report
 
 
-def _note(event: tuple[float, Any], shown: dict[str, tuple[str, float, float]]) -> None:
-    said = event[1]
-    shown[said["take"]] = (said["stage"], said["done"], said["total"])
+def _store_progress(event: tuple[float, Any], progress: dict[str, Progress]) -> None:
+    report = event[1]
+    progress[report["take"]] = (report["stage"], report["done"], report["total"])
 
 
 @contextmanager
 def _client(engine: Engine) -> Iterator[Any]:
-    """A Dask client; a cluster of our own ends with it."""
+    """A Dask client; a local cluster ends with it."""
     if importlib.util.find_spec("distributed") is None:
         raise InputError(MISSING)
     import dask
@@ -181,36 +196,31 @@ def _client(engine: Engine) -> Iterator[Any]:
             dashboard_address=None,
             memory_limit=0,
             silence_logs=50,
-            env=shares(engine.workers, os.cpu_count() or 1),
+            env=thread_limits(engine.workers, os.cpu_count() or 1),
         ) as cluster,
         Client(cluster) as client,
     ):
         yield client
 
 
-def shares(workers: int, cores: int) -> dict[str, str]:
-    """The environment of each worker: as many threads, ours and OpenCV's, as there are cores for it."""
-    share = str(max(1, min(2, cores // workers)))
-    return {"TRICAP_THREADS": share, "OPENCV_FOR_THREADS_NUM": share}
+def thread_limits(workers: int, cores: int) -> dict[str, str]:
+    """The environment of each worker: the threads of Tricap and OpenCV that its share of the cores allows."""
+    threads = str(max(1, min(THREADS_PER_WORKER, cores // workers)))
+    return {"TRICAP_THREADS": threads, "OPENCV_FOR_THREADS_NUM": threads}
 
 
-def _as_they_end(
-    client: Any,
-    futures: Sequence[Any],
-    takes: Sequence[Path],
-    outs: Sequence[Path],
-    shown: Mapping[str, tuple[str, float, float]],
-    monitor: Monitor,
+def _as_completed(
+    futures: Sequence[Any], takes: Sequence[Path], outs: Sequence[Path], progress: Mapping[str, Progress], monitor: Monitor
 ) -> Iterator[tuple[int, Outcome]]:
-    """Number and outcome of each take as soon as it has ended."""
-    waiting, told = dict(enumerate(futures)), dict[str, tuple[str, float, float]]()
+    """The index and the outcome of each take as soon as it has ended."""
+    waiting, reported = dict(enumerate(futures)), dict[str, Progress]()
     while waiting:
         ended = [i for i, future in waiting.items() if future.done()]
         for i in ended:
             yield i, _outcome(waiting.pop(i), takes[i], outs[i])
-        for take, state in list(shown.items()):
-            if told.get(take) != state:
-                told[take] = state
+        for take, state in list(progress.items()):
+            if reported.get(take) != state:
+                reported[take] = state
                 monitor.step(f"{Path(take).name}: {state[0]}", *state[1:])
         monitor.step("takes", len(futures) - len(waiting), len(futures))
         if waiting and not ended:
@@ -219,10 +229,11 @@ def _as_they_end(
 
 def _outcome(future: Any, take: Path, out: Path) -> Outcome:
     if future.status == "finished":
-        return Outcome(**future.result())
+        table = future.result()
+        return Outcome(**{**table, "status": Status(table["status"])})
     error = future.exception()
-    said = f"Its worker was lost, time and again ({type(error).__name__}): is there memory enough, and is Tricap on every worker?"
-    return Outcome(take=str(take), out=str(out), status=LOST, said=said)
+    said = f"Its worker died repeatedly ({type(error).__name__}): check that it has enough memory and that every worker has Tricap."
+    return Outcome(take=str(take), out=str(out), status=Status.LOST, said=said)
 
 
 def _write(folder: Path, engine: Engine, takes: Sequence[Path], outs: Sequence[Path], outcomes: Mapping[int, Outcome]) -> None:
@@ -233,13 +244,13 @@ def _write(folder: Path, engine: Engine, takes: Sequence[Path], outs: Sequence[P
 
 
 def summary(outcomes: Sequence[Outcome]) -> list[str]:
-    """A table: a line for each take, and how many of each kind."""
+    """A table with a line for each take, and the number of takes by status."""
     width = max(len(Path(o.out).name) for o in outcomes)
     lines = [f"{Path(o.out).name:<{width}}  {o.status:<13}  {o.seconds:8.1f} s  {o.said}" for o in outcomes]
-    counts = {status: sum(o.status == status for o in outcomes) for status in (DONE, MEND, BUG, LOST)}
+    counts = {status: sum(o.status == status for o in outcomes) for status in Status}
     return [*lines, f"{len(outcomes)} takes: " + ", ".join(f"{n} {status}" for status, n in counts.items() if n)]
 
 
 def as_json(outcomes: Sequence[Outcome]) -> str:
-    """The outcomes for machines."""
+    """The outcomes as JSON."""
     return json.dumps([asdict(o) for o in outcomes], indent=1, ensure_ascii=False)

@@ -1,6 +1,6 @@
-"""The `tricap` command: what a terminal and `blender --command tricap` offer. Commands that need Blender are joined in __main__.py.
+"""The `tricap` command, for a terminal and for `blender --command tricap`. __main__.py adds the commands that need Blender.
 
-Exit codes: 0 done, 2 the input needs mending (one sentence on stderr), 130 cancelled (what is done is kept), 1 our bug (with a traceback).
+Exit codes: 0 done, 2 invalid input (one sentence on stderr), 130 cancelled (finished work is saved), 1 a bug (with a traceback).
 """
 
 import argparse
@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 
 from . import batch_command, calibrate_command, check_command, contour_command, fields_command, pipeline, points_command, track2d_command
-from .arguments import frame_range, joined, named_path, overrides
+from .arguments import frame_range, named_path, overrides, with_joined_frames
 from .bar_file import read_bar, write_bar
 from .body.model_file import model_names, read_model
 from .calibration.rig_files import read_any
@@ -28,14 +28,15 @@ from .take import open_take, read_take
 from .take_file import footage_entry, make_take, new_table, take_of_table
 from .threads import one_thread_in_linear_algebra
 
-Adder = Callable[[Any], None]  # adds a sub-command to the parser; the command's `run(args, monitor)` gives the lines to show
-# (and leaves in `args.always_shown` those that --quiet does not keep back: findings, and what has failed)
+# Adds a sub-command to the parser. The command's `run(args, monitor)` returns the lines to show, and sets `args.always_shown` to those
+# that --quiet does not suppress: findings and failures.
+Adder = Callable[[Any], None]
 
 
 def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
-    """Run one command of the core, or of those that `adders` join; gives the exit code."""
+    """Run one command of the core, or one that `adders` add; returns the exit code."""
     parser = build_parser(adders)
-    args = parser.parse_args(joined(sys.argv[1:] if argv is None else argv))
+    args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
     args.parser = parser
     _quiet_decoders()
     monitor = Monitor(_progress_line if sys.stderr.isatty() and not args.quiet else None if args.quiet else _plain_progress())
@@ -43,14 +44,14 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
         with _interrupts(monitor), one_thread_in_linear_algebra():
             lines = args.run(args, monitor)
     except InputError as error:
-        _say(f"tricap: {error}", sys.stderr)
+        _write_line(f"tricap: {error}", sys.stderr)
         return 2
     except Cancelled as stop:
-        _say(f"tricap: {stop}", sys.stderr)
+        _write_line(f"tricap: {stop}", sys.stderr)
         return 130
-    told = lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", [])
-    for line in told:
-        _say(line, sys.stdout)
+    shown = lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", [])
+    for line in shown:
+        _write_line(line, sys.stdout)
     return int(getattr(args, "exit_code", 0))
 
 
@@ -59,34 +60,34 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _new_command(commands)
-    _stage_command(commands, "seeds", "show the depth and number of the surface seeds that are found", _seeds, out=False)
-    _stage_command(commands, "measure", "the surface of each frame", _stages("measure"))
-    points_command.add_arguments(_stage_command(commands, "track", "trajectories of the surface's points, or of chosen ones", _track))
-    _stage_command(commands, "fit", "the body's shape and motion", _stages("fit"))
-    everything = _stage_command(commands, "run", "all of it, from the images to the Blender file; a stopped run goes on", _run)
-    everything.add_argument("--restart", action="store_true", help="begin anew instead of going on")
-    everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="the frames of the report's pictures")
-    demo = commands.add_parser("demo", help="make a recording with known truth, run everything on it, and compare")
+    _stage_command(commands, "seeds", "count the surface seeds in one frame and show their depths", _seeds, out=False)
+    _stage_command(commands, "measure", "measure the surface of each frame", _stages("measure"))
+    points_command.add_arguments(_stage_command(commands, "track", "track the points of the surface, or chosen points", _track))
+    _stage_command(commands, "fit", "fit the body's shape and motion", _stages("fit"))
+    everything = _stage_command(commands, "run", "run all stages, from the images to the Blender file; a stopped run resumes", _run)
+    everything.add_argument("--restart", action="store_true", help="start again instead of resuming")
+    everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="frames to show in the report")
+    demo = commands.add_parser("demo", help="make a synthetic recording, run all stages on it, and compare with the truth")
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
     demo.set_defaults(run=_demo, json=False)
-    of_core = (check_command, calibrate_command, track2d_command, contour_command, batch_command, fields_command)
-    for add in (*(module.add_command for module in of_core), *adders):
+    core_commands = (check_command, calibrate_command, track2d_command, contour_command, batch_command, fields_command)
+    for add in (*(module.add_command for module in core_commands), *adders):
         add(commands)
     for sub in commands.choices.values():
         for action in sub._actions:
             action.type = named_path if action.type is Path else action.type
-        sub.add_argument("--quiet", action="store_true", help="no progress, and no words but errors and findings")
+        sub.add_argument("--quiet", action="store_true", help="show errors and findings only")
     return parser
 
 
 def _new_command(commands: Any) -> None:
-    new = commands.add_parser("new", help="make a take of movies or image folders")
-    new.add_argument("take", type=Path, metavar="TAKE", help="the folder to make")
+    new = commands.add_parser("new", help="make a take from movies or image folders")
+    new.add_argument("take", type=Path, metavar="TAKE", help="the folder to create")
     new.add_argument("--views", nargs="+", required=True, metavar="NAME=FILE", help="movies or image folders, in the order of the cameras")
-    new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="which lines to measure of interlaced video")
+    new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="the lines of interlaced video to measure")
     new.add_argument("--fps", type=float, default=25.0, metavar="F", help="images per second (default: 25)")
-    new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or another tool's calibration")
-    new.add_argument("--model", default=None, metavar="NAME", help=f"the body: {', '.join(model_names())}, or a .toml file of your own")
+    new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or a calibration of another tool")
+    new.add_argument("--model", default=None, metavar="NAME", help=f"the body model: {', '.join(model_names())}, or your own .toml file")
     new.set_defaults(run=_new)
 
 
@@ -125,7 +126,7 @@ def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def _build_scene(job: pipeline.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """body.blend, through the command `scene` of the add-on where there is a Blender."""
+    """Build body.blend with the add-on's command `scene`, where Blender is available."""
     blend = job.results.path("body.blend")
     if "scene" not in _names_of(given.parser):
         return []
@@ -154,16 +155,16 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor, settings["enhance"])
     near, far = where.depth_range_m
     args.always_shown = [
-        f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (from {where.method}), "
-        f"{len(footage.take.seeds.joints)} clicked joints, {len(where.planes)} planes of the room left out."
+        f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (depths from {where.method}), "
+        f"{len(footage.take.seeds.joints)} clicked joints, {len(where.planes)} planes of the room excluded."
     ]
     return list(args.always_shown)
 
 
 def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Make TAKE with take.toml; footage outside the folder is linked into it, or copied where links cannot be made.
+    """Make TAKE with take.toml; footage outside the folder is linked into it, or copied where links are impossible.
 
-    Everything is checked before the first file is made.
+    Everything is checked before the first file is written.
     """
     folder: Path = args.take
     if (folder / "take.toml").exists():
@@ -174,11 +175,11 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     sources = [Path(source).resolve() for _, source in views]
     for (name, _), source in zip(views, sources):
         if sources.count(source) > 1:
-            raise InputError(f"View {name} has the same footage as another, {source}; give each view that of its own camera.")
+            raise InputError(f"View {name} has the same footage as another view, {source}; give each view the footage of its own camera.")
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
     table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
-    if args.model and not args.model.endswith(".toml"):  # a model of one's own may come into the folder later
+    if args.model and not args.model.endswith(".toml"):  # a user's own model may be copied into the folder later
         read_model(args.model)
     rig = read_any(args.rig) if args.rig else None
     if rig:
@@ -188,12 +189,14 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if rig and (bar := read_bar(args.rig, rig)):
         write_bar(folder / "rig.toml", rig, *bar)
     todo = [] if rig else ["copy or calibrate rig.toml into it"]
-    todo += ["write clicked joints into its take.toml, or open it in Blender and click"] if args.model else []
-    return [f"{folder}: a take of {len(views)} views, {args.fps:g} images a second. Next: {', '.join([*todo, f'tricap check {folder}'])}."]
+    todo += ["click joints in Blender, or write them into its take.toml"] if args.model else []
+    return [
+        f"{folder}: a take of {len(views)} views, {args.fps:g} images per second. Next: {', '.join([*todo, f'tricap check {folder}'])}."
+    ]
 
 
 def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Make the synthetic arm, run everything, and compare with the truth."""
+    """Make the synthetic arm, run all stages, and compare with the truth."""
     from .synthetic.arm import make_arm_take
     from .synthetic.score import score_run
 
@@ -206,7 +209,7 @@ def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     return [
         str(job),
         *lines,
-        "Measured against the truth of the recording:",
+        "Compared with the truth of the recording:",
         str(score_run(take, out, monitor)),
         f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}   Blender file: {out / 'body.blend'}",
     ]
@@ -214,18 +217,18 @@ def _demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 @contextmanager
 def _interrupts(monitor: Monitor) -> Iterator[None]:
-    """Ctrl-C cancels at the next step instead of breaking off anywhere."""
+    """Ctrl-C cancels at the next step; a second Ctrl-C interrupts at once."""
     try:
         before = signal.getsignal(signal.SIGINT)
-        if before is None:  # set outside Python, as Blender does: it could not be put back
+        if before is None:  # set outside Python, as Blender does: it could not be restored
             raise ValueError
 
         def stop(number: int, frame: Any) -> None:
             monitor.cancel()
-            signal.signal(signal.SIGINT, before)  # a second Ctrl-C breaks off at once
+            signal.signal(signal.SIGINT, before)
 
         signal.signal(signal.SIGINT, stop)
-    except ValueError:  # also when not in the main thread: somebody else owns the signals
+    except ValueError:  # also outside the main thread: the caller owns the signals
         yield
         return
     try:
@@ -235,7 +238,7 @@ def _interrupts(monitor: Monitor) -> Iterator[None]:
 
 
 def _quiet_decoders() -> None:
-    """The decoders' own messages stay away from the terminal: what is wrong with a file is said in our one sentence."""
+    """Silence the messages of the video decoders: a broken file is reported in one sentence of ours."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     getattr(cv2.utils, "logging", cv2).setLogLevel(0)  # OpenCV 5, OpenCV 4
 
@@ -259,11 +262,11 @@ def _plain_progress() -> Callable[[str, float, float], None]:
         tenth = int(10 * done / total) if total else 10
         if last.get(stage) != tenth:
             last[stage] = tenth
-            _say(f"{stage}: {10 * tenth} %", sys.stderr)
+            _write_line(f"{stage}: {10 * tenth} %", sys.stderr)
 
     return report
 
 
-def _say(text: str, stream: Any) -> None:
+def _write_line(text: str, stream: Any) -> None:
     stream.write(text + "\n")
     stream.flush()

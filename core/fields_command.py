@@ -1,4 +1,4 @@
-"""`tricap fields --out FILE.svg`: the fields that metaballs can have, side by side (D'Apuzzo et al. 1999, Fig. 12)."""
+"""`tricap fields --out FILE.svg`: a plot of the field functions of metaballs (D'Apuzzo et al. 1999, Fig. 12)."""
 
 import argparse
 from pathlib import Path
@@ -12,39 +12,40 @@ from .errors import InputError
 from .progress import Monitor
 from .report.graphs import HEIGHT, WIDTH, field_graph
 
-FARTHEST = 1.5  # radius of the plot in units of l
+PLOT_RADIUS = 1.5  # in units of l
+SAMPLES = 301
 
 
 def add_command(commands: Any) -> None:
     """Join the command to the parser's sub-commands."""
-    about = "a plot of the fields that metaballs can have, with r_t, r_a and w_t"
+    about = "plot the field functions of metaballs, with r_t, r_a and w_t"
     parser: argparse.ArgumentParser = commands.add_parser("fields", help=about, description=about[0].upper() + about[1:])
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.svg", help="the picture to write")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Write the plot; the lines to show are each field's radii.
+    """Write the plot; returns lines with the radii of each field.
 
     Raises:
-        InputError: FILE is no .svg, or cannot be written.
+        InputError: FILE is not an .svg, or cannot be written.
     """
     if args.out.suffix.lower() != ".svg":
-        raise InputError(f"--out {args.out} is no .svg; the plot of the fields is written as SVG.")
-    seen = {name: p.as_seen() for name, p in POTENTIALS.items()}
-    graphs = [_graph("Fields of one radius l", POTENTIALS), _graph("The same, as large to the eye as the exponential", seen)]
+        raise InputError(f"--out {args.out} is not an .svg file; choose a name that ends in .svg.")
+    same_size = {name: p.as_seen() for name, p in POTENTIALS.items()}
+    graphs = [_graph("Fields of one radius l", POTENTIALS), _graph("The same, with the surface of the exponential", same_size)]
     second = graphs[1].replace("<svg ", f'<svg y="{2 * HEIGHT}" ', 1)
     head = f'<svg viewBox="0 0 {WIDTH} {4 * HEIGHT}" width="{WIDTH}" height="{4 * HEIGHT}" xmlns="http://www.w3.org/2000/svg">'
     store.write_text(args.out, f"{head}{graphs[0]}{second}</svg>\n")
     rows = [
-        f"{name:<12} r_t {p.threshold_radius():.4f} l   r_a {p.influence:.4f} l{' (in name: it never ends)' if p.endless else ''}"
+        f"{name:<12} r_t {p.threshold_radius():.4f} l   r_a {p.influence:.4f} l{' (nominal: the field is never 0)' if p.endless else ''}"
         for name, p in POTENTIALS.items()
     ]
-    return [f"{args.out}: {len(rows)} fields, seen where they are w_t = {THRESHOLD:g} of their weight.", *rows]
+    return [f"{args.out}: {len(rows)} fields; their surface is at w_t = {THRESHOLD:g} of their weight.", *rows]
 
 
 def _graph(title: str, potentials: dict[str, Potential]) -> str:
-    radius = np.linspace(0, FARTHEST, 301)
+    radius = np.linspace(0, PLOT_RADIUS, SAMPLES)
     return field_graph(
         title,
         radius,

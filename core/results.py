@@ -1,6 +1,6 @@
-"""The folder of a run (OUT): where each result lies, the checkpoints, and run.json, which says what was done.
+"""The folder of a run (OUT): the path of each result, the checkpoints, and run.json, the record of the run.
 
-A checkpoint carries the digest of everything that it depends on; one that does not agree is computed again. Files: docs/formats.md.
+A checkpoint contains a digest of everything that it depends on; if that differs, it is computed again. Files: docs/formats.md.
 """
 
 import os
@@ -20,55 +20,55 @@ from .run_json import FORMAT, VERSION
 from .surface.cloud import PointCloud
 from .tracking.trajectories import Filtered
 
-OURS = (  # what a run replaces
+RESULTS = (  # files and folders that a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report",
     "body.blend",
 )  # fmt: skip
 
 
 def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
-    """Results are kept apart from what is measured: mixed with it, one could replace the other.
+    """Refuse to mix results with footage, because one could replace the other.
 
     Raises:
-        InputError: OUT is a take's own folder or one in which its footage lies, or the take lies where results are replaced.
+        InputError: OUT is a take or contains its footage, or the take lies where results are replaced.
     """
     where = Path(out).resolve()
-    advice = f"give the results a folder of their own, such as {(where if take is None else take) / 'results'}."
+    advice = f"choose a separate folder for the results, such as {(where if take is None else take) / 'results'}."
     if (where / "take.toml").exists():
         raise InputError(f"{out} is itself a take; {advice}")
     for path in footage:
         if where in (path.parent.resolve(), path.resolve().parent):
-            raise InputError(f"{out} holds the footage {path.name}; {advice}")
-    if take is not None and any(take.resolve().is_relative_to(where / name) for name in ("cache", "contours", *OURS)):
-        raise InputError(f"The take {take} lies where results of {out} are replaced; choose another folder for the results.")
+            raise InputError(f"{out} contains the footage {path.name}; {advice}")
+    if take is not None and any(take.resolve().is_relative_to(where / name) for name in ("cache", "contours", *RESULTS)):
+        raise InputError(f"The take {take} is inside {out}, where a run replaces files; choose another folder for the results.")
 
 
 def check_not_result(file: Path, out: Path) -> None:
-    """What is written of a run is none of its results, and what is made of a motion's file is not that file.
+    """Refuse to write over a result of the run, or over the motion file, that is being read.
 
     Raises:
-        InputError: it is.
+        InputError: `file` is such a file.
     """
     path, read = Path(file).resolve(), Path(out).resolve()
     own = path.relative_to(read).parts[:1] if path != read and path.is_relative_to(read) else ()
-    if path == read or set(own) & {"cache", "contours", "fields", "run.json", *OURS} - {"body.blend"}:
-        raise InputError(f"{file} is what is read; give another name, so that it is not lost.")
+    if path == read or set(own) & {"cache", "contours", "fields", "run.json", *RESULTS} - {"body.blend"}:
+        raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
 
 
 class Results:
-    """An OUT folder. Creating the object makes sure that it can be written to."""
+    """An OUT folder. Creating the object checks that it is writable."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
-        away = [path for path in _written(self.folder) if not _inside(path, self.folder)]
-        if away:
-            raise InputError(f"{away[0]} is a link to a place outside {folder}; remove the link, or choose another folder.")
-        theirs = _not_ours(self.folder)
-        if theirs:
+        outside = [path for path in _written(self.folder) if not _inside(path, self.folder)]
+        if outside:
+            raise InputError(f"{outside[0]} is a link to a place outside {folder}; remove the link, or choose another folder.")
+        foreign = _not_from_a_run(self.folder)
+        if foreign:
             raise InputError(
-                f"{folder} holds “{theirs[0]}”, which no run of Tricap wrote; choose an empty or a new folder for the results."
+                f"{folder} contains “{foreign[0]}”, which was not written by Tricap; choose an empty or a new folder for the results."
             )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -81,14 +81,14 @@ class Results:
 
     @contextmanager
     def opened(self) -> Iterator["Results"]:
-        """Keep other runs out of the folder, and clear away what a killed run left half written.
+        """Lock the folder against other runs, and remove the partial files of a killed run.
 
         Raises:
-            InputError: another run is at work in it.
+            InputError: another run is using it.
         """
         with locked(self.folder):
-            ours = [self.path(name) for name in ("clouds", "skin", "report", "contours")]
-            for folder in (self.folder, *ours, *self.path("cache").glob("*/")):
+            folders = [self.path(name) for name in ("clouds", "skin", "report", "contours")]
+            for folder in (self.folder, *folders, *self.path("cache").glob("*/")):
                 for path in [*folder.glob(".*.part"), *folder.glob(".*.part.blend")]:
                     self.remove(str(path.relative_to(self.folder)))
             yield self
@@ -102,7 +102,7 @@ class Results:
         return self.path("clouds", f"{frame:04d}.ply")
 
     def load_checkpoint(self, stage: str, name: str, key: str) -> dict[str, np.ndarray] | None:
-        """The arrays of a checkpoint, or None when it is missing, damaged, or made from something else."""
+        """The arrays of a checkpoint, or None when it is missing, damaged, or made from other input."""
         path = self.path("cache", stage, f"{name}.npz")
         if not path.exists():
             return None
@@ -130,8 +130,8 @@ class Results:
                 else:
                     path.unlink(missing_ok=True)
             except OSError as error:
-                said = f"Cannot remove {path}: {error.strerror or error}. Close what uses it, or choose another folder."
-                raise InputError(said) from error
+                reason = f"Cannot remove {path}: {error.strerror or error}. Close the program that uses it, or choose another folder."
+                raise InputError(reason) from error
 
     def remove_other_clouds(self, frames: range) -> None:
         """Remove the clouds of all other frames."""
@@ -172,40 +172,40 @@ class Results:
 
 
 class FitCheckpoints:
-    """The checkpoints of a fit under way (`fitting.way.Kept`): cache/fit."""
+    """The checkpoints of a running fit: cache/fit."""
 
     def __init__(self, results: Results, key: str) -> None:
         self._results, self._key = results, key
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
-        """What an interrupted fit of the same input left under a name."""
+        """The checkpoint of an interrupted fit of the same input, if there is one."""
         return self._results.load_checkpoint("fit", name, self._key)
 
     def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep this under a name, instead of what was."""
+        """Write a checkpoint, in place of an earlier one of this name."""
         self._results.save_checkpoint("fit", name, self._key, arrays)
 
 
 def _written(folder: Path) -> list[Path]:
-    """Everything that some command writes to in a folder of results, and the folders of checkpoints that are there."""
+    """Every path that a command writes to in a folder of results, and the existing folders of checkpoints."""
     cache = folder / "cache"
-    names = ("run.json", "contours", "points2d.csv", "points3d.csv", NAME, *OURS)
+    names = ("run.json", "contours", "points2d.csv", "points3d.csv", NAME, *RESULTS)
     return [*(folder / name for name in names), cache, *(cache.iterdir() if cache.is_dir() and not cache.is_symlink() else ())]
 
 
 def _inside(path: Path, folder: Path) -> bool:
-    """Whether what a path leads to, over links, lies in the folder."""
+    """Whether a path, with its links resolved, lies in the folder."""
     return not path.is_symlink() or path.resolve().is_relative_to(folder)
 
 
-def _not_ours(folder: Path) -> list[str]:
-    """What lies in a folder under the name of a result or as `cache` though no run wrote there.
+def _not_from_a_run(folder: Path) -> list[str]:
+    """Files and folders that have the name of a result, or `cache`, although no run has written to the folder.
 
-    A run stopped early leaves a cache, and a killed one its lock.
+    A run that was stopped early leaves a cache, and a killed one its lock.
     """
     cache = folder / "cache"
     if (folder / "run.json").exists() or (folder / NAME).exists():
         return []
     if cache.is_dir() and all(p.is_dir() and all(f.suffix in (".npz", ".part") for f in p.iterdir()) for p in cache.iterdir()):
         return []
-    return [name for name in ("cache", *OURS) if (folder / name).exists()]
+    return [name for name in ("cache", *RESULTS) if (folder / name).exists()]

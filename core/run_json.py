@@ -1,4 +1,4 @@
-"""run.json read back: checked once, so that whoever looks into it can rely on what stands where. It may come from a stranger."""
+"""Reads run.json and validates it once, so that its users can rely on its layout. The file may come from an untrusted source."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,19 +8,19 @@ from . import store
 from .errors import InputError
 
 FORMAT, VERSION = "tricap-run", 1
-KINDS: dict[str, type | tuple[type, ...]] = {
+FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     "take": str, "frames": list, "fps": (int, float), "views": list, "settings": dict, "inputs": dict, "stages": dict, "warnings": list,
 }  # fmt: skip
-FIGURES = {  # which a finished stage has
+STAGE_FIGURES = {  # figures that a finished stage must have
     "measure": ("frames", "points_per_frame", "residual_px", "sigma_mm"),
     "track": ("trajectories", "mean_length_frames"),
     "fit": ("joint_sigma_mm",),
 }
-MOST = 1e12  # no figure of ours comes near
+LARGEST_FIGURE = 1e12  # far above every figure of a run
 
 
 def read_run(path: Path) -> dict[str, Any]:
-    """The table in a run.json; what it has of the names in `KINDS` is of that kind, and a finished stage has its figures.
+    """The table in a run.json, with fields of the types in `FIELD_TYPES` and the figures of each finished stage.
 
     Raises:
         InputError: it is missing, damaged, or of another version.
@@ -28,14 +28,14 @@ def read_run(path: Path) -> dict[str, Any]:
     run = store.read_json(path)
     if not isinstance(run, dict) or run.get("format") != FORMAT or run.get("version") != VERSION:
         raise InputError(f"{path} was not written by this version of Tricap; choose another folder, or --restart.")
-    odd = next((name for name, kind in KINDS.items() if name in run and not isinstance(run[name], kind)), None)
-    odd = odd or _odd_table(run) or _odd_stage(run.get("stages", {}))
-    if odd is not None:
-        raise InputError(f"{path} is damaged: “{odd}” cannot be what it says; remove the file and run again.")
+    invalid = next((name for name, kind in FIELD_TYPES.items() if name in run and not isinstance(run[name], kind)), None)
+    invalid = invalid or _invalid_table(run) or _invalid_stage(run.get("stages", {}))
+    if invalid is not None:
+        raise InputError(f"{path} is damaged: “{invalid}” is invalid; remove the file and run again.")
     return run
 
 
-def _odd_table(run: Mapping[str, Any]) -> str | None:
+def _invalid_table(run: Mapping[str, Any]) -> str | None:
     if any(not isinstance(table, dict) for table in run.get("settings", {}).values()):
         return "settings"
     frames = run.get("frames", [0, 0])
@@ -45,12 +45,12 @@ def _odd_table(run: Mapping[str, Any]) -> str | None:
     return next((name for name, values in texts.items() if any(not isinstance(v, str) for v in values)), None)
 
 
-def _odd_stage(stages: Mapping[str, Any]) -> str | None:
-    """The first stage with an entry that no run writes."""
+def _invalid_stage(stages: Mapping[str, Any]) -> str | None:
+    """The first stage with an invalid entry."""
     for stage, entry in stages.items():
         if not isinstance(entry, dict) or not isinstance(entry.get("key", ""), str) or not isinstance(entry.get("not_done", ""), str):
             return stage
-        if "not_done" not in entry and any(not is_figure(entry.get(name)) for name in FIGURES.get(stage, ())):
+        if "not_done" not in entry and any(not is_figure(entry.get(name)) for name in STAGE_FIGURES.get(stage, ())):
             return stage
         counts = entry.get("frames", {}) if stage == "fit" else {}
         if not isinstance(counts, dict) or any(not is_figure(n) for n in counts.values()):
@@ -59,5 +59,5 @@ def _odd_stage(stages: Mapping[str, Any]) -> str | None:
 
 
 def is_figure(value: Any) -> bool:
-    """Whether a value is a number that can be shown and compared."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < MOST
+    """Whether a value is a finite number of plausible size."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < LARGEST_FIGURE

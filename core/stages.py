@@ -1,8 +1,8 @@
-"""What each stage depends on, said once: the run removes and the panel calls stale exactly what a change concerns.
+"""The inputs of each stage, defined once: a run removes, and the panel marks as outdated, exactly the results that a change affects.
 
-The key of a stage is a digest of all that its result depends on, the stages before it included. run.json carries the key with which each
-stage was done; a stage is stale when its key now is another. Footage counts by names, sizes and when its files
-were written (an export of the same size is another one); checkpoints look at its content.
+The key of a stage is a digest of everything that its result depends on, including the earlier stages. run.json stores the key with which
+each stage ran; a stage is outdated when its current key differs. Footage enters a key by file names, sizes and modification times (an
+export of the same size is another file); checkpoints compare its content.
 """
 
 import json
@@ -24,15 +24,15 @@ STAGES = ("measure", "track", "fit")
 
 @dataclass(frozen=True, kw_only=True)
 class StageInput:
-    """What concerns a stage and no stage before it."""
+    """The inputs and files of a stage that no earlier stage has."""
 
     settings: tuple[str, ...]  # groups of knobs
-    take: Callable[[Footage], Any]  # what take.toml, rig.toml and the footage say, as values with a `repr`
-    files: tuple[str, ...]  # what the stage leaves in OUT and no run may leave standing once it is stale
+    take: Callable[[Footage], Any]  # the parts of take.toml, rig.toml and the footage, as values with a `repr`
+    files: tuple[str, ...]  # results in OUT, which a run removes once they are outdated
 
 
-def _seen(footage: Footage) -> Any:
-    """The images, the cameras, and where the person is."""
+def _measure_input(footage: Footage) -> Any:
+    """The images, the cameras, and the person's masks."""
     take = footage.take
     regions = [c for c in _corrections(take) if c[0] == "region"]
     views = [(v.name, v.offset_frames) for v in take.views]
@@ -48,11 +48,11 @@ def _person_files(take: Take, view: View) -> Any:
     return [_stamp(path) for path in sorted(take.folder.glob(pattern))] if pattern else []
 
 
-def _followed(footage: Footage) -> Any:
+def _track_input(footage: Footage) -> Any:
     return footage.take.fps, [c for c in _corrections(footage.take) if c[0] == "trajectory"], following.ALGORITHM
 
 
-def _fitted(footage: Footage) -> Any:
+def _fit_input(footage: Footage) -> Any:
     take = footage.take
     model = take.body_model
     own = store.digest(*model_files(model)) if model and Path(model).is_file() else ""
@@ -60,31 +60,31 @@ def _fitted(footage: Footage) -> Any:
 
 
 STAGE_INPUTS: dict[str, StageInput] = {
-    "measure": StageInput(settings=("timing", "enhance", "matching", "growing", "surface"), take=_seen, files=()),
-    "track": StageInput(settings=("tracking",), take=_followed, files=("trajectories.npz", "trajectories_raw.npz")),
+    "measure": StageInput(settings=("timing", "enhance", "matching", "growing", "surface"), take=_measure_input, files=()),
+    "track": StageInput(settings=("tracking",), take=_track_input, files=("trajectories.npz", "trajectories_raw.npz")),
     "fit": StageInput(
         settings=("fitting", "skin"),
-        take=_fitted,
+        take=_fit_input,
         files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
     ),
 }
-# Groups of knobs that concern no stage: what `tricap contour` writes concerns the fit by its content, the tracks of chosen points nothing.
+# Groups of settings in no stage's key: the outlines of `tricap contour` enter the fit's key by their content, chosen points enter none.
 WITHOUT_STAGE = ("contour", "key_points")
-STAGE_FILES = tuple(name for concern in STAGE_INPUTS.values() for name in concern.files)
+STAGE_FILES = tuple(name for own in STAGE_INPUTS.values() for name in own.files)
 
 
 def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict[str, str]:
-    """The key of every stage, for opened footage, the settings of a run, and the contours that were put into its folder OUT, which are the
+    """The key of every stage, for opened footage, the settings of a run, and the contours in its folder OUT, whose digest is the
     second word of the fit's key.
 
     Raises:
-        InputError: footage, rig or model have gone.
+        InputError: footage, rig or model are missing.
     """
     keys, before = {}, ""
     try:
-        for stage, concern in STAGE_INPUTS.items():
-            said = [settings[name] for name in concern.settings], concern.take(footage)
-            before = keys[stage] = store.digest(before, repr(said))
+        for stage, own in STAGE_INPUTS.items():
+            inputs = [settings[name] for name in own.settings], own.take(footage)
+            before = keys[stage] = store.digest(before, repr(inputs))
         contours = sorted((out / "contours").glob("*.csv"))
         keys["fit"] += f" {store.digest(*contours)}" if contours else ""
     except OSError as error:
@@ -93,42 +93,42 @@ def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict
 
 
 def command_of(footage: Footage, settings: Mapping[str, Any]) -> str:
-    """The command that runs this again; what take.toml says of settings need not be repeated, but does no harm."""
-    said = [
+    """The command that repeats the run; it also repeats the settings of take.toml, which is harmless."""
+    options = [
         f"--set {group}.{name}={shlex.quote(json.dumps(value) if isinstance(value, bool) else str(value))}"
         for group, chosen in settings.items()
         for name, value in to_table(chosen).items()
         if value != to_table(type(chosen)())[name]
     ]
     frames = f"--frames {footage.frames.start}:{footage.frames.stop}"
-    return " ".join(["tricap run", shlex.quote(str(footage.take.folder)), "--out OUT", frames, *said])
+    return " ".join(["tricap run", shlex.quote(str(footage.take.folder)), "--out OUT", frames, *options])
 
 
 def stage_of(group: str) -> str:
-    """The stage that a group of knobs concerns first."""
-    return next(stage for stage, concern in STAGE_INPUTS.items() if group in concern.settings)
+    """The first stage that a group of settings affects."""
+    return next(stage for stage, own in STAGE_INPUTS.items() if group in own.settings)
 
 
 def valid_stages(run: Mapping[str, Any], keys: Mapping[str, str], *, ignore_contours: bool = False) -> dict[str, Any]:
-    """The stages in a run.json that were done with these keys; the report is as good as the fit, and so are tracks that the body guided.
+    """The stages in a run.json that ran with these keys; the report is valid if the fit is, and so are tracks that were guided by the body.
 
-    `ignore_contours`: a body that was fitted with other contours, or none, is good enough.
+    `ignore_contours`: also accept a body that was fitted with other contours, or none.
     """
     stages: dict[str, Any] = run.get("stages", {})
     keys = {**keys, "report": keys["fit"]}
 
-    def done_so(name: str, entry: Mapping[str, Any]) -> bool:
+    def is_valid(name: str, entry: Mapping[str, Any]) -> bool:
         key, now = str(entry.get("key", "")), keys.get(name, "")
         return bool(key) and (key == now or (ignore_contours and key.partition(" ")[0] == now.partition(" ")[0]))
 
-    good = {name: entry for name, entry in stages.items() if done_so(name, entry)}
-    if "fit" not in good and "tracked_again" in stages.get("fit", {}):
-        good.pop("track", None)
-    return good
+    valid = {name: entry for name, entry in stages.items() if is_valid(name, entry)}
+    if "fit" not in valid and "tracked_again" in stages.get("fit", {}):
+        valid.pop("track", None)
+    return valid
 
 
 def _stamp(path: Path) -> tuple[str, int, int]:
-    """Name, size, and when it was written, in whole seconds: some file systems keep no less."""
+    """Name, size, and modification time in whole seconds, the resolution of some file systems."""
     state = path.stat()
     return path.name, state.st_size, state.st_mtime_ns // 1_000_000_000
 

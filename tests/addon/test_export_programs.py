@@ -200,8 +200,8 @@ def test_no_export_takes_the_place_of_what_it_reads(blender: ModuleType, small_r
     for what, kind, file in ((out, "csv", out / "joints.csv"), (out, "ply", out / "clouds"), (out, "ply", out / "skin" / ".." / "skin"),
                              (out, "csv", out / "cache" / "a.csv"), (tmp_path / "walk.bvh", "bvh", tmp_path / "walk")):  # fmt: skip
         assert main(["export", str(what), "--format", kind, "--out", str(file), "--quiet"]) == 2
-        assert "is what is read; give another name" in capfd.readouterr().err
-    with pytest.raises(RuntimeError, match="is what is read"):
+        assert "is also an input; choose another name" in capfd.readouterr().err
+    with pytest.raises(RuntimeError, match="is also an input"):
         blender.ops.tricap.export(kind="csv", out=str(out), filepath=str(out / "motion.csv"))
     argv = ["retarget", str(tmp_path / "walk.bvh"), "--rig", str(tmp_path / "rig.blend"), "--out", str(tmp_path / "rig.blend"), "--quiet"]
     (tmp_path / "rig.blend").write_text("a rig")

@@ -15,7 +15,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from tricap.core import batch, commands, pipeline
-from tricap.core.batch import BUG, DONE, LOST, MEND, Engine, Outcome, out_folders, run_batch, run_take, summary
+from tricap.core.batch import Engine, Outcome, Status, out_folders, run_batch, run_take, summary
 from tricap.core.errors import InputError
 from tricap.core.lock import NAME
 from tricap.core.progress import Cancelled, Monitor
@@ -67,7 +67,7 @@ def test_a_worker_killed_in_mid_take(takes: list[Path], tmp_path: Path, killing:
     printed = capfd.readouterr()
     assert "3 takes: 2 done, 1 needs mending" in printed.out and "kick é: surface" in printed.err
     told = json.loads((out / "batch.json").read_text())["takes"]
-    assert [t["status"] for t in told] == [DONE, MEND, DONE] and "rig.toml" in told[1]["said"]
+    assert [t["status"] for t in told] == [Status.DONE, Status.INVALID_INPUT, Status.DONE] and "rig.toml" in told[1]["said"]
     for take in (takes[0], takes[2]):
         pipeline.run(take, tmp_path / "single" / take.name, COARSE)
         single, many = (without_blend(killing.contents(folder / take.name)) for folder in (tmp_path / "single", out))
@@ -89,26 +89,31 @@ def test_a_scheduler_by_its_address(takes: list[Path], tmp_path: Path, monkeypat
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
         engine = Engine(scheduler=cluster.scheduler_address)
         outcomes = run_batch(takes, tmp_path / "out", engine, COARSE, Monitor())
-        assert [o.status for o in outcomes] == [DONE, MEND, BUG]
+        assert [o.status for o in outcomes] == [Status.DONE, Status.INVALID_INPUT, Status.BUG]
         assert "throw_error.txt" in outcomes[2].said and "ZeroDivisionError: ours" in (tmp_path / "out" / "throw_error.txt").read_text()
         monitor = Monitor()
         monitor.cancel()
         with pytest.raises(Cancelled):
             run_batch(takes, tmp_path / "other", engine, {}, monitor)
-    assert {t["status"] for t in json.loads((tmp_path / "other" / "batch.json").read_text())["takes"]} <= {"waiting", MEND, DONE, BUG}
+    assert {t["status"] for t in json.loads((tmp_path / "other" / "batch.json").read_text())["takes"]} <= {
+        "waiting",
+        Status.INVALID_INPUT,
+        Status.DONE,
+        Status.BUG,
+    }
 
 
 def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch.importlib.util, "find_spec", lambda name: None)  # no Blender
     told = run_take(str(takes[0]), str(tmp_path / "out"), COARSE, False)
-    assert told["status"] == DONE and "4 frames" in told["said"] and (tmp_path / "out" / "report" / "report.html").exists()
+    assert told["status"] == Status.DONE and "4 frames" in told["said"] and (tmp_path / "out" / "report" / "report.html").exists()
     (tmp_path / "file").write_text("")
-    assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == MEND
+    assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == Status.INVALID_INPUT
 
 
 @pytest.mark.parametrize(("workers", "cores", "threads"), [(1, 2, "2"), (2, 2, "1"), (2, 8, "2"), (16, 8, "1")])
 def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, threads: str) -> None:
-    environment = os.environ | batch.shares(workers, cores)
+    environment = os.environ | batch.thread_limits(workers, cores)
     code = "from tricap.core import threads; print(threads.THREADS)"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [threads]
@@ -116,9 +121,9 @@ def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, thread
 
 def test_what_is_doubtful_stands_in_the_summary() -> None:
     job = SimpleNamespace(record={"warnings": []}, __str__=lambda: "")
-    assert batch._told(job) == str(job)
+    assert batch._summary_of(job) == str(job)
     job.record["warnings"] = ["View R stood still.", "Another.", "A third."]
-    assert batch._told(job).endswith(". Doubtful: View R stood still. (2 more in the report)")
+    assert batch._summary_of(job).endswith(". Warning: View R stood still. (2 more in the report)")
 
 
 def test_without_dask(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture) -> None:
@@ -137,12 +142,12 @@ def test_no_scheduler_there(takes: list[Path], tmp_path: Path, capfd: Capture, m
 def test_names_of_results(tmp_path: Path) -> None:
     a, b, c = tmp_path / "monday" / "kick", tmp_path / "tuesday" / "kick", tmp_path / "throw"
     assert [p.name for p in out_folders([a, b, c], tmp_path)] == ["monday_kick", "tuesday_kick", "throw"]
-    with pytest.raises(InputError, match="is named twice"):
+    with pytest.raises(InputError, match="is listed twice"):
         out_folders([a, a], tmp_path)
 
 
 def test_the_summary() -> None:
-    fine = Outcome(take="/t/a", out="/o/a", status=DONE, said="fine", seconds=61.0)
-    lost = Outcome(take="/t/bb", out="/o/bb", status=LOST, said="")
+    fine = Outcome(take="/t/a", out="/o/a", status=Status.DONE, said="fine", seconds=61.0)
+    lost = Outcome(take="/t/bb", out="/o/bb", status=Status.LOST, said="")
     lines = summary([fine, lost])
     assert lines[0].startswith("a   done") and "61.0 s  fine" in lines[0] and lines[-1] == "2 takes: 1 done, 1 lost"

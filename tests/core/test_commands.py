@@ -172,7 +172,7 @@ def test_folders_for_results_that_cannot_be_used(small: Path, tmp_path: Path, ca
     (tmp_path / "foreign" / "report").mkdir(parents=True)
     (tmp_path / "home" / "cache").mkdir(parents=True)
     (tmp_path / "home" / "cache" / "thesis.txt").write_text("x")
-    faults = dict(file="is a file; choose a folder", foreign="holds “report”, which no run of Tricap wrote", home="holds “cache”")
+    faults = dict(file="is a file; choose a folder", foreign="contains “report”, which was not written by Tricap", home="contains “cache”")
     for out, said in (faults | {"file/deep": "Cannot make the folder"}).items():
         assert commands.main(["measure", str(small), "--out", str(tmp_path / out)]) == 2
         printed = capfd.readouterr()
@@ -309,7 +309,7 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
     decoder = opened.sequences[1]._capture  # type: ignore[attr-defined]
     assert len(opened.read(2)) == len(opened.read(3)) == 3  # the second field's image need not be decoded again
     said = capfd.readouterr().out
-    assert opened.sequences[1]._capture is decoder and "a take of 3 views, 25 images a second. Next: write clicked joints" in said
+    assert opened.sequences[1]._capture is decoder and "a take of 3 views, 25 images per second. Next: click joints in Blender" in said
     assert commands.main(argv) == 2
     assert "is a take already" in capfd.readouterr().err
 

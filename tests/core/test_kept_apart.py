@@ -47,7 +47,7 @@ def test_results_go_into_no_take(take: Path, tmp_path: Path, capfd: Capture, com
     (tmp_path / "points.csv").write_text("point,view,x,y\na,L,60,60\na,C,60,60\n")
     argv = [a.format(t=take, o=take, p=tmp_path / "points.csv") for a in WRITERS[command]]
     before = names(tmp_path)
-    assert "is itself a take; give the results a folder of their own, such as " in refused(argv, capfd) and names(tmp_path) == before
+    assert "is itself a take; choose a separate folder for the results, such as " in refused(argv, capfd) and names(tmp_path) == before
 
 
 @LINKS
@@ -57,9 +57,9 @@ def test_results_go_into_no_footage_whatever_way_leads_there(take: Path, tmp_pat
     for link, to in (("to take", take), ("to L", take / "L")):
         (tmp_path / link).symlink_to(to)
     before = names(tmp_path)
-    for out, said in ((take / "L", "holds the footage 0000.png"), (take / "R", "holds the footage"), (tmp_path / "films of R", "holds the"),
-                      (tmp_path / "to take", "is itself a take"), (tmp_path / "to L", "holds the footage"),
-                      (take / "L" / ".." / "C", "holds the footage")):  # fmt: skip
+    for out, said in ((take / "L", "contains the footage 0000.png"), (take / "R", "the footage"), (tmp_path / "films of R", "the footage"),
+                      (tmp_path / "to take", "is itself a take"), (tmp_path / "to L", "contains the footage"),
+                      (take / "L" / ".." / "C", "contains the footage")):  # fmt: skip
         assert said in refused(["run", str(take), "--out", str(out)], capfd)
     assert names(tmp_path) == before
 
@@ -77,7 +77,7 @@ def test_a_take_where_results_are_replaced(take: Path, tmp_path: Path, capfd: Ca
     (tmp_path / "out" / "run.json").write_text("{}")
     inside = tmp_path / "out" / "report" / "take"
     take.rename(inside)
-    assert "lies where results of" in refused(["run", str(inside), "--out", str(tmp_path / "out")], capfd)
+    assert "where a run replaces files" in refused(["run", str(inside), "--out", str(tmp_path / "out")], capfd)
 
 
 def test_a_folder_of_results_in_the_take_is_fine(take: Path, tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_a_folder_of_results_in_the_take_is_fine(take: Path, tmp_path: Path) -> 
 
 def test_a_rig_is_not_written_over_in_another_format(take: Path, capfd: Capture) -> None:
     rig, before = take / "rig.toml", (take / "rig.toml").read_bytes()
-    assert "is what is read" in refused(["calibrate", "--import", str(rig), "--export", "opencv", "--out", str(rig)], capfd)
+    assert "is also an input" in refused(["calibrate", "--import", str(rig), "--export", "opencv", "--out", str(rig)], capfd)
     assert rig.read_bytes() == before
     write_as(take / "other.toml", read_rig(rig), "caliscope")
     assert commands.main(["calibrate", "--import", str(take / "other.toml"), "--out", str(take / "new.toml"), "--quiet"]) == 0
@@ -100,8 +100,8 @@ def test_2d_tracks_replace_neither_their_points_nor_the_images(take: Path, capfd
     (take / "points.csv").write_text("point,x,y\na,60,60\n")
     before = names(take)
     argv = ["track2d", str(take / "L"), "--points", str(take / "points.csv"), "--out"]
-    assert "points.csv is what is read" in refused([*argv, str(take / "points.csv")], capfd)
-    assert "L is what is read" in refused([*argv, str(take / "a.csv"), "--pictures", str(take / "C" / ".." / "L")], capfd)
+    assert "points.csv is also an input" in refused([*argv, str(take / "points.csv")], capfd)
+    assert "L is also an input" in refused([*argv, str(take / "a.csv"), "--pictures", str(take / "C" / ".." / "L")], capfd)
     assert names(take) == before
 
 

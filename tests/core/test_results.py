@@ -42,7 +42,7 @@ def test_what_was_there_and_is_not_ours(tmp_path: Path) -> None:
         folder = tmp_path / f"with {name}"
         (folder / name).mkdir(parents=True)
         (folder / name / "thesis.txt").write_text("x")
-        with pytest.raises(InputError, match=f"holds “{name}”, which no run of Tricap wrote"):
+        with pytest.raises(InputError, match=f"contains “{name}”, which was not written by Tricap"):
             Results(folder)
         Results(folder.parent / "ours").write_run({})
     (tmp_path / "ours" / "clouds").mkdir()
@@ -84,7 +84,7 @@ def test_run_json(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_a_run_json_that_no_run_wrote(tmp_path: Path, name: str, value: object, said: str) -> None:
     store.write_json(tmp_path / "run.json", {"format": "tricap-run", "version": 1, name: value})
-    with pytest.raises(InputError, match=f"run.json is damaged: “{said}” cannot be what it says; remove the file and run again"):
+    with pytest.raises(InputError, match=f"run.json is damaged: “{said}” is invalid; remove the file and run again"):
         Results(tmp_path).read_run()
 
 

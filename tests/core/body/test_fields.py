@@ -110,4 +110,4 @@ def test_the_plot_shows_every_field(tmp_path: Path, capsys: pytest.CaptureFixtur
     svg = "{http://www.w3.org/2000/svg}"
     assert len(list(root.iter(f"{svg}polyline"))) == len(list(root.iter(f"{svg}circle"))) == 2 * len(NAMES)
     assert main(["fields", "--out", str(tmp_path / "fields.png")]) == 2 and not (tmp_path / "fields.png").exists()
-    assert "is no .svg" in capsys.readouterr().err
+    assert "is not an .svg" in capsys.readouterr().err
