@@ -1,14 +1,13 @@
 """Does the rig belong to the footage? What looks alike in two views must lie on the rig's epipolar lines, before both cameras.
 
 Views from very different sides, carpets and rows of chairs give matches that are none. So only pairs of views are asked most of whose
-matches agree with one epipolar geometry, a fundamental matrix of their own (MAGSAC++, Barath 2020, doi:10.1109/CVPR42600.2020.00138),
-and of those pairs only the matches that do. What was clicked in both views of such a pair may speak for the rig against them.
+matches agree with one epipolar geometry of their own (`PairMatches.inliers`), and of those pairs only the matches that do. What was
+clicked in both views of such a pair may speak for the rig against them.
 """
 
 from collections.abc import Sequence
 from itertools import combinations, permutations
 
-import cv2
 import numpy as np
 
 from ..clicked_points import CLICK_SIGMA_PX
@@ -19,8 +18,6 @@ from .view_matches import PairMatches
 
 LIMIT_PX = 2.0
 ENOUGH = 12  # matches of a pair
-DEFINE = 7  # matches that a fundamental matrix fits whatever they are
-OWN, OWN_MATCHES = 0.6, 24  # share of the others that must fit it; different matches of a pair
 FEWEST_CLICKS = 6
 AGREES, AGREES_SWAPPED, AGREES_WELL, MORE = 0.5, 0.7, 0.9, 0.15  # share of the matches
 SAME_PLACE_PX, SAME_SHARE = 0.7, 0.8
@@ -60,7 +57,7 @@ def rig_findings(
 
     `clicks` are what was clicked in each pair of views (`clicked_pairs`).
     """
-    usable = [own for p in pairs if (own := consistent(p)) is not None]
+    usable = [own for p in pairs if (own := p.consistent()) is not None]
     agreeing = share(usable, cameras)
     if not usable or agreeing >= AGREES_WELL:
         return []
@@ -102,6 +99,16 @@ def _misses(pairs: Sequence[PairMatches], cameras: Sequence[Camera]) -> np.ndarr
     return np.abs(np.concatenate([p.miss_px(cameras) for p in pairs]))
 
 
+def rig_misses(pairs: Sequence[PairMatches], cameras: Sequence[Camera], names: Sequence[str]) -> dict[str, float]:
+    """The median miss [px] of each view's matches in the pair of views that it fits best; views without such a pair are left out."""
+    found: dict[str, float] = {}
+    for own in (own for p in pairs if (own := p.consistent()) is not None):
+        miss = float(np.median(np.abs(own.miss_px(cameras))))
+        for name in (names[own.i], names[own.j]):
+            found[name] = min(miss, found.get(name, np.inf))
+    return found
+
+
 def stale_finding(miss_px: dict[str, float]) -> list[Finding]:
     """A rig that nearly fits: `miss_px` is each view's median miss where time plays no part."""
     worst = max(miss_px, key=lambda name: miss_px[name], default=None)
@@ -131,19 +138,6 @@ def _exchanged(order: tuple[int, ...], a: int, b: int) -> tuple[int, ...]:
     changed = list(order)
     changed[a], changed[b] = order[b], order[a]
     return tuple(changed)
-
-
-def consistent(pair: PairMatches) -> PairMatches | None:
-    """The matches that agree with a fundamental matrix of their own, each once; None where it is not most of them, or too few."""
-    matches = np.unique(np.rint(np.hstack([pair.xi_px, pair.xj_px])), axis=0, return_index=True)[1]  # what rests is seen in every frame
-    if len(matches) < OWN_MATCHES:
-        return None
-    xi, xj = np.ascontiguousarray(pair.xi_px[matches]), np.ascontiguousarray(pair.xj_px[matches])
-    F, inlier = cv2.findFundamentalMat(xi, xj, cv2.USAC_MAGSAC, LIMIT_PX, 0.999, 4000)
-    if F is None or inlier is None or inlier.sum() - DEFINE < OWN * (len(xi) - DEFINE):
-        return None
-    kept = inlier.ravel() > 0
-    return PairMatches(i=pair.i, j=pair.j, xi_px=xi[kept], xj_px=xj[kept])
 
 
 def clicked_pairs(take: Take) -> list[PairMatches]:

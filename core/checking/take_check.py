@@ -13,7 +13,7 @@ from ..take import Footage, open_take, read_take
 from .clicks import joint_findings, seed_findings
 from .findings import Checked, Finding, doubtful, wrong
 from .rig_check import geometry_findings, unit_findings
-from .rig_fit import ENOUGH, clicked_pairs, rig_findings, same_views, share, stale_finding
+from .rig_fit import ENOUGH, clicked_pairs, rig_findings, rig_misses, same_views, share, stale_finding
 from .survey import frozen_view, picture_findings, rate_findings, survey
 from .texture import texture_findings
 from .timing import Film, Offset, estimate_offsets
@@ -70,7 +70,9 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
         found += [_lonely(name) for name in lonely]
         found += [timing_finding(o) for o in offsets if o.doubtful]
         found += [rolling_finding(o) for o in offsets if o.rolls]
-        found += stale_finding({o.view: o.miss_px for o in offsets if math.isfinite(o.miss_px)})
+        without_time = rig_misses(pairs, footage.rig.cameras, names)  # for views whose offset in time cannot be estimated
+        misses = {o.view: o.miss_px if math.isfinite(o.miss_px) else without_time.get(o.view, 0.0) for o in offsets if not o.doubtful}
+        found += stale_finding(misses | {o.view: o.miss_px for o in offsets if o.doubtful and math.isfinite(o.miss_px)})
         figures["offsets"] = {o.view: o.to_table() for o in offsets}
     return found, figures
 

@@ -43,6 +43,8 @@ GOES_TOGETHER = 0.7  # correlation of the motion energies
 SURE = 4.0  # sigmas by which it must exceed that without a lag
 FARTHEST_DEG = 50.0  # between the axes of views whose motion energies are compared
 SCALE_PX, MOVES_PX, FITS_PX = 0.5, 0.3, 0.5
+LEAST_OFFSET = 0.05  # frames: less does not matter to a measurement
+SIGNIFICANT = 4.0  # sigmas
 ROUND_TRIP_PX = 0.5
 STEPS = 12
 FLOW_WINDOW, FLOW_LEVELS = 21, 4
@@ -58,14 +60,14 @@ class Offset:
     method: str  # one of METHODS, the weakest on the way to the reference view
     moving: int = 0  # matches that move across the epipolar lines and fit
     speed_px: float = 0.0  # the speed across them that a tenth exceeds, per frame
-    miss_px: float = np.nan  # median miss once the offset is allowed for
+    miss_px: float = np.nan  # median of matches that are certainly right, once a significant offset is allowed for
     readout_frames: float = np.nan  # what its rows take longer than the reference view's, from the first to the last
     readout_sigma: float = np.inf
 
     @property
     def significant(self) -> bool:
         """Larger than its noise, and than what matters to a measurement."""
-        return self.method == "rays" and abs(self.late_frames) > max(0.05, 4 * self.sigma_frames) and self.effect_px > 0.1
+        return self.method == "rays" and abs(self.late_frames) > max(LEAST_OFFSET, SIGNIFICANT * self.sigma_frames) and self.effect_px > 0.1
 
     @property
     def doubtful(self) -> bool:
@@ -211,8 +213,8 @@ def _between(film: Film, base: int, k: int, name: str, monitor: Monitor) -> Offs
     best: Offset | None = None
     for n, lag in enumerate(dict.fromkeys([0, *lags])):
         monitor.step("synchronization", n, len(lags) + 1)
-        misses = [m for f in film.frames() if (m := _misses(film, base, k, f, lag)) is not None]
-        offset = _fit(misses, lag, name) if misses else None
+        followed = [m for f in film.frames() if (m := _followed_matches(film, base, k, f, lag)) is not None]
+        offset = _fit(followed, lag, name) if followed else None
         if offset is not None and (best is None or offset.moving > 1.1 * best.moving):
             best = offset
         if lag == 0 and best is not None and abs(best.late_frames) < CLEAR:
@@ -257,8 +259,16 @@ def _correlation(x: np.ndarray, y: np.ndarray) -> float:
     return float(x @ y) / length if len(x) > 4 and length > 1e-9 else 0.0
 
 
-def _misses(film: Film, base: int, k: int, frame: int, lag: int) -> np.ndarray | None:
-    """e_−, e_0, e_+ in full-frame pixels, and y/h − ½, of the matches of one frame (m, 4)."""
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Followed:
+    """Matches of one frame, followed in the second view to the frames before and after."""
+
+    matches: PairMatches
+    misses: np.ndarray  # (m, 4) e_−, e_0, e_+ in full-frame pixels, and y/h − ½
+
+
+def _followed_matches(film: Film, base: int, k: int, frame: int, lag: int) -> _Followed | None:
+    """What can be followed of the matches of one frame; None without any."""
     if not film.holds(base, frame) or not all(film.holds(k, frame + lag + step) for step in (-1, 0, 1)):
         return None
     a, b = film.features(base, frame), film.features(k, frame + lag)
@@ -270,8 +280,10 @@ def _misses(film: Film, base: int, k: int, frame: int, lag: int) -> np.ndarray |
     good = np.isfinite(np.stack(places)).all(axis=(0, 2))
     xa = film.rows.to_frame(a.xy[i[good]])
     ca, cb = film.cameras[base], film.cameras[k]
-    y = film.rows.to_frame(places[1][good])[:, 1] / cb.size_px[1] - 0.5
-    return np.stack([*(epipolar_miss_px(ca, cb, xa, film.rows.to_frame(place[good])) for place in places), y], axis=1)
+    xb = film.rows.to_frame(places[1][good])
+    y = xb[:, 1] / cb.size_px[1] - 0.5
+    misses = np.stack([*(epipolar_miss_px(ca, cb, xa, film.rows.to_frame(place[good])) for place in places), y], axis=1)
+    return _Followed(matches=PairMatches(i=base, j=k, xi_px=xa, xj_px=xb), misses=misses)
 
 
 def _followed(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -284,9 +296,9 @@ def _followed(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray
     return np.where(good[:, None], end.reshape(-1, 2).astype(np.float64), np.nan)
 
 
-def _fit(misses: list[np.ndarray], lag: int, name: str) -> Offset | None:
-    """The offset from the misses (m, 4) of some frames at one whole-frame lag, or None where too few moving matches fit.  (3)"""
-    e = np.concatenate(misses)
+def _fit(followed: list[_Followed], lag: int, name: str) -> Offset | None:
+    """The offset from the matches of some frames at one whole-frame lag, or None where too few moving matches fit.  (3)"""
+    e = np.concatenate([f.misses for f in followed])
     rate, bend = (e[:, 2] - e[:, 0]) / 2, (e[:, 2] - 2 * e[:, 1] + e[:, 0]) / 2
 
     def miss(s: float) -> np.ndarray:
@@ -309,19 +321,29 @@ def _fit(misses: list[np.ndarray], lag: int, name: str) -> Offset | None:
     good = moving & (np.abs(miss(s) - b) < FITS_PX)
     if abs(s) > FARTHEST or good.sum() < max(FEWEST, LEAST * moving.sum()):
         return None
-    frame = np.repeat(np.arange(len(misses)), [len(m) for m in misses])
+    frame = np.repeat(np.arange(len(followed)), [len(f.misses) for f in followed])
+    sigma = _sigma(A, w, miss(s) - b, frame)
     readout, readout_sigma = _readout(e, s, b, frame)
+    certain, by = _inliers(followed), s if abs(s) > max(LEAST_OFFSET, SIGNIFICANT * sigma) else 0.0
     return Offset(
         view=name,
         late_frames=-(lag + s),
-        sigma_frames=_sigma(A, w, miss(s) - b, frame),
+        sigma_frames=sigma,
         method="rays",
         moving=int(good.sum()),
         speed_px=float(np.percentile(np.abs(rate[good]), 90)),
-        miss_px=float(np.median(np.abs(miss(s)))),
+        miss_px=float(np.median(np.abs(miss(by)[certain]))) if len(certain) else np.nan,
         readout_frames=readout,
         readout_sigma=readout_sigma,
     )
+
+
+def _inliers(followed: list[_Followed]) -> np.ndarray:
+    """Rows (n,) of all frames' matches, concatenated, that agree with one epipolar geometry of their own; empty if most do not."""
+    first = followed[0].matches
+    xi, xj = (np.concatenate([getattr(f.matches, name) for f in followed]) for name in ("xi_px", "xj_px"))
+    rows = PairMatches(i=first.i, j=first.j, xi_px=xi, xj_px=xj).inliers()
+    return np.zeros(0, dtype=int) if rows is None else rows
 
 
 def _readout(e: np.ndarray, s: float, b: float, frame: np.ndarray) -> tuple[float, float]:

@@ -17,6 +17,10 @@ from ..images.fields import RowGrid
 
 MOST_FEATURES, LONGEST_SIDE_PX = 3000, 1600
 RATIO = 0.8
+INLIER_PX = 2.0  # distance from a fundamental matrix
+DEFINE = 7  # matches that a fundamental matrix fits whatever they are
+INLIER_SHARE = 0.6  # of the others
+FEWEST_MATCHES = 24  # different ones, of a pair
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -100,6 +104,25 @@ class PairMatches:
     def miss_px(self, cameras: Sequence[Camera]) -> np.ndarray:
         """(m,) signed distances [px] of the rays."""
         return epipolar_miss_px(cameras[self.i], cameras[self.j], self.xi_px, self.xj_px)
+
+    def inliers(self) -> np.ndarray | None:
+        """Rows (n,) of the matches that agree with one fundamental matrix, whatever the rig; None if most do not, or there are too few.
+
+        MAGSAC++ (Barath 2020, doi:10.1109/CVPR42600.2020.00138). A match at rest, which is found in every frame, counts once.
+        """
+        rows = np.unique(np.rint(np.hstack([self.xi_px, self.xj_px])), axis=0, return_index=True)[1]
+        if len(rows) < FEWEST_MATCHES:
+            return None
+        xi, xj = np.ascontiguousarray(self.xi_px[rows]), np.ascontiguousarray(self.xj_px[rows])
+        F, inlier = cv2.findFundamentalMat(xi, xj, cv2.USAC_MAGSAC, INLIER_PX, 0.999, 4000)
+        if F is None or inlier is None or inlier.sum() - DEFINE < INLIER_SHARE * (len(xi) - DEFINE):
+            return None
+        return rows[inlier.ravel() > 0]
+
+    def consistent(self) -> "PairMatches | None":
+        """The `inliers`."""
+        rows = self.inliers()
+        return None if rows is None else PairMatches(i=self.i, j=self.j, xi_px=self.xi_px[rows], xj_px=self.xj_px[rows])
 
 
 def match_views(pictures: Sequence[Sequence[np.ndarray]], rows: RowGrid) -> list[PairMatches]:
