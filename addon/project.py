@@ -20,7 +20,8 @@ from ..core.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
 from ..core.images.fields import BOTH, Instants, instants
 from ..core.person_sources import PERSON_SOURCES
-from ..core.take import Take
+from ..core.take import NO_BODY, Take
+from ..core.take import body_model as take_body_model
 from ..core.take_file import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import folders, properties, seeds
 from .scene import clips
@@ -213,7 +214,7 @@ def table(scene: bpy.types.Scene) -> Table:
     _put(made, "first_field", _first_field(scene) if said else "")
     _put(made, "reference_view", props.reference_view if props.reference_view in [view.name for view in props.views] else "")
     _put(made, "frames", None if props.all_frames else [props.first_frame, props.last_frame + 1])
-    _put(made, "body", {**old.get("body", {}), "model": model_of(scene)} if model_of(scene) else None)
+    _put(made, "body", _body(scene, old))
     _put_clicks(scene, made)
     _put(made, "settings", properties.overrides(scene))
     for writer in get_session().take_writers:
@@ -278,16 +279,32 @@ def _clip_of(known: bpy.types.MovieClip | None, name: str, path: Path) -> bpy.ty
     return clips.open_clip(f"Footage {name}", path)
 
 
+def _body(scene: bpy.types.Scene, old: Table) -> Table | None:
+    """[body]; a file that has none stays without while no body is chosen."""
+    if model_of(scene):
+        return {**old.get("body", {}), "model": model_of(scene)}
+    return {"model": NO_BODY} if "body" in old or not old else None
+
+
 def model_of(scene: bpy.types.Scene) -> str:
     """The body model as take.toml names it, "" for none."""
     props = scene.tricap
-    return {"none": "", "own": props.model_file}.get(props.model, props.model)
+    return {NO_BODY: "", "own": props.model_file}.get(props.model, props.model)
+
+
+def body_model(scene: bpy.types.Scene) -> str | None:
+    """The body model as `read_model` takes it, a file of the project with its path; None for none.
+
+    Raises:
+        InputError: the file does not lie in the project's folder.
+    """
+    return take_body_model(folder_of(scene), model_of(scene) or None, "the panel")
 
 
 def _show_model(scene: bpy.types.Scene, name: str) -> None:
     props = scene.tricap
     known = {item.identifier for item in props.bl_rna.properties["model"].enum_items}
-    props.model = name if name in known else "own" if name else "none"
+    props.model = name if name in known else "own" if name else NO_BODY
     props.model_file = name if props.model == "own" else ""
 
 

@@ -87,7 +87,8 @@ def _new_command(commands: Any) -> None:
     new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="the lines of interlaced video to measure")
     new.add_argument("--fps", type=float, default=25.0, metavar="F", help="images per second (default: 25)")
     new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or a calibration of another tool")
-    new.add_argument("--model", default=None, metavar="NAME", help=f"the body model: {', '.join(model_names())}, or your own .toml file")
+    about = f"the body model: {', '.join(model_names())}, your own .toml file, or none (surface and tracks only)"
+    new.add_argument("--model", default=None, metavar="NAME", help=about)
     new.set_defaults(run=_new)
 
 
@@ -179,7 +180,7 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
     table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
     take = take_of_table(folder, table)
-    if args.model and not args.model.endswith(".toml"):  # a user's own model may be copied into the folder later
+    if take.body_model and not args.model.endswith(".toml"):  # a user's own model may be copied into the folder later
         read_model(args.model)
     rig = read_any(args.rig) if args.rig else None
     if rig:
@@ -189,7 +190,7 @@ def _new(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if rig and (bar := read_bar(args.rig, rig)):
         write_bar(folder / "rig.toml", rig, *bar)
     todo = [] if rig else ["copy or calibrate rig.toml into it"]
-    todo += ["click joints in Blender, or write them into its take.toml"] if args.model else []
+    todo += ["click joints in Blender, or write them into its take.toml"] if take.body_model else []
     return [
         f"{folder}: a take of {len(views)} views, {args.fps:g} images per second. Next: {', '.join([*todo, f'tricap check {folder}'])}."
     ]

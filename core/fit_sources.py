@@ -94,7 +94,7 @@ def missing_for_fit(footage: Footage) -> str:
     """Why no body can be fitted in these frames, as the end of “take.toml has …”; empty: it can."""
     take = footage.take
     if take.body_model is None:
-        return "no [body] model"
+        return 'model = "none" under [body]' if take.no_body else "no [body] model"
     if take.keypoints or clicks_in(footage):
         return ""
     return "no clicked joints" + (f" in the frames {footage.frames.start} to {footage.frames.stop - 1}" if _with_joints(take) else "")

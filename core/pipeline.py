@@ -293,7 +293,8 @@ def fit(run: Run, monitor: Monitor) -> None:
     missing = missing_for_fit(run.footage)
     run.warn(*clicks_left_out(run.footage))
     if missing:
-        run.warn(f"No body was fitted: take.toml has {missing}.")
+        if not run.footage.take.no_body:
+            run.warn(f"No body was fitted: take.toml has {missing}.")
         run.finish_stage("fit", began, not_done=missing)
         return
     try:

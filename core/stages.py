@@ -17,7 +17,7 @@ from .body.model_file import model_files
 from .errors import InputError
 from .fitting.settings import ALGORITHM
 from .settings import to_table
-from .take import Footage, Seeds, Take, View
+from .take import NO_BODY, Footage, Seeds, Take, View
 
 STAGES = ("measure", "track", "fit")
 
@@ -54,9 +54,10 @@ def _track_input(footage: Footage) -> Any:
 
 def _fit_input(footage: Footage) -> Any:
     take = footage.take
-    model = take.body_model
-    own = store.digest(*model_files(model)) if model and Path(model).is_file() else ""
-    return model, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take), ALGORITHM
+    model = NO_BODY if take.no_body else take.body_model
+    own = store.digest(*model_files(model)) if model and model.endswith(".toml") else ""
+    named = Path(model).name if model and own else model
+    return named, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take), ALGORITHM
 
 
 STAGE_INPUTS: dict[str, StageInput] = {

@@ -45,6 +45,7 @@ KEYS = (
 )
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
+NO_BODY = "none"  # `model` under [body]
 UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
@@ -106,7 +107,8 @@ class Take:
     first_field: str = "odd"  # of "both"
     reference_view: str = ""
     frames: tuple[int, int] | None = None
-    body_model: str | None = None
+    body_model: str | None = None  # the name of one of ours, or the absolute path of the take's own; None: no body
+    no_body: bool = False  # the take asks for surface and tracks only: model = "none"
     locked: tuple[str, ...] = ()  # degrees of freedom that are held at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by degree of freedom, in degrees
     seeds: Seeds = field(default_factory=Seeds)
@@ -293,7 +295,9 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     body = table_of(table, "body", where)
     check_keys(body, ("model", "locked", "limits"), f"[body] of {where}")
     if not isinstance(body.get("model", ""), str):
-        raise InputError(f'`model` under [body] of {where} is {body["model"]!r}; write the name of a body model, such as "arm.R".')
+        raise InputError(
+            f'`model` under [body] of {where} is {body["model"]!r}; write the name of a body model, such as "arm.R", or "none".'
+        )
     return Take(
         folder=folder,
         fps=float(fps) * instants(interlaced).per_image,
@@ -303,7 +307,8 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         first_field=first_field,
         reference_view=reference,
         frames=frame_pair(table.get("frames"), where),
-        body_model=_model(folder, body.get("model"), where),
+        body_model=body_model(folder, body.get("model"), where),
+        no_body=body.get("model") == NO_BODY,
         locked=_locked(body.get("locked", []), where),
         limits=_limits(body.get("limits", {}), where),
         seeds=_seeds(table_of(table, "seeds", where), names, where),
@@ -410,6 +415,12 @@ def _settings(table: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str,
     return table
 
 
-def _model(folder: Path, name: Any, where: str) -> str | None:
-    """The name of one of our models, or the path of the take's own, a .toml file in its folder."""
-    return str(inside(folder, name, where, "model")) if isinstance(name, str) and name.endswith(".toml") else name
+def body_model(folder: Path, name: str | None, where: str) -> str | None:
+    """`model` of [body] as `read_model` takes it: the name of one of ours, or the path of the take's own .toml file; None: no body.
+
+    Raises:
+        InputError: the file does not lie in the take's folder.
+    """
+    if name is None or name == NO_BODY:
+        return None
+    return str(inside(folder, name, where, "model")) if name.endswith(".toml") else name

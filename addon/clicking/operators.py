@@ -315,8 +315,8 @@ def _depths(scene: bpy.types.Scene) -> dict[str, float]:
 
 
 def _model(scene: bpy.types.Scene) -> BodyModel:
-    name = project.model_of(scene)
-    return read_model(project.folder_of(scene) / name) if name.endswith(".toml") else _known_model(name)
+    name = str(project.body_model(scene))
+    return read_model(name) if name.endswith(".toml") else _known_model(name)
 
 
 @cache

@@ -82,10 +82,10 @@ def model_of(scene: bpy.types.Scene) -> BodyModel:
     Raises:
         InputError: none is chosen, or its file is faulty.
     """
-    name = project.model_of(scene)
-    if not name:
+    name = project.body_model(scene)
+    if name is None:
         raise InputError("Choose a body model first; the degrees of freedom are those of the model.")
-    return read_model(project.folder_of(scene) / name if name.endswith(".toml") else name)
+    return read_model(name)
 
 
 def model_limits(model: BodyModel) -> dict[str, tuple[float, float]]:

@@ -118,8 +118,8 @@ def seeds_of(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
     scene = context.scene
     clips = project.clips_of(scene)
     frame = scene.tricap.seed_frame
-    model = project.model_of(scene)
-    wanted = states.joints_of(str(project.folder_of(scene) / model) if model.endswith(".toml") else model) if model else ()
+    model = project.body_model(scene)
+    wanted = states.joints_of(model) if model else ()
     return [(name, [view for view, clip in clips.items() if seeds.click(clip, name, frame) is not None]) for name in wanted]
 
 

@@ -4,7 +4,7 @@ were clicked, and angles beyond what joints allow."""
 import numpy as np
 
 from ..body.model_file import read_model, with_limits
-from ..body.shape import BodyShape, default_shape
+from ..body.shape import BodyShape
 from ..fitting.body_motion import BodyFit, BodyMotion
 from ..fitting.fit_input import FitInput
 
@@ -22,7 +22,7 @@ def odd_body(given: FitInput, body: BodyFit, click_sigma_px: float) -> list[str]
 
 def odd_limbs(shape: BodyShape) -> list[str]:
     """A sentence for each limb of which one part is far too long beside the other."""
-    usual = default_shape(read_model(shape.model)).lengths_m
+    usual = np.array([bone.nominal_length_m for bone in shape.skeleton.bones])
     names = [bone.name for bone in shape.skeleton.bones]
     longer = {name: float(ratio) for name, ratio in zip(names, shape.lengths_m / usual)}
     said = []

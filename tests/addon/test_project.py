@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 from tricap.core.body.model_file import MODELS
-from tricap.core.take_file import read_table, write_table
+from tricap.core.take_file import read_table, take_of_table, write_table
 
 from .conftest import small_rig, write_take
 
@@ -137,6 +137,22 @@ def test_a_model_of_ones_own_tells_which_joints_to_click(project: ModuleType, bl
     assert blender.context.scene.tricap.model == "own"
     bodies = importlib.import_module("bl_ext.user_default.tricap.addon.steps.bodies")
     assert [name for name, _ in bodies.seeds_of(blender.context)] == ["shoulder.R", "elbow.R", "wrist.R"]
+
+
+def test_no_body_is_read_and_written(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    """The panel writes that no body is wanted; a file that says nothing of a body stays as it is."""
+    scene = blender.context.scene
+    without = {key: value for key, value in read_table(take).items() if key != "body"}
+    for said, shown, then in ((without, "none", None), (without | {"body": {"model": "none"}}, "none", {"model": "none"})):
+        write_table(take, said)
+        project.open_take(scene, take)
+        assert scene.tricap.model == shown and project.table(scene).get("body") == then
+        assert project.body_model(scene) is None
+    scene.tricap.model = "arm.R"
+    project.write(scene)
+    scene.tricap.model = "none"
+    project.write(scene)
+    assert read_table(take)["body"] == {"model": "none"} and take_of_table(take, read_table(take)).no_body
 
 
 def test_somebody_elses_change_is_not_written_over(project: ModuleType, blender: ModuleType, take: Path) -> None:

@@ -314,6 +314,12 @@ def test_new_makes_a_take_of_movies_and_folders(take: Path, tmp_path: Path, capf
     assert "is a take already" in capfd.readouterr().err
 
 
+def test_new_makes_a_take_without_a_body(take: Path, tmp_path: Path, capfd: Capture) -> None:
+    views = [f"{name}={take / name}" for name in "LCR"]
+    assert commands.main(["new", str(tmp_path / "new"), "--views", *views, "--model", "none"]) == 0
+    assert read_take(tmp_path / "new").no_body and "click" not in capfd.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("change", "said"), [({"--model": "fulll"}, "no body model “fulll”. Did you mean “full”"), ({"L": "rig.toml"}, "neither a folder")]
 )

@@ -54,6 +54,7 @@ MOVED = {**JOINTS, "elbow.R": {"L": [90.5, 70.0], "C": [92.0, 70.0]}}
         ("fit", "fitting", {}),
         ("fit", "skin", {}),
         ("fit", "", {"body": {"model": "arm.L"}}),
+        ("fit", "", {"body": {"model": "none"}}),
         ("fit", "", {"body": {"model": "arm.R", "locked": ["elbow.R twist"]}}),
         ("fit", "", {"body": {"model": "arm.R", "limits": {"elbow.R flexion": [0, 90]}}}),
         ("fit", "", {"keyframes": [{"frame": 3, "joints": MOVED}]}),
@@ -115,7 +116,7 @@ def test_contours_concern_the_fit(take: Path, tmp_path: Path) -> None:
 def test_every_part_of_a_take_concerns_a_stage() -> None:
     """A new field of Take must be said in stages.py too: then add it here, and a case above."""
     measure = {"views", "rig_path", "interlaced", "first_field", "reference_view", "frames", "seeds", "corrections"}
-    fit = {"body_model", "locked", "limits", "keyframes", "keypoints"}
+    fit = {"body_model", "no_body", "locked", "limits", "keyframes", "keypoints"}
     assert {field.name for field in fields(Take)} == measure | fit | {"fps", "folder", "settings"}
 
 

@@ -87,6 +87,16 @@ def test_corrections_and_keyframes(tmp_path: Path) -> None:
     assert (region.kind, region.view, region.frames, region.xy_px.shape) == ("region", "C", range(2, 9), (3, 2))
 
 
+def test_no_body_and_a_body_of_ones_own(tmp_path: Path) -> None:
+    none = read(tmp_path, text(more='[body]\nmodel = "none"\n'))
+    assert none.body_model is None and none.no_body and not read(tmp_path, text()).no_body
+    own = read(tmp_path, text(more='[body]\nmodel = "my arm é.toml"\n'))
+    assert own.body_model == str(own.folder / "my arm é.toml") and not own.no_body
+    for outside in ("../arm.toml", str(tmp_path / "arm.toml")):
+        with pytest.raises(InputError, match="a file inside the take's folder"):
+            read(tmp_path, text(more=f"[body]\nmodel = '{outside}'\n"))
+
+
 def test_what_may_be_left_out(tmp_path: Path) -> None:
     take = read(tmp_path, text(dict(rig=None)))
     assert (take.reference_view, take.interlaced, take.frames, take.body_model) == ("C", "none", None, None)

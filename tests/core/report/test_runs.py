@@ -9,6 +9,7 @@ import pytest
 
 from tricap.core import commands, pipeline, store
 from tricap.core.errors import InputError
+from tricap.core.take_file import read_table, write_table
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,15 @@ def test_a_run_without_a_body(finished: Path) -> None:
     page = (finished / "report" / "report.html").read_text()
     assert "No body was fitted" in page and "src=" in page and "http://" not in page.replace("http://www.w3.org", "")
     assert not list(finished.rglob("*.part"))
+
+
+def test_a_body_that_nobody_wants_is_no_warning(plane_take: Path, tmp_path: Path) -> None:
+    """model = "none" asks for surface and tracks only; a missing [body] may have been forgotten."""
+    take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"
+    write_table(take, read_table(take) | {"body": {"model": "none"}})
+    job = pipeline.run(take, out, frames=(0, 2))
+    assert job.account["warnings"] == [] and "“" not in job.account["stages"]["fit"]["not_done"]
+    assert not (out / "body.toml").exists()
 
 
 def test_running_again_computes_nothing_again(plane_take: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
