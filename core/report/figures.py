@@ -38,12 +38,13 @@ def figure_rows(
 
 
 def _of_silhouettes(fits: Sequence[SilhouetteFit]) -> list[Row]:
-    """The IoU of each view, and how far the person's outline is from the body's."""
+    """The overlap in each view, and the distance of the outlines."""
     rows = []
     for view, person in dict.fromkeys((f.view, f.person) for f in fits):
         mine = [f for f in fits if (f.view, f.person) == (view, person)]
         for name, unit, values in (
             (f"silhouette of view {view}, IoU with the person's {person}", "", [f.iou for f in mine]),
+            (f"silhouette of view {view}, share inside the person's {person}", "", [f.inside for f in mine]),
             (f"outline of view {view} from the body's", "px", [f.distance_px for f in mine]),
         ):
             known = [v for v in values if np.isfinite(v)]

@@ -20,7 +20,7 @@ from ..tracking.trajectories import Trajectories
 from . import pictures
 from .figures import Row, figure_rows, number, quoted
 from .graphs import curve_graph
-from .silhouettes import OUTLINE, SilhouetteFit, Silhouettes
+from .silhouettes import OUTLINE, Silhouettes
 
 STYLE = (
     "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}img,svg{max-width:100%}"
@@ -73,12 +73,12 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
         files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
     rows = figure_rows(record, report.clouds, report.trajectories, report.body, fits)
     small = {name: (caption, picture) for name, (caption, _, picture) in files.items()}
-    page = _page(record, rows, small, _graphs(report) + _silhouette_graphs(fits))
+    page = _page(record, rows, small, _graphs(report) + _silhouette_graphs(report.silhouettes))
     monitor.step("report", 1, 1)
     results.remove("report")
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
-    per_frame = [asdict(f) | {"iou": number(f.iou), "distance_px": number(f.distance_px)} for f in fits]
+    per_frame = [asdict(f) | {key: number(getattr(f, key)) for key in ("iou", "inside", "distance_px")} for f in fits]
     said = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
     store.write_json(results.path("report", "report.json"), said)
     store.write_text(results.path("report", "report.html"), page)
@@ -115,25 +115,28 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int]) -> dict
             if body is not None:
                 person = silhouettes.outlines.get(name, {}).get(frame)
                 picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
-                said = _said_of(silhouettes, name, frame)
+                said = _agreement_caption(silhouettes, name, frame)
                 add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body{said}", picture)
     return found
 
 
-def _said_of(silhouettes: Silhouettes, view: str, frame: int) -> str:
-    """What a caption says of the silhouette."""
+def _agreement_caption(silhouettes: Silhouettes, view: str, frame: int) -> str:
+    """The silhouette's part of a caption."""
     found = [f for f in silhouettes.fits if (f.view, f.frame) == (view, frame)]
     if not found:
         return ""
     drawn = " (red)" if found[0].person == OUTLINE else ""
-    return f" and its outline (green); IoU {found[0].iou:.3f} with the person's {found[0].person}{drawn}"
+    fit = found[0]
+    agreement = f"IoU {fit.iou:.3f} with" if silhouettes.whole else f"{100 * fit.inside:.1f} % of it inside"
+    return f" and its outline (green); {agreement} the person's {fit.person}{drawn}"
 
 
-def _silhouette_graphs(fits: Sequence[SilhouetteFit]) -> list[str]:
-    """IoU over the frames, view by view."""
+def _silhouette_graphs(silhouettes: Silhouettes) -> list[str]:
+    """The overlap over the frames, view by view."""
+    fits, measure = silhouettes.fits, "IoU of the silhouette" if silhouettes.whole else "Share of the silhouette inside the person's"
     views = list(dict.fromkeys(f.view for f in fits))
-    tables = {view: np.array([(f.frame, f.iou) for f in fits if f.view == view]) for view in views}
-    return [curve_graph(f"IoU of the silhouette, view {view}", "", t[:, 0].astype(int), {view: t[:, 1]}) for view, t in tables.items()]
+    tables = {view: np.array([(f.frame, f.overlap) for f in fits if f.view == view]) for view in views}
+    return [curve_graph(f"{measure}, view {view}", "", t[:, 0].astype(int), {view: t[:, 1]}) for view, t in tables.items()]
 
 
 def _graphs(report: Report) -> list[str]:

@@ -1,10 +1,14 @@
-"""How well the fitted body's silhouette agrees with the person's, view by view and frame by frame.
+"""Agreement of the fitted body's silhouette with the person's, view by view and frame by frame.
 
-    IoU = |body ∩ person| / |body ∪ person|                                                                (1)
+    IoU = |body ∩ person| / |body ∪ person|        of a whole body                                          (1)
+    inside = |body ∩ person| / |body|              of a part of a body, such as an arm                      (2)
 
-The person is what lies within the outline that `tricap contour` found, or else the largest region that hides the still background.
+The person is the region within the outline that `tricap contour` tracked, or else the largest region that occludes the still background.
 An outline has no holes, so those of the body (between an arm and the trunk) are filled too. The distance is that of the person's outline
 from the nearest point of the body's, the median over the outline.
+
+The silhouette of a part can be compared with the person's only where the part is: the rest of the person is missing from the model, so
+that neither (1) nor the distance of the outlines measures the fit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +19,7 @@ import numpy as np
 
 from ..body.ends import shape_for_skin
 from ..body.shape import BodyShape
+from ..body.skeleton import Skeleton
 from ..body.skin import SkinSettings, body_skin
 from ..errors import InputError
 from ..fitting.body_motion import BodyFit
@@ -27,23 +32,34 @@ from ..without_surface import filled
 
 OUTLINE, BACKGROUND = "outline", "background"
 MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take: a frame of four views takes a third of a second
+WHOLE_BODY = frozenset({"head", "forearm.L", "forearm.R", "shin.L", "shin.R"})  # bones; a model without one of them is a part of a body
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SilhouetteFit:
-    """The agreement in one view and frame."""
+    """The agreement in one view and frame. NaN: not comparable."""
 
     view: str
     frame: int
-    iou: float
-    distance_px: float
-    person: str  # what tells where the person is: "outline" or "background"
+    iou: float  # (1) of a whole body
+    inside: float  # (2) of a part of a body
+    distance_px: float  # of a whole body
+    person: str  # source of the person's silhouette: "outline" or "background"
+
+    @property
+    def overlap(self) -> float:
+        """(1) of a whole body, (2) of a part."""
+        return self.inside if np.isnan(self.iou) else self.iou
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Silhouettes:
-    """The agreement wherever the person's silhouette is known, and the outlines (V, 2) px of `tricap contour` by view and frame."""
+    """The agreement wherever the person's silhouette is known, and the outlines (V, 2) px of `tricap contour` by view and frame.
 
+    `whole`: the body is a whole one, not a part such as an arm.
+    """
+
+    whole: bool = True
     fits: tuple[SilhouetteFit, ...] = ()
     outlines: Mapping[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
 
@@ -56,16 +72,16 @@ def silhouettes_of(
     backgrounds: Mapping[str, Background],
     monitor: Monitor,
 ) -> Silhouettes:
-    """The agreement of the body with the outlines, and in views without one with what hides the still background.
+    """The agreement of the body with the outlines, and in views without one with the region that occludes the still background.
 
     Raises:
         Cancelled: the user asked to stop.
     """
-    frames = body.motion.frames
+    frames, whole = body.motion.frames, is_whole_body(body.shape.skeleton)
     most = MOST_FRAMES[OUTLINE if outlines else BACKGROUND]
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
     if not outlines and not backgrounds:
-        return Silhouettes()
+        return Silhouettes(whole=whole)
     found = []
     for n, i in enumerate(chosen.tolist()):
         monitor.step("silhouettes", n, len(chosen))
@@ -75,30 +91,43 @@ def silhouettes_of(
         for camera, mask, image in zip(footage.rig.cameras, masks, images):
             polygon = outlines.get(camera.name, {}).get(frame)
             if polygon is not None:
-                found.append(_agreement(camera.name, frame, mask, filled(polygon, camera.size_px), OUTLINE))
+                person, source = filled(polygon, camera.size_px), OUTLINE
             elif camera.name in backgrounds and image is not None:
-                found.append(_agreement(camera.name, frame, mask, _before(backgrounds[camera.name], image), BACKGROUND))
-    return Silhouettes(fits=tuple(found), outlines=outlines)
+                person, source = _occluding(backgrounds[camera.name], image), BACKGROUND
+            else:
+                continue
+            iou, inside, distance = overlap(mask, person, whole=whole)
+            found.append(SilhouetteFit(view=camera.name, frame=frame, iou=iou, inside=inside, distance_px=distance, person=source))
+    return Silhouettes(whole=whole, fits=tuple(found), outlines=outlines)
+
+
+def is_whole_body(skeleton: Skeleton) -> bool:
+    """Whether a body has all limbs and a head, so that its silhouette is the person's."""
+    return {bone.name for bone in skeleton.bones} >= WHOLE_BODY
 
 
 def by_view(fits: Sequence[SilhouetteFit]) -> dict[str, dict[str, float]]:
-    """The median and least IoU and the median distance of each view, for run.json; frames without a silhouette are passed over."""
+    """The median and least overlap and the median distance of each view, for run.json; frames without a silhouette are left out."""
     table: dict[str, dict[str, float]] = {}
-    known = [f for f in fits if np.isfinite(f.iou) and np.isfinite(f.distance_px)]
-    for view in dict.fromkeys(f.view for f in known):
-        mine = [f for f in known if f.view == view]
-        iou, distance = [f.iou for f in mine], [f.distance_px for f in mine]
-        table[view] = {
-            "iou": round(float(np.median(iou)), 4),
-            "least_iou": round(min(iou), 4),
-            "distance_px": round(float(np.median(distance)), 3),
-            "frames": len(mine),
-        }
+    for view in dict.fromkeys(f.view for f in fits):
+        mine = [f for f in fits if f.view == view]
+        whole, part = [f for f in mine if np.isfinite(f.iou) and np.isfinite(f.distance_px)], [f for f in mine if np.isfinite(f.inside)]
+        if whole:
+            iou, distance = [f.iou for f in whole], [f.distance_px for f in whole]
+            table[view] = {
+                "iou": round(float(np.median(iou)), 4),
+                "least_iou": round(min(iou), 4),
+                "distance_px": round(float(np.median(distance)), 3),
+                "frames": len(whole),
+            }
+        elif part:
+            inside = [f.inside for f in part]
+            table[view] = {"inside": round(float(np.median(inside)), 4), "least_inside": round(min(inside), 4), "frames": len(part)}
     return table
 
 
 def body_masks(cameras: Sequence[Camera], shape: BodyShape, values: np.ndarray, settings: SkinSettings) -> list[np.ndarray]:
-    """What each camera shows of a body (h, w), holes filled; nothing of a body without a skin."""
+    """The silhouette of a body in each camera (h, w), holes filled; empty for a body without a skin."""
     try:
         skin = body_skin(shape_for_skin(shape, settings), values, settings)
     except InputError:
@@ -115,27 +144,34 @@ def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
     return [c[:, 0] for c in cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]
 
 
-def _before(background: Background, image: np.ndarray) -> np.ndarray:
-    """The largest region (h, w) of an image that hides the background, without the rim that the comparison in windows adds."""
-    hides = cv2.erode((~background.shown_by(image)).astype(np.uint8), np.ones((WINDOW_PX // 2 * 2 + 1,) * 2, np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(hides)
-    return _filled_holes(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))) if len(stats) > 1 else hides > 0
+def _occluding(background: Background, image: np.ndarray) -> np.ndarray:
+    """The largest region (h, w) of an image that occludes the background, without the rim that the comparison in windows adds."""
+    occluded = cv2.erode((~background.shown_by(image)).astype(np.uint8), np.ones((WINDOW_PX // 2 * 2 + 1,) * 2, np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(occluded)
+    return _filled_holes(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))) if len(stats) > 1 else occluded > 0
 
 
-def _agreement(view: str, frame: int, body: np.ndarray, person: np.ndarray, source: str) -> SilhouetteFit:
+def overlap(body: np.ndarray, person: np.ndarray, *, whole: bool) -> tuple[float, float, float]:
+    """(1), (2) and the distance [px] of the outlines of two masks (h, w); NaN for those that do not apply to a whole body, or to a part."""
+    common = int((body & person).sum())
+    if not whole:
+        area = int(body.sum())
+        return np.nan, common / area if area and person.any() else np.nan, np.nan
     union = int((body | person).sum())
-    distance = np.nan
+    return common / union if union else np.nan, np.nan, _distance_px(body, person)
+
+
+def _distance_px(body: np.ndarray, person: np.ndarray) -> float:
+    """Median distance of the person's largest outline from the nearest point of the body's; NaN if one has none."""
     edge = np.ones(body.shape, np.uint8)
     for outline in outlines_of(body):
         edge[outline[:, 1], outline[:, 0]] = 0
-    seen = outlines_of(person)
-    if seen and not edge.all():
-        far = cv2.distanceTransform(edge, cv2.DIST_L2, cv2.DIST_MASK_5)
-        largest = max(seen, key=len)
-        distance = float(np.median(far[largest[:, 1], largest[:, 0]]))
-    return SilhouetteFit(
-        view=view, frame=frame, iou=float((body & person).sum() / union) if union else np.nan, distance_px=distance, person=source
-    )
+    outlines = outlines_of(person)
+    if not outlines or edge.all():
+        return np.nan
+    distance = cv2.distanceTransform(edge, cv2.DIST_L2, cv2.DIST_MASK_5)
+    largest = max(outlines, key=len)
+    return float(np.median(distance[largest[:, 1], largest[:, 0]]))
 
 
 def _filled_holes(mask: np.ndarray) -> np.ndarray:

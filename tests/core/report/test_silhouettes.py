@@ -7,63 +7,120 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
-from tricap.core.body.shape import default_shape
+from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skin import SkinSettings
 from tricap.core.errors import InputError
 from tricap.core.images.background import Background
 from tricap.core.progress import Monitor
 from tricap.core.report.figures import figure_rows
-from tricap.core.report.pages import check_pictured
+from tricap.core.report.pages import _agreement_caption, check_pictured
 from tricap.core.report.pictures import BODY_OUTLINE, PERSON_OUTLINE, body_over_footage
-from tricap.core.report.silhouettes import body_masks, by_view, outlines_of, silhouettes_of
+from tricap.core.report.silhouettes import body_masks, by_view, is_whole_body, outlines_of, overlap, silhouettes_of
 
-SHAPE = default_shape(read_model("arm.R"))
-MOTION = np.zeros((3, len(SHAPE.skeleton.dofs)))
-MOTION[:, :3] = 0.15, 0.0, 2.6
-BODY: Any = SimpleNamespace(shape=SHAPE, motion=SimpleNamespace(frames=np.arange(3), values=MOTION))
+ARM = default_shape(read_model("arm.R"))
+ARM_MOTION = np.zeros((3, len(ARM.skeleton.dofs)))
+ARM_MOTION[:, :3] = 0.15, 0.0, 2.6
+PERSON = default_shape(read_model("full"))
+PERSON_MOTION = np.zeros((3, len(PERSON.skeleton.dofs)))
+PERSON_MOTION[:, :3] = 0.0, 0.0, 9.0
+PERSON_MOTION[:, PERSON.skeleton.layout["pelvis tilt"]] = np.pi / 2  # upright for cameras that look along z, y down
+
+
+def _body(shape: BodyShape, motion: np.ndarray) -> Any:
+    return SimpleNamespace(shape=shape, motion=SimpleNamespace(frames=np.arange(3), values=motion))
 
 
 def _footage(scenes: Any) -> Any:
     return SimpleNamespace(rig=scenes.three_cameras(), frames=range(3))
 
 
-def _outline(scenes: Any, shift: float = 0.0) -> np.ndarray:
-    mask = body_masks(scenes.three_cameras().cameras[1:2], SHAPE, MOTION[0], SkinSettings())[0]
-    return max(outlines_of(mask), key=len).astype(np.float64) + (0.0, shift)
+def _mask(scenes: Any, shape: BodyShape, motion: np.ndarray) -> np.ndarray:
+    return body_masks(scenes.three_cameras().cameras[1:2], shape, motion[0], SkinSettings())[0]
+
+
+def _outline(scenes: Any, shape: BodyShape, motion: np.ndarray, shift: float = 0.0) -> np.ndarray:
+    return max(outlines_of(_mask(scenes, shape, motion)), key=len).astype(np.float64) + (0.0, shift)
 
 
 def test_the_silhouette_of_a_body_that_is_known(scenes: Any) -> None:
-    outlines = {"C": {0: _outline(scenes), 2: _outline(scenes, 6.0)}}
-    found = silhouettes_of(_footage(scenes), BODY, SkinSettings(), outlines, {}, Monitor())
+    person = PERSON, PERSON_MOTION
+    outlines = {"C": {0: _outline(scenes, *person), 2: _outline(scenes, *person, 6.0)}}
+    found = silhouettes_of(_footage(scenes), _body(*person), SkinSettings(), outlines, {}, Monitor())
     exact, shifted = found.fits
-    assert (exact.view, exact.frame, exact.person) == ("C", 0, "outline") and exact.iou > 0.99 and exact.distance_px < 0.5
-    mask = body_masks(scenes.three_cameras().cameras[1:2], SHAPE, MOTION[0], SkinSettings())[0]
+    assert (exact.view, exact.frame, exact.person) == ("C", 0, "outline") and exact.iou > 0.97 and exact.distance_px < 0.5
+    mask = _mask(scenes, *person)
     lower = np.zeros_like(mask)
     lower[6:] = mask[:-6]
     assert shifted.iou == pytest.approx((mask & lower).sum() / (mask | lower).sum(), abs=0.02)
-    assert 3.0 < shifted.distance_px <= 6.0 and shifted.frame == 2
+    assert 1.0 <= shifted.distance_px <= 6.0 and shifted.frame == 2
     assert by_view(found.fits)["C"]["least_iou"] == pytest.approx(shifted.iou, abs=1e-3)
     rows = figure_rows({}, [], None, None, found.fits)
     assert [r["name"] for r in rows] == ["silhouette of view C, IoU with the person's outline", "outline of view C from the body's"]
 
 
+def test_the_overlap_of_masks_that_are_known(scenes: Any) -> None:
+    mask = _mask(scenes, ARM, ARM_MOTION)
+    iou, inside, distance = overlap(mask, mask, whole=True)
+    assert iou == 1.0 and np.isnan(inside) and distance < 0.5
+    lower = np.zeros_like(mask)
+    lower[6:] = mask[:-6]
+    iou, _, distance = overlap(mask, lower, whole=True)
+    assert iou == (mask & lower).sum() / (mask | lower).sum() and 3.0 < distance <= 6.0
+    assert overlap(mask, lower, whole=False)[1] == (mask & lower).sum() / mask.sum()
+    assert np.isnan(overlap(mask, mask & False, whole=False)).all() and np.isnan(overlap(mask & False, mask, whole=False)).all()
+
+
+def test_an_arm_is_not_compared_with_the_whole_person(scenes: Any) -> None:
+    """Only the arm's own silhouette is compared: it is inside the person's, or beside it."""
+    arm = _mask(scenes, ARM, ARM_MOTION)
+    person = np.zeros(arm.shape, bool)
+    person[:, : arm.shape[1] // 2 + 60] = True
+    assert (arm & person).sum() == arm.sum() and (arm & person).sum() / (arm | person).sum() < 0.2
+    height, width = arm.shape
+    outlines = {
+        "C": {
+            0: np.array([[0, 0], [width // 2 + 60, 0], [width // 2 + 60, height], [0, height]], float),
+            2: np.array([[0, 0], [9, 0], [9, 9]], float),
+        }
+    }
+    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), outlines, {}, Monitor())
+    inside, beside = found.fits
+    assert not found.whole and inside.inside == 1.0 and beside.inside < 0.02
+    assert all(np.isnan([fit.iou, fit.distance_px]).all() for fit in found.fits)
+    assert by_view(found.fits) == {
+        "C": {
+            "inside": pytest.approx((1.0 + beside.inside) / 2, abs=1e-4),
+            "least_inside": pytest.approx(beside.inside, abs=1e-4),
+            "frames": 2,
+        }
+    }
+    rows = figure_rows({}, [], None, None, found.fits)
+    assert [r["name"] for r in rows] == ["silhouette of view C, share inside the person's outline"]
+    assert "100.0 % of it inside the person's outline" in _agreement_caption(found, "C", 0)
+
+
+@pytest.mark.parametrize(("model", "whole"), [("full", True), ("upper_body", False), ("arm.R", False), ("leg.L", False)])
+def test_which_models_are_whole_bodies(model: str, whole: bool) -> None:
+    assert is_whole_body(read_model(model).skeleton) == whole
+
+
 def test_a_silhouette_before_the_background(scenes: Any) -> None:
     rig = scenes.three_cameras()
-    mask = body_masks(rig.cameras[:1], SHAPE, MOTION[0], SkinSettings())[0]
+    mask = body_masks(rig.cameras[:1], ARM, ARM_MOTION[0], SkinSettings())[0]
     still = np.random.default_rng(0).uniform(60, 90, mask.shape).astype(np.float32)
     image = np.where(mask, 160.0, still).astype(np.float32)
     image[2:14, 150:165] = 10.0  # something else that moved
     footage: Any = SimpleNamespace(rig=rig, frames=range(3), read=lambda frame: [image] * 3)
-    fits = silhouettes_of(footage, BODY, SkinSettings(), {}, {"L": Background(grey=still, noise=1.0)}, Monitor()).fits
+    fits = silhouettes_of(footage, _body(ARM, ARM_MOTION), SkinSettings(), {}, {"L": Background(grey=still, noise=1.0)}, Monitor()).fits
     assert {(f.view, f.person) for f in fits} == {("L", "background")} and len(fits) == 3
-    assert fits[0].iou > 0.9 and fits[0].distance_px <= 1.0
-    assert silhouettes_of(footage, BODY, SkinSettings(), {}, {}, Monitor()).fits == ()
+    assert fits[0].inside > 0.95
+    assert silhouettes_of(footage, _body(ARM, ARM_MOTION), SkinSettings(), {}, {}, Monitor()).fits == ()
 
 
 def test_outlines_are_drawn_over_the_footage(scenes: Any) -> None:
     camera = scenes.three_cameras().cameras[1]
     grey = np.full(camera.size_px[::-1], 90.0, np.float32)
-    picture = body_over_footage(grey, camera, SHAPE, MOTION[0], SkinSettings(), _outline(scenes, 10.0)).astype(int)
+    picture = body_over_footage(grey, camera, ARM, ARM_MOTION[0], SkinSettings(), _outline(scenes, ARM, ARM_MOTION, 10.0)).astype(int)
     for colour in (BODY_OUTLINE, PERSON_OUTLINE):
         assert (np.abs(picture - colour).sum(axis=2) < 60).sum() > 40
 
