@@ -18,7 +18,7 @@ import numpy as np
 from ..core import store
 from ..core.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
-from ..core.images.fields import BOTH, Instants, instants
+from ..core.images.fields import BOTH, FieldLayout, field_layout
 from ..core.person_sources import PERSON_SOURCES
 from ..core.take import NO_BODY, Take
 from ..core.take import body_model as take_body_model
@@ -123,9 +123,9 @@ def write(scene: bpy.types.Scene, *, overwrite: bool = False) -> Path:
     return folder
 
 
-def fields_of(scene: bpy.types.Scene) -> Instants:
+def fields_of(scene: bpy.types.Scene) -> FieldLayout:
     """Where in the footage's images the scene's frames are."""
-    return instants(scene.tricap.interlaced, scene.tricap.first_field)
+    return field_layout(scene.tricap.interlaced, scene.tricap.first_field)
 
 
 def shows_other_lines(scene: bpy.types.Scene) -> bool:
@@ -153,7 +153,7 @@ def _first_field(scene: bpy.types.Scene) -> str:
     return str(scene.tricap.first_field) if scene.tricap.interlaced == BOTH else ""
 
 
-def files_of(folder: Path, entries: Sequence[Table], fields: Instants) -> dict[str, Path]:
+def files_of(folder: Path, entries: Sequence[Table], fields: FieldLayout) -> dict[str, Path]:
     """By view, the file by which Blender opens the footage of every entry of [[views]].
 
     Raises:
@@ -233,7 +233,7 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
         raise InputError(f"{folder} is not a take: there is no take.toml in it. Add footage to make one.")
     opened = take_of_table(folder, said)
     properties.check_settings(opened.settings, str(folder / "take.toml"))
-    files = files_of(folder, said["views"], opened.instants)
+    files = files_of(folder, said["views"], opened.field_layout)
     props = scene.tricap
     props.take = folders.for_user(folder)
     props.fps, props.interlaced, props.first_field = said["fps"], opened.interlaced, opened.first_field

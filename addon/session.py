@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 if TYPE_CHECKING:
-    from ..core.images.sequence import Sequence
+    from ..core.images.sequence import ImageSequence
     from ..core.take_file import Table
     from .clicking.draw import Drawing
     from .clicking.finder import Finder
@@ -42,7 +42,7 @@ class FileState:
     looks: "dict[str, Look]" = field(default_factory=dict)  # by scene: the states of its steps
     stamps: dict[str, Any] = field(default_factory=dict)  # by scene: the files on which these states depend
     step_ends: "dict[tuple[str, str], StepEnd]" = field(default_factory=dict)  # by scene and step: how it failed or was stopped
-    sequences: "dict[tuple[Any, ...], Sequence]" = field(default_factory=dict)  # the opened footage, by file
+    sequences: "dict[tuple[Any, ...], ImageSequence]" = field(default_factory=dict)  # the opened footage, by file
     joints: dict[str, tuple[str, ...]] = field(default_factory=dict)  # those to click, by body model
     click_problems: dict[tuple[Any, ...], str] = field(default_factory=dict)  # by joint, clicks and cameras; "" where there is none
     late_frames: dict[str, dict[str, int]] = field(default_factory=dict)  # by checked input: the delay of each view

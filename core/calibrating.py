@@ -22,8 +22,8 @@ from .calibration.targets import Targets, find_targets
 from .calibration.world_choice import WorldChoice, frame_of_bar
 from .errors import InputError
 from .geometry.rig import Rig
-from .images.fields import Instants, instants
-from .images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, Sequence, open_sequence, read_image
+from .images.fields import FieldLayout, field_layout
+from .images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, open_sequence, read_image
 from .progress import Monitor
 
 Note = Callable[[str, int, int], None]  # view, images looked at, images with both targets
@@ -38,20 +38,20 @@ class BarFootage:
 
     folder: Path
     names: tuple[str, ...]
-    sequences: tuple[Sequence, ...]
+    sequences: tuple[ImageSequence, ...]
     interlaced: str = "none"  # or "odd", "even", "both"
     masks: tuple[np.ndarray | None, ...] = ()  # of each view (h, w), False where no target can be; empty: none
     first_field: str = "odd"  # of "both"
 
     @property
-    def instants(self) -> Instants:
+    def field_layout(self) -> FieldLayout:
         """Which rows of which image show a frame: an image, or one of its two fields where both are measured."""
-        return instants(self.interlaced, self.first_field)
+        return field_layout(self.interlaced, self.first_field)
 
     @property
     def count(self) -> int:
         """Number of frames that all views have."""
-        return min(s.count for s in self.sequences) * self.instants.per_image
+        return min(s.count for s in self.sequences) * self.field_layout.per_image
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -157,7 +157,7 @@ def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note |
     size, whole = (0, 0), 0
     for n in range(footage.count):
         monitor.step(f"targets {name}", n, footage.count)
-        image, rows = sequence.read(footage.instants.image(n)), footage.instants.rows(n)
+        image, rows = sequence.read(footage.field_layout.image(n)), footage.field_layout.rows(n)
         if n and image.shape[::-1] != size:
             raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
         size = (image.shape[1], image.shape[0])
@@ -172,7 +172,7 @@ def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note |
         if note is not None:
             note(name, len(found), whole)
     monitor.step(f"targets {name}", footage.count, footage.count)
-    return track_bar(found, float(size[0]), diameter / np.sqrt(footage.instants.first.step)), size
+    return track_bar(found, float(size[0]), diameter / np.sqrt(footage.field_layout.first.step)), size
 
 
 def _in_frame(targets: Targets, xy_px: np.ndarray) -> Targets:

@@ -10,14 +10,14 @@ import numpy as np
 
 from . import store
 from .errors import InputError
-from .images.fields import Instants
-from .images.sequence import Sequence
+from .images.fields import FieldLayout
+from .images.sequence import ImageSequence
 from .progress import Monitor
 
 MADE_FROM = "made_from.json"
 
 
-def field_pictures(sequence: Sequence, fields: Instants, folder: Path, monitor: Monitor | None = None) -> tuple[Path, ...]:
+def field_pictures(sequence: ImageSequence, fields: FieldLayout, folder: Path, monitor: Monitor | None = None) -> tuple[Path, ...]:
     """FOLDER/000000.png …, a picture of every field of a sequence, made where they are not there yet.
 
     Raises:
@@ -42,7 +42,7 @@ def field_pictures(sequence: Sequence, fields: Instants, folder: Path, monitor: 
     return paths
 
 
-def _said(sequence: Sequence, fields: Instants) -> dict[str, object]:
+def _said(sequence: ImageSequence, fields: FieldLayout) -> dict[str, object]:
     """What identifies the pictures: names, sizes and dates of the footage, and which field is first."""
     files = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in sequence.files()]
     return {"files": files, "count": sequence.count, "first_row": fields.first.offset}

@@ -159,7 +159,7 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
     if source.view:
         points = read_keypoints(paths)
         view = next(v for v in footage.take.views if v.name == source.view)
-        frames = footage.take.instants.per_image * (points.number - source.offset_frames - view.offset_frames)
+        frames = footage.take.field_layout.per_image * (points.number - source.offset_frames - view.offset_frames)
         return _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
     if len(paths) > 1:
         raise InputError(f"“{source.files}” in {folder} are {len(paths)} files; keypoints in space are one file.")

@@ -43,7 +43,7 @@ class TrackingRules:
         return TrackingView(
             cameras=footage.rig.cameras,
             reference=footage.take.reference,
-            instants=footage.take.instants,
+            field_layout=footage.take.field_layout,
             matching=self.matching,
             tracking=self.tracking,
             limit_px=max(self.tracking.max_residual_px, self.limit_px),

@@ -78,14 +78,14 @@ def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
     Raises:
         InputError: see `Footage.read`.
     """
-    grid, step = footage.take.rows_at(frame), footage.take.instants.per_image
+    grid, step = footage.take.rows_at(frame), footage.take.field_layout.per_image
 
     def neighbour(k: int, at: int) -> np.ndarray | None:
         number = footage.number(k, at)
         return grid.rows(footage.sequences[k].read(number)) if 0 <= number < footage.sequences[k].count else None
 
     rows = [grid.rows(image) for image in footage.read(frame)]
-    for k, late in enumerate(footage.late_images):
+    for k, late in enumerate(footage.delay_images):
         if late:
             rows[k] = retimed(rows[k], neighbour(k, frame - step), neighbour(k, frame + step), late)
     return rows
@@ -126,7 +126,7 @@ def measure_frames(
         take.rig_path,
         repr((take.interlaced, take.first_field, take.reference_view, _seed_table(footage))),
         repr([(v.name, v.offset_frames) for v in take.views]),
-        repr(footage.late_images) if any(footage.late_images) else "",
+        repr(footage.delay_images) if any(footage.delay_images) else "",
     )
     start = before = None
     for done, frame in enumerate(order):
@@ -148,8 +148,8 @@ def measure_frames(
 def _image_digests(footage: Footage, frame: int) -> list[str]:
     """What identifies the images of a frame: the content of image files; the size and date of a movie. With views put to the others'
     moment the frames before and after count as well."""
-    step = footage.take.instants.per_image
-    near = (frame - step, frame, frame + step) if any(footage.late_images) else (frame,)
+    step = footage.take.field_layout.per_image
+    near = (frame - step, frame, frame + step) if any(footage.delay_images) else (frame,)
     parts = []
     for path in (path for f in near if f in footage.frames or f == frame for path in footage.files(f)):
         try:
@@ -294,7 +294,7 @@ def _first_foreground(
 
 def _furthest_frame(footage: Footage, frame: int) -> int:
     """The frame of the take, on the same rows, that differs most in time, whether it is to be measured or not."""
-    step = footage.take.instants.per_image
+    step = footage.take.field_layout.per_image
     return max((f for f in footage_frames(footage.take, footage.sequences) if (f - frame) % step == 0), key=lambda f: abs(f - frame))
 
 

@@ -18,9 +18,9 @@ from .body.model_file import read_model
 from .body.shape import write_body
 from .body.skin import SkinSettings, body_skin
 from .body_guide import BodyGuide
-from .checking.body_check import odd_body
+from .checking.body_check import check_fit
 from .checking.take_check import causes_of_failure, doubts, with_cause
-from .checking.timing import in_step
+from .checking.timing import synchronised
 from .clicked_points import clicked_depth
 from .correcting import corrected_cloud, corrected_tracks, missed_clicks
 from .errors import InputError
@@ -199,8 +199,8 @@ def measure(run: Run, monitor: Monitor) -> None:
     began, s = time.perf_counter(), run.settings
     run.results.remove_other_clouds(run.footage.frames)
     done, room = [], None
-    if s["timing"].correct and not run.footage.late_images:
-        run.footage, run.record["offsets"] = in_step(run.footage, monitor)
+    if s["timing"].correct and not run.footage.delay_images:
+        run.footage, run.record["offsets"] = synchronised(run.footage, monitor)
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
             run.results.write_cloud(as_written(run.corrected(m.cloud), s["surface"]))
@@ -313,7 +313,7 @@ def fit(run: Run, monitor: Monitor) -> None:
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.notes[0].frame) if run.measured else error from error
     states = _told_states(run, body)
-    run.warn(*odd_body(given, body, run.settings["fitting"].click_sigma_px))
+    run.warn(*check_fit(given, body, run.settings["fitting"].click_sigma_px))
     run.finish_stage(
         "fit",
         began,

@@ -14,8 +14,8 @@ import numpy as np
 
 from .errors import InputError
 from .geometry.rig import Rig, read_rig
-from .images.fields import BOTH, INTERLACE, Instants, RowGrid, frame_time_s, instants
-from .images.sequence import Sequence, open_sequence
+from .images.fields import BOTH, INTERLACE, FieldLayout, RowGrid, field_layout, frame_time_s
+from .images.sequence import ImageSequence, open_sequence
 from .keypoint_sources import KeypointSource, keypoint_sources
 from .person_sources import PERSON_SOURCES, person_source
 from .settings import nearest_name
@@ -118,9 +118,9 @@ class Take:
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
-    def instants(self) -> Instants:
+    def field_layout(self) -> FieldLayout:
         """Where in the images the take's frames are."""
-        return instants(self.interlaced, self.first_field)
+        return field_layout(self.interlaced, self.first_field)
 
     def time_s(self, frames: np.ndarray) -> np.ndarray:
         """When frames (T,) of the take were taken, in seconds after frame 0."""
@@ -128,13 +128,13 @@ class Take:
 
     def rows_at(self, frame: int) -> RowGrid:
         """The rows of the image that show a frame of the take."""
-        return self.instants.rows(frame)
+        return self.field_layout.rows(frame)
 
     def single(self) -> "Take":
         """This take with one frame an image: of both fields the first, which then has the clicks of both."""
         if self.interlaced != BOTH:
             return self
-        seeds, *keys = (replace(s, frame=self.instants.image(s.frame)) for s in (self.seeds, *self.keyframes))
+        seeds, *keys = (replace(s, frame=self.field_layout.image(s.frame)) for s in (self.seeds, *self.keyframes))
         frames = None if self.frames is None else (self.frames[0] // 2, (self.frames[1] + 1) // 2)
         return replace(self, fps=self.fps / 2, interlaced=self.first_field, frames=frames, seeds=seeds, keyframes=tuple(keys))
 
@@ -150,17 +150,17 @@ class Footage:
 
     take: Take
     rig: Rig
-    sequences: tuple[Sequence, ...]
+    sequences: tuple[ImageSequence, ...]
     frames: range
-    late_images: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
+    delay_images: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
 
     def number(self, view: int, frame: int) -> int:
         """The number of the image in a view's sequence that shows a frame of the take."""
-        return self.take.instants.image(frame) + self.take.views[view].offset_frames
+        return self.take.field_layout.image(frame) + self.take.views[view].offset_frames
 
     def single(self) -> "Footage":
         """The footage with one frame an image, for what is asked of images and not of instants."""
-        take, per = self.take.single(), self.take.instants.per_image
+        take, per = self.take.single(), self.take.field_layout.per_image
         return replace(self, take=take, frames=range(self.frames.start // per, -(-self.frames.stop // per)))
 
     def read(self, frame: int) -> list[np.ndarray]:
@@ -213,7 +213,7 @@ def take_of_text(text: str, path: Path) -> Take:
     return _take(table, path.parent.resolve(), str(path))
 
 
-def open_take(take: Take, sequences: tuple[Sequence, ...] | None = None) -> Footage:
+def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None) -> Footage:
     """Open the footage (unless `sequences` are the opened views) and the rig of a take and check that they belong together.
 
     Raises:
@@ -228,13 +228,13 @@ def open_take(take: Take, sequences: tuple[Sequence, ...] | None = None) -> Foot
     return footage
 
 
-def footage_frames(take: Take, sequences: tuple[Sequence, ...]) -> range:
+def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
     """The frames of a take that are measured, by its own numbers.
 
     Raises:
         InputError: the views have no frames in common, or not those that the take names.
     """
-    per = take.instants.per_image
+    per = take.field_layout.per_image
     counts = [per * (s.count - v.offset_frames) for s, v in zip(sequences, take.views)]
     first = per * max(0, *(-v.offset_frames for v in take.views))
     if take.frames is None:
@@ -300,7 +300,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         )
     return Take(
         folder=folder,
-        fps=float(fps) * instants(interlaced).per_image,
+        fps=float(fps) * field_layout(interlaced).per_image,
         views=views,
         rig_path=inside(folder, table.get("rig", "rig.toml"), where),
         interlaced=interlaced,

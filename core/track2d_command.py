@@ -11,7 +11,7 @@ from . import store
 from .arguments import check_not_read, frame_range, overrides
 from .errors import InputError
 from .images.fields import INTERLACE, row_grid
-from .images.sequence import IMAGE_ENDINGS, Sequence, open_sequence
+from .images.sequence import IMAGE_ENDINGS, ImageSequence, open_sequence
 from .matching.least_squares import MatchingSettings
 from .progress import Monitor
 from .settings import from_table
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     return [f"{args.out}: {len(points.names)} points over {len(frames)} frames, {whole} of them seen in every frame."]
 
 
-def open_footage(path: Path) -> Sequence:
+def open_footage(path: Path) -> ImageSequence:
     """A movie, or the images of a folder.
 
     Raises:
@@ -88,7 +88,7 @@ def _check_inside(points: ChosenPoints, image: np.ndarray, path: Path) -> None:
             raise InputError(f"The point “{name}” of {path} lies at ({x:g}, {y:g}), outside the image of {w}×{h} pixels.")
 
 
-def _draw(folder: Path, sequence: Sequence, points: ChosenPoints, tracks: PlanarTracks, monitor: Monitor) -> None:
+def _draw(folder: Path, sequence: ImageSequence, points: ChosenPoints, tracks: PlanarTracks, monitor: Monitor) -> None:
     index = {name: n for n, name in enumerate(points.names)}
     for t, frame in enumerate(tracks.frames):
         monitor.step("pictures", t, len(tracks.frames))

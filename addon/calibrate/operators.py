@@ -36,13 +36,13 @@ class Done:
     @property
     def tracks(self) -> dict[str, np.ndarray]:
         """The targets (T, 2, 2) by view, one frame an image as the clips show them: of both fields the first."""
-        per = self.footage.instants.per_image
+        per = self.footage.field_layout.per_image
         return {name: track.xy_px[::per] for name, track in zip(self.footage.names, self.measured.tracks)}
 
     @property
     def bar(self) -> tuple[np.ndarray, np.ndarray]:
         """Frames (T,) and ends (T, 2, 3) [m] of the bar, one frame an image likewise."""
-        (frames, ends), per = self.result.bar, self.footage.instants.per_image
+        (frames, ends), per = self.result.bar, self.footage.field_layout.per_image
         first = frames % per == 0
         return frames[first] // per, ends[first]
 

@@ -188,7 +188,7 @@ def _opened_clips(scene: bpy.types.Scene, contents: Contents) -> Opened:
     try:
         for view, camera, sequence in zip(footage.take.views, footage.rig.cameras, footage.sequences) if footage else ():
             beside_take, in_out = (folder / clips.FIELDS / view.name for folder in (footage.take.folder, contents.out))
-            files = clips.shown_files(sequence, footage.take.instants, beside_take if beside_take.is_dir() else in_out)
+            files = clips.shown_files(sequence, footage.take.field_layout, beside_take if beside_take.is_dir() else in_out)
             opened.append((clips.clip_of_view(scene, view.name, files[0], camera), files))
     except InputError:
         bpy.data.batch_remove([clip for clip, _ in opened if clip.users == 0])
@@ -209,7 +209,7 @@ def _add_cameras(scene: bpy.types.Scene, collection: bpy.types.Collection, conte
         camera_object["tricap_interlaced"] = take.interlaced
         if clip.name.startswith(name := f"Footage {view.name}"):
             clip.name = name  # until now the clip of an earlier build had it
-        clip.frame_start = -take.instants.per_image * view.offset_frames
+        clip.frame_start = -take.field_layout.per_image * view.offset_frames
         clips.show_behind(camera_object.data, clip)
         warnings += clips.clip_faults(clip, camera, files, f"view {view.name}")
         if camera is reference:

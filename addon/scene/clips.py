@@ -8,8 +8,8 @@ import bpy
 from ...core.errors import InputError
 from ...core.field_pictures import field_pictures
 from ...core.geometry.camera import Camera
-from ...core.images.fields import Instants
-from ...core.images.sequence import Sequence, open_sequence
+from ...core.images.fields import FieldLayout
+from ...core.images.sequence import ImageSequence, open_sequence
 from .. import folders
 from . import axes
 
@@ -51,7 +51,7 @@ def clip_of_view(scene: bpy.types.Scene, name: str, first_file: Path, camera: Ca
     return own
 
 
-def first_file(folder: Path, images: str | None, movie: str | None, view: str, fields: Instants) -> Path:
+def first_file(folder: Path, images: str | None, movie: str | None, view: str, fields: FieldLayout) -> Path:
     """The file that Blender opens for a view of the take in `folder`; with both fields, the picture of the first one.
 
     Raises:
@@ -60,7 +60,7 @@ def first_file(folder: Path, images: str | None, movie: str | None, view: str, f
     return shown_files(open_sequence(folder, images=images, movie=movie, view=view), fields, folder / FIELDS / view)[0]
 
 
-def shown_files(sequence: Sequence, fields: Instants, folder: Path) -> tuple[Path, ...]:
+def shown_files(sequence: ImageSequence, fields: FieldLayout, folder: Path) -> tuple[Path, ...]:
     """The files that Blender shows of a sequence: its own, or pictures of both fields, written to `folder` if they are not there.
 
     Raises:

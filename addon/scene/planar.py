@@ -6,7 +6,7 @@ scaled. The ends of a curve are hooked to their empties (Hook modifiers), so tha
 """
 
 import re
-from collections.abc import Sequence as Many
+from collections.abc import Sequence
 from math import pi
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ...core.errors import InputError
-from ...core.images.sequence import Sequence
+from ...core.images.sequence import ImageSequence
 from ...core.tracking.point_tables import PlanarTable
 from .action import key
 
@@ -25,7 +25,9 @@ IN_FRONT_M = 0.002  # distance of points and curves from the image
 HIDDEN = ("hide_viewport", "hide_render")
 
 
-def add_planar(scene: bpy.types.Scene, table: PlanarTable, joined: Many[tuple[str, str]], footage: Sequence | None) -> bpy.types.Collection:
+def add_planar(
+    scene: bpy.types.Scene, table: PlanarTable, joined: Sequence[tuple[str, str]], footage: ImageSequence | None
+) -> bpy.types.Collection:
     """A new collection with the points of a table, the curves that join them by name, and the footage where there is one.
 
     A point is hidden in frames where it was not tracked, and a curve where one of its points is hidden.
@@ -60,7 +62,7 @@ def on_picture(xy_px: np.ndarray, size_px: np.ndarray) -> np.ndarray:
     return np.stack([x, y, np.full_like(x, IN_FRONT_M)], axis=-1)
 
 
-def _images(footage: Sequence) -> bpy.types.Image:
+def _images(footage: ImageSequence) -> bpy.types.Image:
     first = footage.files()[0]
     try:
         images = bpy.data.images.load(str(first))
@@ -70,7 +72,7 @@ def _images(footage: Sequence) -> bpy.types.Image:
     return images
 
 
-def _show(picture: bpy.types.Object, footage: Sequence, images: bpy.types.Image) -> None:
+def _show(picture: bpy.types.Object, footage: ImageSequence, images: bpy.types.Image) -> None:
     """Image n of the footage in frame n of the scene."""
     picture.empty_display_type, picture.empty_display_size = "IMAGE", 1.0
     picture.data = images

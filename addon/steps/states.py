@@ -16,7 +16,7 @@ from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
 from ...core.clicked_points import clicked_depth
 from ...core.errors import InputError
 from ...core.geometry.rig import read_rig
-from ...core.images.sequence import Sequence, open_sequence
+from ...core.images.sequence import ImageSequence, open_sequence
 from ...core.pipeline import settings_of
 from ...core.run_json import read_run
 from ...core.stages import stage_keys
@@ -65,7 +65,7 @@ class _Found:
     """What the later steps need of the earlier ones."""
 
     take: Take | None = None
-    sequences: tuple[Sequence, ...] = ()
+    sequences: tuple[ImageSequence, ...] = ()
     frames: range = range(0)
     footage: Footage | None = None
     keys: Mapping[str, str] | None = None
@@ -298,7 +298,7 @@ def _look_into_run(found: _Found) -> None:
         found.problem = str(error)
 
 
-def _sequence(folder: Path, view: Any) -> Sequence:
+def _sequence(folder: Path, view: Any) -> ImageSequence:
     """An opened view, kept as long as its folder or file does not change."""
     where = (folder / (view.movie or view.images)) if view.movie else (folder / view.images).parent
     try:

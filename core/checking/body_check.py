@@ -15,7 +15,7 @@ BEYOND_LIMIT_DEG = 15.0
 MOST_TOLD = 3  # joints of one kind
 
 
-def odd_body(given: FitInput, body: BodyFit, click_sigma_px: float) -> list[str]:
+def check_fit(given: FitInput, body: BodyFit, click_sigma_px: float) -> list[str]:
     """All sentences about a fitted body; `click_sigma_px` is that of a click."""
     return [*odd_limbs(body.shape), *clicks_not_kept(given, body.motion, click_sigma_px), *limits_not_kept(given, body.motion)]
 

@@ -16,7 +16,7 @@ from .rig_check import geometry_findings, unit_findings
 from .rig_fit import ENOUGH, clicked_pairs, rig_findings, rig_misses, same_views, share, stale_finding
 from .survey import frozen_view, picture_findings, rate_findings, survey
 from .texture import texture_findings
-from .timing import Film, Offset, estimate_offsets
+from .timing import Film, TimeOffset, estimate_offsets
 from .view_matches import match_views
 
 DOUBTFUL_RESIDUAL_PX = 1.0
@@ -144,7 +144,7 @@ def first_look(footage: Footage, frame: int) -> list[Finding]:
 
 def still_views(footage: Footage, frame: int, pictures: list[np.ndarray]) -> list[str]:
     """Views of which a few frames after `frame` have its very picture, noise and all, while those of another view differ."""
-    names, step = [v.name for v in footage.take.views], footage.take.instants.per_image
+    names, step = [v.name for v in footage.take.views], footage.take.field_layout.per_image
     after = [f for f in (frame + n * step for n in range(1, FROZEN_FRAMES)) if f in footage.frames]
     same = np.ones(len(names), dtype=bool)
     for f in after:
@@ -158,9 +158,9 @@ def with_cause(error: InputError, footage: Footage, frame: int) -> InputError:
     return error if cause is None else InputError(f"{cause.sentence} {cause.advice}".strip())
 
 
-def timing_finding(offset: Offset) -> Finding:
+def timing_finding(offset: TimeOffset) -> Finding:
     """What to do about a view that is early or late."""
-    late, sigma = offset.late_frames, offset.sigma_frames
+    late, sigma = offset.delay_frames, offset.sigma_frames
     word = "later" if late > 0 else "earlier"
     steps = [f"add {-round(late):+d} to `offset_frames` of view {offset.view} in take.toml"] if round(late) else []
     if abs(late - round(late)) > SMALL:
@@ -183,7 +183,7 @@ def timing_finding(offset: Offset) -> Finding:
     )
 
 
-def rolling_finding(offset: Offset) -> Finding:
+def rolling_finding(offset: TimeOffset) -> Finding:
     """What to do about a view whose rows are exposed one after the other, otherwise than the reference view's."""
     r, word = offset.readout_frames, "longer" if offset.readout_frames > 0 else "shorter"
     return doubtful(

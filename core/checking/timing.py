@@ -51,11 +51,11 @@ FLOW_WINDOW, FLOW_LEVELS = 21, 4
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Offset:
+class TimeOffset:
     """A view's offset in time: its image that should show a moment shows `late_frames` later. NaN where that cannot be told."""
 
     view: str
-    late_frames: float
+    delay_frames: float
     sigma_frames: float
     method: str  # one of METHODS, the weakest on the way to the reference view
     moving: int = 0  # matches that move across the epipolar lines and fit
@@ -67,12 +67,14 @@ class Offset:
     @property
     def significant(self) -> bool:
         """Larger than its noise, and than what matters to a measurement."""
-        return self.method == "rays" and abs(self.late_frames) > max(LEAST_OFFSET, SIGNIFICANT * self.sigma_frames) and self.effect_px > 0.1
+        return (
+            self.method == "rays" and abs(self.delay_frames) > max(LEAST_OFFSET, SIGNIFICANT * self.sigma_frames) and self.effect_px > 0.1
+        )
 
     @property
     def doubtful(self) -> bool:
         """Significant, or told from the motion's rhythm alone by more than three times its sigma."""
-        return self.significant or (self.method == "energy" and abs(self.late_frames) > 3 * self.sigma_frames)
+        return self.significant or (self.method == "energy" and abs(self.delay_frames) > 3 * self.sigma_frames)
 
     @property
     def rolls(self) -> bool:
@@ -92,7 +94,7 @@ class Offset:
             return round(value, digits) if isfinite(value) else None
 
         return {
-            "late_frames": rounded(self.late_frames, 4),
+            "late_frames": rounded(self.delay_frames, 4),
             "sigma_frames": rounded(self.sigma_frames, 4),
             "from": self.method,
             "moving_matches": self.moving,
@@ -104,10 +106,10 @@ class Offset:
     @property
     def effect_px(self) -> float:
         """By how much it makes the rays of moving points miss each other."""
-        return abs(self.late_frames) * self.speed_px
+        return abs(self.delay_frames) * self.speed_px
 
 
-def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = None) -> tuple[Offset, ...]:
+def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = None) -> tuple[TimeOffset, ...]:
     """The offset of every view against the reference view, in the order of the views; about a second per view.
 
     Views that have nothing in common with the reference are compared with a view that has. `offset_frames` of take.toml is in force: what
@@ -119,15 +121,15 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
     film = film or Film(footage, survey(footage, monitor))
     names = [v.name for v in footage.take.views]
     reference = footage.take.reference
-    none = Offset(view=names[reference], late_frames=0.0, sigma_frames=0.0, method="reference", readout_frames=0.0, readout_sigma=0.0)
+    none = TimeOffset(view=names[reference], delay_frames=0.0, sigma_frames=0.0, method="reference", readout_frames=0.0, readout_sigma=0.0)
     found = {reference: none}
     while len(found) < len(names):
         base, k = film.best_link(set(found))
         link = _between(film, base, k, names[k], monitor.part("synchronization", len(found) - 1, len(names) - 1))
-        late, sigma = link.late_frames + found[base].late_frames, float(np.hypot(link.sigma_frames, found[base].sigma_frames))
-        found[k] = Offset(
+        late, sigma = link.delay_frames + found[base].delay_frames, float(np.hypot(link.sigma_frames, found[base].sigma_frames))
+        found[k] = TimeOffset(
             view=names[k],
-            late_frames=late,
+            delay_frames=late,
             sigma_frames=sigma,
             method=max(link.method, found[base].method, key=METHODS.index),
             moving=link.moving,
@@ -139,7 +141,7 @@ def estimate_offsets(footage: Footage, monitor: Monitor, film: "Film | None" = N
     return tuple(found[k] for k in range(len(names)))
 
 
-def in_step(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str, dict[str, object]]]:
+def synchronised(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str, dict[str, object]]]:
     """The footage with every late view put to the moment of the reference view (`images.retime`), and a table of the offsets by view.
 
     Raises:
@@ -147,14 +149,14 @@ def in_step(footage: Footage, monitor: Monitor) -> tuple[Footage, dict[str, dict
     """
     offsets = estimate_offsets(footage.single(), monitor)
     for o in offsets:
-        if o.doubtful and abs(o.late_frames) > LARGEST:
+        if o.doubtful and abs(o.delay_frames) > LARGEST:
             raise InputError(
-                f"View {o.view} is {o.late_frames:+.2f} frames late, too much to interpolate; add {-round(o.late_frames):+d} to its "
+                f"View {o.view} is {o.delay_frames:+.2f} frames late, too much to interpolate; add {-round(o.delay_frames):+d} to its "
                 "`offset_frames` in take.toml, the rest is then corrected."
             )
-    late = tuple(round(o.late_frames, 4) if o.significant else 0.0 for o in offsets)
+    late = tuple(round(o.delay_frames, 4) if o.significant else 0.0 for o in offsets)
     sequences = tuple(Recent(s) if t else s for s, t in zip(footage.sequences, late))
-    return replace(footage, sequences=sequences, late_images=late), {o.view: o.to_table() for o in offsets}
+    return replace(footage, sequences=sequences, delay_images=late), {o.view: o.to_table() for o in offsets}
 
 
 class Film:
@@ -207,25 +209,25 @@ class Film:
         return match_features([[self.features(k, f) for k in range(len(self.cameras))] for f in chosen], self.rows)
 
 
-def _between(film: Film, base: int, k: int, name: str, monitor: Monitor) -> Offset:
+def _between(film: Film, base: int, k: int, name: str, monitor: Monitor) -> TimeOffset:
     """How late view k is against view `base`: the whole frames at which most moving matches fit, and the rest by (3)."""
     lags, correlation = energy_lags(film.seen.energy[base], film.seen.energy[k])
-    best: Offset | None = None
+    best: TimeOffset | None = None
     for n, lag in enumerate(dict.fromkeys([0, *lags])):
         monitor.step("synchronization", n, len(lags) + 1)
         followed = [m for f in film.frames() if (m := _followed_matches(film, base, k, f, lag)) is not None]
         offset = _fit(followed, lag, name) if followed else None
         if offset is not None and (best is None or offset.moving > 1.1 * best.moving):
             best = offset
-        if lag == 0 and best is not None and abs(best.late_frames) < CLEAR:
+        if lag == 0 and best is not None and abs(best.delay_frames) < CLEAR:
             break
     if best is not None:
         return best
     ca, cb = film.cameras[base], film.cameras[k]
     near = float(ca.R_cam_world[2] @ cb.R_cam_world[2]) > np.cos(np.radians(FARTHEST_DEG))
     if near and correlation > GOES_TOGETHER and (not lags[0] or lag_sigmas(film.seen.energy[base], film.seen.energy[k], lags[0]) > SURE):
-        return Offset(view=name, late_frames=float(-lags[0]), sigma_frames=0.5, method="energy")
-    return Offset(view=name, late_frames=np.nan, sigma_frames=np.inf, method="nothing")
+        return TimeOffset(view=name, delay_frames=float(-lags[0]), sigma_frames=0.5, method="energy")
+    return TimeOffset(view=name, delay_frames=np.nan, sigma_frames=np.inf, method="nothing")
 
 
 def energy_lags(a: np.ndarray, b: np.ndarray) -> tuple[list[int], float]:
@@ -296,7 +298,7 @@ def _followed(here: np.ndarray, there: np.ndarray, xy: np.ndarray) -> np.ndarray
     return np.where(good[:, None], end.reshape(-1, 2).astype(np.float64), np.nan)
 
 
-def _fit(followed: list[_Followed], lag: int, name: str) -> Offset | None:
+def _fit(followed: list[_Followed], lag: int, name: str) -> TimeOffset | None:
     """The offset from the matches of some frames at one whole-frame lag, or None where too few moving matches fit.  (3)"""
     e = np.concatenate([f.misses for f in followed])
     rate, bend = (e[:, 2] - e[:, 0]) / 2, (e[:, 2] - 2 * e[:, 1] + e[:, 0]) / 2
@@ -325,9 +327,9 @@ def _fit(followed: list[_Followed], lag: int, name: str) -> Offset | None:
     sigma = _sigma(A, w, miss(s) - b, frame)
     readout, readout_sigma = _readout(e, s, b, frame)
     certain, by = _inliers(followed), s if abs(s) > max(LEAST_OFFSET, SIGNIFICANT * sigma) else 0.0
-    return Offset(
+    return TimeOffset(
         view=name,
-        late_frames=-(lag + s),
+        delay_frames=-(lag + s),
         sigma_frames=sigma,
         method="rays",
         moving=int(good.sum()),

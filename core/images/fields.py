@@ -50,7 +50,7 @@ class RowGrid:
 
 
 @dataclass(frozen=True, slots=True)
-class Instants:
+class FieldLayout:
     """Which image, and which of its rows, show instant n of a recording: one instant an image, or two where both fields are measured."""
 
     first: RowGrid = RowGrid()
@@ -58,7 +58,7 @@ class Instants:
 
     @property
     def per_image(self) -> int:
-        """Instants in an image, 1 or 2."""
+        """FieldLayout in an image, 1 or 2."""
         return 1 if self.second is None else 2
 
     def rows(self, instant: int) -> RowGrid:
@@ -70,12 +70,12 @@ class Instants:
         return instant // self.per_image
 
 
-def instants(interlaced: str, first_field: str = "odd") -> Instants:
+def field_layout(interlaced: str, first_field: str = "odd") -> FieldLayout:
     """The instants of footage of which one field is kept, or "both", of which `first_field` was exposed first."""
     if interlaced != BOTH:
-        return Instants(row_grid(interlaced))
+        return FieldLayout(row_grid(interlaced))
     odd, even = row_grid("odd"), row_grid("even")
-    return Instants(odd, even) if first_field == "odd" else Instants(even, odd)
+    return FieldLayout(odd, even) if first_field == "odd" else FieldLayout(even, odd)
 
 
 def row_grid(interlaced: str) -> RowGrid:

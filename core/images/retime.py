@@ -16,7 +16,7 @@ import numpy as np
 
 from ..settings import knob
 from .sampling import SplineImage
-from .sequence import Sequence
+from .sequence import ImageSequence
 
 LARGEST = 0.75  # frames
 STEPS = 4  # of the inversion of (1)
@@ -61,12 +61,12 @@ def _flow(here: np.ndarray, there: np.ndarray) -> np.ndarray:
 class Recent:
     """A sequence that keeps its last pictures, so that neighbours in time are not decoded again."""
 
-    def __init__(self, sequence: Sequence) -> None:
+    def __init__(self, sequence: ImageSequence) -> None:
         self._sequence = sequence
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
 
     @property
-    def behind(self) -> Sequence:
+    def behind(self) -> ImageSequence:
         """The sequence that is read."""
         return self._sequence
 

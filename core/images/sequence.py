@@ -37,7 +37,7 @@ WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
 KINDS = ("uint8", "uint16", "float32", "float64")
 
 
-class Sequence(Protocol):
+class ImageSequence(Protocol):
     """Frames of one camera, counted from 0."""
 
     @property
@@ -177,7 +177,7 @@ def _capture(path: Path) -> Any:
     return capture
 
 
-def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: str) -> Sequence:
+def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: str) -> ImageSequence:
     """The sequence of one view of the take in `folder`.
 
     Raises:

@@ -26,7 +26,7 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
-from ..images.fields import BOTH, INTERLACE, frame_time_s, instants
+from ..images.fields import BOTH, INTERLACE, field_layout, frame_time_s
 from ..progress import Monitor
 from ..settings import knob
 from .figure import Part, arm_parts, joined, torso_parts, wall
@@ -199,11 +199,11 @@ def _clear(folder: Path) -> None:
 
 def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> np.ndarray:
     """Write one image of all views; return which vertices (V,) all of them see, a row for each instant that is kept."""
-    settings, kept = studio.settings, instants(studio.settings.interlaced).first
+    settings, kept = studio.settings, field_layout(studio.settings.interlaced).first
     moments = [frame_time_s(frame, settings.fps)] + ([frame_time_s(frame + 0.5, settings.fps)] if kept.step == 2 else [])
     bodies = [studio.body(time) for time in moments]
     late = [studio.body(time + settings.late_frames / settings.fps) for time in moments] if settings.late_frames else bodies
-    scenes = [joined(body) for body in bodies[: instants(settings.interlaced).per_image]]
+    scenes = [joined(body) for body in bodies[: field_layout(settings.interlaced).per_image]]
     seen = np.ones((len(scenes), len(scenes[0].vertices_m)), dtype=bool)
     for i, camera in enumerate(studio.rig.cameras):
         monitor.step(STAGE, frame * len(VIEWS) + i, settings.frames * len(VIEWS))
@@ -224,7 +224,7 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
 
 
 def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
-    shape, per = studio.shape, instants(studio.settings.interlaced).per_image
+    shape, per = studio.shape, field_layout(studio.settings.interlaced).per_image
     time = frame_time_s(np.arange(per * studio.settings.frames), per * studio.settings.fps)
     motion, bodies = arm_motion(time), [studio.body(moment) for moment in time]
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)

@@ -68,7 +68,7 @@ def track_key_points(
     xy, xyz, sigma = np.full((T, N, K, 2), np.nan), np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
     status = np.zeros((T, N), dtype=np.int8)
     for t, s in enumerate(steps):
-        xy[t, s.identity], xyz[t, s.identity] = view.instants.rows(s.frame).to_frame(s.xy), s.xyz_m
+        xy[t, s.identity], xyz[t, s.identity] = view.field_layout.rows(s.frame).to_frame(s.xy), s.xyz_m
         sigma[t, s.identity] = np.sqrt(np.trace(s.covariance_m2, axis1=1, axis2=2))
         status[t, s.identity], status[t, s.ended] = TrackStatus.MEASURED, s.reason
     return KeyPoints(frames=np.array(frames), xy_px=xy, xyz_m=xyz, sigma_m=sigma, status=status)

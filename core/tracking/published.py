@@ -73,14 +73,14 @@ STEPS = {"space": track_step, "published": track_step_published}  # by `tracking
 
 def predict_in_images(view: TrackingView, before: TrackedFrame | None, current: TrackedFrame) -> np.ndarray:
     """Predicted positions (N, K, 2), rows' pixels of the view's frame.  (1)"""
-    now = view.instants.rows(current.frame).to_frame(current.xy)
+    now = view.field_layout.rows(current.frame).to_frame(current.xy)
     if before is None or not len(before.identity) or not len(now):
         return view.rows.from_frame(now)
     at = rows_of(before.identity, current.identity)
     known, new = np.flatnonzero(at >= 0), np.flatnonzero(at < 0)
     frames = abs(view.frame - current.frame) / max(1, abs(current.frame - before.frame))
     moved = np.zeros_like(now)
-    moved[known] = frames * (now[known] - view.instants.rows(before.frame).to_frame(before.xy)[at[known]])
+    moved[known] = frames * (now[known] - view.field_layout.rows(before.frame).to_frame(before.xy)[at[known]])
     moved = np.nan_to_num(moved)  # of a view without the point
     rows, there = nearest_neighbours(current.xyz_m[new], current.xyz_m[known], view.tracking.neighbourhood_m)
     if len(new) and len(known):

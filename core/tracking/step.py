@@ -25,7 +25,7 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.small_matrices import invert_spd
-from ..images.fields import Instants, RowGrid
+from ..images.fields import FieldLayout, RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches
 from ..matching.patch_pixels import patch_offsets
@@ -52,7 +52,7 @@ class TrackingView:
 
     cameras: tuple[Camera, ...]
     reference: int
-    instants: Instants
+    field_layout: FieldLayout
     matching: MatchingSettings
     tracking: TrackingSettings
     limit_px: float  # by which rays may miss
@@ -67,7 +67,7 @@ class TrackingView:
     @property
     def rows(self) -> RowGrid:
         """The rows of that frame."""
-        return self.instants.rows(self.frame)
+        return self.field_layout.rows(self.frame)
 
     @property
     def half_patch(self) -> tuple[int, int]:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from _blender_tracker import blender_tracks
 
-from tricap.core.images.fields import Instants
+from tricap.core.images.fields import FieldLayout
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
@@ -121,7 +121,7 @@ def three_views(frames: list[np.ndarray], start: np.ndarray) -> float:
         for name, x in (("L", -0.3), ("C", 0.0), ("R", 0.3))
     )  # to all three a plane at 2 m looks the same
     view = TrackingView(
-        cameras=cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=1.0
+        cameras=cameras, reference=1, field_layout=FieldLayout(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=1.0
     )
     image, after, n = SplineImage(frames[0]), SplineImage(frames[1]), len(start)
     A, b = motion(1)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from tricap.core.field_pictures import field_pictures
-from tricap.core.images.fields import BOTH, instants
+from tricap.core.images.fields import BOTH, field_layout
 from tricap.core.images.sequence import open_sequence
 
 
@@ -21,7 +21,7 @@ def test_fields_as_pictures(tmp_path: Path) -> None:
     sequence = open_sequence(tmp_path, images="C/*.png", movie=None, view="C")
 
     def made(first: str) -> tuple[list[int], list[Any]]:
-        paths = field_pictures(sequence, instants(BOTH, first), tmp_path / "fields")
+        paths = field_pictures(sequence, field_layout(BOTH, first), tmp_path / "fields")
         pictures = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
         assert all(picture.shape == (6, 8) and np.ptp(picture) == 0 for picture in pictures)
         return [int(picture[0, 0]) for picture in pictures], [path.stat().st_mtime_ns for path in paths]

@@ -9,7 +9,7 @@ import pytest
 
 from tricap.core.errors import InputError
 from tricap.core.fit_sources import clicks_in, clicks_left_out, joint_named, missing_for_fit, read_contours, read_source
-from tricap.core.images.fields import Instants
+from tricap.core.images.fields import FieldLayout
 from tricap.core.keypoint_sources import keypoint_sources
 from tricap.core.motion.keypoints_json import LAYOUTS
 from tricap.core.motion.markers import Markers
@@ -20,7 +20,7 @@ from tricap.core.take import JOINTS, Seeds
 
 def _footage(folder):
     views = (SimpleNamespace(name="L", offset_frames=0), SimpleNamespace(name="C", offset_frames=2))
-    return SimpleNamespace(take=SimpleNamespace(folder=folder, views=views, instants=Instants()))
+    return SimpleNamespace(take=SimpleNamespace(folder=folder, views=views, field_layout=FieldLayout()))
 
 
 def _source(**table):

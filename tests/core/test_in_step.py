@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tricap.core import pipeline
-from tricap.core.checking.timing import in_step
+from tricap.core.checking.timing import synchronised
 from tricap.core.errors import InputError
 from tricap.core.images.retime import Recent, retimed
 from tricap.core.measuring import measured_rows
@@ -56,7 +56,7 @@ def test_recent_pictures_are_not_decoded_again() -> None:
 def test_a_view_late_by_frames_is_told_to_be_shifted_first(tmp_path: Path) -> None:
     make_arm_take(tmp_path / "take", ArmTakeSettings(width_px=320, frames=8, interlaced="none", late_frames=1.3))
     with pytest.raises(InputError, match=r"View R is .1.[23]\d frames late, too much to interpolate; add -1"):
-        in_step(open_take(read_take(tmp_path / "take")), Monitor())
+        synchronised(open_take(read_take(tmp_path / "take")), Monitor())
 
 
 @pytest.mark.parametrize(("interlaced", "second"), [("odd", 0), ("even", 1)])
@@ -67,8 +67,8 @@ def test_each_field_is_put_to_its_moment_as_if_it_were_alone(tmp_path: Path, int
     alone = open_take(replace(both.take, interlaced=interlaced, fps=25.0))
     late = (0.0, 0.0, 0.4)
     for image in range(3):
-        rows = measured_rows(replace(both, late_images=late), 2 * image + second)
-        expected = measured_rows(replace(alone, late_images=late), image)
+        rows = measured_rows(replace(both, delay_images=late), 2 * image + second)
+        expected = measured_rows(replace(alone, delay_images=late), image)
         assert all(np.array_equal(a, b) for a, b in zip(rows, expected))
     assert not np.array_equal(rows[2], measured_rows(both, 4 + second)[2])
 
@@ -89,7 +89,7 @@ def test_a_view_half_a_frame_late_costs_nothing_once_corrected(tmp_path: Path) -
         assert ("offsets" in run.record) == correct
     assert abs(run.record["offsets"]["R"]["late_frames"] - 0.5) < 0.05
     assert error["corrected"] < 1.2 * error["synchronous"] and error["late"] > 2 * error["synchronous"], error
-    footage, _ = in_step(open_take(read_take(tmp_path / "take 0.5")), Monitor())
+    footage, _ = synchronised(open_take(read_take(tmp_path / "take 0.5")), Monitor())
     sound = open_take(read_take(tmp_path / "take 0.0"))
     left = measured_rows(footage, 4)[2] - measured_rows(sound, 4)[2]
     assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean((footage.read(4)[2] - sound.read(4)[2]) ** 2))

@@ -54,7 +54,7 @@ def test_the_readout_is_found_with_its_sigma_beside_an_offset(tmp_path: Path) ->
     for view, readout, late in (("L", -0.3, 0.0), ("R", 0.5, -0.4)):
         offset = found[view]
         assert abs(offset.readout_frames - readout) < 0.03 and 0 < offset.readout_sigma < 0.02 and offset.rolls, offset
-        assert abs(offset.late_frames - late) < 0.03, offset
+        assert abs(offset.delay_frames - late) < 0.03, offset
     assert found["C"].readout_frames == 0.0 and not found["C"].rolls
     said = rolling_finding(found["R"])
     assert "View R takes 0.5" in said.sentence and "longer from its first row to its last" in said.sentence and not said.certain

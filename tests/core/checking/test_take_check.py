@@ -17,7 +17,7 @@ import pytest
 from tricap.core import commands, pipeline
 from tricap.core.checking.findings import Checked
 from tricap.core.checking.take_check import check_take, doubts, sudden_step, timing_finding
-from tricap.core.checking.timing import Film, Offset, _between, energy_lags, estimate_offsets, lag_sigmas
+from tricap.core.checking.timing import Film, TimeOffset, _between, energy_lags, estimate_offsets, lag_sigmas
 from tricap.core.errors import InputError
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
@@ -216,9 +216,9 @@ def test_a_late_view_is_found_to_a_twentieth_of_a_frame(arm_recording: Record, l
     offsets = {o.view: o for o in estimate_offsets(open_take(read_take(arm_recording(late_frames=late))), monitor)}
     parts = [part for stage, part in told if stage == "synchronization"]
     assert parts == sorted(parts) and len(parts) > 1, "the bar never goes back"
-    assert abs(offsets["R"].late_frames - late) < 0.05 and offsets["R"].significant
-    assert abs(offsets["L"].late_frames) < 0.02 and not offsets["L"].significant
-    assert (offsets["C"].method, offsets["C"].late_frames) == ("reference", 0.0)
+    assert abs(offsets["R"].delay_frames - late) < 0.05 and offsets["R"].significant
+    assert abs(offsets["L"].delay_frames) < 0.02 and not offsets["L"].significant
+    assert (offsets["C"].method, offsets["C"].delay_frames) == ("reference", 0.0)
 
 
 def test_whole_frames_from_the_motion_alone() -> None:
@@ -235,7 +235,7 @@ def rhythm(n: int, seed: int = 0) -> np.ndarray:
     return np.asarray(np.abs(np.convolve(random.normal(size=n + 6), np.hanning(7), "valid"))) + 0.1
 
 
-def told(a: np.ndarray, b: np.ndarray, *, degrees: float = 20.0) -> Offset:
+def told(a: np.ndarray, b: np.ndarray, *, degrees: float = 20.0) -> TimeOffset:
     """What is said of views, so far apart, in which nothing can be followed, by how much moves in them when."""
     beside = Camera(name="R", size_px=(9, 9), matrix=np.eye(3), R_cam_world=rotation_from_vector(np.array([0, np.radians(degrees), 0])))
     seen = SimpleNamespace(energy=np.stack([a, b]))
@@ -250,20 +250,20 @@ def test_views_that_show_one_movement_from_two_sides_are_not_called_out_of_step(
     lags, correlation = energy_lags(a, b)
     assert lags[0] == -2 and correlation > 0.99 and lag_sigmas(a, b, -2) < 2
     assert told(a, b).method == "nothing" and not told(a, b).doubtful
-    assert (told(a, a).method, told(a, a).late_frames) == ("energy", 0.0)
+    assert (told(a, a).method, told(a, a).delay_frames) == ("energy", 0.0)
 
 
 def test_many_movements_tell_whole_frames_of_views_that_are_not_far_apart() -> None:
     motion, noise = rhythm(154), 0.1 * rhythm(150, seed=1)
     late = told(motion[:150], motion[4:] + noise)
-    assert (late.method, late.late_frames) == ("energy", 4.0) and late.doubtful
+    assert (late.method, late.delay_frames) == ("energy", 4.0) and late.doubtful
     said = timing_finding(late)
     assert not said.certain and "View R seems to be 4 frames later" in said.sentence and "add -4 to" in said.advice
     assert told(motion[:150], motion[4:] + noise, degrees=60).method == "nothing"
 
 
 def test_what_only_the_rhythm_tells_is_a_finding_from_three_sigmas_on() -> None:
-    late = {lag: Offset(view="R", late_frames=lag, sigma_frames=0.5, method="energy") for lag in (0.0, 0.15, -1.0, 2.0)}
+    late = {lag: TimeOffset(view="R", delay_frames=lag, sigma_frames=0.5, method="energy") for lag in (0.0, 0.15, -1.0, 2.0)}
     assert [lag for lag, offset in late.items() if offset.doubtful] == [2.0]
 
 

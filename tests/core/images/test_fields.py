@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tricap.core.images.fields import BOTH, INTERLACE, instants, row_grid
+from tricap.core.images.fields import BOTH, INTERLACE, field_layout, row_grid
 
 
 @pytest.mark.parametrize("interlaced", INTERLACE)
@@ -49,10 +49,10 @@ def test_covariances_scale_with_the_rows() -> None:
 def test_both_fields_are_two_instants_of_an_image() -> None:
     frame = np.arange(6.0)[:, None] * np.ones(3)
     for first, expected in (("odd", [[0, 2, 4], [1, 3, 5]]), ("even", [[1, 3, 5], [0, 2, 4]])):
-        both = instants(BOTH, first)
+        both = field_layout(BOTH, first)
         assert [both.rows(n).rows(frame)[:, 0].tolist() for n in range(4)] == expected * 2
         assert [both.image(n) for n in range(4)] == [0, 0, 1, 1] and both.per_image == 2
-    assert [instants("even").image(n) for n in range(3)] == [0, 1, 2] and instants("even").rows(1) == row_grid("even")
+    assert [field_layout("even").image(n) for n in range(3)] == [0, 1, 2] and field_layout("even").rows(1) == row_grid("even")
 
 
 @pytest.mark.parametrize("height", [11, 12])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.images.fields import Instants
+from tricap.core.images.fields import FieldLayout
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
 from tricap.core.tracking.key_points import track_key_points
@@ -39,7 +39,7 @@ def test_chosen_points(scenes: Any, frames: int, noise: float) -> None:
     truth = np.stack([own @ b.R.T + b.t for b in bodies])
     clicks = {str(n): {c.name: c.project(truth[0, n]) for c in rig.cameras} for n in range(len(own))}
     view = TrackingView(
-        cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7
+        cameras=rig.cameras, reference=1, field_layout=FieldLayout(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7
     )
     read = lambda i: [scenes.render(c, [bodies[i]], noise=noise, seed=i) for c in rig.cameras]  # noqa: E731
     points = track_key_points(read, range(frames), clicks, view, Monitor())

@@ -11,7 +11,7 @@ import pytest
 from tricap.core.commands import main
 from tricap.core.errors import InputError
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.images.fields import Instants
+from tricap.core.images.fields import FieldLayout
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
 from tricap.core.tracking.key_points import KeyPoints, distances, track_key_points
@@ -41,7 +41,7 @@ def follow(
         str(n): {c.name: c.project(truth[0, n]) + (c.name != "C") * off_px * random.uniform(-1, 1, 2) for c in seeing} for n in range(5)
     }
     view = TrackingView(
-        cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(**settings),
+        cameras=rig.cameras, reference=1, field_layout=FieldLayout(), matching=MatchingSettings(), tracking=TrackingSettings(**settings),
         limit_px=0.7,
     )  # fmt: skip
     read = lambda i: [shown(i, c.name, scenes.render(c, [bodies[i]], noise=1.5, seed=i)) for c in rig.cameras]  # noqa: E731
@@ -114,7 +114,9 @@ def test_retroreflective_markers(scenes: Any) -> None:
     clicks = {name: {c.name: c.project(truth[0, n]) + (1.0, -0.8) for c in rig.cameras} for n, name in enumerate(("wrist", "elbow"))}
     markers = KeyPointSettings(markers=True)
     tracking = TrackingSettings()
-    view = TrackingView(cameras=rig.cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=tracking, limit_px=0.7)
+    view = TrackingView(
+        cameras=rig.cameras, reference=1, field_layout=FieldLayout(), matching=MatchingSettings(), tracking=tracking, limit_px=0.7
+    )
     read = lambda i: [picture(c, i) for c in rig.cameras]  # noqa: E731
     points = track_key_points(read, range(10), clicks, view, Monitor(), markers)
     assert (points.status == TrackStatus.MEASURED).all()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.images.fields import Instants
+from tricap.core.images.fields import FieldLayout
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.tracking.published import predict_in_images, search_radius
 from tricap.core.tracking.settings import TrackingSettings
@@ -55,7 +55,7 @@ def test_prediction_and_box(scenes: Any) -> None:
     """Each image goes on by itself, over missing frames too; a new point goes as its neighbours; boxes grow with dt² and nearness."""
     cameras = scenes.three_cameras().cameras
     view = TrackingView(
-        cameras=cameras, reference=1, instants=Instants(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7,
+        cameras=cameras, reference=1, field_layout=FieldLayout(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7,
         dt_s=0.04,
     ).at(4)  # fmt: skip
     before = frame(1, [[0.0, 0.0, 2.0], [0.02, 0.0, 2.0]], cameras)

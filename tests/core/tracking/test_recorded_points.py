@@ -11,7 +11,7 @@ import pytest
 from tricap.core.calibration.rig_files import read_any
 from tricap.core.commands import main
 from tricap.core.geometry.camera import Camera
-from tricap.core.images.fields import Instants
+from tricap.core.images.fields import FieldLayout
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.progress import Monitor
 from tricap.core.tracking.key_points import KeyPoints, track_key_points
@@ -61,7 +61,7 @@ def test_corners_of_a_board_keep_their_distances(shared_takes: Path) -> None:
     images = board_images(folder)
     corners = {n: views for n, views in detected(images[0]).items() if len(views) == len(VIEWS)}
     view = TrackingView(
-        cameras=tuple(rig.cameras[n] for n in VIEWS), reference=1, instants=Instants(), matching=MatchingSettings(patch_px=21),
+        cameras=tuple(rig.cameras[n] for n in VIEWS), reference=1, field_layout=FieldLayout(), matching=MatchingSettings(patch_px=21),
         tracking=TrackingSettings(box_px=48, max_residual_px=3.0, max_speed=20.0), limit_px=3.0, dt_s=1 / 6,
     )  # fmt: skip
     names = [camera.name for camera in view.cameras]
@@ -102,7 +102,7 @@ def test_a_cylinder_under_load_is_followed_through_its_steps(shared_takes: Path)
     angle, z = np.meshgrid(np.radians(np.linspace(45, 105, 15)), np.linspace(0.06, 0.15, 13))
     about = np.stack([RADIUS_M * np.cos(angle), RADIUS_M * np.sin(angle), z], axis=-1).reshape(-1, 3)
     cameras, images = windows(shared_takes / "cylinder_2cam_multidic", about)
-    view = TrackingView(cameras=tuple(cameras), reference=0, instants=Instants(), matching=MatchingSettings(patch_px=21),
+    view = TrackingView(cameras=tuple(cameras), reference=0, field_layout=FieldLayout(), matching=MatchingSettings(patch_px=21),
                         tracking=TrackingSettings(max_residual_px=2.0), limit_px=2.0, dt_s=1.0)  # fmt: skip
     clicks = {str(n): {c.name: c.project(X) for c in cameras} for n, X in enumerate(about)}
     there = track_key_points(lambda t: images[t], range(STEPS), clicks, view, Monitor())
