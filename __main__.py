@@ -17,7 +17,7 @@ def main(argv: list[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is there: its own threads would fight ours over small matrices
     from .addon import command
     from .addon.retarget import command as retargeting
-    from .core import commands
+    from .core.cli import main as commands
 
     return commands.main(argv, (command.add_commands, retargeting.add_commands))
 

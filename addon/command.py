@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from ..core.body.fields import EXPONENTIAL, POTENTIALS
-from ..core.body.one_skin import DETAIL
-from ..core.errors import InputError
-from ..core.progress import Monitor
+from ..core.body.skin.closed_skin import DETAIL
+from ..core.foundation.errors import InputError
+from ..core.foundation.progress import Monitor
 
 
 def add_commands(subparsers: Any) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import InputError
+from ..core.foundation.errors import InputError
 
 
 def take_folder(given: str, scene: bpy.types.Scene) -> Path:

@@ -20,9 +20,9 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..core.errors import InputError
-from ..core.progress import Cancelled, Monitor
-from ..core.threads import one_thread_in_linear_algebra
+from ..core.foundation.errors import InputError
+from ..core.foundation.progress import Cancelled, Monitor
+from ..core.foundation.threads import one_thread_in_linear_algebra
 from . import status
 from .session import get_session
 

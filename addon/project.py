@@ -15,14 +15,14 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core import store
-from ..core.errors import InputError
+from ..core.foundation import store
+from ..core.foundation.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
-from ..core.images.fields import BOTH, FieldLayout, field_layout
-from ..core.person_sources import PERSON_SOURCES
-from ..core.take import NO_BODY, Take
-from ..core.take import body_model as take_body_model
-from ..core.take_file import Table, new_table, read_table, renumbered, take_of_table, write_table
+from ..core.images.interlace import BOTH, FieldLayout, field_layout
+from ..core.take.sources import PERSON_SOURCES
+from ..core.take.take import NO_BODY, Take
+from ..core.take.take import body_model as take_body_model
+from ..core.take.writing import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import folders, properties, seeds
 from .scene import clips
 from .session import get_session

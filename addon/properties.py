@@ -11,8 +11,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core import pipeline
-from ..core import settings as knobs
+from ..core.foundation import settings as knobs
+from ..core.run import pipeline
 from . import take_properties
 from .session import get_session
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import bpy
 import numpy as np
 
-from ..core.take import JOINTS
+from ..core.take.take import JOINTS
 from .scene import axes
 
 SURFACE = re.compile(r"seed (\d+)")

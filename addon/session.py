@@ -12,7 +12,7 @@ import bpy
 
 if TYPE_CHECKING:
     from ..core.images.sequence import ImageSequence
-    from ..core.take_file import Table
+    from ..core.take.writing import Table
     from .clicking.draw import Drawing
     from .clicking.finder import Finder
     from .clicking.operators import ClickOperator

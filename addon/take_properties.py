@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from ..core.images.fields import BOTH, INTERLACE
+from ..core.images.interlace import BOTH, INTERLACE
 from .scene.clips import frames_per_image
 from .session import get_session
 

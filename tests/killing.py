@@ -22,8 +22,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tricap.core import commands, pipeline  # noqa: F401  loaded before the first fork
-from tricap.core.progress import Monitor
+from tricap.core.foundation.progress import Monitor
+from tricap.core.run import pipeline  # noqa: F401  loaded before the first fork
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
 EXTENSION = "bl_ext.user_default.tricap"

@@ -11,32 +11,34 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tricap.core import frame_table, store
-from tricap.core.bar_file import read_bar, write_bar
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
 from tricap.core.checking.run_check import check_run
-from tricap.core.contour_table import ContourTable
-from tricap.core.errors import InputError
+from tricap.core.foundation import store
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rig import read_rig, write_rig
-from tricap.core.images.fields import row_grid
+from tricap.core.images.interlace import row_grid
 from tricap.core.images.sequence import open_sequence
-from tricap.core.inspection import patch_boxes, read_removed, read_tracks
-from tricap.core.inspection import read_points as read_shown
-from tricap.core.motion import bvh, c3d, keypoints_json, points_csv, tables, trc
-from tricap.core.motion.markers import Markers
-from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
+from tricap.core.motion import tables
+from tricap.core.motion.formats import bvh, c3d, keypoints_json, markers, trc
+from tricap.core.motion.formats.markers import Markers
+from tricap.core.motion.formats.ply import read_ply, write_cloud, write_mesh
 from tricap.core.motion.retarget.mapping import read_preset
-from tricap.core.motion.retarget.unshown import ResidualChain, ResidualMotion, from_text, to_text
-from tricap.core.motion.retarget.vrm import read_humanoid
-from tricap.core.pipeline import Run
-from tricap.core.progress import Monitor
-from tricap.core.results import Results
-from tricap.core.stages import valid_stages
+from tricap.core.motion.retarget.residual_motion import ResidualChain, ResidualMotion, from_text, to_text
+from tricap.core.motion.retarget.roles import read_humanoid
+from tricap.core.results.folder import Results
+from tricap.core.run import record as frame_table
+from tricap.core.run.inspection import patch_boxes, read_removed, read_tracks
+from tricap.core.run.inspection import read_points as read_shown
+from tricap.core.run.pipeline import Run
+from tricap.core.run.stages import valid_stages
 from tricap.core.synthetic.arm import arm_rig
-from tricap.core.take import read_take
-from tricap.core.take_file import read_table
+from tricap.core.take.bar_file import read_bar, write_bar
+from tricap.core.take.take import read_take
+from tricap.core.take.writing import read_table
+from tricap.core.tracking.contour import ContourTable
 from tricap.core.tracking.point_tables import read_planar, read_points, read_polygon
 from tricap.core.tracking.settings import TrackStatus
 
@@ -320,8 +322,8 @@ READERS: dict[str, tuple[Make, Read]] = {
     "check of a run": (run_folder, lambda f: check_run(f, Monitor())),
     "trc": (written("a.trc", lambda p: trc.write_trc(p, points())), lambda f: trc.read_trc(f / "a.trc")),
     "c3d": (written("a.c3d", lambda p: c3d.write_c3d(p, points())), lambda f: c3d.read_c3d(f / "a.c3d")),
-    "csv of points": (written("a.csv", lambda p: points_csv.write_points_csv(p, points())),
-                      lambda f: points_csv.read_points_csv(f / "a.csv")),
+    "csv of points": (written("a.csv", lambda p: markers.write_points_csv(p, points())),
+                      lambda f: markers.read_points_csv(f / "a.csv")),
     "bvh": (written("a.bvh", bvh_file), lambda f: bvh.read_bvh(f / "a.bvh")),
     "joints.csv": (text("joints.csv", "frame,time_s,joint,x,y,z,sigma\n0,0.0,elbow.R,1,2,3,0.1\n1,0.04,elbow.R,1,2,3,0.1\n"),
                    lambda f: tables.read_joints(f / "joints.csv")),

@@ -22,7 +22,7 @@ LAYERS = (
 ).split()
 SYNTHETIC_USES = {"errors", "progress", "settings", "values", "store", "geometry", "images", "body", "motion", "take"}
 THIRD_PARTY = {"numpy", "scipy", "cv2", "threadpoolctl"}
-OPTIONAL = {"core/batch.py": {"dask", "distributed"}}  # the extra [batch]; imported only when it is used
+OPTIONAL = {"core/run/batch.py": {"dask", "distributed"}}  # the extra [batch]; imported only when it is used
 NETWORK = {"socket", "ssl", "http", "urllib", "ftplib", "smtplib", "xmlrpc", "requests", "asyncio"}
 SERIALIZERS = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "joblib"}
 LONGEST_FILE = 450
@@ -184,30 +184,30 @@ def files_stay_small(name: str, source: str) -> list[str]:
 Rule = Callable[[str, str], list[str]]
 REJECTED: list[tuple[Rule, str, str]] = [
     (layer_order, "core/geometry/camera.py", "from ..matching.seeds import grow"),
-    (layer_order, "core/errors.py", "from . import settings"),
-    (layer_order, "core/body/skin.py", "def f():\n    from ..fitting import solver"),
-    (layer_order, "core/pipeline.py", "from .synthetic.arm import make_arm_take"),
+    (layer_order, "core/foundation/errors.py", "from . import settings"),
+    (layer_order, "core/body/skin/contour_skin.py", "def f():\n    from ..fitting import solver"),
+    (layer_order, "core/run/pipeline.py", "from .synthetic.arm import make_arm_take"),
     (layer_order, "core/synthetic/arm.py", "from ..pipeline import run"),
-    (layer_order, "core/take.py", "from ..addon import jobs"),
+    (layer_order, "core/take/take.py", "from ..addon import jobs"),
     (layer_order, "core/helpers.py", ""),
-    (core_is_pure, "core/body/skin.py", "import bpy"),
-    (core_is_pure, "core/body/skin.py", "from mathutils import Vector"),
+    (core_is_pure, "core/body/skin/contour_skin.py", "import bpy"),
+    (core_is_pure, "core/body/skin/contour_skin.py", "from mathutils import Vector"),
     (core_is_pure, "core/report.py", "def draw():\n    import matplotlib.pyplot"),
-    (core_is_pure, "core/pipeline.py", "def f():\n    from distributed import Client"),
-    (core_is_pure, "core/batch.py", "from distributed import Client"),
+    (core_is_pure, "core/run/pipeline.py", "def f():\n    from distributed import Client"),
+    (core_is_pure, "core/run/batch.py", "from distributed import Client"),
     (bpy_stays_in_the_addon, "__init__.py", "import bpy"),
     (bpy_stays_in_the_addon, "__init__.py", "from . import addon"),
-    (imports_are_relative, "core/take.py", "from tricap.core.errors import InputError"),
+    (imports_are_relative, "core/take/take.py", "from tricap.core.foundation.errors import InputError"),
     (imports_are_relative, "addon/jobs.py", "import core.pipeline"),
     (core_does_not_print, "core/surface/cloud.py", "print('done')"),
     (core_does_not_print, "core/surface/cloud.py", "import sys\nsys.stdout.write('done')"),
-    (files_carry_no_code, "core/store.py", "import pickle"),
-    (files_carry_no_code, "core/store.py", "from pickle import loads"),
+    (files_carry_no_code, "core/foundation/store.py", "import pickle"),
+    (files_carry_no_code, "core/foundation/store.py", "from pickle import loads"),
     (files_carry_no_code, "addon/presets.py", "eval(text)"),
-    (files_carry_no_code, "core/store.py", "np.load(path, allow_pickle=True)"),
-    (no_network, "core/commands.py", "from urllib.request import urlopen"),
-    (no_silent_except, "core/store.py", "try:\n    f()\nexcept OSError:\n    pass"),
-    (no_silent_except, "core/store.py", "try:\n    f()\nexcept:\n    g()"),
+    (files_carry_no_code, "core/foundation/store.py", "np.load(path, allow_pickle=True)"),
+    (no_network, "core/cli/main.py", "from urllib.request import urlopen"),
+    (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept OSError:\n    pass"),
+    (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept:\n    g()"),
     (state_is_in_the_session, "addon/jobs.py", "_current: list[Job] = []"),
     (state_is_in_the_session, "addon/jobs.py", "LISTENERS = []"),
     (state_is_in_the_session, "addon/jobs.py", "known = {'L': 1}"),
@@ -216,24 +216,24 @@ REJECTED: list[tuple[Rule, str, str]] = [
     (state_is_in_the_session, "addon/steps/watch.py", "from .. import jobs\njobs.ENDED['x'] = 1"),
     (state_is_in_the_session, "addon/jobs.py", "COUNT = 0\ndef f():\n    global COUNT\n    COUNT = 1"),
     (state_is_in_the_session, "addon/clicking/operators.py", "class ClickOperator:\n    running: ClassVar[list[int]] = []"),
-    (files_stay_small, "core/take.py", "x = 1\n" * (LONGEST_FILE + 1)),
+    (files_stay_small, "core/take/take.py", "x = 1\n" * (LONGEST_FILE + 1)),
 ]
 ACCEPTED: list[tuple[Rule, str, str]] = [
     (layer_order, "core/matching/seeds.py", "from ..geometry.rig import Rig\nfrom ..errors import InputError\nfrom .filters import sift"),
-    (layer_order, "core/commands.py", "from .synthetic import arm\nfrom . import pipeline"),
+    (layer_order, "core/cli/main.py", "from .synthetic import arm\nfrom . import pipeline"),
     (layer_order, "addon/jobs.py", "from ..core import pipeline"),
     (core_is_pure, "core/images/sampling.py", "import json\nimport cv2\nimport numpy as np\nfrom scipy import ndimage"),
-    (core_is_pure, "core/batch.py", "def f():\n    from distributed import Client"),
+    (core_is_pure, "core/run/batch.py", "def f():\n    from distributed import Client"),
     (bpy_stays_in_the_addon, "__init__.py", "def register():\n    from . import addon"),
     (imports_are_relative, "addon/jobs.py", "import bpy\nfrom ..core import pipeline"),
-    (core_does_not_print, "core/commands.py", "print('done')"),
-    (files_carry_no_code, "core/store.py", "np.load(path, allow_pickle=False)"),
-    (no_network, "core/commands.py", "import json"),
-    (no_silent_except, "core/store.py", "try:\n    f()\nexcept OSError as error:\n    raise InputError('x') from error"),
+    (core_does_not_print, "core/cli/main.py", "print('done')"),
+    (files_carry_no_code, "core/foundation/store.py", "np.load(path, allow_pickle=False)"),
+    (no_network, "core/cli/main.py", "import json"),
+    (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept OSError as error:\n    raise InputError('x') from error"),
     (state_is_in_the_session, "addon/session.py", "known = []"),
     (state_is_in_the_session, "addon/jobs.py", "NAMES = ['L']\ndef f():\n    found = []\n    found.append(NAMES[0])"),
     (state_is_in_the_session, "addon/jobs.py", "class Run:\n    bl_options = {'UNDO'}\n    def f(self):\n        self.found = []"),
-    (files_stay_small, "core/take.py", "x = 1\n" * LONGEST_FILE),
+    (files_stay_small, "core/take/take.py", "x = 1\n" * LONGEST_FILE),
 ]
 RULES = tuple(dict.fromkeys(rule for rule, _, _ in REJECTED))
 
@@ -268,4 +268,4 @@ def test_every_rule_has_samples_of_both_kinds() -> None:
 
 def test_all_modules_are_read() -> None:
     names = our_modules()
-    assert {"__init__.py", "core/errors.py", "core/geometry/camera.py"} <= set(names)
+    assert {"__init__.py", "core/foundation/errors.py", "core/geometry/camera.py"} <= set(names)

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tricap.core import store
 from tricap.core.body.shape import read_body
-from tricap.core.motion.ply import read_ply
+from tricap.core.foundation import store
+from tricap.core.motion.formats.ply import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 # Measured on this take: no difference but in the last digit of lengths and radii.

@@ -11,12 +11,12 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.errors import InputError
-from tricap.core.fitting.conditions import Conditions
-from tricap.core.fitting.sequence import FitInput, fit_sequence
+from tricap.core.fitting.context import Conditions
+from tricap.core.fitting.stages.sequence import FitInput, fit_sequence
 from tricap.core.fitting.state import ShapeParameters
+from tricap.core.foundation.errors import InputError
 from tricap.core.motion import sources
-from tricap.core.motion.markers import Markers
+from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.retarget.mapping import find_map
 
 from .core.fitting.limb_scene import make_scene

@@ -15,13 +15,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import store
-from tricap.core.errors import LONGEST, InputError
-from tricap.core.images.headers import claimed_size
-from tricap.core.images.sequence import read_image
-from tricap.core.motion.keypoints_json import natural_order, read_keypoints
+from tricap.core.foundation import store
+from tricap.core.foundation.errors import LONGEST, InputError
+from tricap.core.images.sequence import claimed_size, read_image
+from tricap.core.motion.formats.keypoints_json import natural_order, read_keypoints
 from tricap.core.motion.tables import read_joints
-from tricap.core.results import Results
+from tricap.core.results.folder import Results
 from tricap.core.tracking.point_tables import read_planar, read_points
 
 HERE = Path(__file__).resolve().parent

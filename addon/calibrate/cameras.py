@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.geometry.rig import Rig
 from ..scene import axes, clips

@@ -8,13 +8,13 @@ import bpy
 import numpy as np
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from ...core.bar_file import write_bar
-from ...core.calibrating import BarFootage, CalibratedRig, MeasuredBar, calibrate_rig, measure_bar, open_bar, write_report
+from ...core.calibration.calibrate import BarFootage, CalibratedRig, MeasuredBar, calibrate_rig, measure_bar, open_bar, write_report
 from ...core.calibration.rig_files import FORMATS, read_any, write_as
-from ...core.calibration.world_choice import WorldChoice
-from ...core.errors import InputError
+from ...core.calibration.world_frame import WorldChoice
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
 from ...core.geometry.rig import write_rig
-from ...core.progress import Monitor
+from ...core.take.bar_file import write_bar
 from .. import folders, project
 from ..jobs import JobOperator
 from ..steps.cameras import use_rig

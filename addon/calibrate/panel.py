@@ -2,7 +2,7 @@
 
 import bpy
 
-from ...core.images.fields import BOTH
+from ...core.images.interlace import BOTH
 from ..panels import sentence
 from . import live
 

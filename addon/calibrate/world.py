@@ -4,8 +4,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...core.calibration.world_choice import frame_of_clicks
-from ...core.errors import InputError
+from ...core.calibration.world_frame import frame_of_clicks
+from ...core.foundation.errors import InputError
 from ...core.geometry.rig import Rig
 from .. import project, seeds
 from ..scene import axes

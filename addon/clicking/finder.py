@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.images.sampling import SplineImage
 from ...core.matching.least_squares import MatchingSettings
 from ...core.matching.proposals import Proposal, propose
-from ...core.take import Footage
+from ...core.take.take import Footage
 from ..session import get_session
 
 log = logging.getLogger(__name__)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import bpy
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from .. import project, seeds
 from ..overlay import canvas
 

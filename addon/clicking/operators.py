@@ -6,10 +6,10 @@ from typing import Any
 
 import bpy
 
-from ...core import pipeline
 from ...core.body.model_file import BodyModel, joint_depths_m, read_model
-from ...core.errors import InputError
-from ...core.take import JOINTS, Seeds, open_take
+from ...core.foundation.errors import InputError
+from ...core.run import pipeline
+from ...core.take.take import JOINTS, Seeds, open_take
 from .. import project, properties, seeds, status
 from ..overlay import canvas
 from ..session import get_session

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from .. import project, seeds
 from ..panels import sentence
 from .operators import model_joints

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from ...core.errors import InputError
-from ...core.fitting.clicks import intersection
+from ...core.fitting.inputs.clicks import intersection
+from ...core.foundation.errors import InputError
 from ...core.matching.foreground import around_clicks
 from ...core.matching.proposals import Proposal, below_surface, epipolar_curve, where_rays_meet
 from .. import seeds

@@ -6,8 +6,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core.errors import InputError
-from ...core.take_file import take_of_table
+from ...core.foundation.errors import InputError
+from ...core.take.writing import take_of_table
 from .. import project, status
 from ..overlay import canvas, draw, layers, results
 from ..overlay.operators import pointed

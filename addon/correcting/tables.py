@@ -9,8 +9,8 @@ import bpy
 import numpy as np
 
 from ...core.body.model_file import BodyModel, read_model
-from ...core.errors import InputError
-from ...core.take_file import Table
+from ...core.foundation.errors import InputError
+from ...core.take.writing import Table
 from .. import project, properties
 
 UNLIMITED_DEG = 360.0  # stands for no limit

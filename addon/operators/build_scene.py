@@ -9,7 +9,7 @@ import bpy
 from mathutils import Matrix
 
 from ...core.body.fields import POTENTIALS
-from ...core.progress import Monitor
+from ...core.foundation.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
 from ..scene import armature

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import bpy
 
-from ...core.errors import InputError
-from ...core.settings import nearest_name
-from ...core.track2d_command import open_footage
+from ...core.cli.track2d import open_footage
+from ...core.foundation.errors import InputError
+from ...core.foundation.settings import nearest_name
 from ...core.tracking.point_tables import PlanarTable, read_planar, read_points
 from .. import folders
 from ..scene.planar import add_planar

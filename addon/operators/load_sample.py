@@ -5,9 +5,9 @@ from pathlib import Path
 
 import bpy
 
-from ...core import pipeline
-from ...core.errors import InputError
-from ...core.progress import Monitor
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.run import pipeline
 from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
 from .. import folders, project
 from ..jobs import JobOperator

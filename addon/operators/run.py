@@ -6,8 +6,8 @@ from typing import Any
 
 import bpy
 
-from ...core import pipeline
-from ...core.progress import Monitor
+from ...core.foundation.progress import Monitor
+from ...core.run import pipeline
 from .. import project
 from ..scene.contents import Contents, read_contents
 from .build_scene import RELATIVE, put_into_scene

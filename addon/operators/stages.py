@@ -6,9 +6,9 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ...core import pipeline
-from ...core.fit_sources import check_body
-from ...core.progress import Monitor
+from ...core.fitting.inputs.take_inputs import check_body
+from ...core.foundation.progress import Monitor
+from ...core.run import pipeline
 from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE

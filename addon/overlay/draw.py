@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core.frame_table import FrameTable
+from ...core.run.record import FrameTable
 from ..session import get_session
 from . import canvas, layers, results
 from .canvas import Canvas, Colour

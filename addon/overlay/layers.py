@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...core.inspection import TrackHistory, patch_boxes
+from ...core.run.inspection import TrackHistory, patch_boxes
 from ...core.surface.cloud import FILTERS
 from ...core.tracking.settings import TrackStatus
 

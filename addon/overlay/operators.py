@@ -6,9 +6,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...core import pipeline
-from ...core.contour_command import Start, write_contours
-from ...core.progress import Monitor
+from ...core.cli.contour import Start, write_contours
+from ...core.foundation.progress import Monitor
+from ...core.run import pipeline
 from .. import project, status
 from ..jobs import JobOperator
 from . import canvas, draw, layers, results

@@ -9,17 +9,16 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core.contour_table import ContourTable
-from ...core.errors import InputError
-from ...core.frame_table import FrameTable, read_frame_table
+from ...core.foundation.errors import InputError
+from ...core.foundation.settings import from_table
 from ...core.geometry.camera import Camera
-from ...core.images.fields import RowGrid
-from ...core.inspection import FramePoints, TrackHistory, body_outline, read_points, read_removed, read_tracks
+from ...core.images.interlace import RowGrid
 from ...core.matching.least_squares import MatchingSettings
-from ...core.run_json import read_run
-from ...core.settings import from_table
-from ...core.take import open_take, read_take
-from ...core.tracking.contour import Contour
+from ...core.results.run_json import read_run
+from ...core.run.inspection import FramePoints, TrackHistory, body_outline, read_points, read_removed, read_tracks
+from ...core.run.record import FrameTable, read_frame_table
+from ...core.take.take import open_take, read_take
+from ...core.tracking.contour import Contour, ContourTable
 from .. import folders, project
 from ..session import OpenResults, get_session
 

@@ -4,7 +4,7 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from ...core.motion.retarget.retarget import Retargeted
 from ...core.motion.retarget.rig import Motion, channels, head_of
 from .apply import set_range

@@ -17,10 +17,10 @@ from typing import Any
 import bpy
 from mathutils import Matrix
 
-from ...core import store
 from ...core.body.shape import read_body
-from ...core.errors import InputError
-from ...core.motion.markers import metres_per
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
+from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
 from ..scene import skin
 from .apply import set_range

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ...core import store
-from ...core.arguments import check_not_read
-from ...core.errors import InputError
-from ...core.motion.markers import UNITS_M
-from ...core.progress import Monitor
-from ...core.results import check_not_result
-from ...core.settings import from_table
+from ...core.cli.arguments import check_not_read
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.foundation.settings import from_table
+from ...core.motion.formats.markers import UNITS_M
+from ...core.results.folder import check_not_result
 from ..command import check_simplify, standard_output_kept_clean
 from .programs import PROGRAMS, is_imported_by_blender
 

@@ -5,18 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import store
-from ...core.errors import InputError
-from ...core.motion.bvh import write_bvh
-from ...core.motion.c3d import write_c3d
-from ...core.motion.markers import Markers, metres_per
-from ...core.motion.points_csv import rate, write_points_csv
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.motion.formats.bvh import write_bvh
+from ...core.motion.formats.c3d import write_c3d
+from ...core.motion.formats.markers import Markers, metres_per, rate, write_points_csv
+from ...core.motion.formats.trc import write_trc
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
 from ...core.motion.tables import read_joints
-from ...core.motion.trc import write_trc
-from ...core.progress import Monitor
-from ...core.results import check_not_result
+from ...core.results.folder import check_not_result
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")

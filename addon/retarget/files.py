@@ -8,14 +8,14 @@ from pathlib import Path
 
 import bpy
 
-from ...core.errors import InputError
-from ...core.motion.bvh import read_bvh
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.motion.formats.bvh import read_bvh
 from ...core.motion.retarget.mapping import MappedMotion, find_map
-from ...core.motion.retarget.rest import with_person_like_rest
+from ...core.motion.retarget.rest_pose import with_person_like_rest
 from ...core.motion.retarget.rig import Motion
-from ...core.motion.retarget.vrm import read_humanoid
+from ...core.motion.retarget.roles import read_humanoid
 from ...core.motion.sources import read_motion_source
-from ...core.progress import Monitor
 from ..scene.armature import ROLES_KEY
 from .build import build_armature
 from .programs import is_imported_by_blender

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from ...core.motion.retarget.mapping import write_map
 from ...core.motion.retarget.roles import ROLES
 from . import apply, properties

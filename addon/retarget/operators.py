@@ -7,14 +7,14 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
 from ...core.motion.retarget.contacts import FeetSettings
+from ...core.motion.retarget.keys import resampled
 from ...core.motion.retarget.mapping import MappedMotion, MappedRig
-from ...core.motion.retarget.resample import resampled
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
-from ...core.progress import Monitor
 from ..jobs import JobOperator
 from ..properties import snapshot
 from . import apply, preview, properties

@@ -7,8 +7,8 @@ import bpy
 import cv2
 import numpy as np
 
-from ...core import store
-from ...core.errors import InputError
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.roles import ARM, LEG, SIDES, sided

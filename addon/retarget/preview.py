@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from ...core.motion.retarget.mapping import MappedRig, RigMap
 from ...core.motion.retarget.retarget import leg_ratio
 from ...core.motion.retarget.roles import part_of

@@ -6,13 +6,13 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
-from ...core.motion.markers import UNITS_M
+from ...core.foundation.errors import InputError
+from ...core.motion.formats.markers import UNITS_M
 from ...core.motion.retarget.contacts import FeetSettings
+from ...core.motion.retarget.control_rig import ControlRig
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.retarget.roles import ROLES
-from ...core.motion.retarget.steering import ControlRig
 from ..properties import group_class
 
 USUAL = "USUAL"

@@ -10,12 +10,12 @@ from dataclasses import replace
 import bpy
 import numpy as np
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
 from ...core.motion.retarget.mapping import RigMap
+from ...core.motion.retarget.residual_motion import from_text
 from ...core.motion.retarget.rig import Motion, Rig
-from ...core.motion.retarget.unshown import from_text
-from ...core.motion.retarget.vrm import role_of
-from ...core.progress import Monitor
+from ...core.motion.retarget.roles import role_of
 from ..scene.armature import ROLES_KEY
 
 UNIFORM = 1e-3  # scales along the axes may differ by this part

@@ -13,13 +13,13 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...core import store
 from ...core.body.fields import EXPONENTIAL, potential_named
-from ...core.body.one_skin import DETAIL
-from ...core.errors import InputError
-from ...core.motion.ply import Ply
-from ...core.progress import Monitor
-from ...core.stages import STAGES
+from ...core.body.skin.closed_skin import DETAIL
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.motion.formats.ply import Ply
+from ...core.run.stages import STAGES
 from . import action, armature, cameras, clips, metaballs, skin, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
@@ -29,7 +29,7 @@ from .trajectories import add_arrows, add_trajectories, sparser
 COLLECTION = "Tricap"
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
-KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/stages.py)
+KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/run/stages.py)
 
 
 @dataclass(frozen=True, kw_only=True)

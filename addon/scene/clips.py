@@ -5,10 +5,9 @@ from pathlib import Path
 
 import bpy
 
-from ...core.errors import InputError
-from ...core.field_pictures import field_pictures
+from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
-from ...core.images.fields import FieldLayout
+from ...core.images.interlace import FieldLayout, field_pictures
 from ...core.images.sequence import ImageSequence, open_sequence
 from .. import folders
 from . import axes

@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from ...core import store
-from ...core.bar_file import read_bar
-from ...core.body.ends import shape_for_skin
 from ...core.body.shape import BodyShape, read_body
-from ...core.body.skin_mesh import SkinSettings
-from ...core.errors import InputError
-from ...core.motion.ply import Ply, read_ply
+from ...core.body.skin.extremities import shape_for_skin
+from ...core.body.skin.mesh import SkinSettings
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.foundation.settings import from_table
+from ...core.motion.formats.ply import Ply, read_ply
 from ...core.motion.tables import MotionTable, read_motion
-from ...core.progress import Monitor
-from ...core.run_json import read_run
-from ...core.settings import from_table
-from ...core.take import Footage, open_take, read_take
+from ...core.results.run_json import read_run
+from ...core.take.bar_file import read_bar
+from ...core.take.take import Footage, open_take, read_take
 from .prepare import Prepared, prepare
 
 DEFAULT_FPS = 25.0  # of a scene whose take is missing

@@ -17,7 +17,7 @@ the flanks.
 import bpy
 import numpy as np
 
-from ...core.body.families import families
+from ...core.body.metaball_groups import families
 from ...core.body.metaballs import THRESHOLD, Metaballs
 from ...core.body.shape import BodyShape
 from . import nodes

@@ -13,7 +13,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from ...core.images.sequence import ImageSequence
 from ...core.tracking.point_tables import PlanarTable
 from .action import key

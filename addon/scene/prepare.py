@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...core.body.one_skin import DETAIL, OneSkin, one_skin
 from ...core.body.shape import BodyShape
-from ...core.body.skin_mesh import SkinSettings
-from ...core.errors import InputError
-from ...core.fitting.cloud_points import CloudPoints
+from ...core.body.skin.closed_skin import DETAIL, OneSkin, one_skin
+from ...core.body.skin.mesh import SkinSettings
+from ...core.fitting.inputs.cloud_points import CloudPoints
 from ...core.fitting.segmentation import segment
 from ...core.fitting.state import ShapeParameters
-from ...core.motion.ply import Ply
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.motion.formats.ply import Ply
 from ...core.motion.tables import MotionTable
-from ...core.progress import Monitor
 
 NO_BONE = -1
 GATE_M = 0.04  # a point farther from the surface of every limb belongs to no bone

@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ...core import store
-from ...core.errors import InputError
-from ...core.geometry.camera import Camera
-from ...core.geometry.camera_derivatives import image_of, interior_of
-from ...core.progress import Monitor
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
+from ...core.geometry.camera import Camera, image_of, interior_of
 from . import cloud, trajectories
 from .contents import Contents
 

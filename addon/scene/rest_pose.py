@@ -15,7 +15,7 @@ from mathutils import Matrix
 
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Dof, bone_frames, frames_and_axes
-from ...core.body.skin_rays import swing
+from ...core.body.skin.rays import swing
 
 POSES = ("A", "T")
 T_POSE_ARM = {".R": np.array([-1.0, 0.0, 0.0]), ".L": np.array([1.0, 0.0, 0.0])}

@@ -14,16 +14,16 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...core import store
-from ...core.body.field_grid import field_grid
 from ...core.body.fields import EXPONENTIAL, Potential
 from ...core.body.metaballs import THRESHOLD
-from ...core.body.one_skin import OneSkin, one_skin
 from ...core.body.shape import BodyShape
-from ...core.body.skin import SkinSettings, body_skin
-from ...core.body.skin_patches import corner_uv
-from ...core.errors import InputError
-from ...core.progress import Monitor
+from ...core.body.skin.closed_skin import OneSkin, one_skin
+from ...core.body.skin.contour_skin import SkinSettings, body_skin
+from ...core.body.skin.mesh import corner_uv
+from ...core.body.skin.whole_surface import field_grid
+from ...core.foundation import store
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
 from . import nodes
 from .contents import FrameSkins
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
-from ...core.images.fields import BOTH
-from ...core.stages import STAGE_INPUTS
+from ...core.foundation.errors import InputError
+from ...core.images.interlace import BOTH
+from ...core.run.stages import STAGE_INPUTS
 from .. import project, properties, seeds
 from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs

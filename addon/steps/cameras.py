@@ -6,9 +6,9 @@ import bpy
 import numpy as np
 from bpy_extras.io_utils import ImportHelper
 
-from ...core.bar_file import bar_path, read_bar, write_bar
 from ...core.calibration.rig_files import read_any
 from ...core.geometry.rig import Rig, write_rig
+from ...core.take.bar_file import bar_path, read_bar, write_bar
 from .. import folders, project
 from ..calibrate.cameras import rig_of_scene
 from ..scene import clips

@@ -7,7 +7,7 @@ import bpy
 
 from ...core.checking.findings import Checked
 from ...core.checking.take_check import check_take
-from ...core.progress import Monitor
+from ...core.foundation.progress import Monitor
 from .. import project
 from ..jobs import JobOperator
 from ..session import get_session

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import bpy
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
+from ...core.foundation.progress import Monitor
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.sources import read_motion_source
-from ...core.progress import Monitor
 from .. import folders
 from ..jobs import JobOperator
 from ..retarget.by_blender import export_motion

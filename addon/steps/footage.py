@@ -6,11 +6,11 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
-from ...core.footage_files import copy_take, find_footage, find_moved, name_views, take_files
-from ...core.images.fields import BOTH
+from ...core.foundation.errors import InputError
+from ...core.images.interlace import BOTH
 from ...core.images.sequence import open_sequence
-from ...core.take_file import footage_entry, link_footage, read_table, relink_footage, unlink_footage
+from ...core.take.footage_files import copy_take, find_footage, find_moved, name_views, take_files
+from ...core.take.writing import footage_entry, link_footage, read_table, relink_footage, unlink_footage
 from .. import folders, project
 from ..panels import sentence
 from . import states, watch

@@ -4,9 +4,9 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
-from ...core.person_sources import person_files, read_picture
-from ...core.take_file import link_footage
+from ...core.foundation.errors import InputError
+from ...core.take.sources import person_files, read_picture
+from ...core.take.writing import link_footage
 from .. import folders, project
 from .footage import Told
 

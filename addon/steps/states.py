@@ -13,14 +13,14 @@ import bpy
 
 from ...core.body.model_file import read_model
 from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
-from ...core.clicked_points import clicked_depth
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from ...core.geometry.rig import read_rig
 from ...core.images.sequence import ImageSequence, open_sequence
-from ...core.pipeline import settings_of
-from ...core.run_json import read_run
-from ...core.stages import stage_keys
-from ...core.take import Footage, Take, footage_frames, open_take
+from ...core.results.run_json import read_run
+from ...core.run.pipeline import settings_of
+from ...core.run.stages import stage_keys
+from ...core.take.clicked_points import clicked_depth
+from ...core.take.take import Footage, Take, footage_frames, open_take
 from .. import folders, project
 from ..clicking import session
 from ..scene.build import KEYS_KEY, OUT_KEY

@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
+from ...core.foundation.errors import InputError
 from .. import folders, jobs, project
 from ..session import get_session
 from . import states

@@ -11,7 +11,7 @@ import numpy as np
 from .metaballs import STATIONS, THRESHOLD, Metaballs
 from .shape import BodyShape
 from .skeleton import Skeleton, bone_frames
-from .skin_parts import body_parts
+from .skin.parts import body_parts
 
 ALONG = 5  # places along a bone, from its first ball to its last
 SIDES = np.array([[1.0, 0, 0], [0, 0, 1.0], [-1.0, 0, 0], [0, 0, -1.0]])  # in the bone's axes: x, z, −x, −z

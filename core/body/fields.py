@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import InputError
-from ..settings import nearest_name
+from ..foundation.errors import InputError
+from ..foundation.settings import nearest_name
 
 THRESHOLD = 0.5
 VISIBLE = float(np.sqrt(0.5 * np.log(1 / THRESHOLD)))  # r_t / l of the exponential

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..values import frozen
+from ..foundation.arrays import frozen
 from .fields import EXPONENTIAL, THRESHOLD, VISIBLE, Potential
 
 __all__ = [

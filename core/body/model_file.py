@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..settings import nearest_name
-from ..values import frozen
+from ..foundation.arrays import frozen
+from ..foundation.errors import InputError
+from ..foundation.settings import nearest_name
 from .metaballs import STATIONS
 from .skeleton import Bone, Dof, Skeleton
 

@@ -18,9 +18,9 @@ from math import inf
 
 import numpy as np
 
-from ..errors import InputError
-from ..settings import nearest_name
-from ..values import frozen
+from ..foundation.arrays import frozen
+from ..foundation.errors import InputError
+from ..foundation.settings import nearest_name
 
 ROTATION_MODES = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 

@@ -21,8 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from ..geometry.camera import Camera
-from ..geometry.camera_derivatives import INTERIOR, camera_of, columns_of_derivatives, columns_of_exterior, image_of, interior_of
+from ..geometry.camera import INTERIOR, Camera, camera_of, columns_of_derivatives, columns_of_exterior, image_of, interior_of
 from ..geometry.rotation import cross_matrix, rotation_from_vector
 
 STRETCH = 256  # positions

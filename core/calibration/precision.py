@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..geometry.camera import Camera
-from ..geometry.camera_derivatives import INTERIOR, exterior_derivatives, image_with_derivatives, interior_of
+from ..geometry.camera import INTERIOR, Camera, exterior_derivatives, image_with_derivatives, interior_of
 from ..geometry.rotation import cross_matrix
 from .bundle import Network, Normals, Unknowns, free_network, reduce_to_cameras
 

@@ -13,13 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..geometry.camera import Camera
-from ..geometry.camera_derivatives import INTERIOR
+from ..foundation.progress import Monitor
+from ..geometry.camera import INTERIOR, Camera
 from ..geometry.intersection import forward_intersection
-from ..progress import Monitor
-from .bars import met_ends
+from .bars import BarObservations, met_ends
 from .bundle import Network, adjust
-from .observations import BarObservations
 from .precision import PredictedError, predicted_error
 from .self_calibration import GROSS, Calibration
 

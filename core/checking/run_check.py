@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from .. import store
 from ..body.shape import read_body
-from ..errors import InputError
-from ..motion.ply import read_ply
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..motion.formats.ply import read_ply
 from ..motion.tables import MotionTable, read_joints, read_motion
-from ..progress import Monitor
-from ..run_json import read_run
+from ..results.run_json import read_run
 from .findings import Checked, Finding, doubtful, wrong
 
 MOST_FRAMES = 10_000_000

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..foundation.progress import Monitor
 from ..images.retime import Recent
 from ..images.sequence import Movie
-from ..progress import Monitor
-from ..take import Footage
+from ..take.take import Footage
 from .findings import Finding, doubtful, wrong
 
 LONGEST = 240  # frames; a longer take is looked at from its middle

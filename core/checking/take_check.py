@@ -1,23 +1,184 @@
-"""`tricap check TAKE`: the footage, its timing, its texture, and whether the rig belongs to it."""
+"""`tricap check TAKE`: the footage, its timing, its texture, and whether the rig belongs to it.
+
+Clicks that are missing, contradict each other or lie on the room instead of the person.
+
+Where the cloth has too little texture to be measured: the sigma that matching could reach at best, before anything is matched.
+
+    S = Σ ∇f ∇fᵀ − n σ_∇² I ,   σ_px = √2 σ_noise / √λ_min(S)                     (1)
+
+over the pixels of a patch: the Cramér–Rao bound of a shift between two equally noisy pictures, the noise's own gradients taken off.
+"""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from ..errors import InputError
+from ..body.model_file import read_model
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..foundation.settings import from_table
+from ..images.sampling import noise_sigma
+from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
-from ..progress import Monitor
-from ..settings import from_table
-from ..take import Footage, open_take, read_take
-from .clicks import joint_findings, seed_findings
+from ..take.clicked_points import clicked_depth
+from ..take.take import Clicks, Footage, Take, open_take, read_take
 from .findings import Checked, Finding, doubtful, wrong
-from .rig_check import geometry_findings, unit_findings
-from .rig_fit import ENOUGH, clicked_pairs, rig_findings, rig_misses, same_views, share, stale_finding
+from .rig_check import ENOUGH, clicked_pairs, geometry_findings, rig_findings, rig_misses, same_views, share, stale_finding, unit_findings
 from .survey import frozen_view, picture_findings, rate_findings, survey
-from .texture import texture_findings
 from .timing import Film, TimeOffset, estimate_offsets
 from .view_matches import match_views
+
+FAR_M = 1.0  # in depth: more than a stretched-out arm reaches from the body
+
+LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joints) for side in ("right", "left")
+         for limb, joints in (("arm", ("shoulder", "elbow", "wrist")), ("leg", ("hip", "knee", "ankle")))}  # fmt: skip
+
+
+def joint_findings(take: Take) -> list[Finding]:
+    """A body that is wanted and not clicked, or limbs of it: which way a limb goes is what the fit takes from clicks.
+
+    Raises:
+        InputError: there is no such body model.
+    """
+    if take.body_model is None or take.keypoints:
+        return []
+    joints = read_model(take.body_model).skeleton.joint_names
+    clicked = {name for seeds in (take.seeds, *take.keyframes) for name, at in seeds.joints.items() if len(at) > 1}
+    advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
+    if not clicked:
+        sentence = f"No joint of the body “{take.body_model}” is clicked: there will be surface and tracks, but no body."
+        return [doubtful("no clicks", sentence, advice)]
+    bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
+    if not bare:
+        return []
+    said = ", ".join(bare)
+    return [doubtful("few clicks", f"Fewer than two joints are clicked of: {said}. The fit has to guess where they are.", advice)]
+
+
+def seed_findings(footage: Footage) -> list[Finding]:
+    """Clicks without a place in space, far behind the others, or surface seeds on what never moves."""
+    seeds, found, depth = footage.take.seeds, [], dict[str, float]()
+    labelled: list[tuple[str, Clicks]] = [*seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(seeds.surface))]
+    for name, at in labelled:
+        try:
+            depth[name] = clicked_depth(footage, name, at)
+        except InputError as error:
+            found.append(wrong("clicks", str(error)))
+    middle = float(np.median(list(depth.values()))) if depth else 0.0
+    far = {name: d for name, d in depth.items() if abs(d - middle) > FAR_M}
+    for name, d in far.items():
+        advice = "Is it on the background, or clicked on different spots in the views? Click it again."
+        found.append(doubtful("clicks", f"The click “{name}” is {abs(d - middle):.1f} m away from the others in depth.", advice, depth_m=d))
+    rest = [i for i in _resting(footage) if f"surface seed {i + 1}" not in far]
+    if rest:
+        said = ", ".join(str(i + 1) for i in rest)
+        advice = "Is it on the background? What is measured is taken from the clicks' depths; click it on the person."
+        found.append(doubtful("seed on the background", f"Surface seed {said} lies on something that never moves.", advice))
+    return found
+
+
+def _resting(footage: Footage) -> list[int]:
+    """Surface seeds (their numbers from 0) around which the reference picture is the same in the frame furthest in time."""
+    take, name = footage.take, footage.take.reference_view
+    frame = take.seeds.frame
+    clicked = [i for i, at in enumerate(take.seeds.surface) if name in at]
+    other = max(footage.frames, key=lambda f: abs(f - frame))
+    if not clicked or other == frame:
+        return []
+    here, later = (take.rows_at(f).rows(footage.read(f)[take.reference]) for f in (frame, other))
+    xy = take.rows_at(frame).from_frame(np.array([take.seeds.surface[i][name] for i in clicked]))
+    xy = np.clip(xy, 0, np.array(here.shape[::-1]) - 1)
+    return [i for i, same in zip(clicked, unchanged(here, later, xy)) if same]
+
+
+GRADIENT_NOISE = 0.5  # variance of a central difference of noise of variance 1
+LEAST_NOISE = 0.3  # grey values: rounding alone
+POOR_SHARE = 0.5  # of the places of a limb
+ALONG = (0.15, 0.85)  # of a limb, from joint to joint
+SAMPLES = 24
+MOVES = 3.0  # times the noise
+
+
+def bound_px(grey: np.ndarray, patch_px: int, row_step: int) -> np.ndarray:
+    """Smallest sigma [px] (h, w) of a match at each pixel of the measured rows; inf where the noise is all there is.  (1)"""
+    noise = max(noise_sigma(grey), LEAST_NOISE)
+    gx = cv2.filter2D(grey, cv2.CV_32F, np.array([[-0.5, 0.0, 0.5]], np.float32))
+    gy = cv2.filter2D(grey, cv2.CV_32F, np.array([[-0.5], [0.0], [0.5]], np.float32))
+    size = (patch_px, max(3, patch_px // row_step))
+    n = size[0] * size[1]
+    xx, yy, xy = (n * cv2.blur(a * b, size).astype(np.float64) for a, b in ((gx, gx), (gy, gy), (gx, gy)))
+    smallest = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy) - n * GRADIENT_NOISE * noise**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(smallest > 0, np.sqrt(2.0) * noise / np.sqrt(np.maximum(smallest, 1e-12)), np.inf)
+
+
+def texture_findings(footage: Footage, patch_px: int, max_sigma_px: float) -> tuple[list[Finding], dict[str, float]]:
+    """Limbs between clicked joints, or what moves, with too little texture in the reference view; and the median bound [px] of each."""
+    take, ref = footage.take, footage.take.reference
+    frame = take.seeds.frame if take.seeds.frame in footage.frames else footage.frames.start
+    grey = take.rows_at(frame).rows(footage.read(frame)[ref])
+    bound = bound_px(grey, patch_px, take.rows_at(frame).step)
+    view = take.views[ref].name
+    if not np.isfinite(bound).any() or np.mean(bound < max_sigma_px) < 1e-3:
+        return [
+            wrong(
+                "no texture",
+                f"View {view} has no texture in frame {frame}: nothing in it can be matched.",
+                "Wear clothes with a fine pattern, and focus the cameras on the person.",
+                frame=frame,
+            )
+        ], {}
+    places = _limbs(footage, view) or _moving(footage, grey, frame)
+    medians = {name: _median_at(bound, xy) for name, xy in places.items()}
+    found = [
+        doubtful(
+            "weak texture",
+            f"The texture of {name} is too poor in view {view}: "
+            + (f"a match there has a sigma of {value:.2g} px at best" if np.isfinite(value) else "it drowns in the noise")
+            + f" ({max_sigma_px:g} px is allowed).",
+            "Wear a pattern there, or more light; or try --set matching.patch_px=21.",
+            bound_px=value if np.isfinite(value) else None,
+            limit_px=max_sigma_px,
+        )
+        for name, value in medians.items()
+        if value > max_sigma_px
+    ]
+    return found, {name: value for name, value in medians.items() if np.isfinite(value)}
+
+
+def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
+    """Pixels (n, 2) of the measured rows along each bone whose two joints are clicked in the reference view."""
+    take = footage.take
+    if take.body_model is None:
+        return {}
+    clicked = {name: at[view] for name, at in take.seeds.joints.items() if view in at}
+    t = np.linspace(*ALONG, SAMPLES)[:, None]
+    bones = read_model(take.body_model).skeleton.bones
+    return {
+        b.name: take.rows_at(take.seeds.frame).from_frame(clicked[b.head_joint] * (1 - t) + clicked[b.tail_joint] * t)
+        for b in bones
+        if b.head_joint in clicked and b.tail_joint in clicked
+    }
+
+
+def _moving(footage: Footage, grey: np.ndarray, frame: int) -> Mapping[str, np.ndarray]:
+    """Pixels (n, 2) of what moved until the frame furthest in time."""
+    other = max(footage.frames, key=lambda f: abs(f - frame))
+    later = footage.take.rows_at(other).rows(footage.read(other)[footage.take.reference])
+    difference = cv2.blur(np.abs((grey - np.median(grey)) - (later - np.median(later))), (9, 9))
+    y, x = np.nonzero(difference > MOVES * max(1.0, noise_sigma(grey)))
+    return {"what moves": np.stack([x, y], axis=1)[:: max(1, len(x) // 5000)]} if len(x) > 50 else {}
+
+
+def _median_at(bound: np.ndarray, xy: np.ndarray) -> float:
+    inside = (xy >= 0).all(axis=1) & (xy <= np.array(bound.shape[::-1]) - 1).all(axis=1)
+    at = np.rint(xy[inside]).astype(int)
+    values = bound[at[:, 1], at[:, 0]]
+    return float(np.quantile(values, POOR_SHARE, method="higher")) if len(values) else 0.0
+
 
 DOUBTFUL_RESIDUAL_PX = 1.0
 FROZEN_FRAMES = 3

@@ -24,10 +24,10 @@ from math import isfinite
 import cv2
 import numpy as np
 
-from ..errors import InputError
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
 from ..images.retime import LARGEST, Recent
-from ..progress import Monitor
-from ..take import Footage
+from ..take.take import Footage
 from .survey import Survey, survey
 from .view_matches import Features, PairMatches, alike, eight_bits, epipolar_miss_px, find_features, match_features
 

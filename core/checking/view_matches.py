@@ -13,7 +13,7 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.rotation import cross_matrix
-from ..images.fields import RowGrid
+from ..images.interlace import RowGrid
 
 MOST_FEATURES, LONGEST_SIDE_PX = 3000, 1600
 RATIO = 0.8

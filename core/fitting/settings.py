@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ..settings import knob
+from ..foundation.settings import knob
 
 ALGORITHM = "body 3"  # part of the fit's key: raise it when the same input gives another body
 

@@ -3,9 +3,11 @@
 One frame's motion (D,) [rad, m] is followed by the shape (S,), which all frames share: ln of the bone lengths (B,), then ln of the cross
 radii l_x and l_z of every ball (M, 2), and, where they are free, ln of the balls' weights w (M). Logarithms keep lengths positive and make
 their sigmas relative. A ball's centre and its radius along the bone scale with the bone.
+
+Jacobians in blocks: an observation of one body part knows few of the parameters; the zeros are not stored and not multiplied.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -226,3 +228,28 @@ def _sets(n_lengths: int, n_balls: int, weights: bool) -> dict[str, range]:
     return dict(
         lengths=range(n_lengths), radii=range(n_lengths, n), weights=range(n, last), flesh=range(n_lengths, last), shape=range(last)
     )
+
+
+Block = tuple[np.ndarray, np.ndarray, np.ndarray]  # rows (n,), columns (c,) of D + S, values (n, c)
+
+
+class FromBlocks:
+    """An observation that gives its Jacobian in blocks; every row is in one block only."""
+
+    __slots__ = ()
+
+    @property
+    def size(self) -> int:
+        """Number of residuals."""
+        raise NotImplementedError
+
+    def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
+        """The blocks of the derivative to motion and shape, or to motion."""
+        raise NotImplementedError
+
+    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
+        """The whole derivative (n, D + S), or (n, D) without shape."""
+        J = np.zeros((self.size, state.n_motion + (state.n_shape if shape else 0)))
+        for rows, columns, block in self.blocks(state, shape):
+            J[rows[:, None], columns] = block
+        return J

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..values import frozen
+from ..foundation.arrays import frozen
 from .camera import Camera
 
 NEAR_M = 0.01  # what is nearer than this to the camera is cut off

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import store
-from ..errors import InputError
-from ..settings import nearest_name
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.settings import nearest_name
 from .camera import Camera
 from .rotation import rotation_from_vector, vector_from_rotation
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..values import frozen
+from ..foundation.arrays import frozen
 
 FEWEST, FEWEST_BARE = 5, 3  # images that tell what stands still, and of these without anybody near
 ROWS = 64

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..settings import knob
+from ..foundation.settings import knob
 from .sampling import noise_sigma
 
 NOISE_SIGMAS = 2.0

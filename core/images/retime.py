@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..settings import knob
+from ..foundation.settings import knob
 from .sampling import SplineImage
 from .sequence import ImageSequence
 

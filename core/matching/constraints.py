@@ -20,20 +20,17 @@ from typing import TypeVar
 
 import numpy as np
 
+from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from ..images.sampling import SplineImage
-from ..progress import Monitor
-from .epipolar import Epipolar
 from .foreground import Foreground
-from .grid import TemplateGrid
-from .growing import RETRY_SMOOTHING_PX, TripletField, loosened
+from .grid import RADIUS_CELLS, NeighbourFit, TemplateGrid, fit_neighbours, neighbours_of
 from .least_squares import MatchingSettings, MatchStatus
 from .multi_image import MultiImageMatches, match_multi_image
-from .neighbourhood import RADIUS_CELLS, NeighbourFit, fit_neighbours, neighbours_of
-from .object_space import SurfacePatch, SurfacePrior, match_surface, normal_to
-from .patch_pixels import patch_offsets
+from .object_space import Epipolar, SurfacePatch, SurfacePrior, match_surface, normal_to
+from .patches import monomials, patch_offsets
+from .region_growing import RETRY_SMOOTHING_PX, TripletField, loosened
 from .seeds import fewest_views
-from .template_patches import monomials
 
 WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
 SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SHARE = 0.1, 0.001, 1.0  # px/px and px/px² in the search view that moves fastest; of itself

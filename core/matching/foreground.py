@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..images.fields import RowGrid
+from ..images.interlace import RowGrid
 
 REACH_M = 0.55  # a body's extent in depth beyond clicked joints
 SPEED_M_S = 2.0  # of someone who walks, in depth

@@ -23,6 +23,14 @@ What was matched is the texture, so the point that is transferred with least bia
 H belongs to the template alone, so it is built once; all patches of a piece, in all search images, are arrays, and what has converged
 leaves them.
 Coordinates are pixels of the images given (a field's rows count as rows).
+
+The inverse-compositional update of affine warps, for many patches at once (equation (3) of `least_squares`).
+
+Smaller parameter sets where the texture cannot tell a patch's shape (SCIENCE §4; Gruen 1985: parameters excluded as not determinable).
+
+An error of a shape parameter moves the rim of the patch by half its width times that error. Where the noise of both images alone moves it
+by more than a limit, the shears go first (6 unknowns: shift, two scales, radiometry), then the scales too (4: shift, radiometry); the shape
+then stays that of the start. The parameters are those of `least_squares` (3): d1, B11, B12, d2, B21, B22.
 """
 
 from collections.abc import Sequence
@@ -32,14 +40,59 @@ from enum import IntEnum
 
 import numpy as np
 
+from ..foundation.progress import Monitor
+from ..foundation.settings import knob
+from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
-from ..progress import Monitor
-from ..settings import knob
-from ..threads import equal_pieces, in_threads
-from .affine_steps import compose
-from .parameter_sets import PARAMETERS, reduced_sets
-from .patch_pixels import compare, patch_offsets, template_pixels
+from .patches import compare, patch_offsets, template_pixels
+
+MAX_STEP_PX = 2.0
+
+
+def compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (N, 2) and shapes (N, 2, 2) after steps Δp (N, 6), and how far the centres moved (N,) [px]; a longer step is shortened."""
+    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
+    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
+    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
+    det = a * e - b * d
+    inverse = 1 / np.where(np.abs(det) < 0.1, np.nan, det)
+    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
+    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
+    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
+    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
+    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
+    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
+    if bad.any():
+        A_new[bad], move[bad] = A[bad], 0.0
+    return c - move, A_new, moved
+
+
+PARAMETERS = 8
+SETS = ((6, (1, 2, 4, 5), (0, 1, 3, 5)), (4, (1, 5), (0, 3)))  # unknowns, the shape parameters that must be sure, those that stay
+
+
+def reduced_sets(H: np.ndarray, inverse: np.ndarray, noise: float, half_px: float, limit_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Inverses (N, 6, 6) of normal matrices H (N, 6, 6) with zeros for what is left out, and the numbers of unknowns (N,).
+
+    `inverse` is that of all parameters, `noise` that of an image in grey values, `half_px` half the patch's width; a limit of 0 leaves
+    all as it is.
+    """
+    count = np.full(len(H), PARAMETERS, dtype=np.int8)
+    if not limit_px:
+        return inverse, count
+    inverse = inverse.copy()
+    for unknowns, needed, kept in SETS:
+        variance = np.max([inverse[:, i, i] for i in needed], axis=0)
+        rows = np.flatnonzero(np.sqrt(2 * np.maximum(variance, 0.0)) * noise * half_px > limit_px)
+        block = np.ix_(rows, np.array(kept), np.array(kept))
+        part = H[block]
+        scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-9))
+        both = scale[:, :, None] * scale[:, None, :]
+        inverse[rows], count[rows] = 0.0, unknowns
+        inverse[block] = invert_spd(part * both + 1e-6 * np.eye(len(kept))) * both
+    return inverse, count
+
 
 LARGEST, SHARED_FROM = 4096, 513  # patches of a piece; from so many on threads share them
 STILL_WORTH = 0.75  # of the patches at work: with fewer that move, those that have ended are taken out

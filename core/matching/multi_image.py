@@ -19,14 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..foundation.progress import Monitor
+from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
-from ..images.fields import RowGrid
+from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
-from ..progress import Monitor
-from ..threads import equal_pieces, in_threads
 from .least_squares import MatchingSettings, MatchStatus
 from .object_space import MIN_NOISE, SHARED_FROM, inverse_normals, solve_normals, without_noise
-from .template_patches import TemplatePatches
+from .patches import TemplatePatches
 
 LARGEST = 512  # points of a piece
 NEIGHBOUR_SHIFT_PX, NEIGHBOUR_SHAPE = 1.0, 0.1

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
-from ..images.fields import RowGrid
+from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
 from .least_squares import MatchingSettings, match_patches
 from .seeds import approximations_at_depth, sweep_ray

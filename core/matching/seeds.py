@@ -17,14 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from ..foundation.progress import Monitor
+from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
-from ..images.fields import RowGrid
+from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
-from ..progress import Monitor
-from ..threads import equal_pieces, in_threads
 from .grid import TemplateGrid
 from .least_squares import MatchingSettings
-from .patch_pixels import patch_offsets
+from .patches import patch_offsets
 
 NEAREST_BASES, FARTHEST_BASES = 0.8, 40.0  # depth range to look in, in lengths of the longest base, when nothing else is known
 SWEEP_STEP_PX = 1.0

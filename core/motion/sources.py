@@ -7,16 +7,15 @@ import numpy as np
 
 from ..body.shape import BodyShape, read_body
 from ..body.skeleton import bone_frames
-from ..errors import InputError
-from .bvh import read_bvh
-from .c3d import read_c3d
-from .markers import Markers, metres_per
-from .points_csv import rate, read_points_csv
+from ..foundation.errors import InputError
+from .formats.bvh import read_bvh
+from .formats.c3d import read_c3d
+from .formats.markers import Markers, metres_per, rate, read_points_csv
+from .formats.trc import read_trc
 from .retarget.points import motion_from_points
 from .retarget.rig import Motion, Rig
 from .retarget.roles import model_roles
 from .tables import read_motion
-from .trc import read_trc
 
 Z_UP = {"": "Z up", "Y": "Y up", "Z": "Z up"}
 POINTS: dict[str, tuple[Callable[..., Markers], dict[str, str]]] = {  # the reader of each kind, and its axes by the axis that is up

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import store
+from ..body.motion import BodyMotion
 from ..body.skeleton import Skeleton
-from ..errors import InputError
-from ..fitting.body_motion import BodyMotion
-from ..values import check_sparse, frozen
+from ..foundation import store
+from ..foundation.arrays import check_sparse, frozen
+from ..foundation.errors import InputError
 
 LARGEST_FRAME = 2**53
 JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")

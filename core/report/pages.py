@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from .. import store
-from ..body.skin import SkinSettings
-from ..errors import InputError
-from ..fitting.body_motion import BodyFit
-from ..progress import Monitor
-from ..results import Results
+from ..body.motion import BodyFit
+from ..body.skin.contour_skin import SkinSettings
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..results.folder import Results
 from ..surface.cloud import PointCloud
-from ..take import Footage
+from ..take.take import Footage
 from ..tracking.trajectories import Trajectories
 from . import pictures
-from .figures import Row, figure_rows, number, quoted
-from .graphs import curve_graph
+from .figures import Row, curve_graph, figure_rows, number, quoted
 from .silhouettes import OUTLINE, Silhouettes
 
 STYLE = (

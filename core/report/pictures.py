@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ..body.ends import shape_for_skin
 from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
-from ..body.skin import SkinSettings, body_skin
+from ..body.skin.contour_skin import SkinSettings, body_skin
+from ..body.skin.extremities import shape_for_skin
 from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..surface.cloud import PointCloud

@@ -17,18 +17,18 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from ..body.ends import shape_for_skin
+from ..body.motion import BodyFit
 from ..body.shape import BodyShape
 from ..body.skeleton import Skeleton
-from ..body.skin import SkinSettings, body_skin
-from ..errors import InputError
-from ..fitting.body_motion import BodyFit
+from ..body.skin.contour_skin import SkinSettings, body_skin
+from ..body.skin.extremities import shape_for_skin
+from ..fitting.inputs.no_surface import filled
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize
 from ..images.background import WINDOW_PX, Background
-from ..progress import Monitor
-from ..take import Footage
-from ..without_surface import filled
+from ..take.take import Footage
 
 OUTLINE, BACKGROUND = "outline", "background"
 MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take: a frame of four views takes a third of a second

@@ -2,6 +2,14 @@
 
 Filters (D'Apuzzo et al. 2000, §2.3): a point must agree with its neighbours and must not stand alone. The sigma of a point contains the ray
 intersection's covariance, what its neighbours scatter by beyond it, and half of the curvature correction, for what remains of it.
+
+Thinning a cloud evenly: the points in a cube of space are replaced by their centre of gravity (D'Apuzzo et al. 2000, §2.3).
+
+With weights w_i ∝ 1 / tr K_i, Σ w_i = 1,
+
+    X = Σ w_i X_i ,   K = Σ w_i K_i                                                                  (1)
+
+The patches of neighbouring points overlap, so their errors are alike: K is what the mean of wholly dependent points has, at most.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -9,14 +17,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.ndimage import label
 
+from ..foundation.arrays import frozen
+from ..foundation.settings import knob
 from ..geometry.camera import Camera
-from ..matching.growing import TripletField
-from ..settings import knob
-from ..values import frozen
+from ..matching.region_growing import TripletField
 from .local_surface import LocalSurface, local_surface
 
 FILTERS = ("other surface", "small island", "depth in doubt")  # what they find; why a point went is 1 + its filter's number
-IN_DOUBT = 3  # told by the images (matching/middle.py)
+IN_DOUBT = 3  # told by the images (matching/occlusion_check.py)
 REMAINING_BIAS = 0.5  # of the curvature correction
 LIMB_SCATTER = 0.06  # of the spacing on the surface: what a round limb's own shape makes neighbours scatter about a quadric
 ROUGHNESS = 0.7  # of the variance by which they scatter beyond that and beyond their own
@@ -138,3 +146,38 @@ def _island_size(field: TripletField) -> np.ndarray:
     islands, _ = label(taken, structure=np.ones((3, 3)))
     size = np.bincount(islands.ravel())
     return np.asarray(size[islands.ravel()[field.cell]])
+
+
+def as_written(cloud: PointCloud, settings: SurfaceSettings) -> PointCloud:
+    """The cloud that is written to a file: thinned where that was asked for."""
+    return voxel_filtered(cloud, 1e-3 * settings.voxel_mm, settings.voxel_points) if settings.voxel_mm else cloud
+
+
+def voxel_filtered(cloud: PointCloud, edge_m: float, fewest: int) -> PointCloud:
+    """The cloud with one point for every cube of side `edge_m` that holds `fewest` points or more, in the order of the cubes.
+
+    A point of cubes counts a view only if all of its points were measured there.
+    """
+    if not len(cloud.xyz_m):
+        return cloud
+    _, cube, count = np.unique(np.floor(cloud.xyz_m / edge_m).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+    cube = cube.reshape(-1)
+    weight = 1 / np.maximum(np.trace(cloud.covariance_m2, axis1=1, axis2=2), 1e-18)
+    weight /= np.bincount(cube, weight)[cube]
+    kept = count >= fewest
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        columns = [np.bincount(cube, weight * column, minlength=len(count)) for column in flat.T]
+        return np.stack(columns, axis=1).reshape(-1, *values.shape[1:])[kept]
+
+    normals = mean(cloud.normals)
+    return PointCloud(
+        frame=cloud.frame,
+        xyz_m=mean(cloud.xyz_m),  # (1)
+        covariance_m2=mean(cloud.covariance_m2),
+        normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
+        intensity=mean(cloud.intensity),
+        xy_px=mean(cloud.xy_px),
+        residual_px=mean(cloud.residual_px),
+    )

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
-from ..matching.growing import TripletField
-from ..threads import equal_pieces, in_threads
+from ..matching.region_growing import TripletField
 
 RADIUS_CELLS = 3
 LARGEST = 512  # points whose neighbours stay in the cache

@@ -17,21 +17,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .. import store
 from ..body.metaballs import three_balls
 from ..body.model_file import read_model
 from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
-from ..errors import InputError
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..foundation.settings import knob
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
-from ..images.fields import BOTH, INTERLACE, field_layout, frame_time_s
-from ..progress import Monitor
-from ..settings import knob
+from ..images.interlace import BOTH, INTERLACE, field_layout, frame_time_s
 from .figure import Part, arm_parts, joined, torso_parts, wall
-from .film import Layer, Sensor, digitize, expose, paint, seen_vertices
-from .texture import SolidNoise, solid_noise
+from .film import Layer, Sensor, SolidNoise, digitize, expose, paint, seen_vertices, solid_noise
 from .truth import motion_capture_name
 
 STAGE = "sample recording"

@@ -10,9 +10,9 @@ import numpy as np
 
 from ..body.shape import BodyShape
 from ..body.skeleton import bone_frames
-from ..body.skin import SkinSettings, limb_skin
+from ..body.skin.contour_skin import SkinSettings, limb_skin
+from ..foundation.arrays import frozen
 from ..geometry.raster import vertex_normals
-from ..values import frozen
 
 SKIN = SkinSettings(contours=48, rays=64, cap_contours=10)
 HAND_SEMI_AXES_M = (0.036, 0.092, 0.018)  # across, along the forearm, through the palm

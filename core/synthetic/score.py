@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..body.shape import read_body
-from ..errors import InputError
-from ..motion.ply import Ply, read_ply
-from ..progress import Monitor
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..motion.formats.ply import Ply, read_ply
 from .truth import Truth, motion_capture_name, read_truth
 
 STAGE = "score"

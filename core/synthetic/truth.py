@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..errors import InputError
+from ..foundation.errors import InputError
 
 NEEDED = ("vertices_m", "triangles", "textured", "visible", "joints_m", "joint_names", "time_s")
 LIMBS = {"shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg", "knee": "Leg", "ankle": "Foot"}

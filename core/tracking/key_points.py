@@ -14,17 +14,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..calibration.targets import TargetStatus, find_targets
-from ..errors import InputError
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
 from ..geometry.intersection import forward_intersection
 from ..images.sampling import SplineImage
 from ..matching.least_squares import match_patches
-from ..matching.patch_pixels import patch_offsets
-from ..progress import Monitor
-from .published import STEPS
-from .search import search_box
+from ..matching.patches import patch_offsets
+from .published_step import STEPS
 from .settings import KeyPointSettings, TrackStatus
 from .step import MODEL_SIGMA_PX, FramePair, TrackingView, intersect, measured_at
-from .templates import REACQUIRE_CORRELATION, Templates, Tiles, atlas, cut_tiles, no_templates
+from .templates import REACQUIRE_CORRELATION, Templates, Tiles, atlas, cut_tiles, no_templates, search_box
 from .tracked import TrackedFrame, born, joined, nothing, rows_of
 
 DEFAULT_SETTINGS = KeyPointSettings()

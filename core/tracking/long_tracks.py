@@ -18,12 +18,11 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..images.fields import frame_time_s
-from .kinematics import Kinematics, differences, smoothed
+from ..foundation.errors import InputError
+from ..images.interlace import frame_time_s
 from .settings import TrackingSettings, TrackStatus
 from .tracked import TrackedFrame
-from .trajectories import Filtered, Seen, Trajectories, assembled, seen_of
+from .trajectories import Filtered, Kinematics, Seen, Trajectories, assembled, differences, seen_of, smoothed
 
 STRETCH_CELLS = 500_000  # frames times trajectories of a stretch: filtering it takes about 0.3 GB
 TABLE_CELLS = 4_000_000  # of the table that is written

@@ -15,14 +15,12 @@ from functools import partial
 
 import numpy as np
 
-from ..images.fields import RowGrid
+from ..foundation.progress import Monitor
+from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches
-from ..progress import Monitor
-from .control import TemplateState, control_drift
-from .search import search_box
 from .settings import TrackingSettings, TrackStatus
-from .templates import REACQUIRE_CORRELATION, Templates, atlas, cut_tiles, no_templates
+from .templates import REACQUIRE_CORRELATION, Templates, TemplateState, atlas, control_drift, cut_tiles, no_templates, search_box
 
 ALL_ROWS = RowGrid()
 RETURN_PX = 0.5  # of (1) (D'Apuzzo et al. 2000, §4)

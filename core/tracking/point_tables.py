@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import store
-from ..errors import InputError
-from ..images.fields import frame_time_s
-from ..settings import nearest_name
-from ..values import check_sparse
+from ..foundation import store
+from ..foundation.arrays import check_sparse
+from ..foundation.errors import InputError
+from ..foundation.settings import nearest_name
+from ..images.interlace import frame_time_s
 from .key_points import KeyPoints
 from .planar import PlanarTracks
 from .settings import TrackStatus

@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any
 
-from ..settings import knob
+from ..foundation.settings import knob
 
 SCHEMES = ("space", "published")
 UNIFORMITY = ("rigid", "voxels", "off")

@@ -22,20 +22,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.small_matrices import invert_spd
-from ..images.fields import FieldLayout, RowGrid
+from ..images.interlace import FieldLayout, RowGrid
 from ..images.sampling import SplineImage
 from ..matching.least_squares import Matches, MatchingSettings, match_patches
-from ..matching.patch_pixels import patch_offsets
-from ..progress import Monitor
-from .control import REGULARISATION_PX2, TemplateState, at_least_best, control_drift
+from ..matching.patches import patch_offsets
+from .curvature_correction import CurvatureCorrection
 from .neighbours import common_motion, nearest_neighbours
-from .relief import CurvatureCorrection
-from .search import search_box
 from .settings import TrackingSettings, TrackStatus
-from .templates import Templates
+from .templates import REGULARISATION_PX2, Templates, TemplateState, at_least_best, control_drift, search_box
 from .tracked import TrackedFrame, rows_of
 
 CHI2, CHI2_90 = 13.82, 4.605  # two degrees of freedom: 0.999 and 0.9

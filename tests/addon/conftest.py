@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import store
 from tricap.core.body.model_file import read_model
+from tricap.core.body.motion import BodyMotion
 from tricap.core.body.shape import BodyShape, default_shape, write_body
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.body.skin import body_skin
-from tricap.core.fitting.body_motion import BodyMotion
+from tricap.core.body.skin.contour_skin import body_skin
+from tricap.core.foundation import store
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.motion.ply import write_cloud, write_mesh
+from tricap.core.motion.formats.ply import write_cloud, write_mesh
 from tricap.core.motion.tables import write_joints, write_motion
 
 if importlib.util.find_spec("bpy"):

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.bar_file import read_bar
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
-from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, waved_bar
-from tricap.core.synthetic.bar_images import BarPictures, write_bar_folder
+from tricap.core.synthetic.bar import BarNoise, BarPictures, benchmark_cameras, waved_bar, write_bar_folder
+from tricap.core.take.bar_file import read_bar
 
 from .conftest import small_rig
 

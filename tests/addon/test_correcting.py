@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from tricap.core.body.model_file import read_model
-from tricap.core.take import read_take
-from tricap.core.take_file import read_table, write_table
+from tricap.core.take.take import read_take
+from tricap.core.take.writing import read_table, write_table
 
 from .conftest import SmallRun
 
@@ -118,9 +118,9 @@ def test_undo_save_and_open(blender: ModuleType, scene: Any, tmp_path: Path) -> 
 
 
 def test_a_correction_makes_the_later_steps_stale(blender: ModuleType, scene: Any, take: Path) -> None:
-    from tricap.core import pipeline
-    from tricap.core.stages import stage_keys
-    from tricap.core.take import open_take
+    from tricap.core.run import pipeline
+    from tricap.core.run.stages import stage_keys
+    from tricap.core.take.take import open_take
 
     def keys() -> dict[str, str]:
         module("project").write(scene)

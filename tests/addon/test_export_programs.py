@@ -16,14 +16,13 @@ import pytest
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.export import export_file, named_for, points_of
-from tricap.core.errors import InputError
-from tricap.core.motion.bvh import read_bvh, write_bvh
-from tricap.core.motion.c3d import read_c3d
-from tricap.core.motion.markers import AXES
-from tricap.core.motion.points_csv import read_points_csv
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
+from tricap.core.motion.formats.bvh import read_bvh, write_bvh
+from tricap.core.motion.formats.c3d import read_c3d
+from tricap.core.motion.formats.markers import AXES, read_points_csv
+from tricap.core.motion.formats.trc import read_trc
 from tricap.core.motion.sources import from_run, read_motion_source
-from tricap.core.motion.trc import read_trc
-from tricap.core.progress import Monitor
 
 from ..core.motion.persons import person, squat
 from .conftest import SmallRun

@@ -6,7 +6,7 @@ from types import ModuleType
 
 import pytest
 
-from tricap.core import pipeline
+from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import make_arm_take
 from tricap.core.synthetic.score import score_run
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core import store
-from tricap.core.frame_table import COLUMNS, FrameTable, write_frame_table
+from tricap.core.foundation import store
 from tricap.core.matching.proposals import Proposal
-from tricap.core.motion.ply import write_mesh
+from tricap.core.motion.formats.ply import write_mesh
+from tricap.core.run.record import COLUMNS, FrameTable, write_frame_table
 from tricap.core.tracking.settings import TrackStatus
 
 from .conftest import FRAMES, SIZE, SmallRun

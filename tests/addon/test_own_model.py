@@ -5,11 +5,11 @@ from types import ModuleType
 
 import pytest
 
-from tricap.core import pipeline
 from tricap.core.body.model_file import MODELS
 from tricap.core.body.shape import read_body
+from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
-from tricap.core.take_file import read_table, write_table
+from tricap.core.take.writing import read_table, write_table
 
 
 @pytest.fixture(scope="module")

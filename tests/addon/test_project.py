@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 from tricap.core.body.model_file import MODELS
-from tricap.core.take_file import read_table, take_of_table, write_table
+from tricap.core.take.writing import read_table, take_of_table, write_table
 
 from .conftest import small_rig, write_take
 

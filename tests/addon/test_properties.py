@@ -6,7 +6,7 @@ from types import ModuleType
 
 import pytest
 
-from tricap.core.settings import knob
+from tricap.core.foundation.settings import knob
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -19,16 +19,16 @@ from tricap.addon.retarget.write import push_to_strip
 from tricap.addon.scene.armature import add_armature
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.errors import InputError
-from tricap.core.motion.bvh import write_bvh
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.rotation import angle_of, transposed
+from tricap.core.motion.formats.bvh import write_bvh
 from tricap.core.motion.retarget.contacts import FeetSettings
 from tricap.core.motion.retarget.mapping import find_map
 from tricap.core.motion.retarget.measure import measure
 from tricap.core.motion.retarget.retarget import RetargetSettings
 from tricap.core.motion.retarget.rig import Motion, channels
-from tricap.core.motion.retarget.turns import angle_of, transposed
 from tricap.core.motion.sources import read_motion_source
-from tricap.core.progress import Monitor
 
 from ..core.motion.persons import flail, mapped, mapped_rig, person, squat
 from ..core.motion.test_retarget import recorded

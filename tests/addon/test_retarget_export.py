@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from tricap.addon.retarget.export import export_file
-from tricap.core.errors import InputError
-from tricap.core.motion.bvh import read_bvh, write_bvh
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.rotation import matrix_from_euler, shortest
+from tricap.core.motion.formats.bvh import read_bvh, write_bvh
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
-from tricap.core.motion.retarget.turns import matrix_from_euler, shortest
-from tricap.core.progress import Monitor
 
 from .conftest import SmallRun
 

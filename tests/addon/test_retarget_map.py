@@ -10,7 +10,7 @@ import pytest
 
 from tricap.addon.retarget.apply import folded
 from tricap.addon.retarget.build import build_armature
-from tricap.core.motion.bvh import write_bvh
+from tricap.core.motion.formats.bvh import write_bvh
 from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.motion.retarget.rig import Rig
 

@@ -12,9 +12,9 @@ from tricap.addon.retarget import read
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.read import action_frames, read_motion, read_rig
 from tricap.addon.retarget.write import push_to_strip
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
+from tricap.core.geometry.rotation import angle_of, transposed
 from tricap.core.motion.retarget.rig import Motion
-from tricap.core.motion.retarget.turns import angle_of, transposed
 
 from ..core.motion.persons import flail, person
 

@@ -13,12 +13,12 @@ from tricap.addon.retarget import apply
 from tricap.addon.retarget.build import build_armature
 from tricap.addon.retarget.preview import add_preview, remove_preview
 from tricap.addon.retarget.read import read_motion, read_rig
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 from tricap.core.motion.retarget.contacts import FeetSettings
 from tricap.core.motion.retarget.mapping import apply_preset, read_preset, write_map
 from tricap.core.motion.retarget.measure import measure
 from tricap.core.motion.retarget.retarget import RetargetSettings
-from tricap.core.progress import Monitor
 
 from ..core.motion.persons import mapped, mapped_rig, person, squat
 

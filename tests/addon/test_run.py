@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tricap.core import pipeline
+from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
 NUMBERS = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply", "clouds/0003.ply", "skin/0003.ply")

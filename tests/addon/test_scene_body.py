@@ -7,11 +7,11 @@ import pytest
 
 from tricap.core.body import metaballs as core_metaballs
 from tricap.core.body.complete import complete_shape
-from tricap.core.body.families import families
+from tricap.core.body.metaball_groups import families
 from tricap.core.body.model_file import model_names, read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin import limb_skin
+from tricap.core.body.skin.contour_skin import limb_skin
 
 from .conftest import FRAMES, arm
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tricap.__main__ import main
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 
 from .conftest import FPS, FRAMES, SmallRun
 

@@ -7,14 +7,14 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from tricap.core import store
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.errors import InputError
+from tricap.core.foundation import store
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.camera import Camera
-from tricap.core.motion.ply import write_cloud
-from tricap.core.progress import Cancelled, Monitor
+from tricap.core.motion.formats.ply import write_cloud
 
 from .conftest import FRAMES, SmallRun, write_result
 

@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import store
 from tricap.core.body.fields import potential_named
 from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
-from tricap.core.body.one_skin import one_skin
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin import SkinSettings, body_skin
-from tricap.core.errors import InputError
+from tricap.core.body.skin.closed_skin import one_skin
+from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
+from tricap.core.foundation import store
+from tricap.core.foundation.errors import InputError
 
 from .conftest import FRAMES, SmallRun
 from .test_scene_body import animated, curves, world_vertices
@@ -159,7 +159,7 @@ def test_the_bar_of_a_calibration_moves(empty: ModuleType) -> None:
 def test_the_bar_beside_the_rig_is_in_the_scene(empty: ModuleType, small_run: SmallRun) -> None:
     """From the scene's first frame on, whatever its own recording counted; one of other cameras is left out and told."""
     from tricap.addon.scene.build import build_scene
-    from tricap.core.bar_file import bar_path, write_bar
+    from tricap.core.take.bar_file import bar_path, write_bar
 
     ends = np.random.default_rng(1).uniform(-1, 1, (3, 2, 3))
     write_bar(small_run.take / "rig.toml", small_run.rig, np.array([100, 101, 104]), ends)
@@ -263,7 +263,7 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
 @pytest.mark.slow
 def test_preview_and_turntable(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     from tricap.addon.scene import build, contents, preview
-    from tricap.core.progress import Monitor
+    from tricap.core.foundation.progress import Monitor
 
     results = contents.read_contents(small_run.out, Monitor())
     build.write_scene(results)

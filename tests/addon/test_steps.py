@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from tricap.core import pipeline
 from tricap.core.geometry.rig import read_rig, write_rig
+from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
-from tricap.core.take_file import read_table, write_table
+from tricap.core.take.writing import read_table, write_table
 
 NAME = "bl_ext.user_default.tricap.addon"
 QUICK = {"growing": {"spacing_px": 6}}

@@ -14,7 +14,7 @@ import pytest
 
 from tricap.__main__ import main
 from tricap.addon.retarget.build import build_armature
-from tricap.core.motion.bvh import write_bvh
+from tricap.core.motion.formats.bvh import write_bvh
 
 from ..core.motion.persons import person, squat
 from .conftest import SmallRun

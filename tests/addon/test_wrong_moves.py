@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from tricap.core import pipeline
+from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
 ADDON = "bl_ext.user_default.tricap.addon"
@@ -226,7 +226,7 @@ def test_nothing_to_retarget_onto_or_to_export(scene: ModuleType, tmp_path: Path
 
 def test_another_job_is_running(scene: ModuleType, take: Path) -> None:
     """In another process: it holds the folder."""
-    lock = importlib.import_module("tricap.core.lock")
+    lock = importlib.import_module("tricap.core.foundation.lock")
     take.with_name("results").mkdir()
     with lock.locked(take.with_name("results")):
         refused(run(scene, take, take.with_name("results")), "Another run")

@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.intersection import forward_intersection
-from tricap.core.images.fields import RowGrid
+from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
-from tricap.core.matching.growing import GrowingSettings, TripletField, grow
 from tricap.core.matching.least_squares import MatchingSettings, match_patches
-from tricap.core.matching.middle import in_doubt
+from tricap.core.matching.occlusion_check import in_doubt
+from tricap.core.matching.region_growing import GrowingSettings, TripletField, grow
 from tricap.core.matching.seeds import sweep_seeds
-from tricap.core.progress import Monitor
 from tricap.core.surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 
 TAKES = Path(__file__).resolve().parents[3] / "shared" / "takes"

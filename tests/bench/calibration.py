@@ -29,14 +29,23 @@ from truth import TEST_BARS, bound, error_m, observed, rigid  # noqa: E402
 from tricap.core.calibration.bars import enough_rays, with_bars  # noqa: E402
 from tricap.core.calibration.bundle import Network, adjust  # noqa: E402
 from tricap.core.calibration.precision import predicted_error  # noqa: E402
-from tricap.core.calibration.pseudo import lens_knowledge  # noqa: E402
-from tricap.core.calibration.reference_bar import initial_network  # noqa: E402
+from tricap.core.calibration.reference_bar import (
+    initial_network,  # noqa: E402
+    lens_knowledge,  # noqa: E402
+)
 from tricap.core.calibration.self_calibration import GROSS, PART, calibrate  # noqa: E402
 from tricap.core.calibration.targets import find_blobs, find_targets  # noqa: E402
-from tricap.core.geometry.camera_derivatives import INTERIOR, camera_of  # noqa: E402
-from tricap.core.progress import Monitor  # noqa: E402
-from tricap.core.synthetic.bar import RIG_KINDS, BarNoise, WavedBar, benchmark_cameras, random_cameras, waved_bar  # noqa: E402
-from tricap.core.synthetic.bar_images import draw_disc  # noqa: E402
+from tricap.core.foundation.progress import Monitor  # noqa: E402
+from tricap.core.geometry.camera import INTERIOR, camera_of  # noqa: E402
+from tricap.core.synthetic.bar import (  # noqa: E402
+    RIG_KINDS,
+    BarNoise,
+    WavedBar,
+    benchmark_cameras,
+    draw_disc,  # noqa: E402
+    random_cameras,
+    waved_bar,
+)
 
 CASES = ((100, 0.05), (1000, 0.05), (5000, 0.05), (100, 0.3), (1000, 0.3), (5000, 0.3))
 SEEDS = 5

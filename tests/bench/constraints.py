@@ -17,15 +17,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 import _surfaces as surfaces
 import numpy as np
 
-from tricap.core.images.fields import RowGrid
+from tricap.core.foundation.progress import Monitor
+from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
 from tricap.core.matching.grid import template_grid
-from tricap.core.matching.growing import GrowingSettings, TripletField, grow
 from tricap.core.matching.least_squares import MatchingSettings
+from tricap.core.matching.region_growing import GrowingSettings, TripletField, grow
 from tricap.core.matching.seeds import sweep_seeds
-from tricap.core.progress import Monitor
 from tricap.core.surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 
 GROSS_M = 0.005

@@ -25,15 +25,15 @@ import limb_scene  # noqa: E402  the scenes of the tests
 from tricap.core.body.complete import complete_shape
 from tricap.core.body.metaballs import field, field_and_derivatives
 from tricap.core.body.model_file import read_model
+from tricap.core.body.motion import BodyFit
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.fitting import sequence
-from tricap.core.fitting.body_motion import BodyFit
-from tricap.core.fitting.cloud_points import thinned
-from tricap.core.fitting.conditions import Conditions
-from tricap.core.fitting.fit_input import FitInput
+from tricap.core.fitting.context import Conditions
+from tricap.core.fitting.inputs.cloud_points import thinned
+from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.solver import FURTHEST, solve
+from tricap.core.fitting.solve.solver import FURTHEST, solve
+from tricap.core.fitting.stages import sequence
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 

@@ -18,16 +18,16 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from tricap.core import threads as shared
+from tricap.core.foundation import threads as shared
+from tricap.core.foundation.progress import Monitor
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import MatchingSettings, match_patches
-from tricap.core.matching.patch_pixels import patch_offsets
-from tricap.core.measuring import measure_frames
-from tricap.core.pipeline import settings_of
-from tricap.core.progress import Monitor
-from tricap.core.results import Results
+from tricap.core.matching.patches import patch_offsets
+from tricap.core.results.folder import Results
+from tricap.core.run.pipeline import settings_of
+from tricap.core.surface.measure import measure_frames
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
-from tricap.core.take import open_take, read_take
+from tricap.core.take.take import open_take, read_take
 
 SHAPE, SPACING, NOISE, RUNS, FINE, BORDER = (576, 768), 4, 2.0, 7, 4, 24
 START_ERROR_PX = 0.5

@@ -25,9 +25,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
 
-from tricap.core.account import track_figures  # noqa: E402
-from tricap.core.fitting.stretches import AT_ONCE  # noqa: E402
-from tricap.core.results import Results  # noqa: E402
+from tricap.core.fitting.stages.long_sequence import AT_ONCE  # noqa: E402
+from tricap.core.results.folder import Results  # noqa: E402
+from tricap.core.run.record import track_figures  # noqa: E402
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E402
 from tricap.core.tracking.long_tracks import trajectories_of  # noqa: E402
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus  # noqa: E402
@@ -90,10 +90,10 @@ def long_fit(frames: int, at_once: int) -> None:
     """A fit of a whole body over so many frames, `at_once` of them in one adjustment."""
     import fit
 
-    from tricap.core.fitting import sequence, stretches
+    from tricap.core.fitting.stages import long_sequence, sequence
 
-    sequence.AT_ONCE = stretches.AT_ONCE = at_once
-    stretches.MARGIN = at_once // 6
+    sequence.AT_ONCE = long_sequence.AT_ONCE = at_once
+    long_sequence.MARGIN = at_once // 6
     shape, random, rig = fit.default_shape(fit.read_model("full")), np.random.default_rng(0), fit.rig()
     motion = fit.walk(shape, KINDS)
     clouds = ToAndFro([fit.cloud(shape, m, t, random) for t, m in enumerate(motion)], frames)

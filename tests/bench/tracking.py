@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from _blender_tracker import blender_tracks
 
-from tricap.core.images.fields import FieldLayout
+from tricap.core.foundation.progress import Monitor
+from tricap.core.images.interlace import FieldLayout
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import MatchingSettings
-from tricap.core.progress import Monitor
 from tricap.core.tracking.planar import track_planar
 from tricap.core.tracking.settings import TrackingSettings
 from tricap.core.tracking.step import FramePair, TrackingView, track_step

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import pipeline
-from tricap.core.following import TrackingRules, track_frames
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
-from tricap.core.measuring import MeasuredFrame, measure_frames
-from tricap.core.progress import Monitor
-from tricap.core.results import Results
-from tricap.core.take import open_take, read_take
+from tricap.core.results.folder import Results
+from tricap.core.run import pipeline
+from tricap.core.surface.measure import MeasuredFrame, measure_frames
+from tricap.core.take.take import open_take, read_take
+from tricap.core.tracking.lost_points import Guide
 from tricap.core.tracking.step import TrackedFrame
-from tricap.core.tracking.waiting import Guide
+from tricap.core.tracking.track import TrackingRules, track_frames
 
 WIDTH, HEIGHT, FOCAL_PX, DEPTH_M = 200, 150, 600.0, 2.16  # 3.6 mm a pixel
 

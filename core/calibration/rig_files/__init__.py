@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from ...errors import InputError
+from ...foundation.errors import InputError
 from ...geometry.rig import Rig
 from . import agisoft, colmap, opencv_files, openptv, toml_files
 

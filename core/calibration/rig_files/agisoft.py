@@ -12,10 +12,9 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 
-from ... import store
-from ...errors import InputError
-from ...geometry.camera import Camera
-from ...geometry.camera_derivatives import camera_of, interior_of
+from ...foundation import store
+from ...foundation.errors import InputError
+from ...geometry.camera import Camera, camera_of, interior_of
 from ...geometry.rig import Rig
 from .reading import NO_UNIT, make_camera, numbers, text_of
 

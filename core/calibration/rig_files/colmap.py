@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ... import store
-from ...errors import InputError
+from ...foundation import store
+from ...foundation.errors import InputError
 from ...geometry.rig import Rig
-from .reading import NO_UNIT, make_camera, numbers, text_of
-from .refit import plain
+from .reading import NO_UNIT, make_camera, numbers, plain, text_of
 
 # Parameters of each model: which of fx fy cx cy k1 k2 p1 p2 k3 they are, in order; "f" is both fx and fy.
 MODELS = {

@@ -14,14 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import store
-from ...errors import InputError
-from ...geometry.camera import Camera
-from ...geometry.camera_derivatives import camera_of, exterior_derivatives, image_with_derivatives
+from ...foundation import store
+from ...foundation.errors import InputError
+from ...geometry.camera import Camera, camera_of, exterior_derivatives, image_with_derivatives
 from ...geometry.rig import Rig
 from ...geometry.rotation import axis_rotation, rotation_from_vector
-from .reading import make_camera, numbers, text_of
-from .refit import fitted, turned
+from .reading import fitted, make_camera, numbers, text_of, turned
 
 TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 PIXEL_MM = 0.01  # of a file that we write: only products with it matter

@@ -1,13 +1,22 @@
-"""What all readers of other tools' files need: text that is there, numbers that are numbers, and one sentence when they are not."""
+"""What all readers of other tools' files need: text that is there, numbers that are numbers, and one sentence when they are not.
 
-from collections.abc import Sequence
+A camera in another tool's model: the parameters with which that model comes closest to ours over the whole image.
+
+Most files have no shear, some no k3, and OpenPTV distorts about the sensor's middle. The parameters are fitted to rays of a grid of pixels;
+a small turn of the camera is free as well, since a shear is half a turn.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from ...errors import InputError
+from ...foundation.errors import InputError
 from ...geometry.camera import Camera
+from ...geometry.rotation import rotation_from_vector
 
 LARGEST_FILE, LARGEST_PX = 50_000_000, 100_000
 NO_UNIT = "the file has no unit, so its lengths were taken as metres"
@@ -84,3 +93,55 @@ def make_camera(
         R_cam_world=R_cam_world,
         t_cam_world_m=t_cam_world_m,
     )
+
+
+GRID = 30
+
+Model = Callable[[np.ndarray, np.ndarray], np.ndarray]  # parameters (q,), points in the camera's frame (M, 3) -> pixels (M, 2)
+
+
+def grid_of(camera: Camera) -> np.ndarray:
+    """Pixels (GRID², 2) over the whole image."""
+    w, h = camera.size_px
+    x, y = np.meshgrid(np.linspace(0, w - 1, GRID), np.linspace(0, h - 1, GRID))
+    return np.stack([x.ravel(), y.ravel()], axis=-1)
+
+
+def fitted(camera: Camera, model: Model, start: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Parameters of `model`, the camera's rotation, and the largest distance left [px]. `scale` are magnitudes of the parameters."""
+    xy = grid_of(camera)
+    rays = camera.directions(xy)
+
+    def residual(p: np.ndarray) -> np.ndarray:
+        turned = rays @ rotation_from_vector(p[:3] * 1e-3).T
+        return (model(start + p[3:] * scale, turned) - xy).ravel()
+
+    found = least_squares(residual, np.zeros(3 + len(start)), method="lm", xtol=1e-14, ftol=1e-14)
+    left = float(np.linalg.norm(found.fun.reshape(-1, 2), axis=1).max())
+    return start + found.x[3:] * scale, rotation_from_vector(found.x[:3] * 1e-3), left
+
+
+def turned(camera: Camera, turn: np.ndarray) -> Camera:
+    """The camera turned about its projection centre."""
+    return replace(camera, R_cam_world=turn @ camera.R_cam_world, t_cam_world_m=turn @ camera.t_cam_world_m)
+
+
+def plain(camera: Camera, k3: bool = True) -> Camera:
+    """The camera without affinity (fx and fy take the scale), and without k3 on request; exact where there is no shear and no k3."""
+    fx, fy = camera.matrix[0, 0] * (1 + camera.affinity[0]), camera.matrix[1, 1]
+    shear = camera.matrix[0, 0] * camera.affinity[1] + camera.matrix[0, 1]
+    cx, cy = camera.matrix[:2, 2]
+    simple = replace(camera, matrix=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), affinity=np.zeros(2))
+    if not shear and (k3 or not camera.distortions[4]):
+        return simple
+
+    def with_parameters(p: np.ndarray) -> Camera:
+        d = np.append(p[4:], 0.0) if not k3 else p[4:]
+        matrix = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]])
+        return replace(simple, matrix=matrix, distortions=d, R_cam_world=np.eye(3), t_cam_world_m=np.zeros(3))
+
+    start = np.array([fx, fy, cx, cy, *camera.distortions[: 5 if k3 else 4]])
+    scale = np.array([1.0, 1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-5, 1e-5, 1e-3])[: len(start)]
+    p, turn, _ = fitted(camera, lambda p, rays: with_parameters(p).project(rays), start, scale)
+    fit = with_parameters(p)
+    return turned(replace(simple, matrix=fit.matrix, distortions=fit.distortions), turn)

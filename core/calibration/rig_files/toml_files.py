@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from ... import store
-from ...errors import InputError
+from ...foundation import store
+from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig, sigmas_of
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
-from .reading import five, make_camera, numbers, text_of
-from .refit import plain
+from .reading import five, make_camera, numbers, plain, text_of
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 

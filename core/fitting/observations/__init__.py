@@ -7,21 +7,15 @@ from typing import Protocol
 
 import numpy as np
 
-from ..state import BodyState
-from .apart import Apart
-from .blocks import Block, FromBlocks
-from .clicked_joint import ClickedJoints
-from .empty_space import EmptySpace
-from .equal_radii import EqualRadii
-from .foot_on_floor import FootOnFloor
-from .gaussian_prior import MotionPrior, ShapePrior
-from .joint_limit import JointLimits
-from .keypoint import Keypoints
+from ..state import Block, BodyState, FromBlocks
+from .background import EmptySpace
+from .joints import ClickedJoints, FootOnFloor, Keypoints
 from .material_step import MaterialSteps, StepsFromFixed
-from .proportions import Proportions
+from .pose_priors import JointLimits, MotionPrior, ShapePrior
+from .self_collision import Apart
+from .shape_priors import EqualRadii, Proportions, Symmetry
 from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
-from .symmetry import Symmetry
 
 __all__ = [
     "Apart",

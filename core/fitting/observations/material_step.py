@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..part_field import cross
-from ..state import BodyState
-from .blocks import Block, FromBlocks
+from ..state import Block, BodyState, FromBlocks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..state import BodyState
-from .blocks import Block, FromBlocks
+from ..state import Block, BodyState, FromBlocks
 from .surface_point import SurfacePoints
 
 MEAN_STEPS, NEWTON_STEPS, LONGEST_M = 10, 5, 0.01

@@ -17,8 +17,7 @@ import numpy as np
 
 from ...body.metaballs import THRESHOLD, VISIBLE, Metaballs
 from ..part_field import PartField
-from ..state import CROSS, BodyState
-from .blocks import Block, FromBlocks
+from ..state import CROSS, Block, BodyState, FromBlocks
 
 SCALE_RANGE = (0.4, 2.5)  # bounds of |∇D| in units of 1 / (mean l of the part)
 

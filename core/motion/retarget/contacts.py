@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from ...settings import knob
+from ...foundation.settings import knob
+from ...geometry.rotation import angle_of, quaternion_from_matrix, unit
 from .mapping import RigMap
 from .rig import Motion
 from .roles import SIDES, sided
-from .turns import angle_of, quaternion_from_matrix, unit
 
 LEG_M = 0.9
 LOW_PERCENTILE = 3.0

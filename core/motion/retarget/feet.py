@@ -22,12 +22,11 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ...geometry.rotation import cross_matrix
+from ...geometry.rotation import cross_matrix, matrix_from_vector, rotate, shortest, unit, vector_from_matrix
 from .contacts import Contacts, FeetSettings, runs, stance
 from .mapping import RigMap
 from .rig import Rig
 from .roles import sided
-from .turns import matrix_from_vector, rotate, shortest, unit, vector_from_matrix
 
 SMOOTH_S = 0.05  # τ [s]: time constant that keeps the feet's noise out of the body's path
 LEVEL = 0.1  # λ: damps the velocity of the correction, so that it stays in the air what it was on the ground

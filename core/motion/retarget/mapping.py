@@ -10,14 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ... import store
-from ...errors import InputError
-from ...settings import nearest_name
-from .names import Reading, read_name
+from ...foundation import store
+from ...foundation.errors import InputError
+from ...foundation.settings import nearest_name
+from .control_rig import ControlRig
 from .rig import Motion, Rig
-from .roles import ARM, FINGERS, LEG, ROLES, SIDES, sided
+from .roles import ARM, FINGERS, LEG, ROLES, SIDES, Reading, read_name, sided
 from .shape import ShapeMatch, by_shape
-from .steering import ControlRig
 
 FITS = 0.9  # fraction of a preset's bones that a rig must have for the preset to be chosen
 LIMB_ROLES = 8  # a rig with whole limbs but at most so many parts is a limb or half a body, not an unrecognised person

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...geometry.rotation import angle_of, transposed
 from .contacts import Contacts, runs
 from .feet import find_legs, lowest
 from .mapping import MappedMotion
 from .rig import Motion
 from .transfer import directions
-from .turns import angle_of, transposed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,12 +8,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ...errors import InputError
-from ..markers import Markers, filled
-from .names import WORD, read_name, side_of_words
+from ...foundation.errors import InputError
+from ...geometry.rotation import shortest, transposed, unit
+from ..formats.markers import Markers, filled
 from .rig import Motion, Rig
-from .roles import SIDES, sided
-from .turns import shortest, transposed, unit
+from .roles import SIDES, WORD, read_name, side_of_words, sided
 
 WORDS = {
     "hip": "thigh",

@@ -13,14 +13,14 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
+from ...geometry.rotation import matrix_from_vector, transposed, vector_from_matrix
 from .contacts import Contacts, FeetSettings
 from .mapping import MappedMotion, MappedRig
-from .places import hip_centre, outwards
+from .residual_motion import ResidualChain
+from .rest_pose import hip_centre, outwards
 from .rig import Rig
 from .roles import FINGERS, SPREAD, above, part_of
 from .transfer import body_axes, fractions_of, partners_of, untwisted_bone
-from .turns import matrix_from_vector, transposed, vector_from_matrix
-from .unshown import ResidualChain
 
 PLANTED = ("hips", "thigh", "shin", "foot", "toe")  # parts that planting the feet turns
 ATTACHED = ("neck", "head", "clavicle", "hand", "toe", *(f"{finger}.{k}" for finger in FINGERS for k in (1, 2, 3)))  # if lacking

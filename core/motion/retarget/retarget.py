@@ -8,21 +8,20 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ...errors import InputError
-from ...progress import Monitor
-from ...settings import knob
+from ...foundation.errors import InputError
+from ...foundation.progress import Monitor
+from ...foundation.settings import knob
+from ...geometry.rotation import matrix_from_vector, unit
 from . import feet
 from .contacts import Contacts, FeetSettings, find_contacts
 from .hands import keep_hand_distances
 from .mapping import MappedMotion, MappedRig, RigMap
-from .places import TargetPose, hip_centre, loose_parts
-from .rest import with_person_like_rest
+from .residual_motion import STATES, ResidualMotion
+from .rest_pose import TargetPose, hip_centre, loose_parts, with_person_like_rest
 from .restore import lacking, planting_turns, turned_by, with_residual
 from .rig import Motion, Rig, channels, head_of
 from .roles import SEGMENTS, SIDES, sided
 from .transfer import alignments, body_axes, share_twist, turn
-from .turns import matrix_from_vector, unit
-from .unshown import STATES, ResidualMotion
 
 SHORTEST_LIMB_M = 1e-4
 LYING = 0.3  # height of the head over the hips by their distance: a lower median means that the source lies

@@ -14,10 +14,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ...errors import InputError
-from ...values import frozen
-from .turns import transposed
-from .unshown import ResidualMotion
+from ...foundation.arrays import frozen
+from ...foundation.errors import InputError
+from ...geometry.rotation import transposed
+from .residual_motion import ResidualMotion
 
 SHORTEST_BONE_M = 1e-6
 

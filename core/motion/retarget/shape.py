@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .names import marks_an_end
 from .rig import Rig
-from .roles import sided
+from .roles import marks_an_end, sided
 
 # By the rig's height
 SHORTEST_LIMB = 0.1  # shorter branches are no limbs

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from ...geometry.rotation import about, between, rotate, shortest, transposed, twist_about, unit
 from .mapping import MappedMotion, MappedRig, RigMap
 from .rig import Motion, Rig, following
 from .roles import ROLES, SEGMENTS, SIDES, SPREAD, above, part_of, side_of, sided
-from .turns import about, between, rotate, shortest, transposed, twist_about, unit
 
 UPRIGHT = np.cos(np.radians(35.0))  # a rest pose that leans by less counts as upright
 LEVEL = 0.35  # a foot whose direction has a smaller horizontal component has no heading

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tricap.core.body.bone_profile import bone_profiles, chain_neighbours
-from tricap.core.body.ends import TABLES, person_shape, shape_for_skin
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin import body_skin
-from tricap.core.body.skin_mesh import SkinSettings
+from tricap.core.body.skin.contour_skin import body_skin
+from tricap.core.body.skin.extremities import TABLES, person_shape, shape_for_skin
+from tricap.core.body.skin.mesh import SkinSettings
 
 
 @cache

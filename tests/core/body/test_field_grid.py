@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from tricap.core.body.field_grid import field_grid
 from tricap.core.body.metaballs import THRESHOLD, field
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin import limb_skin
+from tricap.core.body.skin.contour_skin import limb_skin
+from tricap.core.body.skin.whole_surface import field_grid
 
 
 def test_the_grid_of_a_limb_is_its_field() -> None:

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.body.field_grid import field_grid
 from tricap.core.body.fields import EXPONENTIAL, POTENTIALS, VISIBLE, potential_named
 from tricap.core.body.metaballs import Metaballs, field, field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.commands import main
-from tricap.core.errors import InputError
+from tricap.core.body.skin.whole_surface import field_grid
+from tricap.core.cli.main import main
+from tricap.core.foundation.errors import InputError
 
 # Where f = 1/2: closed forms, of the definitions at the head of fields.py.
 THRESHOLD_RADII = {

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from tricap.core.body import model_file
-from tricap.core.body.ends import person_shape
 from tricap.core.body.model_file import read_model
-from tricap.core.body.one_skin import DETAIL, OneSkin, one_skin
-from tricap.core.body.seams import seam_jumps, turned_over
 from tricap.core.body.shape import BodyShape, default_shape
-from tricap.core.body.skin import body_skin
-from tricap.core.body.skin_mesh import SkinSettings
-from tricap.core.body.skin_weights import MOST_BONES, hinge, strongest
-from tricap.core.body.whole_surface import WholeSurface
+from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, one_skin, seam_jumps, turned_over
+from tricap.core.body.skin.contour_skin import MOST_BONES, body_skin, hinge, strongest
+from tricap.core.body.skin.extremities import person_shape
+from tricap.core.body.skin.mesh import SkinSettings
+from tricap.core.body.skin.whole_surface import WholeSurface
 
 
 @cache

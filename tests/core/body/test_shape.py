@@ -8,7 +8,7 @@ import pytest
 
 from tricap.core.body.model_file import model_files, model_names, read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 
 
 @pytest.mark.parametrize("model", model_names())

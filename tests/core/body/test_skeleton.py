@@ -5,7 +5,7 @@ import pytest
 
 from tricap.core.body.model_file import mirrored, model_names, other_side, read_model, without
 from tricap.core.body.skeleton import Bone, Dof, Skeleton, bone_frames, frames_and_axes, joint_positions
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rotation import axis_rotation
 
 RNG = np.random.default_rng(0)

@@ -7,8 +7,8 @@ from tricap.core.body.metaballs import Metaballs, field
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.body.skin import SkinSettings, limb_skin
-from tricap.core.errors import InputError
+from tricap.core.body.skin.contour_skin import SkinSettings, limb_skin
+from tricap.core.foundation.errors import InputError
 
 
 def posture(shape: BodyShape, bend_deg: float, twist_deg: float = 0.0) -> np.ndarray:

@@ -7,8 +7,8 @@ from tricap.core.body.metaballs import field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin import SkinSettings, limb_skin
-from tricap.core.body.skin_patches import APPROXIMATING, control_net, corner_uv, refined, shrinkage
+from tricap.core.body.skin.contour_skin import SkinSettings, limb_skin
+from tricap.core.body.skin.mesh import APPROXIMATING, control_net, corner_uv, refined, shrinkage
 
 from .test_skin import crossing_edges
 

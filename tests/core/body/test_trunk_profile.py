@@ -4,9 +4,8 @@ import numpy as np
 
 from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
-from tricap.core.body.shape import default_shape
+from tricap.core.body.shape import default_shape, stout_chain
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.trunk_profile import stout_chain
 
 
 def _half_widths(shape, bone: int, along: np.ndarray, axis: int) -> np.ndarray:

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.bar_file import bar_path, read_bar, write_bar
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
+from tricap.core.take.bar_file import bar_path, read_bar, write_bar
 
 FRAMES = np.array([0, 3, 4])
 ENDS = np.random.default_rng(2).uniform(-1, 1, (3, 2, 3))

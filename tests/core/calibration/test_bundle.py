@@ -5,18 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.calibration.blunders import redundant_parts
-from tricap.core.calibration.bundle import (
-    Unknowns,
-    adjust,
-    design,
-    free_network,
-    moved,
-    normal_equations,
-    reduce_to_cameras,
-    residuals,
-)
-from tricap.core.geometry.camera_derivatives import EXTERIOR, INTERIOR, camera_of, image_with_derivatives, interior_of
+from tricap.core.calibration.bundle import Unknowns, adjust, design, free_network, moved, normal_equations, reduce_to_cameras, residuals
+from tricap.core.calibration.self_calibration import redundant_parts
+from tricap.core.geometry.camera import EXTERIOR, INTERIOR, camera_of, image_with_derivatives, interior_of
 from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, random_cameras, waved_bar
 
 from .truth import true_network

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.calibrating import CalibratedRig, calibrate_rig
-from tricap.core.calibration.observations import BarObservations
+from tricap.core.calibration.bars import BarObservations
+from tricap.core.calibration.calibrate import CalibratedRig, calibrate_rig
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.intersection import forward_intersection
-from tricap.core.progress import Monitor
 
 SAME_INSTANT_S = 0.02
 OUTER_M, FIRST_M, SECOND_M = 0.39, 0.13, 0.26  # between the lamps of ewand's wand

@@ -8,7 +8,7 @@ import pytest
 
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
 from tricap.core.calibration.rig_files.openptv import image
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.synthetic.bar import bar_ends, benchmark_cameras
@@ -275,7 +275,7 @@ def test_an_entity_bomb_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_command_converts(tmp_path: Path) -> None:
-    from tricap.core.commands import main
+    from tricap.core.cli.main import main
 
     write_as(tmp_path / "cameras.xml", Rig(cameras=benchmark_cameras()), "agisoft")
     assert main(["calibrate", "--import", str(tmp_path / "cameras.xml"), "--out", str(tmp_path / "rig.toml"), "--quiet"]) == 0

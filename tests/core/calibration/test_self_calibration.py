@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.calibrating import calibrate_rig
 from tricap.core.calibration.bundle import Unknowns
+from tricap.core.calibration.calibrate import calibrate_rig
 from tricap.core.calibration.precision import predicted_error, with_left_out
 from tricap.core.calibration.quality import held_out_lengths
 from tricap.core.calibration.self_calibration import calibrate
-from tricap.core.errors import InputError
-from tricap.core.geometry.camera_derivatives import INTERIOR
-from tricap.core.progress import Cancelled, Monitor
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Cancelled, Monitor
+from tricap.core.geometry.camera import INTERIOR
 from tricap.core.synthetic.bar import RIG_KINDS, BarNoise, WavedBar, bar_ends, benchmark_cameras, random_cameras, waved_bar
 
 from .truth import TEST_BARS, bound, error_m, observed, rigid

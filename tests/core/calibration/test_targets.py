@@ -9,14 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.calibrating import calibrate_rig, measure_bar, open_bar, write_report
-from tricap.core.calibration.target_tracks import track_bar
-from tricap.core.calibration.targets import Targets, TargetStatus, find_blobs, find_targets
-from tricap.core.commands import main
-from tricap.core.errors import InputError
-from tricap.core.progress import Monitor
-from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, waved_bar
-from tricap.core.synthetic.bar_images import BarPictures, draw_disc, picture, write_bar_folder
+from tricap.core.calibration.calibrate import calibrate_rig, measure_bar, open_bar, write_report
+from tricap.core.calibration.targets import Targets, TargetStatus, find_blobs, find_targets, track_bar
+from tricap.core.cli.main import main
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
+from tricap.core.synthetic.bar import BarNoise, BarPictures, benchmark_cameras, draw_disc, picture, waved_bar, write_bar_folder
 
 from .truth import error_m
 

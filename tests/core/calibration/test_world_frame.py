@@ -7,20 +7,21 @@ import numpy as np
 import pytest
 
 from tricap.__main__ import main
-from tricap.core.calibrating import calibrate_rig
-from tricap.core.calibration.world_choice import WorldChoice, frame_of_clicks
+from tricap.core.calibration.calibrate import calibrate_rig
 from tricap.core.calibration.world_frame import (
+    WorldChoice,
     WorldFrame,
     frame_like,
     frame_of_cameras,
+    frame_of_clicks,
     frame_of_level_bar,
     frame_of_points,
     frame_on_floor,
 )
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.progress import Monitor
 from tricap.core.synthetic.bar import BarNoise, bar_ends, benchmark_cameras, waved_bar
 
 from .truth import observed

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tricap.core.calibration.bars import BarObservations
 from tricap.core.calibration.bundle import Network, Unknowns, normal_equations, residuals
-from tricap.core.calibration.observations import BarObservations
 from tricap.core.calibration.precision import PredictedError, camera_covariance, predicted_error
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.intersection import forward_intersection

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core import commands, pipeline
 from tricap.core.checking.rig_check import check_rig
 from tricap.core.checking.run_check import check_run
+from tricap.core.cli import main
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rig import Rig, write_rig
-from tricap.core.motion.ply import read_ply, write_cloud
-from tricap.core.progress import Monitor
+from tricap.core.motion.formats.ply import read_ply, write_cloud
+from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import arm_rig
 
 CAMERAS = arm_rig(768).cameras
@@ -66,9 +67,9 @@ def test_a_fault_of_a_rig_is_named(name: str, tmp_path: Path) -> None:
 
 def test_a_sound_rig_passes_and_a_broken_one_says_why(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.toml", arm_rig(768))
-    assert commands.main(["check", str(tmp_path / "rig.toml")]) == 0
+    assert main.main(["check", str(tmp_path / "rig.toml")]) == 0
     (tmp_path / "rig.toml").write_text("[cam_0]\nname = 3")
-    assert commands.main(["check", str(tmp_path / "rig.toml")]) == 1
+    assert main.main(["check", str(tmp_path / "rig.toml")]) == 1
 
 
 @pytest.fixture(scope="module")

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.checking.rig_fit import clicked_pairs, rig_findings, stale_finding
+from tricap.core.checking.rig_check import clicked_pairs, rig_findings, stale_finding
 from tricap.core.checking.take_check import check_take
 from tricap.core.checking.timing import _fit, _Followed
 from tricap.core.checking.view_matches import PairMatches
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.progress import Monitor
-from tricap.core.take import Seeds, Take, View
-from tricap.core.take_file import new_table, toml_text
+from tricap.core.take.take import Seeds, Take, View
+from tricap.core.take.writing import new_table, toml_text
 
 from ..conftest import three_cameras
 

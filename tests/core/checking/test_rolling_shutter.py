@@ -8,10 +8,10 @@ import pytest
 
 from tricap.core.checking.take_check import rolling_finding
 from tricap.core.checking.timing import _readout, estimate_offsets
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import write_rig
-from tricap.core.progress import Monitor
-from tricap.core.take import open_take, read_take
+from tricap.core.take.take import open_take, read_take
 
 from ..conftest import Body, three_cameras, write_take_toml
 

@@ -14,16 +14,17 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core import commands, pipeline
 from tricap.core.checking.findings import Checked
 from tricap.core.checking.take_check import check_take, doubts, sudden_step, timing_finding
 from tricap.core.checking.timing import Film, TimeOffset, _between, energy_lags, estimate_offsets, lag_sigmas
-from tricap.core.errors import InputError
+from tricap.core.cli import main
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.progress import Monitor
-from tricap.core.take import open_take, read_take
+from tricap.core.run import pipeline
+from tricap.core.take.take import open_take, read_take
 
 from ..images.test_sequence import with_a_pause
 
@@ -279,12 +280,12 @@ def test_a_take_of_one_frame_has_no_motion_to_look_for(arm_recording: Record, tm
 
 def test_exit_codes_and_json(arm_recording: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(arm_recording(), tmp_path / "take")
-    assert commands.main(["check", str(tmp_path / "take"), "--json"]) == 0
+    assert main.main(["check", str(tmp_path / "take"), "--json"]) == 0
     table = json.loads(capsys.readouterr().out)
     assert table["good"] and table["kind"] == "take" and table["figures"]["offsets"]["R"]["from"] == "rays"
     image_gone(tmp_path / "take")
-    assert commands.main(["check", str(tmp_path / "take"), "--quiet"]) == 1
-    assert commands.main(["check", str(tmp_path / "nothing")]) == 2
+    assert main.main(["check", str(tmp_path / "take"), "--quiet"]) == 1
+    assert main.main(["check", str(tmp_path / "nothing")]) == 2
 
 
 MEASURED = {black: "View L is black", identical: "show the same picture", swapped: "L and R are swapped",

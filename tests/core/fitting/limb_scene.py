@@ -9,8 +9,8 @@ from tricap.core.body.metaballs import field, field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.body.skin import limb_skin
-from tricap.core.fitting.fit_input import ViewContours
+from tricap.core.body.skin.contour_skin import limb_skin
+from tricap.core.fitting.inputs.fit_input import ViewContours
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import rasterize
 from tricap.core.geometry.rig import Rig

@@ -9,14 +9,14 @@ from tricap.core.body.metaballs import field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.errors import InputError
-from tricap.core.fitting.fit_input import FitInput
+from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.observations import MotionPrior
-from tricap.core.fitting.problem import Problem
-from tricap.core.fitting.sequence import _statuses, conditions, fit_sequence
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.solver import _next_damping, solve
+from tricap.core.fitting.solve.problem import Problem
+from tricap.core.fitting.solve.solver import _next_damping, solve
+from tricap.core.fitting.stages.sequence import _statuses, conditions, fit_sequence
 from tricap.core.fitting.state import ShapeParameters, free_bones
+from tricap.core.foundation.errors import InputError
 
 from .limb_scene import front_rig, surface
 

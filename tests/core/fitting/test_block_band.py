@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tricap.core.fitting.block_band import NormalEquations, eliminated, reversed_in_time
-from tricap.core.fitting.solver import FURTHEST, bounded_step
+from tricap.core.fitting.solve.block_band import NormalEquations, eliminated, reversed_in_time
+from tricap.core.fitting.solve.solver import FURTHEST, bounded_step
 
 
 def _random(T: int, D: int, S: int, seed: int) -> tuple[NormalEquations, np.ndarray, np.ndarray]:

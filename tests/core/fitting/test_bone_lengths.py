@@ -6,11 +6,11 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, scaled_shape
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.fitting.bone_lengths import clicked_chains, proportions
-from tricap.core.fitting.clicks import enough, read_clicks
-from tricap.core.fitting.inverse_kinematics import clicked_stature, dof_priors
+from tricap.core.fitting.inputs.clicks import enough, read_clicks
+from tricap.core.fitting.inputs.silhouettes import Rays, touched
 from tricap.core.fitting.observations import Proportions
-from tricap.core.fitting.silhouettes import Rays, touched
+from tricap.core.fitting.observations.shape_priors import clicked_chains, proportions
+from tricap.core.fitting.stages.inverse_kinematics import clicked_stature, dof_priors
 from tricap.core.fitting.state import ShapeParameters
 
 from .limb_scene import front_rig

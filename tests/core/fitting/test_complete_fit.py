@@ -8,11 +8,11 @@ import pytest
 from tricap.core.body.complete import complete_shape
 from tricap.core.body.metaballs import field_and_derivatives
 from tricap.core.body.model_file import read_model
+from tricap.core.body.motion import BodyFit
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.fitting.body_motion import BodyFit
-from tricap.core.fitting.sequence import FitInput, fit_sequence
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.stages.sequence import FitInput, fit_sequence
 
 from . import limb_scene
 

@@ -9,20 +9,20 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.body.skin import limb_skin
-from tricap.core.errors import InputError
-from tricap.core.fitting import fit_input
-from tricap.core.fitting.empty_views import EmptyViews
-from tricap.core.fitting.fit_input import EmptyView, FitInput, JointPlaces, Packed
-from tricap.core.fitting.limbs_apart import LimbsApart
+from tricap.core.body.skin.contour_skin import limb_skin
+from tricap.core.fitting.inputs import fit_input
+from tricap.core.fitting.inputs.background import EmptyViews
+from tricap.core.fitting.inputs.fit_input import EmptyView, FitInput, JointPlaces, Packed
+from tricap.core.fitting.inputs.silhouettes import Silhouettes
+from tricap.core.fitting.inputs.standing_feet import StandingFeet
 from tricap.core.fitting.observations import MotionPrior
-from tricap.core.fitting.problem import Problem
-from tricap.core.fitting.sequence import fit_sequence
+from tricap.core.fitting.observations.self_collision import LimbsApart
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.silhouettes import Silhouettes
-from tricap.core.fitting.solver import solve
-from tricap.core.fitting.standing_feet import StandingFeet
+from tricap.core.fitting.solve.problem import Problem
+from tricap.core.fitting.solve.solver import solve
+from tricap.core.fitting.stages.sequence import fit_sequence
 from tricap.core.fitting.state import ShapeParameters
+from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.raster import rasterize
 from tricap.core.geometry.rig import Rig
 

@@ -5,8 +5,6 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.fitting.acceleration import Acceleration
-from tricap.core.fitting.block_band import NormalEquations
 from tricap.core.fitting.observations import (
     Apart,
     ClickedJoints,
@@ -24,7 +22,9 @@ from tricap.core.fitting.observations import (
     SurfacePoints,
     Symmetry,
 )
-from tricap.core.fitting.observations.empty_space import Distances
+from tricap.core.fitting.observations.background import Distances
+from tricap.core.fitting.solve.block_band import NormalEquations
+from tricap.core.fitting.solve.time_priors import Acceleration
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.geometry.camera import Camera
 

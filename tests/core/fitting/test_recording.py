@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tricap.core.fitting.sequence import FitInput, fit_sequence
+from tricap.core.fitting.stages.sequence import FitInput, fit_sequence
 from tricap.core.geometry.rig import read_rig
 
 TAKE = Path(__file__).resolve().parents[4] / "shared" / "takes" / "dev_arm"

@@ -9,15 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tricap.core.errors import InputError
-from tricap.core.fitting import click_frame, lost_limbs, problem, solver
-from tricap.core.fitting.click_frame import fit_posture_and_shape
-from tricap.core.fitting.cloud_points import thinned
-from tricap.core.fitting.inverse_kinematics import inverse_kinematics
-from tricap.core.fitting.problem import Scales
-from tricap.core.fitting.sequence import FitInput, FitSettings, _begun_anew, conditions, fit_sequence
-from tricap.core.fitting.solver import Solution, solve
-from tricap.core.progress import Cancelled, Monitor
+from tricap.core.fitting.inputs.cloud_points import thinned
+from tricap.core.fitting.solve import problem, solver
+from tricap.core.fitting.solve.problem import Scales
+from tricap.core.fitting.solve.solver import Solution, solve
+from tricap.core.fitting.stages import click_frame, hidden_limbs
+from tricap.core.fitting.stages.click_frame import fit_posture_and_shape
+from tricap.core.fitting.stages.inverse_kinematics import inverse_kinematics
+from tricap.core.fitting.stages.sequence import FitInput, FitSettings, _begun_anew, conditions, fit_sequence
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Cancelled, Monitor
 
 KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
 UNKNOWN = FitSettings(model_sigma_m=0.0, voxel_m=0.002)
@@ -229,7 +230,7 @@ class _Heard(Monitor):
         super().__init__()
         self.told: list[tuple[str, float]] = []
         self.most, self.since = 0, 0
-        for module, name in ((solver, "linearise"), (lost_limbs, "_postures")):
+        for module, name in ((solver, "linearise"), (hidden_limbs, "_postures")):
             monkeypatch.setattr(module, name, self._counted(getattr(module, name)))
 
     def _counted(self, work):
@@ -252,8 +253,8 @@ def test_every_step_of_the_click_frame_is_told_and_can_be_stopped(make_scene, mo
     scene = make_scene(frames=2, seed=1, points=80)
     monkeypatch.setattr(click_frame, "OTHERS_AROUND", 1)
     monkeypatch.setattr(click_frame, "SUSPICIOUS", 0.0)  # all other starts are tried too
-    monkeypatch.setattr(lost_limbs, "lost_limbs", lambda fit, counts: [np.array([1])])
-    monkeypatch.setattr(lost_limbs, "_unexplained", lambda fit, points, state, limb: np.arange(40))
+    monkeypatch.setattr(hidden_limbs, "lost_limbs", lambda fit, counts: [np.array([1])])
+    monkeypatch.setattr(hidden_limbs, "_unexplained", lambda fit, points, state, limb: np.arange(40))
     monitor = _Heard(monkeypatch)
     fit_sequence(_given(scene), replace(KNOWN, method=method), monitor)
     parts = [part for stage, part in monitor.told if stage == "fit the click frame"]

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.fitting.cloud_points import CloudPoints
-from tricap.core.fitting.segmentation import segment
-from tricap.core.fitting.sequence import FitInput, fit_sequence
+from tricap.core.fitting.inputs.cloud_points import CloudPoints
+from tricap.core.fitting.segmentation import OUTLIERS, responsibilities, segment, soft_segment
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.soft_segmentation import OUTLIERS, responsibilities, soft_segment
+from tricap.core.fitting.stages.sequence import FitInput, fit_sequence
 from tricap.core.fitting.state import ShapeParameters
 
 EVERYWHERE = np.tile([0.0, 1.0], (2, 1))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tricap.core.fitting import sequence, stretches
-from tricap.core.fitting.sequence import FitInput, FitSettings, fit_sequence
+from tricap.core.fitting.stages import long_sequence, sequence
+from tricap.core.fitting.stages.sequence import FitInput, FitSettings, fit_sequence
 
 KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.005)
 
@@ -23,9 +23,9 @@ def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.Monkey
         trajectories=scene.trajectories,
     )
     whole = fit_sequence(given, KNOWN)
-    for module in (sequence, stretches):
+    for module in (sequence, long_sequence):
         monkeypatch.setattr(module, "AT_ONCE", 9)
-    monkeypatch.setattr(stretches, "MARGIN", 4)
+    monkeypatch.setattr(long_sequence, "MARGIN", 4)
     pieces = fit_sequence(given, KNOWN)
     assert np.array_equal(pieces.motion.frames, whole.motion.frames) and pieces.motion.status == whole.motion.status
     off = np.linalg.norm(pieces.motion.joints_m - whole.motion.joints_m, axis=2) / whole.motion.joint_sigma_m
@@ -36,9 +36,9 @@ def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.Monkey
 
 def test_spans_cover_every_frame_once(monkeypatch: pytest.MonkeyPatch) -> None:
     for frames in (1, 299, 300, 301, 1000):
-        found = stretches.spans(frames)
-        assert [t for span in found for t in span] == list(range(frames)) and max(map(len, found)) <= stretches.AT_ONCE
-    assert stretches.sample(1000, 500) == sorted(set(stretches.sample(1000, 500))) and 500 in stretches.sample(1000, 500)
-    order = stretches.outwards(1000, 600)
+        found = long_sequence.spans(frames)
+        assert [t for span in found for t in span] == list(range(frames)) and max(map(len, found)) <= long_sequence.AT_ONCE
+    assert long_sequence.sample(1000, 500) == sorted(set(long_sequence.sample(1000, 500))) and 500 in long_sequence.sample(1000, 500)
+    order = long_sequence.outwards(1000, 600)
     assert [direction for *_, direction in order] == [0, 1, -1, -1] and 600 in order[0][0]
     assert sorted(t for own, *_ in order for t in own) == list(range(1000)) and all(set(own) <= set(around) for own, around, _ in order)

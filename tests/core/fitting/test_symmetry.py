@@ -7,11 +7,11 @@ import numpy as np
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.fitting.conditions import Conditions
-from tricap.core.fitting.fit_input import FitInput
+from tricap.core.fitting.context import Conditions
+from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.observations import Symmetry
-from tricap.core.fitting.sequence import conditions, fit_sequence
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.stages.sequence import conditions, fit_sequence
 
 from .limb_scene import front_rig, measured_cloud
 

@@ -7,8 +7,8 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.fitting.sequence import FitInput, fit_sequence
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.stages.sequence import FitInput, fit_sequence
 from tricap.core.fitting.state import ShapeParameters
 
 SETTINGS = FitSettings(model_sigma_m=0.0, voxel_m=0.002, length_sigma=0.01, proportion_sigma=0.01, radius_sigma=0.02)

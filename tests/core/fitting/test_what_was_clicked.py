@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.checking.body_check import clicks_not_kept, limits_not_kept
-from tricap.core.fitting.fit_input import FitInput
-from tricap.core.fitting.sequence import fit_sequence
+from tricap.core.checking.fit_check import clicks_not_kept, limits_not_kept
+from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.stages.sequence import fit_sequence
 
 from .limb_scene import Scene, measured_cloud
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 from tricap.core.images import sequence
 from tricap.core.images.sequence import ImageFiles, Movie, grey, open_sequence, read_image
 

@@ -7,30 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.images.fields import RowGrid
+from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.constraints import (
-    OUTLINE_ACROSS_PX,
-    OUTLINE_ALONG_PX,
-    RAY_SIGMA_PX,
-    _model_covariance,
-    _over_outline,
-    constrain,
-)
-from tricap.core.matching.epipolar import Epipolar
+from tricap.core.matching.constraints import OUTLINE_ACROSS_PX, OUTLINE_ALONG_PX, RAY_SIGMA_PX, _model_covariance, _over_outline, constrain
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import template_grid
-from tricap.core.matching.growing import GrowingSettings, TripletField, grow, rounds_of_larger_patches
+from tricap.core.matching.grid import NeighbourFit, template_grid
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
-from tricap.core.matching.middle import believed, depth_doubt, in_doubt
 from tricap.core.matching.multi_image import match_multi_image
-from tricap.core.matching.neighbourhood import NeighbourFit
-from tricap.core.matching.object_space import SurfacePrior, match_surface
-from tricap.core.matching.patch_pixels import patch_offsets
+from tricap.core.matching.object_space import Epipolar, SurfacePrior, match_surface
+from tricap.core.matching.occlusion_check import believed, depth_doubt, in_doubt
+from tricap.core.matching.patches import TemplatePatches, monomials, patch_offsets
+from tricap.core.matching.region_growing import GrowingSettings, TripletField, grow, rounds_of_larger_patches
 from tricap.core.matching.seeds import sweep_seeds
-from tricap.core.matching.template_patches import TemplatePatches, monomials
-from tricap.core.progress import Monitor
 
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 SETTINGS = MatchingSettings()

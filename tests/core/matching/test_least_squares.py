@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.fft import fft2, fftfreq, ifft2
 
+from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import (
     Matches,
@@ -23,8 +24,7 @@ from tricap.core.matching.least_squares import (
     match_prepared,
     prepare_templates,
 )
-from tricap.core.matching.patch_pixels import patch_offsets, template_pixels
-from tricap.core.progress import Cancelled, Monitor
+from tricap.core.matching.patches import patch_offsets, template_pixels
 
 SIZE, CONTRAST = 300, 20.0
 OPEN = MatchingSettings(max_sigma_px=2.0, min_correlation=0.0, max_sigma0=100.0, max_shear=3.0)  # nothing is refused: all scatter counts

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from tricap.core.geometry.camera import Camera
-from tricap.core.images.fields import RowGrid
+from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.matching.proposals import below_surface, epipolar_curve, propose, where_rays_meet
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.truth import Truth, read_truth
-from tricap.core.take import Footage, open_take, read_take
+from tricap.core.take.take import Footage, open_take, read_take
 
 
 def distance_to(curve: np.ndarray, xy: np.ndarray) -> float:

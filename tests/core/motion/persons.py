@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from tricap.core.geometry.rotation import about, matrix_from_vector, shortest
 from tricap.core.motion.retarget.mapping import MappedMotion, MappedRig, RigMap, find_map
 from tricap.core.motion.retarget.rig import Motion, Rig, posed
 from tricap.core.motion.retarget.roles import SIDES, sided
-from tricap.core.motion.retarget.turns import about, matrix_from_vector, shortest
 
 # role, parent, head, tail of the left side or the middle; faces −Y, metres
 PARTS = (

@@ -9,18 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.errors import InputError
-from tricap.core.motion.bvh import read_bvh, write_bvh
-from tricap.core.motion.c3d import BLOCK, _Number, _read_parameters, read_c3d, write_c3d
-from tricap.core.motion.markers import Markers
-from tricap.core.motion.points_csv import read_points_csv, write_points_csv
+from tricap.core.foundation.errors import InputError
+from tricap.core.geometry.rotation import angle_of, transposed
+from tricap.core.motion.formats.bvh import read_bvh, write_bvh
+from tricap.core.motion.formats.c3d import BLOCK, _Number, _read_parameters, read_c3d, write_c3d
+from tricap.core.motion.formats.markers import Markers, read_points_csv, write_points_csv
+from tricap.core.motion.formats.trc import read_trc, write_trc
 from tricap.core.motion.retarget.mapping import find_map
 from tricap.core.motion.retarget.points import joint_of, joint_of_bone, motion_from_points
 from tricap.core.motion.retarget.retarget import lying_note, retarget
 from tricap.core.motion.retarget.transfer import directions
-from tricap.core.motion.retarget.turns import angle_of, transposed
 from tricap.core.motion.sources import read_motion_source
-from tricap.core.motion.trc import read_trc, write_trc
 
 from .persons import flail, mapped, mapped_rig, person, squat
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.errors import InputError
-from tricap.core.motion.ply import read_ply, write_cloud, write_mesh
+from tricap.core.foundation.errors import InputError
+from tricap.core.motion.formats.ply import read_ply, write_cloud, write_mesh
 
 
 def cloud(n: int) -> dict[str, np.ndarray]:

@@ -10,17 +10,8 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.errors import InputError
-from tricap.core.motion.bvh import write_bvh
-from tricap.core.motion.retarget.contacts import FeetSettings, hysteresis, planted, steady, without_short
-from tricap.core.motion.retarget.feet import Stand, carry_root
-from tricap.core.motion.retarget.keys import needed_keys
-from tricap.core.motion.retarget.mapping import RigMap, find_map
-from tricap.core.motion.retarget.measure import measure
-from tricap.core.motion.retarget.resample import resampled
-from tricap.core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
-from tricap.core.motion.retarget.rig import Motion, Rig, channels, posed
-from tricap.core.motion.retarget.turns import (
+from tricap.core.foundation.errors import InputError
+from tricap.core.geometry.rotation import (
     EULER_MODES,
     about,
     angle_of,
@@ -30,6 +21,14 @@ from tricap.core.motion.retarget.turns import (
     quaternion_from_matrix,
     transposed,
 )
+from tricap.core.motion.formats.bvh import write_bvh
+from tricap.core.motion.retarget.contacts import FeetSettings, hysteresis, planted, steady, without_short
+from tricap.core.motion.retarget.feet import Stand, carry_root
+from tricap.core.motion.retarget.keys import needed_keys, resampled
+from tricap.core.motion.retarget.mapping import RigMap, find_map
+from tricap.core.motion.retarget.measure import measure
+from tricap.core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
+from tricap.core.motion.retarget.rig import Motion, Rig, channels, posed
 from tricap.core.motion.sources import body_motion, read_motion_source
 
 from .persons import flail, mapped, mapped_rig, person, squat

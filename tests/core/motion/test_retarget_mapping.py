@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 from tricap.core.motion.retarget.mapping import NEEDED, apply_preset, best_preset, by_names, find_map, fit_of, read_preset, write_map
-from tricap.core.motion.retarget.names import read_name
 from tricap.core.motion.retarget.rig import Rig
-from tricap.core.motion.retarget.roles import ROLES, parent_role, part_of, side_of, sided
+from tricap.core.motion.retarget.roles import ROLES, parent_role, part_of, read_name, side_of, sided
 from tricap.core.motion.retarget.shape import by_shape
 
 from .persons import person

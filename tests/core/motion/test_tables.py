@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tricap.core.body.model_file import read_model
+from tricap.core.body.motion import BodyMotion
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.errors import InputError
-from tricap.core.fitting.body_motion import BodyMotion
+from tricap.core.foundation.errors import InputError
 from tricap.core.motion.tables import read_joints, read_motion, write_joints, write_motion
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tricap.core import commands, pipeline
+from tricap.core.cli import main
 from tricap.core.report.figures import quoted
+from tricap.core.run import pipeline
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,6 @@ def test_every_figure_has_a_unit_and_a_sigma(plane_take: Path, tmp_path: Path) -
     command = shlex.split(report["repeat"])
     assert command[:2] == ["tricap", "run"] and {"growing.spacing_px=6", "surface.correct_curvature=false", "0:3"} <= set(command)
     again = [str(tmp_path / "again") if word == "OUT" else word for word in command[2:]]
-    assert commands.main(["track", *again, "--quiet"]) == 0
+    assert main.main(["track", *again, "--quiet"]) == 0
     for name in ("0000.ply", "0002.ply"):
         assert (tmp_path / "again" / "clouds" / name).read_bytes() == (out / "clouds" / name).read_bytes()

@@ -7,9 +7,11 @@ from typing import Any
 
 import pytest
 
-from tricap.core import commands, pipeline, store
-from tricap.core.errors import InputError
-from tricap.core.take_file import read_table, write_table
+from tricap.core.cli import main
+from tricap.core.foundation import store
+from tricap.core.foundation.errors import InputError
+from tricap.core.run import pipeline
+from tricap.core.take.writing import read_table, write_table
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +50,9 @@ def test_a_body_that_nobody_wants_is_no_warning(plane_take: Path, tmp_path: Path
 
 
 def test_running_again_computes_nothing_again(plane_take: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tricap.core import measuring
+    from tricap.core.surface import measure
 
-    monkeypatch.setattr(measuring, "_measure", lambda *args: pytest.fail("computed again"))
+    monkeypatch.setattr(measure, "_measure", lambda *args: pytest.fail("computed again"))
     before = (out / "trajectories.npz").read_bytes()
     pipeline.run(plane_take, out)
     again, _ = store.load(out / "trajectories.npz")
@@ -72,10 +74,10 @@ def test_one_frame_is_a_run(plane_take: Path, tmp_path: Path) -> None:
 
 
 def test_restart_measures_anew(plane_take: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tricap.core import measuring
+    from tricap.core.surface import measure
 
-    once, computed = measuring._measure, []
-    monkeypatch.setattr(measuring, "_measure", lambda *args: computed.append(args) or once(*args))
+    once, computed = measure._measure, []
+    monkeypatch.setattr(measure, "_measure", lambda *args: computed.append(args) or once(*args))
     pipeline.run(plane_take, out, frames=(0, 2), restart=True)
     assert len(computed) == 2
 
@@ -99,6 +101,6 @@ def test_an_unknown_body_is_noticed_before_anything_is_computed(plane_take: Path
 
 def test_results_of_other_settings_do_not_stay(plane_take: Path, out: Path) -> None:
     """`tricap measure` with another patch into the folder of a finished run: its trajectories belong to clouds that are gone."""
-    assert commands.main(["measure", str(plane_take), "--out", str(out), "--set", "matching.patch_px=11", "--quiet"]) == 0
+    assert main.main(["measure", str(plane_take), "--out", str(out), "--set", "matching.patch_px=11", "--quiet"]) == 0
     run = json.loads((out / "run.json").read_text())
     assert not (out / "trajectories.npz").exists() and "track" not in run["stages"]

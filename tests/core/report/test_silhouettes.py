@@ -8,10 +8,10 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
-from tricap.core.body.skin import SkinSettings
-from tricap.core.errors import InputError
+from tricap.core.body.skin.contour_skin import SkinSettings
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 from tricap.core.images.background import Background
-from tricap.core.progress import Monitor
 from tricap.core.report.figures import figure_rows
 from tricap.core.report.pages import _agreement_caption, check_pictured
 from tricap.core.report.pictures import BODY_OUTLINE, PERSON_OUTLINE, body_over_footage

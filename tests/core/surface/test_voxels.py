@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core import measuring, pipeline
-from tricap.core.motion.ply import read_ply
-from tricap.core.progress import Monitor
-from tricap.core.surface.cloud import PointCloud
-from tricap.core.surface.voxels import voxel_filtered
+from tricap.core.foundation.progress import Monitor
+from tricap.core.motion.formats.ply import read_ply
+from tricap.core.run import pipeline
+from tricap.core.surface import measure
+from tricap.core.surface.cloud import PointCloud, voxel_filtered
 
 EDGE_M = 0.01
 
@@ -55,5 +55,5 @@ def test_only_the_file_is_thinned(plane_take: Path, tmp_path: Path, monkeypatch:
         with pipeline.open_run(plane_take, tmp_path / "out", settings, (0, 1)) as run:
             pipeline.measure(run, Monitor())
             sizes.append((len(read_ply(tmp_path / "out" / "clouds" / "0000.ply").xyz_m), len(run.clouds[0].xyz_m)))
-        monkeypatch.setattr(measuring, "_measure", None)
+        monkeypatch.setattr(measure, "_measure", None)
     assert sizes[0][0] == sizes[0][1] == sizes[1][1] > 3 * sizes[1][0] > 300

@@ -6,8 +6,7 @@ import pytest
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import vertex_normals
 from tricap.core.synthetic.figure import BARE_SKIN, CLOTH, Material, Part, superellipsoid, wall
-from tricap.core.synthetic.film import AMBIENT, LIGHT, Sensor, digitize, expose, paint, seen_vertices
-from tricap.core.synthetic.texture import solid_noise
+from tricap.core.synthetic.film import AMBIENT, LIGHT, Sensor, digitize, expose, paint, seen_vertices, solid_noise
 
 CAMERA = Camera(
     name="C",

@@ -10,9 +10,9 @@ from tricap.core.body.complete import complete_shape
 from tricap.core.body.metaballs import Metaballs
 from tricap.core.body.shape import BodyShape, write_body
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.errors import InputError
+from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.raster import vertex_normals
-from tricap.core.motion.ply import write_cloud, write_mesh
+from tricap.core.motion.formats.ply import write_cloud, write_mesh
 from tricap.core.synthetic.arm import ArmTakeSettings, arm_motion, arm_shape, make_arm_take
 from tricap.core.synthetic.figure import superellipsoid
 from tricap.core.synthetic.score import score_run

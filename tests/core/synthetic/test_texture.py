@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tricap.core.synthetic.texture import SolidNoise, solid_noise
+from tricap.core.synthetic.film import SolidNoise, solid_noise
 
 
 def test_noise_is_normalised_band_limited_and_reproducible() -> None:

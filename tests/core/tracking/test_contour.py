@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.tracking.contour import (
+from tricap.core.tracking.contour import (  # fmt: skip
     ContourSettings,
     _sample,
     contour_of_mask,
@@ -15,7 +15,7 @@ from tricap.core.tracking.contour import (
     predict_contour,
     relax_contour,
     resampled,
-)  # fmt: skip
+)
 
 SETTINGS = ContourSettings()
 

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.correcting import corrected_cloud, corrected_tracks, missed_clicks
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
-from tricap.core.progress import Monitor
 from tricap.core.surface.cloud import PointCloud
-from tricap.core.take import Correction
-from tricap.core.tracking.corrections import inside_polygon
+from tricap.core.take.take import Correction
+from tricap.core.tracking.corrections import corrected_cloud, corrected_tracks, inside_polygon, missed_clicks
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus
 from tricap.core.tracking.trajectories import Trajectories, filter_trajectories, with_kinematics
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core.commands import main
-from tricap.core.errors import InputError
+from tricap.core.cli.main import main
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.images.fields import FieldLayout
+from tricap.core.images.interlace import FieldLayout
 from tricap.core.matching.least_squares import MatchingSettings
-from tricap.core.progress import Monitor
 from tricap.core.tracking.key_points import KeyPoints, distances, track_key_points
 from tricap.core.tracking.settings import KeyPointSettings, TrackingSettings, TrackStatus
 from tricap.core.tracking.step import TrackingView

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tricap.core.tracking.kinematics import differences, smoothed
+from tricap.core.tracking.trajectories import differences, smoothed
 
 DT = 1 / 25
 

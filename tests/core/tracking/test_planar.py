@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.commands import main
-from tricap.core.errors import InputError
-from tricap.core.images.fields import row_grid
+from tricap.core.cli.main import main
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
+from tricap.core.images.interlace import row_grid
 from tricap.core.matching.least_squares import MatchingSettings
-from tricap.core.progress import Monitor
 from tricap.core.tracking.planar import PlanarTracks, track_planar
 from tricap.core.tracking.point_tables import read_planar, read_points, read_polygon
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from tricap.core.calibration.rig_files import read_any
-from tricap.core.commands import main
+from tricap.core.cli.main import main
+from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
-from tricap.core.images.fields import FieldLayout
+from tricap.core.images.interlace import FieldLayout
 from tricap.core.matching.least_squares import MatchingSettings
-from tricap.core.progress import Monitor
 from tricap.core.tracking.key_points import KeyPoints, track_key_points
 from tricap.core.tracking.point_tables import read_planar
 from tricap.core.tracking.settings import TrackingSettings, TrackStatus

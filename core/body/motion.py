@@ -1,0 +1,57 @@
+"""What the fit gives: a body's shape, and its motion with the quality of every number."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..foundation.arrays import frozen
+from .shape import BodyShape
+
+FITTED, PARTIAL, BRIDGED, SUSPECT = "fitted", "partial", "bridged", "suspect"
+STATUSES = (FITTED, PARTIAL, BRIDGED, SUSPECT)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BodyMotion:
+    """T frames of D DOFs and J joints.
+
+    status, the most serious that holds: "bridged": nothing is seen, the whole posture is predicted; "suspect": the residuals are far
+    larger, or what is seen far less, than in the other frames; "partial": a limb is hardly seen and rests on prediction; "fitted".
+    """
+
+    frames: np.ndarray  # (T,) the take's frame numbers
+    time_s: np.ndarray  # (T,)
+    dof_names: tuple[str, ...]  # D
+    values: np.ndarray  # (T, D) rad; metres for the base
+    covariance: np.ndarray  # (T, D, D)
+    joint_names: tuple[str, ...]  # J
+    joints_m: np.ndarray  # (T, J, 3) world
+    joint_sigma_m: np.ndarray  # (T, J) mean standard deviation of a coordinate
+    status: tuple[str, ...]  # T
+    sigma0: np.ndarray  # (T,) robust standard deviation of unit-weight residuals: of points, or else outlines; NaN without
+
+    def __post_init__(self) -> None:
+        t, d, j = len(self.frames), len(self.dof_names), len(self.joint_names)
+        object.__setattr__(self, "frames", frozen(self.frames, (t,), np.int64, "frames"))
+        shapes = dict(time_s=(t,), values=(t, d), covariance=(t, d, d), joints_m=(t, j, 3), joint_sigma_m=(t, j), sigma0=(t,))
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+        if len(self.status) != t or not set(self.status) <= set(STATUSES):
+            raise ValueError(f"status needs {t} words of {STATUSES}")
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviation of every value (T, D)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BodyFit:
+    """The person and how the person moved."""
+
+    shape: BodyShape
+    motion: BodyMotion
+    iterations: int  # of the adjustment over the whole sequence
+    converged: bool
+    points: np.ndarray  # (T, B) points that each bone's surface had in each frame
+    outline_m: np.ndarray  # (K,) distances of the views' outlines from the limbs that they touch; none without contours

@@ -1,0 +1,1 @@
+"""The skin: a mesh around the metaballs."""

@@ -1,0 +1,287 @@
+"""The stage that calibrates: from a folder with the images of a waved reference bar to a rig with its report.
+
+BARDIR holds a folder of images or a movie per camera; their names are the cameras' names. Nothing else is required but the bar's length.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..geometry.rig import Rig
+from ..images.interlace import FieldLayout, field_layout
+from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, open_sequence, read_image
+from . import report
+from . import report as verdict
+from .bars import BarObservations
+from .quality import Quality, assess
+from .report import pictures
+from .self_calibration import Calibration, calibrate
+from .targets import BarTrack, Targets, find_targets, moved_targets, track_bar
+from .world_frame import WorldChoice, frame_of_bar
+
+Note = Callable[[str, int, int], None]  # view, images looked at, images with both targets
+MIN_POSITIONS = 12
+MIN_WAY = 0.02  # of the image width: a bar that moves less stands still
+LONGEST_BAR_M = 20.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BarFootage:
+    """The opened sequences of a waved bar, one per camera."""
+
+    folder: Path
+    names: tuple[str, ...]
+    sequences: tuple[ImageSequence, ...]
+    interlaced: str = "none"  # or "odd", "even", "both"
+    masks: tuple[np.ndarray | None, ...] = ()  # of each view (h, w), False where no target can be; empty: none
+    first_field: str = "odd"  # of "both"
+
+    @property
+    def field_layout(self) -> FieldLayout:
+        """Which rows of which image show a frame: an image, or one of its two fields where both are measured."""
+        return field_layout(self.interlaced, self.first_field)
+
+    @property
+    def count(self) -> int:
+        """Number of frames that all views have."""
+        return min(s.count for s in self.sequences) * self.field_layout.per_image
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MeasuredBar:
+    """What was found in the images: per view the track of the two targets, and the observations made of them."""
+
+    tracks: tuple[BarTrack, ...]
+    observations: BarObservations
+
+
+def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, first_field: str = "odd") -> BarFootage:
+    """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
+
+    With `interlaced` "both" each image shows the bar at two instants, in the `first_field` at the first.
+
+    `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one.
+
+    Raises:
+        InputError: the folder is missing, holds fewer than two views, or views of different length; a mask belongs to no camera.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; give the folder that holds one folder of images or one movie of the bar per camera.")
+    names, sequences = [], []
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            endings = {p.suffix for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS}
+            if endings:
+                ending = max(sorted(endings), key=lambda e: sum(1 for _ in path.glob(f"*{e}")))
+                names.append(path.name)
+                sequences.append(open_sequence(folder, images=f"{path.name}/*{ending}", movie=None, view=path.name))
+        elif path.suffix.lower() in MOVIE_ENDINGS:
+            names.append(path.stem)
+            sequences.append(open_sequence(folder, images=None, movie=path.name, view=path.stem))
+    if len(names) < 2:
+        raise InputError(
+            f"{folder} holds {'no views' if not names else 'only the view ' + names[0]}; "
+            "it needs a folder of images, or a movie, for each of at least two cameras."
+        )
+    counts = {name: s.count for name, s in zip(names, sequences)}
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise InputError(f"The views in {folder} have different numbers of frames ({said}); trim them to the same instants.")
+    masks = () if mask is None else _masks(Path(mask), names)
+    return BarFootage(
+        folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, masks=masks, first_field=first_field
+    )
+
+
+def _masks(path: Path, names: list[str]) -> tuple[np.ndarray | None, ...]:
+    if not path.is_dir():
+        shown = read_image(path) > 0
+        return (shown,) * len(names)
+    found = {file.stem: file for file in sorted(path.iterdir()) if file.suffix.lower() in IMAGE_ENDINGS}
+    strangers = [name for name in found if name not in names]
+    if strangers or not found:
+        what = f"the mask {found[strangers[0]].name}, and there is no camera of that name" if strangers else "no image"
+        raise InputError(f"{path} holds {what}; name the masks as the cameras: {', '.join(names)}.")
+    return tuple(read_image(found[name]) > 0 if name in found else None for name in names)
+
+
+def measure_bar(
+    footage: BarFootage, length_m: float, monitor: Monitor, note: Note | None = None, diameter_m: float | None = None
+) -> MeasuredBar:
+    """Find, measure and follow the bar's targets in all images; `note` hears how many images of a view showed two targets so far.
+
+    With the targets' diameter, pairs of spots that are too small for their distance, such as reflections, take no part.
+
+    Raises:
+        InputError: the length or the diameter cannot be, images cannot be read, or the bar is not seen well enough to calibrate with.
+    """
+    if not (math.isfinite(length_m) and 0 < length_m < LONGEST_BAR_M):
+        raise InputError(
+            f"The bar's length is given as {length_m:g} m; give the distance between the middles of its two targets in metres, such as 0.6."
+        )
+    if diameter_m is not None and not 0 < diameter_m < length_m:
+        raise InputError(f"The targets' diameter is given as {diameter_m:g} m; it must lie between 0 and the bar's length, {length_m:g} m.")
+    tracks, sizes = [], []
+    for view in range(len(footage.names)):
+        track, size = _measure_view(footage, view, monitor, note, (diameter_m or 0.0) / length_m)
+        _check_view(footage, view, track, size[0])
+        tracks.append(track)
+        sizes.append(size)
+    observations = BarObservations(
+        names=footage.names,
+        size_px=np.array(sizes, dtype=np.float64),
+        xy_px=np.stack([t.xy_px for t in tracks], axis=1),
+        length_m=length_m,
+        frames=np.arange(footage.count),
+        labelled=False,
+    )
+    _check_positions(footage, observations)
+    return MeasuredBar(tracks=tuple(tracks), observations=observations)
+
+
+def _measure_view(footage: BarFootage, view: int, monitor: Monitor, note: Note | None, diameter: float) -> tuple[BarTrack, tuple[int, int]]:
+    """The bar's track in one view, and the size of its images; `diameter` of the targets as a part of the bar's length, 0: unknown."""
+    name, sequence = footage.names[view], footage.sequences[view]
+    mask = footage.masks[view] if footage.masks else None
+    found: list[Targets] = []
+    size, whole = (0, 0), 0
+    for n in range(footage.count):
+        monitor.step(f"targets {name}", n, footage.count)
+        image, rows = sequence.read(footage.field_layout.image(n)), footage.field_layout.rows(n)
+        if n and image.shape[::-1] != size:
+            raise InputError(f"The images of view {name} have different sizes, from frame {n} on; use one sequence of one camera.")
+        size = (image.shape[1], image.shape[0])
+        if mask is not None and mask.shape != image.shape:
+            raise InputError(
+                f"The mask of view {name} has {mask.shape[1]}×{mask.shape[0]} pixels, its images {size[0]}×{size[1]}; give a folder with a "
+                "mask for each camera, as large as its images."
+            )
+        targets = find_targets(rows.rows(image), None if mask is None else rows.rows(mask))
+        found.append(_in_frame(targets, rows.to_frame(targets.xy_px)))
+        whole += int(moved_targets(found[-2:]) >= 2)
+        if note is not None:
+            note(name, len(found), whole)
+    monitor.step(f"targets {name}", footage.count, footage.count)
+    return track_bar(found, float(size[0]), diameter / np.sqrt(footage.field_layout.first.step)), size
+
+
+def _in_frame(targets: Targets, xy_px: np.ndarray) -> Targets:
+    return Targets(xy_px=xy_px, sigma_px=targets.sigma_px, area_px=targets.area_px, contrast=targets.contrast, status=targets.status)
+
+
+def _check_view(footage: BarFootage, view: int, track: BarTrack, width_px: int) -> None:
+    """Raise InputError if a view does not show a bar that is waved."""
+    name = footage.names[view]
+    complete = np.isfinite(track.xy_px).all(axis=(1, 2))
+    if not track.spots.any():
+        raise InputError(f"No bright target is seen in any image of view {name} in {footage.folder}; light the bar from beside the camera.")
+    if complete.sum() < 2:
+        raise InputError(
+            f"View {name} in {footage.folder} never shows both targets of the bar; wave it where this camera sees both, "
+            "or leave the camera out."
+        )
+    way = np.ptp(track.xy_px[complete], axis=0).max()
+    if complete.sum() > 3 and (track.still or way < MIN_WAY * width_px):
+        raise InputError(
+            f"The bar stands still in view {name} in {footage.folder} (it moves {way:.1f} px), "
+            "or only lamps and reflections are seen there; wave it through the whole volume, in all directions."
+        )
+
+
+def _check_positions(footage: BarFootage, observations: BarObservations) -> None:
+    shared = int((observations.complete.sum(axis=1) >= 2).sum())
+    if shared < MIN_POSITIONS:
+        raise InputError(
+            f"Only {shared} bar positions in {footage.folder} are seen whole by two cameras; at least {MIN_POSITIONS} are needed "
+            "and 100 or more are good: wave the bar longer, through the whole volume."
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CalibratedRig:
+    """The cameras and all that is known of their quality."""
+
+    rig: Rig
+    calibration: Calibration
+    quality: Quality
+    verdict: verdict.Verdict
+
+    @property
+    def bar(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frames (T,) in which both ends of the bar were measured, and the ends (T, 2, 3) [m] in the world."""
+        known = (self.calibration.used.sum(axis=1) >= 2).all(axis=1)
+        return self.calibration.observations.frames[known], self.calibration.network.ends_m[known]
+
+
+def calibrate_rig(
+    observations: BarObservations, monitor: Monitor, *, focal_px: float | None = None, world: WorldChoice | None = None
+) -> CalibratedRig:
+    """Calibrate from what was seen of the bar, judge the result, and put it into the world's frame.
+
+    Raises:
+        InputError: the data cannot determine the rig, or not the world's frame; the sentence says what is missing.
+    """
+    world = world or WorldChoice()
+    calibration = calibrate(observations, monitor, focal_px)
+    verdict.refuse_if_useless(calibration)
+    calibration = in_world(calibration, world)
+    quality = assess(calibration, monitor)
+    verdict.refuse_if_undetermined(calibration, quality)
+    judged = verdict.judge(calibration, quality)
+    metadata = {
+        "unit": "m",
+        "sigma0_px": calibration.sigma0_px,
+        "bar_length_m": observations.length_m,
+        "positions": verdict.positions_used(calibration),
+        "predicted_error_m": quality.predicted.rms_m,
+        "held_out_length_rms_m": quality.held_out.rms_m,
+        "verdict": judged.sentence,
+        "floor": world.on_floor,
+    }
+    cameras = calibration.network.cameras(observations.names, observations.size_px)
+    rig = Rig(cameras=cameras, metadata=metadata, sigmas=report.camera_sigmas(calibration))
+    return CalibratedRig(rig=rig, calibration=calibration, quality=quality, verdict=judged)
+
+
+def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
+    """The calibration turned and shifted into the world's frame. Its covariance stays: the cameras' unknowns are in their own frames.
+
+    Raises:
+        InputError: what the frame is to be made of was not seen, or makes none.
+    """
+    observations, network = calibration.observations, calibration.network
+    cameras = network.cameras(observations.names, observations.size_px)
+    known = (calibration.used.sum(axis=1) >= 2).all(axis=1)
+    frame = frame_of_bar(world, cameras, observations.frames[known], network.ends_m[known])
+    moved = network.with_cameras([frame.camera(c) for c in cameras])
+    moved = replace(moved, middle=frame.points(network.middle), direction=network.direction @ frame.R.T)
+    return replace(calibration, network=moved)
+
+
+def write_report(folder: Path, result: CalibratedRig) -> list[Path]:
+    """Write calibration.txt, calibration.json and the pictures; their paths.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    calibration, quality, judged = result.calibration, result.quality, result.verdict
+    folder = Path(folder)
+    paths = [folder / "calibration.txt", folder / "calibration.json"]
+    store.write_text(paths[0], report.page(calibration, quality, judged))
+    store.write_json(paths[1], report.figures(calibration, quality, judged))
+    for name, picture in pictures(calibration, quality).items():
+        ok, data = cv2.imencode(".png", picture)
+        if ok:
+            store.write_bytes(folder / name, data.tobytes())
+            paths.append(folder / name)
+    return paths

@@ -1,0 +1,1 @@
+"""The `tricap` command: one file a command."""

@@ -1,0 +1,73 @@
+"""Arguments shared by several commands."""
+
+import argparse
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from ..foundation.errors import InputError
+
+
+def overrides(pairs: list[str]) -> dict[str, dict[str, Any]]:
+    """--set GROUP.NAME=VALUE as tables; values are read as TOML, plain words as text.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    tables: dict[str, dict[str, Any]] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        group, dot, knob = name.partition(".")
+        if not equals or not dot:
+            raise InputError(f"--set {pair} cannot be read; write GROUP.NAME=VALUE, such as matching.patch_px=17.")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        tables.setdefault(group, {})[knob] = value
+    return tables
+
+
+def frame_range(text: str | None) -> tuple[int, int] | None:
+    """--frames A:B as (A, B), None where it was not given.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    if not colon or not first.isdecimal() or not last.isdecimal():
+        raise InputError(f"--frames {text} cannot be read; write the first frame and the one after the last, such as 0:40.")
+    return int(first), int(last)
+
+
+def named_path(text: str) -> Path:
+    """A file or folder; an empty argument would mean the working folder and is refused.
+
+    Raises:
+        argparse.ArgumentTypeError: it is empty.
+    """
+    if not text.strip():
+        raise argparse.ArgumentTypeError("is empty; name a file or a folder")
+    return Path(text)
+
+
+def with_joined_frames(argv: list[str]) -> list[str]:
+    """The arguments with `--frames -5:3` joined by "=", because argparse takes a negative first frame for a flag."""
+    frames = [i for i, flag in enumerate(argv[:-1]) if flag == "--frames" and re.match(r"-\d", argv[i + 1])]
+    merged = [f"{word}={argv[i + 1]}" if i in frames else word for i, word in enumerate(argv)]
+    return [word for i, word in enumerate(merged) if i - 1 not in frames]
+
+
+def check_not_read(flag: str, out: Path, *read: Path | None) -> None:
+    """Refuse to write over a file or folder that the command reads.
+
+    Raises:
+        InputError: the two are the same.
+    """
+    for path in read:
+        if path is not None and path.exists() and out.exists() and os.path.samefile(path, out):
+            raise InputError(f"{flag} {out} is also an input; choose another name, so that it is not overwritten.")

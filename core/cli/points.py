@@ -1,0 +1,78 @@
+"""`tricap track TAKE --points FILE`: points that a user chose, followed as single trajectories in the images and in space."""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..results.folder import Results, check_separate_folder
+from ..run import pipeline
+from ..take.take import Footage, open_take, read_take
+from ..tracking.key_points import KeyPoints, track_key_points
+from ..tracking.point_tables import ChosenPoints, read_points, write_key_points
+from ..tracking.settings import TrackStatus
+from ..tracking.track import TrackingRules
+from .arguments import frame_range, overrides
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Join the arguments to those of `tricap track`."""
+    parser.add_argument("--points", type=Path, metavar="FILE", help="follow only the points of a CSV: point,view,x,y (two views or more)")
+    parser.add_argument("--points-frame", type=int, metavar="N", help="the frame of these pixels; by default the first")
+
+
+def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Track the chosen points and write OUT/points3d.csv and OUT/points2d.csv; the lines to show.
+
+    Raises:
+        InputError: the arguments, the points or the footage need mending.
+    """
+    take = read_take(args.take)
+    settings = pipeline.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
+    footage, frames = open_take(take), frame_range(args.frames)
+    check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
+    footage = footage if frames is None else pipeline.only_frames(footage, frames)
+    first = footage.frames.start if args.points_frame is None else args.points_frame
+    if first not in footage.frames:
+        raise InputError(f"--points-frame {first} is not among the frames {footage.frames.start} to {footage.frames.stop - 1}.")
+    points = _by_name(read_points(args.points, with_views=True), footage, args.points)
+    views = tuple(c.name for c in footage.rig.cameras)
+    with Results(args.out).opened() as results:
+        tracked = follow_points(footage, points, first, settings, monitor)
+        write_key_points(results.path("points3d.csv"), results.path("points2d.csv"), tuple(points), views, take.fps, tracked)
+    whole = int((tracked.status == TrackStatus.MEASURED).all(axis=0).sum())
+    return [f"{results.folder}: {len(points)} points over {len(tracked.frames)} frames, {whole} of them seen in every frame."]
+
+
+def follow_points(
+    footage: Footage, points: Mapping[str, Mapping[str, np.ndarray]], first: int, settings: Mapping[str, Any], monitor: Monitor
+) -> KeyPoints:
+    """The points, clicked in frame `first`, from it to the end of the footage and back to its beginning.
+
+    Raises:
+        InputError: a point has no place in space, or the images cannot be read.
+    """
+    view = TrackingRules(matching=settings["matching"], tracking=settings["tracking"]).view(footage)
+
+    def read(frame: int) -> list[np.ndarray]:
+        return [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
+
+    ahead = track_key_points(read, range(first, footage.frames.stop), points, view, monitor, settings["key_points"])
+    if first == footage.frames.start:
+        return ahead
+    back = track_key_points(read, range(first, footage.frames.start - 1, -1), points, view, monitor, settings["key_points"])
+    names = KeyPoints.__dataclass_fields__
+    return KeyPoints(**{name: np.concatenate([getattr(back, name)[:0:-1], getattr(ahead, name)]) for name in names})
+
+
+def _by_name(chosen: ChosenPoints, footage: Footage, path: Path) -> dict[str, dict[str, np.ndarray]]:
+    points: dict[str, dict[str, np.ndarray]] = {}
+    for name, view, xy in zip(chosen.names, chosen.views, chosen.xy_px):
+        if not footage.rig[view].sees(xy):
+            raise InputError(f"The point “{name}” of {path} lies at ({xy[0]:g}, {xy[1]:g}), outside the image of view {view}.")
+        points.setdefault(name, {})[view] = xy
+    return points

@@ -1,0 +1,104 @@
+"""`tricap track2d`: the 2-D mode. Points chosen in the first frame of one camera are followed through its images."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..foundation.settings import from_table
+from ..images.interlace import INTERLACE, row_grid
+from ..images.sequence import IMAGE_ENDINGS, ImageSequence, open_sequence
+from ..matching.least_squares import MatchingSettings
+from ..tracking.planar import PlanarTracks, track_planar
+from ..tracking.point_tables import ChosenPoints, read_points, write_planar
+from ..tracking.settings import TrackingSettings, TrackStatus
+from .arguments import check_not_read, frame_range, overrides
+
+LOOSE = MatchingSettings(min_correlation=0.7, max_sigma_px=0.4)  # faces: weak texture, and they deform
+WAIT_FRAMES = 100  # nothing moves a point that waits but its own return
+
+
+def add_command(commands: Any) -> None:
+    """Join `track2d` to the parser's commands."""
+    about = "the 2-D mode: follow chosen points through the images of one camera"
+    parser = commands.add_parser("track2d", help=about, description=about[0].upper() + about[1:])
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a movie, or a folder of images")
+    parser.add_argument("--points", type=Path, required=True, metavar="FILE", help="CSV with point,x,y in the first frame (and joined_to)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="CSV to write: frame,point,x,y,sigma,correlation,status")
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1; the points are those of frame A")
+    parser.add_argument("--interlaced", choices=INTERLACE, default="none", help="which lines of interlaced video to look at")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw the points, joined with lines, over the images")
+    parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
+    parser.set_defaults(run=run, json=False)
+
+
+def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Track and write; the lines to show.
+
+    Raises:
+        InputError: the arguments, the points or the footage need mending.
+    """
+    tables = overrides(args.set)
+    if set(tables) - {"matching", "tracking"}:
+        raise InputError("--set of track2d knows the groups matching and tracking.")
+    matching = from_table(MatchingSettings, {"min_correlation": LOOSE.min_correlation, "max_sigma_px": LOOSE.max_sigma_px,
+                                             **tables.get("matching", {})}, "[matching]")  # fmt: skip
+    tracking = from_table(TrackingSettings, {"wait_frames": WAIT_FRAMES, **tables.get("tracking", {})}, "[tracking]")
+    points, sequence = read_points(args.points), open_footage(args.sequence)
+    check_not_read("--out", args.out, args.points, args.sequence)
+    if args.pictures is not None:
+        check_not_read("--pictures", args.pictures, *{path.parent for path in sequence.files()[:1]})
+    frames = range(*(frame_range(args.frames) or (0, sequence.count)))
+    if not frames or frames[0] < 0 or frames[-1] >= sequence.count:
+        raise InputError(f"--frames {args.frames} are not among the frames 0 to {sequence.count - 1} of {args.sequence}.")
+    _check_inside(points, sequence.read(frames[0]), args.points)
+    tracks = track_planar(sequence.read, frames, points.xy_px, matching, tracking, monitor, row_grid(args.interlaced))
+    write_planar(args.out, points.names, tracks)
+    if args.pictures is not None:
+        _draw(args.pictures, sequence, points, tracks, monitor)
+    whole = int((tracks.status == TrackStatus.MEASURED).all(axis=0).sum())
+    return [f"{args.out}: {len(points.names)} points over {len(frames)} frames, {whole} of them seen in every frame."]
+
+
+def open_footage(path: Path) -> ImageSequence:
+    """A movie, or the images of a folder.
+
+    Raises:
+        InputError: there is none, or the folder holds images of several kinds.
+    """
+    if path.is_dir():
+        endings = sorted({p.suffix for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS})
+        if len(endings) != 1:
+            raise InputError(f"The folder {path} holds {'no images' if not endings else 'images of several kinds'}; it needs one kind.")
+        return open_sequence(path, images=f"*{endings[0]}", movie=None, view=path.name)
+    if not path.is_file():
+        raise InputError(f"The footage {path} is missing; give a movie or a folder of images.")
+    return open_sequence(path.parent, images=None, movie=path.name, view=path.stem)
+
+
+def _check_inside(points: ChosenPoints, image: np.ndarray, path: Path) -> None:
+    h, w = image.shape
+    for name, (x, y) in zip(points.names, points.xy_px):
+        if not (0 <= x <= w - 1 and 0 <= y <= h - 1):
+            raise InputError(f"The point “{name}” of {path} lies at ({x:g}, {y:g}), outside the image of {w}×{h} pixels.")
+
+
+def _draw(folder: Path, sequence: ImageSequence, points: ChosenPoints, tracks: PlanarTracks, monitor: Monitor) -> None:
+    index = {name: n for n, name in enumerate(points.names)}
+    for t, frame in enumerate(tracks.frames):
+        monitor.step("pictures", t, len(tracks.frames))
+        picture = cv2.cvtColor(np.clip(sequence.read(int(frame)), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+        at = [None if np.isnan(xy).any() else (round(float(xy[0])), round(float(xy[1]))) for xy in tracks.xy_px[t]]
+        for name, other in points.joined:
+            a, b = at[index[name]], at[index[other]]
+            if a is not None and b is not None:
+                cv2.line(picture, a, b, (255, 200, 0), 1, cv2.LINE_AA)
+        for place in at:
+            if place is not None:
+                cv2.circle(picture, place, 3, (0, 0, 255), 1, cv2.LINE_AA)
+        store.write_bytes(folder / f"{frame:04d}.png", cv2.imencode(".png", picture)[1].tobytes())

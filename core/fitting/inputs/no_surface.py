@@ -1,0 +1,107 @@
+"""Recordings whose surface cannot be measured (views far apart, a person without texture) or need not be: what a body can rest on then."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from ...foundation.progress import Monitor
+from ...images.background import Background
+from ...results.folder import Results
+from ...surface.cloud import PointCloud
+from ...take.take import Footage
+from ...tracking.contour import ContourTable, Polygons
+from ..settings import FitSettings
+from .background import STEP_PX, UNIT_PX, find_empty, still_backgrounds
+from .fit_input import EmptyView, Packed
+
+LEAST_CORNERS = 3
+
+
+def can_do_without(footage: Footage, results: Results) -> bool:
+    """Whether outlines (`tricap contour`) or keypoints can stand for measured points."""
+    return bool(footage.take.keypoints) or any(results.path("contours", f"{v.name}.csv").is_file() for v in footage.take.views)
+
+
+def empty_clouds(footage: Footage) -> list[PointCloud]:
+    """A cloud without points for every frame."""
+    none, views = np.zeros((0, 3)), len(footage.take.views)
+    return [
+        PointCloud(
+            frame=frame,
+            xyz_m=none,
+            covariance_m2=np.zeros((0, 3, 3)),
+            normals=none,
+            intensity=np.zeros(0),
+            xy_px=np.zeros((0, views, 2)),
+            residual_px=np.zeros(0),
+        )
+        for frame in footage.frames
+    ]
+
+
+def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[int, np.ndarray]]:
+    """The polygon (V, 2) px that `tricap contour` found about the person, by view and frame; views without one are left out.
+
+    Raises:
+        InputError: a table of contours is damaged.
+    """
+    tables = {view.name: ContourTable(results.path("contours", f"{view.name}.csv")) for view in footage.take.views}
+    polygons = {name: Polygons(table, footage.frames, LEAST_CORNERS) for name, table in tables.items()}
+    return {name: found for name, found in polygons.items() if found}
+
+
+def known_silhouettes(
+    footage: Footage, results: Results, settings: FitSettings
+) -> tuple[dict[str, Mapping[int, np.ndarray]], dict[str, Background]]:
+    """The outlines, and the still backgrounds of views that have none: what tells the person's silhouette.
+
+    Raises:
+        InputError: an image or a table of contours cannot be read.
+    """
+    outlines = outline_polygons(footage, results)
+    if not settings.use_background or len(outlines) == len(footage.take.views):
+        return outlines, {}
+    backgrounds = still_backgrounds(footage, np.array(footage.frames))
+    names = [view.name for view in footage.take.views]
+    return outlines, {n: b for n, b in zip(names, backgrounds) if b is not None and n not in outlines}
+
+
+def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """The mask (h, w) of a polygon (V, 2)."""
+    mask = np.zeros(size_px[::-1], np.uint8)
+    cv2.fillPoly(mask, [np.rint(polygon_px * 16).astype(np.int32)], 1, shift=4)
+    return mask.astype(bool)
+
+
+def empty_views(
+    footage: Footage, results: Results, clouds: Sequence[PointCloud], settings: FitSettings, monitor: Monitor
+) -> list[EmptyView]:
+    """Where the views show no part of the person: outside the outline, and in views without one where the still background is seen.
+
+    Raises:
+        InputError: an image or a table of contours cannot be read.
+        Cancelled: the user asked to stop.
+    """
+    if not settings.use_background:
+        return []
+    outlines = outline_polygons(footage, results) if settings.use_contours else {}
+    others = find_empty(footage, clouds, monitor) if len(outlines) < len(footage.take.views) else []
+    return outside_outlines(footage, outlines) + [empty for empty in others if empty.view not in outlines]
+
+
+def outside_outlines(footage: Footage, outlines: Mapping[str, Mapping[int, np.ndarray]]) -> list[EmptyView]:
+    """Where the views show no part of the person: outside of the outline."""
+    found = []
+    for name, polygons in outlines.items():
+        tables = Packed(_distances(filled(xy, footage.rig[name].size_px)) for xy in polygons.values())
+        found.append(EmptyView(view=name, frame=np.array(list(polygons)), distance=tables, step_px=STEP_PX, unit_px=UNIT_PX))
+    return found
+
+
+def _distances(inside: np.ndarray) -> np.ndarray:
+    """Distance (h', w') of the middles of squares from the mask, in steps of `UNIT_PX`."""
+    far = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    h, w = (n // STEP_PX for n in inside.shape)
+    middles = far[: h * STEP_PX, : w * STEP_PX].reshape(h, STEP_PX, w, STEP_PX).mean(axis=(1, 3))
+    return np.asarray(np.minimum(middles / UNIT_PX, 255)).astype(np.uint8)

@@ -1,0 +1,212 @@
+"""Where the fit's input comes from: the take's clicks and limits, the run's clouds and trajectories, contours/*.csv in OUT, keypoints."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import radians
+from pathlib import Path
+
+import numpy as np
+
+from ...body.model_file import read_model, with_limits
+from ...foundation.errors import InputError
+from ...foundation.settings import nearest_name
+from ...motion.formats.c3d import read_c3d
+from ...motion.formats.keypoints_json import natural_order, read_keypoints
+from ...motion.formats.markers import Markers, read_points_csv
+from ...motion.formats.trc import read_trc
+from ...motion.retarget.points import joint_of
+from ...results.folder import Results
+from ...surface.cloud import PointCloud
+from ...take.sources import KeypointSource
+from ...take.take import JOINTS, Footage, Seeds, Take
+from ...tracking.contour import ContourTable
+from ...tracking.trajectories import Trajectories
+from ..settings import FitSettings
+from .clicks import enough, read_clicks
+from .fit_input import ClickedAt, EmptyView, FitInput, JointPlaces, Outline
+
+OURS = {
+    "upper_arm": "shoulder",
+    "forearm": "elbow",
+    "hand": "wrist",
+    "thigh": "hip",
+    "shin": "knee",
+    "foot": "ankle",
+    "toe": "toe",
+    "clavicle": "clavicle",
+    "hips": "pelvis",
+    "neck": "neck",
+}  # of the roles that retargeting reads in names
+LOOSE = {"toe.L": 2.0, "toe.R": 2.0, "neck": 2.0, "pelvis": 2.0}  # where detectors mean another place than we do: times the sigma
+LEAST_CONFIDENCE = 0.2
+
+
+def fit_input(
+    footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results, empty: Sequence[EmptyView] = ()
+) -> FitInput:
+    """All that the fit can use of a run; clicks in other frames than the footage's are left out.
+
+    Raises:
+        InputError: a table of contours or keypoints cannot be read.
+    """
+    take, frames = footage.take, [c.frame for c in clouds]
+    return FitInput(
+        rig=footage.rig,
+        model=str(take.body_model),
+        clouds=clouds,  # type: ignore[arg-type]
+        frames=frames,
+        time_s=take.time_s(np.array(frames)),
+        clicks=clicks_in(footage),
+        click_frame=take.seeds.frame,
+        trajectories=trajectories,  # type: ignore[arg-type]
+        contours=read_contours(results, [v.name for v in take.views]),
+        keypoints=[read_source(footage, source) for source in take.keypoints],
+        empty=empty,
+        locked=take.locked,
+        limits={name: (radians(low), radians(high)) for name, (low, high) in take.limits.items()},
+    )
+
+
+def clicks_in(footage: Footage) -> dict[int, ClickedAt]:
+    """The clicked joints in the footage's frames, by frame."""
+    return {s.frame: _clicked(s) for s in _with_joints(footage.take) if s.frame in footage.frames}
+
+
+def check_body(footage: Footage, settings: FitSettings) -> None:
+    """See that clicks and degrees of freedom are those of the body that is wanted, before anything is computed for hours.
+
+    Raises:
+        InputError: the model has no such degree of freedom, clicks contradict each other, or too few joints are clicked.
+    """
+    take, clicks = footage.take, clicks_in(footage)
+    if missing_for_fit(footage):
+        return
+    model = with_limits(read_model(str(take.body_model)), take.limits, take.locked)
+    names = model.skeleton.joint_names
+    places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
+    if not take.keypoints:
+        best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
+        enough(places.get(take.seeds.frame, places[best]), names, [])
+
+
+def missing_for_fit(footage: Footage) -> str:
+    """Why no body can be fitted in these frames, as the end of “take.toml has …”; empty: it can."""
+    take = footage.take
+    if take.body_model is None:
+        return 'model = "none" under [body]' if take.no_body else "no [body] model"
+    if take.keypoints or clicks_in(footage):
+        return ""
+    return "no clicked joints" + (f" in the frames {footage.frames.start} to {footage.frames.stop - 1}" if _with_joints(take) else "")
+
+
+def clicks_left_out(footage: Footage) -> list[str]:
+    """What the user should know of clicked joints outside the footage's frames."""
+    outside = [s.frame for s in _with_joints(footage.take) if s.frame not in footage.frames]
+    if not outside or missing_for_fit(footage):
+        return []
+    begins = "; the fit begins at other clicks or keypoints" if footage.take.seeds.frame in outside else ""
+    return [
+        f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
+        f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."
+    ]
+
+
+def _with_joints(take: Take) -> list[Seeds]:
+    return [s for s in (*take.keyframes, take.seeds) if s.joints]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class EdgesOfTable:
+    """The outlines of a table (`fitting.fit_input.Outlines`): the vertices on an edge only, read when they are asked for."""
+
+    view: str
+    table: ContourTable
+
+    def of_frame(self, frame: int) -> Outline | None:
+        """The outline in a frame; None without one.
+
+        Raises:
+            InputError: its rows are damaged.
+        """
+        found = self.table.get(frame)
+        if found is None:
+            return None
+        rows = np.flatnonzero(found.seen)
+        return (found.xy_px[rows], found.normal[rows], found.sigma_px[rows]) if len(rows) else None
+
+
+def read_contours(results: Results, views: Sequence[str]) -> list[EdgesOfTable]:
+    """The outlines that `tricap contour` wrote, of the views that have one.
+
+    Raises:
+        InputError: a table is damaged.
+    """
+    tables = [(view, ContourTable(results.path("contours", f"{view}.csv"))) for view in views]
+    return [EdgesOfTable(view=view, table=table) for view, table in tables if table]
+
+
+def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
+    """The keypoints of one [[keypoints]] entry, in the take's frames.
+
+    Raises:
+        InputError: there are no such files, they cannot be read, or none of their names is a joint.
+    """
+    folder = footage.take.folder
+    paths = sorted((p for p in folder.glob(source.files) if p.is_file()), key=lambda p: natural_order(p.name))
+    if not paths:
+        raise InputError(f"There are no keypoints “{source.files}” in {folder}; mend `files` under [[keypoints]].")
+    if source.view:
+        points = read_keypoints(paths)
+        view = next(v for v in footage.take.views if v.name == source.view)
+        frames = footage.take.field_layout.per_image * (points.number - source.offset_frames - view.offset_frames)
+        return _places(source, points.names, frames, points.xy_px, points.confidence, paths[0])
+    if len(paths) > 1:
+        raise InputError(f"“{source.files}” in {folder} are {len(paths)} files; keypoints in space are one file.")
+    markers = _markers(paths[0], source.axes)
+    return _places(source, markers.names, markers.frames - source.offset_frames, markers.xyz_m, np.ones(markers.sigma_m.shape), paths[0])
+
+
+def _markers(path: Path, axes: str | None) -> Markers:
+    if path.suffix.lower() == ".csv":
+        return read_points_csv(path)
+    read = read_trc if path.suffix.lower() == ".trc" else read_c3d
+    return read(path) if axes is None else read(path, axes=axes)
+
+
+def _places(
+    source: KeypointSource, names: Sequence[str], frames: np.ndarray, places: np.ndarray, confidence: np.ndarray, path: Path
+) -> JointPlaces:
+    """What a file says of joints, one row per place; a point of confidence c has the sigma over √c."""
+    for name in source.names:
+        if name not in names:
+            raise InputError(f"{path} has no point “{name}”.{nearest_name(name, list(names))} Mend `names` under [[keypoints]].")
+    joints = [source.names.get(name, joint_named(name)) for name in names]
+    rows = [
+        (t, n)
+        for t in range(len(frames))
+        for n, joint in enumerate(joints)
+        if joint and confidence[t, n] >= LEAST_CONFIDENCE and np.isfinite(places[t, n]).all()
+    ]
+    if not rows:
+        raise InputError(f"None of the points in {path} ({', '.join(names[:6])} …) is a joint of ours; say which under `names`.")
+    t, n = np.array(rows).T
+    loose = np.array([LOOSE.get(joint, 1.0) for joint in joints])
+    return JointPlaces(
+        view=source.view,
+        frame=frames[t],
+        joint=tuple(joints[i] for i in n),
+        place=places[t, n],
+        sigma=source.sigma * loose[n] / np.sqrt(confidence[t, n]),
+    )
+
+
+def joint_named(name: str) -> str:
+    """Our joint of another system's name: "RKnee", "left_hip" -> "knee.R", "hip.L"; "" for what is no joint of ours."""
+    if name in JOINTS:
+        return name
+    part, dot, side = joint_of(name).partition(".")
+    return OURS.get(part, "") + (dot + side if part in OURS else "")
+
+
+def _clicked(seeds: Seeds) -> ClickedAt:
+    return {name: {view: xy.tolist() for view, xy in at.items()} for name, at in seeds.joints.items()}

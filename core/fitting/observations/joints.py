@@ -1,0 +1,87 @@
+"""Joints clicked in the views, or found in them by another system: projection(joint) = click + ε, σ about 5 px (the papers'
+initialisation).
+
+Imported keypoints in space: position of a joint = keypoint ± σ, each coordinate. (In images a keypoint is a clicked joint.)
+
+A standing foot neither sinks into the floor nor hovers: the height of its joints above the floor = a given height ± σ (optional).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...geometry.camera import Camera
+from ..state import BodyState
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ClickedJoints:
+    """K clicks, each of one joint in one camera."""
+
+    cameras: tuple[Camera, ...]  # K
+    joint: np.ndarray  # (K,) index in Skeleton.joint_names
+    xy_px: np.ndarray  # (K, 2) full-frame pixels
+    sigma_px: np.ndarray | float  # (K,) or for all
+    kind: str = ""
+    crowding: np.ndarray | float = 1.0
+
+    def residual(self, state: BodyState) -> np.ndarray:
+        """(2K,)"""
+        X = state.joint_jacobian[0]
+        rows = [(camera.project(X[j]) - xy) / s for camera, j, xy, s in zip(self.cameras, self.joint, self.xy_px, self._sigmas)]
+        return np.concatenate(rows) if rows else np.zeros(0)
+
+    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
+        """(2K, D + S) or (2K, D)"""
+        X, dX = state.joint_jacobian
+        n = dX.shape[2] if shape else state.n_motion
+        rows = [camera.project_with_jacobian(X[j])[1] @ dX[j, :, :n] / s for camera, j, s in zip(self.cameras, self.joint, self._sigmas)]
+        return np.concatenate(rows) if rows else np.zeros((0, n))
+
+    @property
+    def _sigmas(self) -> np.ndarray:
+        return np.broadcast_to(self.sigma_px, (len(self.joint),))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Keypoints:
+    """K joints seen in space by another system (TRC, C3D, CSV)."""
+
+    joint: np.ndarray  # (K,) index in Skeleton.joint_names
+    xyz_m: np.ndarray  # (K, 3)
+    sigma_m: np.ndarray  # (K,)
+    kind: str = ""
+    crowding: np.ndarray | float = 1.0
+
+    def residual(self, state: BodyState) -> np.ndarray:
+        """(3K,)"""
+        return ((state.joint_jacobian[0][self.joint] - self.xyz_m) / self.sigma_m[:, None]).ravel()
+
+    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
+        """(3K, D + S) or (3K, D)"""
+        J = state.joint_jacobian[1][self.joint] / self.sigma_m[:, None, None]
+        J = J.reshape(-1, J.shape[2])
+        return J if shape else J[:, : state.n_motion]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FootOnFloor:
+    """K joints at known heights above a plane. `up` is the plane's unit normal, `floor_m` its height along `up`."""
+
+    joint: np.ndarray  # (K,) index in Skeleton.joint_names
+    height_m: np.ndarray  # (K,) of the joint's centre above the floor when the foot stands
+    floor_m: float
+    sigma_m: float
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    kind: str = ""
+    crowding: float = 1.0
+
+    def residual(self, state: BodyState) -> np.ndarray:
+        """(K,)"""
+        X = state.joint_jacobian[0][self.joint]
+        return (X @ np.array(self.up) - self.floor_m - self.height_m) / self.sigma_m
+
+    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
+        """(K, D + S) or (K, D)"""
+        J = np.einsum("i,kic->kc", np.array(self.up), state.joint_jacobian[1][self.joint]) / self.sigma_m
+        return J if shape else J[:, : state.n_motion]

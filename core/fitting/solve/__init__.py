@@ -1,0 +1,1 @@
+"""The least squares problem of the fit, and its solution."""

@@ -1,0 +1,167 @@
+"""Weak smoothness over time: every DOF's acceleration is zero within a sigma.
+
+a_t = 2/(h1 + h2) · ((θ_{t+1} − θ_t)/h2 − (θ_t − θ_{t−1})/h1) = 0 ± σ ,   h1, h2: the times between the three frames
+
+What the frames on one side say of the next two, handed over from one stretch of a recording to the next.
+
+Frames i on that side are eliminated from their normal equations (Schur complement); accelerations and tracked points reach two frames far:
+
+    Λ = A_bb − A_bi A_ii⁻¹ A_ib ,   g = g_b − A_bi A_ii⁻¹ g_i        (x − x₀)ᵀ Λ (x − x₀) − 2 gᵀ (x − x₀)                          (1)
+
+of the postures x of two frames, with x₀ where it was linearised. Nothing is lost of what is linear: a twist that only tracked points tell
+is known over any number of stretches.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..observations import MaterialSteps, Observation
+from ..state import BodyState
+from .block_band import NormalEquations, eliminated, reversed_in_time
+from .problem import Problem, Scales, linearise
+from .solver import Solution
+
+SPAN_S = 0.1  # accelerations of a start are taken over this time, so that its noise does not count
+LEAST = 0.1  # of the loosest sigma: however steady a motion was where it was seen
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Acceleration:
+    """Observations of T−2 accelerations for each of D DOFs."""
+
+    time_s: np.ndarray  # (T,)
+    sigma: np.ndarray  # (D,) rad/s², m/s²
+
+    def coefficients(self) -> np.ndarray:
+        """(T−2, 3) of θ_{t−1}, θ_t, θ_{t+1}."""
+        h = np.diff(self.time_s)
+        h1, h2 = h[:-1], h[1:]
+        return (2 / (h1 + h2))[:, None] * np.stack([1 / h1, -1 / h1 - 1 / h2, 1 / h2], axis=1)
+
+    def cost(self, motion: np.ndarray) -> float:
+        """Sum of squares at a motion (T, D)."""
+        if len(motion) < 3:
+            return 0.0
+        c = self.coefficients()
+        values = c[:, 0, None] * motion[:-2] + c[:, 1, None] * motion[1:-1] + c[:, 2, None] * motion[2:]
+        return float(np.sum((values / self.sigma) ** 2))
+
+    def add_to(self, equations: NormalEquations, motion: np.ndarray) -> None:
+        """Add the normal equations of these observations."""
+        weight = 1 / self.sigma**2
+        for t, c in enumerate(self.coefficients() if len(motion) > 2 else ()):
+            value = weight * (c @ motion[t : t + 3])
+            for i in range(3):
+                equations.diagonal[t + i] += np.diag(c[i] ** 2 * weight)
+                equations.g[t + i] -= c[i] * value
+            equations.next1[t] += np.diag(c[1] * c[0] * weight)
+            equations.next1[t + 1] += np.diag(c[2] * c[1] * weight)
+            equations.next2[t] += np.diag(c[2] * c[0] * weight)
+
+
+def typical_acceleration(motion: np.ndarray, known: np.ndarray, time_s: np.ndarray, loosest: np.ndarray) -> np.ndarray:
+    """Sigma (D,) of the accelerations of a motion (T, D), from where it is `known` (T, D); between `LEAST` times and once the `loosest`.
+
+    A hidden limb goes on as that limb moves where it is seen. The root mean square of second differences over `SPAN_S`.
+    """
+    step = max(1, round(SPAN_S / float(np.median(np.diff(time_s))))) if len(time_s) > 1 else 1
+    if len(motion) < 2 * step + 3:
+        return loosest
+    h = (time_s[2 * step :] - time_s[: -2 * step]) / 2
+    a = (motion[2 * step :] - 2 * motion[step:-step] + motion[: -2 * step]) / h[:, None] ** 2
+    good = known[2 * step :] & known[step:-step] & known[: -2 * step]
+    count = good.sum(axis=0)
+    rms = np.sqrt((np.where(good, a, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1))
+    return np.where(count >= 3, np.clip(rms, LEAST * loosest, loosest), loosest)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandedOver:
+    """(1) of the first two frames of a stretch, or of the last two."""
+
+    equations: NormalEquations  # of two frames, in the order of time
+    motion: np.ndarray  # (2, D) x₀
+    first: bool
+
+    def _rows(self, frames: int) -> slice:
+        return slice(0, 2) if self.first else slice(frames - 2, frames)
+
+    def cost(self, motion: np.ndarray) -> float:
+        """(1) at a motion (T, D), with the least that it can be added: it is not negative."""
+        information, g = self._dense()
+        step = (motion[self._rows(len(motion))] - self.motion).ravel()
+        return float(step @ information @ step - 2 * g @ step + g @ np.linalg.lstsq(information, g, rcond=None)[0])
+
+    def add_to(self, equations: NormalEquations, motion: np.ndarray) -> None:
+        """Add the normal equations, with the shape's part if the shape is free."""
+        rows, information, g = self._rows(len(motion)), *self._dense()
+        step = (motion[rows] - self.motion).ravel()
+        equations.diagonal[rows] += self.equations.diagonal
+        equations.next1[rows.start] += self.equations.next1[0]
+        equations.g[rows] += (g - information @ step).reshape(2, -1)
+        if equations.border.shape[2]:
+            equations.border[rows] += self.equations.border
+
+    def _dense(self) -> tuple[np.ndarray, np.ndarray]:
+        e = self.equations
+        return np.block([[e.diagonal[0], e.next1[0].T], [e.next1[0], e.diagonal[1]]]), e.g.ravel()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tied:
+    """Accelerations within a stretch, and what the frames beside it say."""
+
+    acceleration: Acceleration
+    beside: HandedOver | None
+
+    def cost(self, motion: np.ndarray) -> float:
+        """Sum of squares at a motion (T, D)."""
+        return self.acceleration.cost(motion) + (self.beside.cost(motion) if self.beside is not None else 0.0)
+
+    def add_to(self, equations: NormalEquations, motion: np.ndarray) -> None:
+        """Add the normal equations."""
+        self.acceleration.add_to(equations, motion)
+        if self.beside is not None:
+            self.beside.add_to(equations, motion)
+
+
+def hand_over(
+    problem: Problem,
+    solution: Solution,
+    own: range,
+    beside: HandedOver | None,
+    time_s: np.ndarray,
+    sigma: np.ndarray,
+    *,
+    ahead: bool,
+    understated: Scales | None = None,
+) -> HandedOver:
+    """What the `own` frames of an adjusted stretch, and those `beside` it, say of the two frames ahead of them or before them.
+
+    `time_s` (T,) are the times of the stretch's frames, `sigma` (D,) those of accelerations, `understated` as in `linearise`.
+    """
+    frames = slice(own.start, own.stop + 2) if ahead else slice(own.start - 2, own.stop)
+    first, observe_step = frames.start, problem.observe_step
+
+    def observe(t: int, state: BodyState) -> list[Observation]:
+        return problem.observe(t + first, state) if t + first in own else []
+
+    def step(t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
+        return observe_step(t + first, a, b) if observe_step and (t + first in own or t + first + 1 in own) else None
+
+    tied = Tied(acceleration=Acceleration(time_s=time_s[frames], sigma=sigma), beside=beside)
+    part = replace(problem, smoothness=tied, of_shape=(), observe=observe, observe_step=step)
+    e = linearise(part, solution.motion[frames], solution.vector, solution.scales, understated).equations
+    left = eliminated(e, len(own)) if ahead else reversed_in_time(eliminated(reversed_in_time(e), len(own)))
+    return HandedOver(equations=_definite(left), motion=solution.motion[frames][-2:] if ahead else solution.motion[frames][:2], first=ahead)
+
+
+def _definite(e: NormalEquations) -> NormalEquations:
+    """Equations of two frames without the negative eigenvalues that rounding leaves of directions of which nothing is known."""
+    D = e.g.shape[1]
+    A = np.block([[e.diagonal[0], e.next1[0].T], [e.next1[0], e.diagonal[1]]])
+    scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-12))
+    values, vectors = np.linalg.eigh((A + A.T) / 2 * scale * scale[:, None])
+    A = (vectors * np.maximum(values, 0.0)) @ vectors.T / scale / scale[:, None]
+    return replace(e, diagonal=np.stack([A[:D, :D], A[D:, D:]]), next1=A[None, D:, :D])

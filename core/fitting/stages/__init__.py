@@ -1,0 +1,1 @@
+"""The stages of the fit: click frame, pose tracking from frame to frame, whole sequence."""

@@ -1,0 +1,171 @@
+"""The first body: posture and shape at the frame in which the joints were clicked (D'Apuzzo et al. 1999, §3.3)."""
+
+from collections.abc import Callable
+from itertools import chain
+
+import numpy as np
+from scipy.stats import qmc
+
+from ...foundation.errors import InputError
+from ...foundation.progress import Monitor
+from ..context import Conditions
+from ..inputs.cloud_points import CloudPoints
+from ..observations import Observation
+from ..observations.shape_priors import clicked_chains
+from ..segmentation import crop
+from ..solve.problem import linearise
+from ..solve.solver import FURTHEST, Solution, solve
+from ..state import BodyState
+from .hidden_limbs import found_again
+from .inverse_kinematics import inverse_kinematics, other_postures
+
+REACH_M = 0.20  # points further than this from the clicked limb's surface are not looked at
+WIDE = 1.5  # the gate, as long as the radii are the model's
+POSE_STEPS, STEPS = 15, 25
+SUSPICIOUS = 3.0  # sigma0 of a posture behind the limb or beside it
+ALTERNATIONS, ALTERNATION_STEPS = 8, 5
+OTHERS_AROUND, AROUND_RAD, AROUND_M = 6, float(np.radians(20.0)), 0.05  # of new starts: six found the true arm in all of 20 trials
+MOST_OTHERS = 12  # of the starts for limbs that nobody clicked, those that explain most points
+STAGE = "fit the click frame"
+DEPTH_SHIFT_M = 0.04  # clicks from a short base are least certain along the view
+
+
+def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> Solution:
+    """Motion (1, D) and shape: the best supported of several starts about the clicked posture.
+
+    Raises:
+        InputError: neither measured points nor outlines lie near the clicked joints, and there are no keypoints.
+    """
+    monitor.step(STAGE, 0, 1)
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
+    best, best_score = None, -np.inf
+    starts = _starts(fit, points, clicked.motion[0], clicked.vector, monitor)
+    parts = [monitor.part(STAGE, i, len(starts) + 1) for i in range(len(starts) + 1)]
+    for part, motion in zip(parts, starts):
+        solution = fit_posture_and_shape(fit, points, motion, clicked.vector, part)
+        score = fit.score(fit.click, points, solution.motion[0], solution.vector)
+        if score > best_score:
+            best, best_score = solution, score
+    support = fit.support(fit.click, points, best.motion[0], best.vector) if best is not None else 0.0
+    if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
+        if not fit.settings.use_surface:
+            raise InputError(
+                f"Frame {points.frame} has no outlines near the clicked joints, and without a measured surface "
+                "(fitting.use_surface=false) the body rests on them; give outlines with `tricap contour`."
+            )
+        raise InputError(
+            f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
+            "rig, or click in a frame where the limb was measured."
+        )
+    return _with_lost_limbs(fit, points, best, best_score, parts[-1])
+
+
+def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> Solution:
+    """The solution, or one from where a limb without points explains points that nothing else does.
+
+    Clicks from a short base leave a limb's depth open: bent towards the cameras and away from them look alike.
+    """
+    found = found_again(fit, points, best.motion[0], best.vector, _try(monitor, 0))
+    for i, start in enumerate(found):
+        solution = fit_posture_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
+        score = fit.score(fit.click, points, solution.motion[0], solution.vector)
+        if score > best_score + fit.settings.min_points / 4:
+            best, best_score = solution, score
+    return best
+
+
+def fit_posture_and_shape(
+    fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
+) -> Solution:
+    """From a motion (D,) and shape (S,) to the points and outlines.
+
+    When the residuals stay suspiciously large, again from the posture of the clicks and from others around it; the best supported is kept.
+
+    Raises:
+        Cancelled: the user asked to stop.
+    """
+    monitor = monitor or Monitor()
+    best = _to_surface(fit, points, motion, vector, _try(monitor, 0))
+    if _plausible(best):
+        return best
+    best_score = fit.score(fit.click, points, best.motion[0], best.vector)
+    clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
+    for i, start in enumerate(_around(fit, clicked.motion[0])):
+        solution = _to_surface(fit, points, start, clicked.vector, _try(monitor, i + 1))
+        score = fit.score(fit.click, points, solution.motion[0], solution.vector)
+        if score > best_score:
+            best, best_score = solution, score
+        if _plausible(best):
+            break
+    return best
+
+
+def _try(monitor: Monitor, number: int) -> Monitor:
+    """The monitor of one of several tries, of which nobody knows how many it will take: each counts for half of what is left."""
+    return monitor.part(STAGE, 2 ** (number + 1) - 2, 2 ** (number + 1))
+
+
+def _plausible(solution: Solution) -> bool:
+    return max(solution.scales.points, solution.scales.contours) < SUSPICIOUS
+
+
+def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
+    """The posture (D,) and others evenly around it (K, D), always the same ones, within the joints' limits; what is held stays."""
+    skeleton = fit.model.skeleton
+    spread = np.full(len(motion), AROUND_RAD)
+    spread[skeleton.layout.group("base")] = AROUND_M
+    spread[skeleton.held] = 0.0
+    low, high = np.array([dof.limits for dof in skeleton.dofs]).T
+    moved = motion + spread * (2 * qmc.Halton(len(motion), scramble=False).random(OTHERS_AROUND + 1)[1:] - 1)  # its first is a corner
+    within = np.where(spread > 0, np.clip(moved, np.minimum(low, motion), np.maximum(high, motion)), motion)
+    return np.concatenate([motion[None], within])
+
+
+def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> Solution:
+    """First the posture, then posture and shape, together or in turns as published: each holds the other."""
+    near = crop(points, fit.parameters.state(motion, vector), REACH_M)
+    ways = 2 if fit.settings.method == "joint" else 2 * ALTERNATIONS
+    parts = iter([monitor.part(STAGE, i, 1 + ways) for i in range(1 + ways)])
+    begun = fit.problem(_observe(fit, near, WIDE))
+    solution = solve(begun, motion[None], vector, steps=POSE_STEPS, furthest=FURTHEST, monitor=next(parts))
+    if fit.settings.method == "joint":
+        for wide, part in zip((WIDE, 1.0), parts):
+            problem = fit.problem(_observe(fit, near, wide), "shape")
+            solution = solve(problem, solution.motion, solution.vector, steps=STEPS, scales=solution.scales, monitor=part)
+        return solution
+    for _ in range(ALTERNATIONS):
+        for free, part in zip(("shape", None), parts):
+            problem = fit.problem(_observe(fit, near, 1.0), free, hold_motion=free is not None)
+            solution = solve(problem, solution.motion, solution.vector, steps=ALTERNATION_STEPS, scales=solution.scales, monitor=part)
+    return solution
+
+
+def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """ln of the bone lengths (B,) and their sigmas, as the click frame knows them; infinite for bones that are not between clicks."""
+    near = crop(points, fit.parameters.state(solution.motion[0], solution.vector), REACH_M)
+    problem = fit.problem(_observe(fit, near, 1.0), "shape")
+    covariance = linearise(problem, solution.motion, solution.vector, solution.scales).equations.covariance()[2]
+    lengths = fit.parameters.layout.group("lengths")
+    between = np.isin(lengths, list(chain.from_iterable(clicked_chains(fit.model.skeleton, fit.located))))
+    return solution.vector[lengths], np.where(between, np.sqrt(np.diag(covariance)[lengths]), np.inf)
+
+
+def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> list[np.ndarray]:
+    others = other_postures(fit.parameters, fit.clicks, motion)
+    if len(others) > MOST_OTHERS:
+        support = []
+        for other in others:
+            monitor.step(STAGE, 0, 1)
+            support.append(fit.support(fit.click, points, other, vector))
+        others = [others[i] for i in np.argsort(support)[::-1][:MOST_OTHERS]]
+    starts = [motion, *others]
+    view = np.mean([camera.R_cam_world[2] for camera in fit.cameras], axis=0)
+    for shift in (-DEPTH_SHIFT_M, DEPTH_SHIFT_M):
+        moved = motion.copy()
+        moved[fit.model.skeleton.layout.group("base")] += shift * view
+        starts.append(moved)
+    return starts
+
+
+def _observe(fit: Conditions, points: CloudPoints, wide: float) -> Callable[[int, BodyState], list[Observation]]:
+    return lambda t, state: [*fit.seen_surface(fit.click, points, state, wide), *fit.joints(fit.click), *fit.beliefs(state)]

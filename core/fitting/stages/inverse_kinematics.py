@@ -1,0 +1,210 @@
+"""From clicked joints to a posture and bone lengths: the trunk as a rigid body, a coarse search outwards along the limbs, then least
+squares in the images.
+"""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...body.skeleton import Skeleton, joint_positions
+from ..inputs.clicks import Clicks
+from ..observations import JointLimits, MotionPrior, Observation, Proportions
+from ..observations.shape_priors import STATURE_SIGMA
+from ..solve.solver import Problem, Solution, solve
+from ..state import FIRM, ShapeParameters
+
+GRID_STEP = np.radians(25.0)
+FREE_SPAN = np.pi  # search range of a DOF without limits
+STEPS = 40
+LITTLE = np.radians(65.0)  # what bends less belongs to the trunk
+LASTS_S = 0.5
+ENOUGH_BONES = 4
+OWN_SIGMA = 0.10  # of a clicked bone about its person's proportions
+ANYONES_SIGMA = 0.15  # of a person, a child or a giant, about the model
+CLICKED_STATURE_SIGMA = 0.02  # some sixteen lengths of about 8 % each
+
+
+def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], lengths: Proportions) -> Solution:
+    """Motion (1, D) and shape vector at the click frame. `priors`: limits and beliefs about the DOFs.
+
+    Bone lengths are free within what is believed of them, radii are not.
+    """
+    vector = parameters.vector()
+    start = coarse_posture(parameters, clicks)
+    problem = Problem(
+        parameters=parameters,
+        observe=lambda t, state: [*clicks.observations, *priors],
+        of_shape=[lengths],
+        free_shape=parameters.layout.group("lengths"),
+        held=parameters.skeleton.held,
+    )
+    return solve(problem, start[None], vector, steps=STEPS)
+
+
+def clicked_stature(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation]) -> tuple[float, float]:
+    """The person's stature over that of the parameters' template, and its relative sigma.
+
+    It is that of the lengths and the posture that explain the clicks together. Clicks from a short base scatter along the view by many
+    centimetres, which makes the distance between any two of them longer than it is; a posture takes that up.
+
+    Few bones say less about a stature than their own clicks say about them: then 1.
+    """
+    skeleton, place = parameters.skeleton, dict(zip(parameters.skeleton.joint_names, clicks.xyz_m))
+    clicked = [bone for bone in skeleton.bones if np.isfinite([place[bone.head_joint], place[bone.tail_joint]]).all()]
+    if len(clicked) < ENOUGH_BONES:
+        return 1.0, STATURE_SIGMA
+    lengths = np.log(parameters.template.lengths_m)
+    covariance = ANYONES_SIGMA**2 + OWN_SIGMA**2 * np.eye(len(lengths))
+    found = inverse_kinematics(parameters, clicks, priors, Proportions(mean=lengths, covariance=covariance))
+    return float(np.exp(np.mean(found.vector[parameters.layout.group("lengths")] - lengths))), CLICKED_STATURE_SIGMA
+
+
+def trunk_joints(skeleton: Skeleton) -> list[str]:
+    """The joints that keep their places in the trunk: those of the first bone and of the bones on it that turn by little."""
+    stiff = [
+        not b or max((abs(limit) for dof in bone.dofs for limit in dof.limits), default=0.0) <= LITTLE
+        for b, bone in enumerate(skeleton.bones)
+    ]
+    for b, p in enumerate(skeleton.parents):
+        stiff[b] = stiff[b] and (p < 0 or stiff[p])
+    return list(dict.fromkeys(j for bone, s in zip(skeleton.bones, stiff) if s for j in (bone.head_joint, bone.tail_joint)))
+
+
+def coarse_posture(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
+    """A motion vector (D,) near the located joints: the trunk turned as a whole, then for limb after limb the best on a grid of the DOFs
+    that move its tail."""
+    skeleton, lengths = parameters.skeleton, parameters.template.lengths_m
+    motion = np.array([np.clip(0.0, *dof.limits) for dof in skeleton.dofs])
+    names, trunk = list(skeleton.joint_names), trunk_joints(skeleton)
+    placed = [names.index(j) for j in trunk if clicks.located[names.index(j)]]
+    turned = len(placed) >= 3
+    if turned:
+        _turn_trunk(skeleton, lengths, clicks.xyz_m, placed, motion)
+    known = placed if turned else np.flatnonzero(clicks.located)[:1].tolist()
+    _shift(skeleton, lengths, clicks.xyz_m, known, motion)
+    return _towards(skeleton, lengths, clicks.xyz_m, motion, trunk if turned else [], known)
+
+
+def posture_as_clicked(parameters: ShapeParameters, xyz_m: np.ndarray, motion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """The posture (D,) in which limbs lead to where their joints (J, 3) were clicked, NaN those that were not; the rest as in `motion`
+    (D,) of the shape `vector`."""
+    skeleton = parameters.skeleton
+    return _towards(skeleton, parameters.state(motion, vector).lengths_m, xyz_m, motion, trunk_joints(skeleton), [])
+
+
+def _towards(
+    skeleton: Skeleton,
+    lengths: np.ndarray,
+    xyz_m: np.ndarray,
+    motion: np.ndarray,
+    trunk: list[str],
+    known: list[int],
+) -> np.ndarray:
+    """Limb after limb the best on a grid of the DOFs that move its tail towards its place (J, 3); the base brings the joints `known` to
+    theirs."""
+    names, located = list(skeleton.joint_names), np.isfinite(xyz_m).all(axis=1)
+    for b, bone in enumerate(skeleton.bones):
+        target = xyz_m[names.index(bone.tail_joint)]
+        dofs = _movers(skeleton, b)
+        if not np.isfinite(target).all() or not len(dofs) or bone.tail_joint in trunk:
+            continue
+        grid = np.array(list(product(*(_values(skeleton, d) for d in dofs))))
+        trial = np.repeat(motion[None], len(grid), axis=0)
+        trial[:, dofs] = grid
+        places = joint_positions(skeleton, lengths, trial)
+        head = places[bone.head_joint]
+        wanted = target - (xyz_m[names.index(bone.head_joint)] if located[names.index(bone.head_joint)] else head)
+        angle = _angle(places[bone.tail_joint] - head, wanted)
+        motion = trial[np.argmin(angle + 1e-3 * np.abs(grid).sum(axis=1))]
+        if known:
+            _shift(skeleton, lengths, xyz_m, known, motion)
+    return motion
+
+
+def _shift(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, known: list[int], motion: np.ndarray) -> None:
+    """Bring the middle of the joints `known` to its place, by the base."""
+    places = np.stack(list(joint_positions(skeleton, lengths, motion).values()))
+    motion[skeleton.layout.group("base")] += (xyz_m[known] - places[known]).mean(axis=0)
+
+
+def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, placed: list[int], motion: np.ndarray) -> None:
+    """Turn the first bone so that the trunk's joints fit best (Kabsch 1976)."""
+    rest = np.stack(list(joint_positions(skeleton, lengths, np.zeros(len(motion))).values()))[placed]
+    found = xyz_m[placed]
+    U, _, Vt = np.linalg.svd((found - found.mean(axis=0)).T @ (rest - rest.mean(axis=0)))
+    turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    bone, R = skeleton.bones[0], skeleton.bones[0].R_rest
+    order = bone.rotation_mode[::-1]
+    angles = dict(zip(order.lower(), Rotation.from_matrix(R.T @ turn @ R).as_euler(order)))
+    for dof in bone.dofs:
+        motion[skeleton.layout[dof.name]] = np.clip(angles[dof.axis], *dof.limits)
+
+
+def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarray) -> list[np.ndarray]:
+    """Further starts for bones whose tail nobody clicked: a coarse grid of the DOFs that move it, the others as in `motion` (D,).
+
+    Bones whose posture the model believes firmly have none.
+    """
+    skeleton, starts = parameters.skeleton, []
+    trunk = trunk_joints(skeleton)
+    turned = sum(clicks.located[skeleton.joint_names.index(j)] for j in trunk) >= 3
+    for b, bone in enumerate(skeleton.bones):
+        dofs = _movers(skeleton, b)
+        believed = all(dof.prior_sigma <= FIRM for dof in bone.dofs)
+        if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or believed or (turned and bone.tail_joint in trunk):
+            continue
+        for values in product(*(_values(skeleton, d)[1::2] for d in dofs)):
+            start = motion.copy()
+            start[dofs] = values
+            starts.append(start)
+    return starts
+
+
+def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> list[Observation]:
+    """Soft limits, and the model's beliefs about DOFs; where it has none, a sigma of 180° or 10 m keeps the equations regular."""
+    low, high = np.array([dof.limits for dof in skeleton.dofs]).T
+    mean, sigma = np.array([(dof.prior_mean, dof.prior_sigma) for dof in skeleton.dofs]).T
+    base = skeleton.layout.group("base")
+    free = ~np.isfinite(sigma)
+    mean[free] = np.clip(0.0, low, high)[free]
+    sigma[free] = np.pi
+    mean[base], sigma[base] = about_m, 10.0
+    return [JointLimits(low=low, high=high, sigma=limit_sigma), MotionPrior(mean=mean, sigma=sigma)]
+
+
+def lasting(priors: list[Observation], time_s: np.ndarray) -> list[Observation]:
+    """The beliefs of one frame for every frame of a sequence: a posture lasts, so frames closer than `LASTS_S` share one belief.
+
+    Not so firm beliefs: they stand for what is hardly measured, and are up against the model's error, which is the same in all frames.
+    """
+    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else LASTS_S
+    frames = min(max(1.0, LASTS_S / step), float(len(time_s)))
+    return [
+        replace(p, sigma=np.where(p.sigma <= FIRM, p.sigma, p.sigma * np.sqrt(frames))) if isinstance(p, MotionPrior) else p for p in priors
+    ]
+
+
+def _movers(skeleton: Skeleton, bone: int) -> np.ndarray:
+    """DOFs that move a bone's tail but not its head: its own across the bone, and its parent's twist."""
+    n = len(skeleton.base_dofs)
+    return np.array(
+        [
+            i
+            for i, dof in enumerate(skeleton.dofs[n:], n)
+            if (skeleton.dof_bone[i] == bone and dof.axis != "y") or (skeleton.dof_bone[i] == skeleton.parents[bone] and dof.axis == "y")
+        ],
+        dtype=np.intp,
+    )
+
+
+def _values(skeleton: Skeleton, dof: int) -> np.ndarray:
+    low, high = skeleton.dofs[dof].limits
+    low, high = max(low, -FREE_SPAN), min(high, FREE_SPAN)
+    return np.linspace(low, high, max(2, int(np.ceil((high - low) / GRID_STEP)) + 1))
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    cosine = (a * b).sum(-1) / np.maximum(np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1), 1e-12)
+    return np.arccos(np.clip(cosine, -1, 1))

@@ -1,0 +1,137 @@
+"""Video fields: an interlaced frame holds two instants, one in its even rows and one in its odd rows.
+
+Matching works on the rows of one field; every coordinate that leaves this package is in FULL-FRAME pixels
+(D'Apuzzo et al. 1999, §2.1: only odd lines are kept; SCIENCE: field row r is frame row 2 r or 2 r + 1).
+
+Pictures of single fields, for programs that show footage frame by frame: picture n is field n, its missing rows interpolated.
+
+They are made once: a file beside them says what they were made from.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from .sequence import ImageSequence
+
+INTERLACE = ("none", "odd", "even")
+BOTH = "both"  # fields, one after the other
+
+
+@dataclass(frozen=True, slots=True)
+class RowGrid:
+    """Which rows of the frame an image holds: frame row = step · row + offset. Columns are those of the frame."""
+
+    step: int = 1
+    offset: int = 0
+
+    def rows(self, frame: np.ndarray) -> np.ndarray:
+        """The rows (h', w) of a full frame (h, w), contiguous."""
+        return np.ascontiguousarray(frame[self.offset :: self.step])
+
+    def to_frame(self, xy: np.ndarray) -> np.ndarray:
+        """Full-frame pixels (…, 2) of coordinates (…, 2) in the rows' image."""
+        return np.asarray(xy, dtype=np.float64) * (1.0, self.step) + (0.0, self.offset)
+
+    def from_frame(self, xy: np.ndarray) -> np.ndarray:
+        """Coordinates (…, 2) in the rows' image of full-frame pixels (…, 2)."""
+        return (np.asarray(xy, dtype=np.float64) - (0.0, self.offset)) / (1.0, self.step)
+
+    def whole(self, frame: np.ndarray) -> np.ndarray:
+        """The frame (h, w) with the rows that this grid does not have, of another instant, interpolated."""
+        if self.step == 1:
+            return frame
+        filled = frame.copy()
+        other = np.arange(1 - self.offset, len(frame), 2)
+        above, below = np.clip(other - 1, self.offset, None), other + 1
+        below = np.where(below < len(frame), below, above)
+        filled[other] = 0.5 * (frame[above] + frame[below])
+        return filled
+
+    def covariance_to_frame(self, covariance: np.ndarray) -> np.ndarray:
+        """Covariances (…, 2, 2) of coordinates in the rows' image, as of full-frame pixels."""
+        scale = np.array([1.0, self.step])
+        return covariance * scale[:, None] * scale[None, :]
+
+
+@dataclass(frozen=True, slots=True)
+class FieldLayout:
+    """Which image, and which of its rows, show instant n of a recording: one instant an image, or two where both fields are measured."""
+
+    first: RowGrid = RowGrid()
+    second: RowGrid | None = None
+
+    @property
+    def per_image(self) -> int:
+        """FieldLayout in an image, 1 or 2."""
+        return 1 if self.second is None else 2
+
+    def rows(self, instant: int) -> RowGrid:
+        """The rows that show it."""
+        return self.first if self.second is None or instant % 2 == 0 else self.second
+
+    def image(self, instant: int) -> int:
+        """Number of the image that shows it."""
+        return instant // self.per_image
+
+
+def field_layout(interlaced: str, first_field: str = "odd") -> FieldLayout:
+    """The instants of footage of which one field is kept, or "both", of which `first_field` was exposed first."""
+    if interlaced != BOTH:
+        return FieldLayout(row_grid(interlaced))
+    odd, even = row_grid("odd"), row_grid("even")
+    return FieldLayout(odd, even) if first_field == "odd" else FieldLayout(even, odd)
+
+
+def row_grid(interlaced: str) -> RowGrid:
+    """The grid of rows to keep: "odd" keeps the 1st, 3rd, … line (rows 0, 2, …), "even" the others, "none" all."""
+    return {"none": RowGrid(1, 0), "odd": RowGrid(2, 0), "even": RowGrid(2, 1)}[interlaced]
+
+
+@overload
+def frame_time_s(frame: float, fps: float) -> float: ...
+@overload
+def frame_time_s(frame: np.ndarray, fps: float) -> np.ndarray: ...
+def frame_time_s(frame: float | np.ndarray, fps: float) -> float | np.ndarray:
+    """When a frame of a recording (or each of several) was taken, in seconds after its frame 0; `fps` frames per second, fields counted."""
+    return frame / fps
+
+
+MADE_FROM = "made_from.json"
+
+
+def field_pictures(sequence: ImageSequence, fields: FieldLayout, folder: Path, monitor: Monitor | None = None) -> tuple[Path, ...]:
+    """FOLDER/000000.png …, a picture of every field of a sequence, made where they are not there yet.
+
+    Raises:
+        InputError: an image cannot be read, or the folder cannot be written to.
+        Cancelled: the monitor was cancelled; the pictures are made anew when they are asked for again.
+    """
+    paths = tuple(folder / f"{n:06d}.png" for n in range(fields.per_image * sequence.count))
+    source, record = _said(sequence, fields), folder / MADE_FROM
+    if record.is_file() and store.read_json(record) == source and all(path.is_file() for path in paths):
+        return paths
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        record.unlink(missing_ok=True)
+        for n, path in enumerate(paths):
+            if monitor is not None:
+                monitor.step("fields", n, len(paths))
+            picture = fields.rows(n).whole(sequence.read(fields.image(n)))
+            store.write_bytes(path, cv2.imencode(".png", np.clip(np.rint(picture), 0, 255).astype(np.uint8))[1].tobytes())
+        store.write_json(record, source)
+    except OSError as error:
+        raise InputError(f"Cannot write pictures of the fields into {folder}: {error.strerror or error}. Choose another folder.") from error
+    return paths
+
+
+def _said(sequence: ImageSequence, fields: FieldLayout) -> dict[str, object]:
+    """What identifies the pictures: names, sizes and dates of the footage, and which field is first."""
+    files = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in sequence.files()]
+    return {"files": files, "count": sequence.count, "first_row": fields.first.offset}

@@ -1,0 +1,261 @@
+"""C3D: points over time with residuals, binary (The C3D File Format User Guide, Motion Lab Systems, 2008).
+
+Own and small: only the points are read and written, no analogue channels. The library `c3d` would be one more wheel to carry for these
+lines, trusts the counts in a file's header, and leaves sigmas to its user; it serves the tests as an independent reader.
+
+Blocks of 512 bytes: header, parameters (groups and entries with relative pointers), then per frame and point x, y, z and a fourth word:
+negative for an unknown point, else its low byte times the scale is the residual; here that is the point's sigma, 0 if that is unknown.
+Frames are numbered from 1 and without gaps: frames that are not there are written as unknown points, and TRICAP:FRAME_OFFSET says how far
+a take's own numbers, which may begin at 0, are from the file's.
+"""
+
+import struct
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...foundation import store
+from ...foundation.errors import InputError
+from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
+
+BLOCK = 512
+INTEL, DEC, MIPS = 84, 85, 86
+RESIDUAL_SCALE_MM = 0.1
+LARGEST_BYTES = 1 << 30
+MOST_WORD = 65535
+BATCH = 255  # labels in one parameter
+
+
+def write_c3d(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "mm") -> None:
+    """Write points as float32; sigmas as residuals in steps of 0.1 mm, from 0.1 to 25.5 mm.
+
+    Raises:
+        InputError: axes or unit are not known, the frames go back or are too far apart, or the file cannot be written.
+    """
+    markers = without_gaps(markers, path)
+    per_unit = metres_per(unit, path)
+    xyz = markers.xyz_m @ axes_of(axes).T / per_unit
+    t, n = xyz.shape[:2]
+    scale = RESIDUAL_SCALE_MM * 1e-3 / per_unit
+    known = np.isfinite(xyz).all(axis=2)
+    steps = np.where(np.isfinite(markers.sigma_m), np.clip(np.round(np.nan_to_num(markers.sigma_m) / per_unit / scale), 1, 255), 0)
+    data = np.concatenate([np.where(known[..., None], xyz, 0.0), np.where(known, steps, -1.0)[..., None]], axis=2).astype("<f4")
+    first = int(markers.frames[0]) if 1 <= markers.frames[0] and markers.frames[-1] <= MOST_WORD else 1
+    last = first + t - 1
+    start = 2 + len(_parameters(markers, scale, unit, first)) // BLOCK
+    parameters = _parameters(markers, scale, unit, first, start)
+    header = struct.pack("<BB5HfHHf", 2, 0x50, n, 0, first, min(last, MOST_WORD), 0, -scale, start, 0, markers.fps)
+    store.write_bytes(Path(path), header.ljust(BLOCK, b"\0") + parameters + _padded(data.tobytes()))
+
+
+def without_gaps(markers: Markers, where: object) -> Markers:
+    """The points with a row for every frame number from the first to the last; those that were not there are unknown.
+
+    Raises:
+        InputError: the numbers do not rise, or are too far apart.
+    """
+    steps = np.diff(markers.frames)
+    if (steps == 1).all():
+        return markers
+    t, n = int(markers.frames[-1] - markers.frames[0]) + 1, len(markers.names)
+    if (steps < 1).any() or t * n * 4 > MOST_VALUES:
+        raise InputError(
+            f"{where} cannot be written: C3D needs every frame from the first to the last, and these ({markers.frames[0]} … "
+            f"{markers.frames[-1]}) do not rise or are too far apart; mend the frame numbers."
+        )
+    xyz, sigma = np.full((t, n, 3), np.nan), np.full((t, n), np.nan)
+    rows = markers.frames - markers.frames[0]
+    xyz[rows], sigma[rows] = markers.xyz_m, markers.sigma_m
+    return replace(markers, frames=markers.frames[0] + np.arange(t), xyz_m=xyz, sigma_m=sigma)
+
+
+def _padded(data: bytes) -> bytes:
+    return data + b"\0" * (-len(data) % BLOCK)
+
+
+def _parameters(markers: Markers, scale: float, unit: str, first: int, start: int = 0) -> bytes:
+    """The parameters of points without gaps, the first frame having the number `first`, the data beginning in block `start`."""
+    t, n = len(markers.frames), len(markers.names)
+    last = first + t - 1
+    point: list[tuple[str, Any]] = [
+        ("USED", np.uint16(n)),
+        ("FRAMES", np.uint16(min(t, MOST_WORD))),
+        ("DATA_START", np.uint16(start)),
+        ("SCALE", np.float32(-scale)),
+        ("RATE", np.float32(markers.fps)),
+        ("UNITS", unit),
+    ]
+    for k in range(0, n, BATCH):
+        number = "" if k == 0 else str(k // BATCH + 1)
+        point.append((f"LABELS{number}", markers.names[k : k + BATCH]))
+        point.append((f"DESCRIPTIONS{number}", tuple("" for _ in markers.names[k : k + BATCH])))
+    trial: list[tuple[str, Any]] = [
+        ("ACTUAL_START_FIELD", np.array([first & 0xFFFF, first >> 16], dtype=np.uint16)),
+        ("ACTUAL_END_FIELD", np.array([last & 0xFFFF, last >> 16], dtype=np.uint16)),
+    ]
+    groups = [("POINT", point), ("ANALOG", [("USED", np.uint16(0))]), ("TRIAL", trial)]
+    offset = (int(markers.frames[0]) - first) & 0xFFFFFFFF
+    if offset:
+        groups.append(("TRICAP", [("FRAME_OFFSET", np.array([offset & 0xFFFF, offset >> 16], dtype=np.uint16))]))
+    body = b"".join(_entry(name, -k, b"\0") for k, (name, _) in enumerate(groups, 1))
+    entries = [_entry(name, k, _value(value) + b"\0") for k, (_, rows) in enumerate(groups, 1) for name, value in rows]
+    body += b"".join(entries) + b"\0\0"
+    blocks = -(-(len(body) + 4) // BLOCK)
+    return _padded(struct.pack("<BBBB", 1, 0x50, blocks, INTEL) + body)
+
+
+def _entry(name: str, number: int, rest: bytes) -> bytes:
+    """Length of the name, group number, name, pointer to the next entry, and what follows."""
+    return struct.pack("<bb", len(name), number) + name.encode("ascii") + struct.pack("<h", 2 + len(rest)) + rest
+
+
+def _value(value: Any) -> bytes:
+    """Type, dimensions and data of a parameter."""
+    if isinstance(value, str):
+        text = value.encode("utf-8")
+        return struct.pack("<bBB", -1, 1, len(text)) + text
+    if isinstance(value, tuple):
+        texts = [name.encode("utf-8")[:127] for name in value]
+        width = max(map(len, texts), default=0)
+        return struct.pack("<bBBB", -1, 2, width, len(texts)) + b"".join(text.ljust(width) for text in texts)
+    kind = {2: 2, 4: 4}[value.dtype.itemsize]
+    shape = value.shape
+    return struct.pack(f"<bB{len(shape)}B", kind, len(shape), *shape) + value.astype(value.dtype.newbyteorder("<")).tobytes()
+
+
+@dataclass
+class _Number:
+    """How a file writes numbers."""
+
+    order: str
+    dec: bool
+
+    def floats(self, data: bytes) -> np.ndarray:
+        if self.dec:  # VAX F: words swapped, exponent off by two
+            words = np.frombuffer(data, "<u2").reshape(-1, 2)[:, ::-1].copy()
+            return np.asarray(words.view("<f4").ravel() / 4.0)
+        return np.frombuffer(data, f"{self.order}f4")
+
+    def words(self, data: bytes) -> np.ndarray:
+        return np.frombuffer(data, f"{self.order}u2")
+
+
+def read_c3d(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
+    """Read the points, in the file's unit unless `unit` says otherwise; their residuals become sigmas.
+
+    Raises:
+        InputError: it cannot be read, is no C3D file, or is shorter than its header says.
+    """
+    rotation = axes_of(axes)
+    try:
+        if Path(path).stat().st_size > LARGEST_BYTES:
+            raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
+    if len(data) < 2 * BLOCK or data[1] != 0x50 or data[0] < 2:
+        raise InputError(f"{path} is not a C3D file; export it again.")
+    try:
+        return _read(data, path, rotation, unit)
+    except (struct.error, IndexError, ValueError, KeyError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is a damaged C3D file ({error}); export it again.") from error
+
+
+def _read(data: bytes, path: Path, rotation: np.ndarray, unit: str) -> Markers:
+    at = (data[0] - 1) * BLOCK
+    number = _Number(order=">" if data[at + 3] == MIPS else "<", dec=data[at + 3] == DEC)
+    table = _read_parameters(data, at, number, path)
+    words = number.words(data[2:24])
+    n, analogue, first, last, start = int(words[0]), int(words[1]), int(words[2]), int(words[3]), int(words[7])
+    scale, fps = float(number.floats(data[12:16])[0]), float(number.floats(data[20:24])[0])
+    first, t = _range(table, first, last)
+    check_size((t, n, 4), len(data), path)
+    size = 4 if scale < 0 else 2
+    stride = size * (4 * n + analogue)
+    begin = (start - 1) * BLOCK
+    if begin < BLOCK or begin + t * stride > len(data):
+        raise InputError(f"{path} promises {t} frames of {n} points but is too short for them; export it again.")
+    rows = np.frombuffer(data, np.uint8, t * stride, begin).reshape(t, stride)[:, : size * 4 * n].tobytes()
+    raw = (number.floats(rows) if scale < 0 else np.frombuffer(rows, f"{number.order}i2")).astype(np.float64).reshape(t, n, 4)
+    per_unit = metres_per(unit or table.get(("POINT", "UNITS"), "mm") or "mm", path)
+    xyz = raw[..., :3] * (1.0 if scale < 0 else scale) * per_unit
+    known = (raw[..., 3] >= 0) & np.isfinite(xyz).all(axis=2)
+    residual = np.clip(np.nan_to_num(raw[..., 3]), 0, MOST_WORD).astype(np.int64) & 0xFF
+    sigma = np.where(known & (residual > 0), residual * abs(scale) * per_unit, np.nan)
+    xyz[~known] = np.nan
+    return Markers(names=_labels(table, n), fps=fps, frames=first + _offset(table) + np.arange(t), xyz_m=xyz @ rotation, sigma_m=sigma)
+
+
+def _range(table: dict[tuple[str, str], Any], first: int, last: int) -> tuple[int, int]:
+    """First frame and their number; the header's words overflow beyond 65535, TRIAL's do not."""
+    begin, end = table.get(("TRIAL", "ACTUAL_START_FIELD")), table.get(("TRIAL", "ACTUAL_END_FIELD"))
+    if begin is not None and end is not None and np.size(begin) == 2 and np.size(end) == 2:
+        first, last = (int(pair[0]) + (int(pair[1]) << 16) for pair in (begin, end))
+    return first, last - first + 1
+
+
+def _offset(table: dict[tuple[str, str], Any]) -> int:
+    """By how much the numbers of the take's frames are greater than the file's."""
+    pair = table.get(("TRICAP", "FRAME_OFFSET"))
+    if pair is None or np.size(pair) != 2:
+        return 0
+    value = int(pair[0]) + (int(pair[1]) << 16)
+    return value - (1 << 32) if value >= 1 << 31 else value
+
+
+def _labels(table: dict[tuple[str, str], Any], n: int) -> tuple[str, ...]:
+    names: list[str] = []
+    for k in range(1, n // BATCH + 2):
+        names += table.get(("POINT", "LABELS" if k == 1 else f"LABELS{k}"), ())
+    names = names[:n] + [f"point {i + 1}" for i in range(len(names), n)]
+    seen: dict[str, int] = {}
+    for i, name in enumerate(names):
+        seen[name] = seen.get(name, 0) + 1
+        names[i] = name if name and seen[name] == 1 else f"{name or 'point'} {i + 1}"
+    return tuple(names)
+
+
+def _read_parameters(data: bytes, at: int, number: _Number, path: Path) -> dict[tuple[str, str], Any]:
+    """Values by (group, name)."""
+    position, groups, rows = at + 4, {}, []
+    while position + 2 < len(data):
+        length, group = struct.unpack_from("<bb", data, position)
+        length = abs(length)
+        if length == 0 or group == 0:
+            break
+        name = data[position + 2 : position + 2 + length].decode("ascii", errors="replace").strip().upper()
+        pointer = position + 2 + length
+        step = int(number.words(data[pointer : pointer + 2])[0])
+        if group < 0:
+            groups[-group] = name
+        else:
+            rows.append((group, name, pointer + 2))
+        if step == 0:
+            break
+        position = pointer + step
+    return {
+        (groups.get(group, ""), name): value for group, name, where in rows if (value := _read_value(data, where, number, path)) is not None
+    }
+
+
+def _read_value(data: bytes, where: int, number: _Number, path: Path) -> Any:
+    kind, count = struct.unpack_from("<bB", data, where)
+    shape = list(data[where + 2 : where + 2 + count])
+    size = int(np.prod(shape)) if shape else 1
+    begin = where + 2 + count
+    if kind not in (-1, 1, 2, 4) or begin + abs(kind) * size > len(data):
+        raise InputError(f"{path} has a parameter that runs over its end; it is damaged, export it again.")
+    raw = data[begin : begin + abs(kind) * size]
+    if kind == -1:
+        if count < 2:
+            return raw.decode("utf-8", errors="replace").strip(" \0")
+        width = shape[0]
+        return [
+            raw[i * width : (i + 1) * width].decode("utf-8", errors="replace").strip(" \0") for i in range(size // width if width else 0)
+        ]
+    if kind == 1:
+        return None
+    values = number.words(raw) if kind == 2 else number.floats(raw)
+    return values if shape else values[0]

@@ -1,0 +1,196 @@
+"""Points with names over time: what TRC, C3D and CSV files hold, in the world's metres, Z up.
+
+Axes of other worlds are given by the rows of a rotation: `file = rotation @ world`. In OpenSim's, X is forward, Y up and Z to the
+right of a person who faces −Y here.
+
+Points over time as CSV, in metres: long like joints.csv (frame, time_s, joint, x, y, z, sigma), or wide with columns frame, time_s,
+NAME x, NAME y, NAME z, …
+"""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...foundation import store
+from ...foundation.arrays import frozen
+from ...foundation.errors import InputError
+from ...images.interlace import frame_time_s
+from ..tables import read_joints
+
+AXES = {
+    "Z up": np.eye(3),
+    "Y up": np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]),
+    "OpenSim": np.array([[0, -1.0, 0], [0, 0, 1.0], [-1.0, 0, 0]]),
+}
+UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "inch": 0.0254}
+MOST_VALUES = 1 << 28  # 2 GB of float64
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Markers:
+    """N points over T frames; NaN where a point is not known."""
+
+    names: tuple[str, ...]
+    fps: float
+    frames: np.ndarray  # (T,) integer frame numbers
+    xyz_m: np.ndarray  # (T, N, 3) world
+    sigma_m: np.ndarray  # (T, N); NaN: not known
+
+    def __post_init__(self) -> None:
+        t, n = len(self.frames), len(self.names)
+        object.__setattr__(self, "frames", frozen(self.frames, (t,), np.int64, "frames"))
+        object.__setattr__(self, "xyz_m", frozen(self.xyz_m, (t, n, 3), float, "xyz_m"))
+        object.__setattr__(self, "sigma_m", frozen(self.sigma_m, (t, n), float, "sigma_m"))
+        if t == 0 or n == 0:
+            raise InputError("There are no points in any frame; choose a file with points.")
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise InputError(f"The points have {self.fps} frames per second; that must be a positive number.")
+
+
+def metres_per(unit: str, where: object) -> float:
+    """The factor of a unit's name.
+
+    Raises:
+        InputError: nobody knows that unit.
+    """
+    factor = UNITS_M.get(unit.strip().lower())
+    if factor is None:
+        raise InputError(f"{where} is in the unit “{unit.strip()[:20]}”, which is not known; write it in m or mm.")
+    return factor
+
+
+def axes_of(name: str) -> np.ndarray:
+    """The rotation (3, 3) from the world to a file's axes.
+
+    Raises:
+        InputError: there are no such axes.
+    """
+    if name not in AXES:
+        raise InputError(f"There are no axes “{name}”; choose one of {', '.join(AXES)}.")
+    return AXES[name]
+
+
+def check_size(counts: Sequence[int], available: int, where: object) -> None:
+    """See that a header's counts can be true, before memory is asked for.
+
+    Raises:
+        InputError: they cannot.
+    """
+    total = 1
+    for count in counts:
+        total *= max(int(count), 0)
+    if total == 0 or total > min(MOST_VALUES, available):
+        promised = " × ".join(map(str, counts))
+        raise InputError(f"{where} promises {promised} values but cannot hold them; it is damaged, export it again.")
+
+
+def filled(markers: Markers) -> Markers:
+    """Gaps filled on straight lines, and the ends with the nearest place; points that are never known are left out.
+
+    Raises:
+        InputError: no point is ever known.
+    """
+    known = np.isfinite(markers.xyz_m).all(axis=2)
+    keep = np.flatnonzero(known.any(axis=0))
+    if not len(keep):
+        raise InputError("None of the points is ever known; choose a file with points.")
+    xyz = np.stack(
+        [
+            np.stack([np.interp(markers.frames, markers.frames[known[:, n]], markers.xyz_m[known[:, n], n, i]) for i in range(3)], axis=1)
+            for n in keep
+        ],
+        axis=1,
+    )
+    return Markers(
+        names=tuple(markers.names[n] for n in keep), fps=markers.fps, frames=markers.frames, xyz_m=xyz, sigma_m=markers.sigma_m[:, keep]
+    )
+
+
+LARGEST_BYTES = 1 << 30
+DEFAULT_FPS = 25.0
+
+
+def write_points_csv(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "m") -> None:
+    """Write points like joints.csv; unknown ones have no row. joints.csv itself has metres and Z up.
+
+    Raises:
+        InputError: axes or unit are not known, or the file cannot be written.
+    """
+    per_unit = metres_per(unit, path)
+    rows = ["frame,time_s,joint,x,y,z,sigma"]
+    for frame, places, sigmas in zip(markers.frames, markers.xyz_m @ axes_of(axes).T / per_unit, markers.sigma_m / per_unit):
+        for name, X, sigma in zip(markers.names, places, sigmas):
+            if np.isfinite(X).all():
+                text = io.StringIO()
+                csv.writer(text, lineterminator="").writerow([name])
+                rows.append(
+                    f"{frame},{frame_time_s(frame, markers.fps):.6f},{text.getvalue()},{X[0]:.6f},{X[1]:.6f},{X[2]:.6f},"
+                    f"{'nan' if np.isnan(sigma) else format(sigma, '.6f')}"
+                )
+    store.write_text(Path(path), "\n".join(rows) + "\n")
+
+
+def read_points_csv(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
+    """Read points, in metres unless `unit` says otherwise.
+
+    Raises:
+        InputError: it cannot be read, its columns are none of the two kinds, or axes or unit are not known.
+    """
+    rotation, per_unit = axes_of(axes), metres_per(unit or "m", path)
+    found = _read(path)
+    return replace(found, xyz_m=found.xyz_m @ rotation * per_unit, sigma_m=found.sigma_m * per_unit)
+
+
+def _read(path: Path) -> Markers:
+    """Points as they stand in the file."""
+    try:
+        if Path(path).stat().st_size > LARGEST_BYTES:
+            raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+            header = [name.strip() for name in next(csv.reader(file), [])]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"Cannot read the table {path}: {error}.") from error
+    if "joint" in header:
+        table = read_joints(path)
+        frames, names = table.frames, tuple(table.joints_m)
+        if not names:
+            raise InputError(f"The table {path} has no rows; choose one with points.")
+        xyz, sigma = (np.stack([column[name] for name in names], axis=1) for column in (table.joints_m, table.sigma_m))
+        return Markers(names=names, fps=rate(frames, table.time_s), frames=frames, xyz_m=xyz, sigma_m=sigma)
+    return _wide(path, header)
+
+
+def _wide(path: Path, header: list[str]) -> Markers:
+    columns: dict[str, dict[str, int]] = {}
+    for i, name in enumerate(header):
+        if len(name) > 2 and name[-1].lower() in "xyz" and name[-2] in " _.":
+            columns.setdefault(name[:-2], {})[name[-1].lower()] = i
+    columns = {name: places for name, places in columns.items() if len(places) == 3}
+    if not columns or "frame" not in header:
+        raise InputError(f"{path} has no columns of points; write frame, time_s, NAME x, NAME y, NAME z, or rows like joints.csv.")
+    try:
+        table = np.genfromtxt(path, delimiter=",", skip_header=1, encoding="utf-8-sig", ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{path} has rows of different lengths; export it again.") from error
+    if table.shape[0] == 0 or table.shape[1] != len(header):
+        raise InputError(f"{path} has no rows that fit its header; export it again.")
+    check_size(table.shape, table.size, path)
+    frames = table[:, header.index("frame")]
+    if not np.isfinite(frames).all():
+        raise InputError(f"{path} has rows without a frame number; export it again.")
+    xyz = np.stack([table[:, [places[axis] for axis in "xyz"]] for places in columns.values()], axis=1)
+    time = table[:, header.index("time_s")] if "time_s" in header else frames / DEFAULT_FPS
+    return Markers(names=tuple(columns), fps=rate(frames, time), frames=frames, xyz_m=xyz, sigma_m=np.full(xyz.shape[:2], np.nan))
+
+
+def rate(frames: np.ndarray, time_s: np.ndarray) -> float:
+    """Frames per second of a table with frame numbers and times."""
+    if len(frames) < 2:
+        return DEFAULT_FPS
+    steps = np.diff(time_s) / np.maximum(np.diff(frames), 1)
+    step = float(np.median(steps))
+    return 1.0 / step if np.isfinite(step) and step > 0 else DEFAULT_FPS

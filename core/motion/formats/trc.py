@@ -1,0 +1,98 @@
+"""TRC: points over time as text (Motion Analysis; OpenSim). Read with distrust, written as OpenSim reads it: Y up."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ...foundation import store
+from ...foundation.errors import InputError
+from ...images.interlace import frame_time_s
+from .markers import Markers, axes_of, check_size, metres_per
+
+HEADINGS = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames".split()
+LARGEST_BYTES = 1 << 30
+
+
+def write_trc(path: Path, markers: Markers, *, axes: str = "OpenSim", unit: str = "m") -> None:
+    """Write points; unknown ones are left empty.
+
+    Raises:
+        InputError: axes or unit are not known, or the file cannot be written.
+    """
+    xyz = markers.xyz_m @ axes_of(axes).T / metres_per(unit, path)
+    t, n = xyz.shape[:2]
+    rate = f"{markers.fps:.9g}"
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",
+        "\t".join(HEADINGS),
+        "\t".join([rate, rate, str(t), str(n), unit, rate, str(markers.frames[0]), str(t)]),
+        "Frame#\tTime\t" + "\t\t\t".join(markers.names) + "\t\t",
+        "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, n + 1) for axis in "XYZ"),
+        "",
+    ]
+    time = frame_time_s(markers.frames - markers.frames[0], markers.fps)
+    for frame, second, row in zip(markers.frames, time, xyz.reshape(t, -1)):
+        lines.append("\t".join([str(frame), f"{second:.6f}", *("" if np.isnan(v) else f"{v:.6f}" for v in row)]))
+    store.write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def read_trc(path: Path, *, axes: str = "OpenSim", unit: str = "") -> Markers:
+    """Read points, in the file's unit unless `unit` says otherwise.
+
+    Raises:
+        InputError: it cannot be read, is no TRC file, or is shorter than its header says.
+    """
+    rotation = axes_of(axes)
+    lines = _lines(path)
+    if len(lines) < 5 or not lines[0].startswith("PathFileType"):
+        raise InputError(f"{path} is not a TRC file: its first line is not “PathFileType …”.")
+    header = dict(zip(lines[1].split(), lines[2].split()))
+    missing = [name for name in HEADINGS[:5] if name not in header]
+    if missing:
+        raise InputError(f"{path} has no {missing[0]} in its header; export it again.")
+    t, n = _count(header["NumFrames"], path), _count(header["NumMarkers"], path)
+    check_size((t, n, 3), sum(map(len, lines)), path)
+    names = [name.strip() for name in lines[3].split("\t")[2:] if name.strip()]
+    if len(names) != n or len(set(names)) < n:
+        raise InputError(f"{path} promises {n} markers and names {len(set(names))} different ones; export it again.")
+    rows = [line.split("\t") for line in lines[5:] if line.strip()]
+    if len(rows) < t:
+        raise InputError(f"{path} promises {t} frames and holds {len(rows)}; export it again.")
+    table = np.array([_row(row, n, path) for row in rows[:t]])
+    xyz = table[:, 1:].reshape(t, n, 3) * metres_per(unit or header["Units"], path) @ rotation
+    return Markers(names=tuple(names), fps=_rate(header["DataRate"], path), frames=table[:, 0], xyz_m=xyz, sigma_m=np.full((t, n), np.nan))
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        if Path(path).stat().st_size > LARGEST_BYTES:
+            raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")
+        return Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
+
+
+def _count(text: str, path: Path) -> int:
+    if not text.isdecimal() or len(text) > 12:
+        raise InputError(f"{path} has “{text[:20]}” where a count is needed; export it again.")
+    return int(text)
+
+
+def _rate(text: str, path: Path) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"{path} has the data rate “{text[:20]}”, which is no number; export it again.") from error
+
+
+def _row(row: list[str], n: int, path: Path) -> list[float]:
+    """Frame number and 3 n coordinates; empty fields are unknown points."""
+    fields = [row[0], *row[2 : 2 + 3 * n]]
+    fields += [""] * (1 + 3 * n - len(fields))
+    try:
+        values = [float(text) if text.strip() else np.nan for text in fields]
+    except ValueError as error:
+        raise InputError(f"{path} holds something that is no number in frame “{row[0][:20]}”; export it again.") from error
+    if not np.isfinite(values[0]):
+        raise InputError(f"{path} has a row without a frame number; export it again.")
+    return values

@@ -1,0 +1,212 @@
+"""The folder of a run (OUT): the path of each result, the checkpoints, and run.json, the record of the run.
+
+A checkpoint contains a digest of everything that it depends on; if that differs, it is computed again. Files: docs/formats.md.
+"""
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.lock import NAME, locked
+from ..motion.formats.ply import write_cloud
+from ..surface.cloud import PointCloud
+from ..tracking.trajectories import Filtered
+from . import run_json
+from .run_json import FORMAT, VERSION
+
+RESULTS = (  # files and folders that a run replaces
+    "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report",
+    "body.blend",
+)  # fmt: skip
+
+
+def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
+    """Refuse to mix results with footage, because one could replace the other.
+
+    Raises:
+        InputError: OUT is a take or contains its footage, or the take lies where results are replaced.
+    """
+    where = Path(out).resolve()
+    advice = f"choose a separate folder for the results, such as {(where if take is None else take) / 'results'}."
+    if (where / "take.toml").exists():
+        raise InputError(f"{out} is itself a take; {advice}")
+    for path in footage:
+        if where in (path.parent.resolve(), path.resolve().parent):
+            raise InputError(f"{out} contains the footage {path.name}; {advice}")
+    if take is not None and any(take.resolve().is_relative_to(where / name) for name in ("cache", "contours", *RESULTS)):
+        raise InputError(f"The take {take} is inside {out}, where a run replaces files; choose another folder for the results.")
+
+
+def check_not_result(file: Path, out: Path) -> None:
+    """Refuse to write over a result of the run, or over the motion file, that is being read.
+
+    Raises:
+        InputError: `file` is such a file.
+    """
+    path, read = Path(file).resolve(), Path(out).resolve()
+    own = path.relative_to(read).parts[:1] if path != read and path.is_relative_to(read) else ()
+    if path == read or set(own) & {"cache", "contours", "fields", "run.json", *RESULTS} - {"body.blend"}:
+        raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
+
+
+class Results:
+    """An OUT folder. Creating the object checks that it is writable."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder).resolve()
+        if self.folder.exists() and not self.folder.is_dir():
+            raise InputError(f"{folder} is a file; choose a folder for the results.")
+        outside = [path for path in _written(self.folder) if not _inside(path, self.folder)]
+        if outside:
+            raise InputError(f"{outside[0]} is a link to a place outside {folder}; remove the link, or choose another folder.")
+        foreign = _not_from_a_run(self.folder)
+        if foreign:
+            raise InputError(
+                f"{folder} contains “{foreign[0]}”, which was not written by Tricap; choose an empty or a new folder for the results."
+            )
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"Cannot make the folder {folder}: {error.strerror or error}. Choose another place for the results."
+            ) from error
+        if not os.access(self.folder, os.W_OK):
+            raise InputError(f"The folder {folder} is read-only; choose another place for the results.")
+
+    @contextmanager
+    def opened(self) -> Iterator["Results"]:
+        """Lock the folder against other runs, and remove the partial files of a killed run.
+
+        Raises:
+            InputError: another run is using it.
+        """
+        with locked(self.folder):
+            folders = [self.path(name) for name in ("clouds", "skin", "report", "contours")]
+            for folder in (self.folder, *folders, *self.path("cache").glob("*/")):
+                for path in [*folder.glob(".*.part"), *folder.glob(".*.part.blend")]:
+                    self.remove(str(path.relative_to(self.folder)))
+            yield self
+
+    def path(self, *names: str) -> Path:
+        """A file or folder inside OUT."""
+        return self.folder.joinpath(*names)
+
+    def cloud_path(self, frame: int) -> Path:
+        """clouds/NNNN.ply"""
+        return self.path("clouds", f"{frame:04d}.ply")
+
+    def load_checkpoint(self, stage: str, name: str, key: str) -> dict[str, np.ndarray] | None:
+        """The arrays of a checkpoint, or None when it is missing, damaged, or made from other input."""
+        path = self.path("cache", stage, f"{name}.npz")
+        if not path.exists():
+            return None
+        try:
+            arrays, header = store.load(path)
+        except InputError:
+            return None  # a damaged checkpoint is computed again
+        return arrays if header.get("key") == key else None
+
+    def save_checkpoint(self, stage: str, name: str, key: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a checkpoint."""
+        store.save(self.path("cache", stage, f"{name}.npz"), arrays, {"key": key}, compress=False)
+
+    def remove(self, *names: str) -> None:
+        """Remove a result of an earlier run, a file or a folder, if it is there.
+
+        Raises:
+            InputError: it cannot be removed.
+        """
+        for name in names:
+            path = self.path(name)
+            try:
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+            except OSError as error:
+                reason = f"Cannot remove {path}: {error.strerror or error}. Close the program that uses it, or choose another folder."
+                raise InputError(reason) from error
+
+    def remove_other_clouds(self, frames: range) -> None:
+        """Remove the clouds of all other frames."""
+        for path in self.path("clouds").glob("*.ply"):
+            if not path.stem.isdecimal() or int(path.stem) not in frames:
+                path.unlink()
+
+    def write_cloud(self, cloud: PointCloud) -> None:
+        """clouds/NNNN.ply"""
+        write_cloud(
+            self.cloud_path(cloud.frame),
+            xyz_m=cloud.xyz_m,
+            sigma_m=cloud.sigma_m,
+            normals=cloud.normals,
+            intensity=cloud.intensity,
+            rays=cloud.rays,
+        )
+
+    def write_trajectories(self, filtered: Filtered, fps: float) -> None:
+        """trajectories.npz, and trajectories_raw.npz with those that the filters or the user removed."""
+        kept = filtered.kept.arrays() | ({"source": filtered.source} if filtered.kept.track is None else {})
+        for name, arrays in (("", kept), ("_raw", filtered.arrays())):
+            single = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in arrays.items()}
+            store.save(self.path(f"trajectories{name}.npz"), single, {"format": f"tricap-trajectories{name}", "version": 1, "fps": fps})
+
+    def read_run(self) -> dict[str, Any]:
+        """run.json, or an empty table where there is none yet.
+
+        Raises:
+            InputError: it is damaged, or of a newer version.
+        """
+        path = self.path("run.json")
+        return run_json.read_run(path) if path.exists() else {}
+
+    def write_run(self, run: Mapping[str, Any]) -> None:
+        """run.json"""
+        store.write_json(self.path("run.json"), {"format": FORMAT, "version": VERSION, **run})
+
+
+class FitCheckpoints:
+    """The checkpoints of a running fit: cache/fit."""
+
+    def __init__(self, results: Results, key: str) -> None:
+        self._results, self._key = results, key
+
+    def load(self, name: str) -> dict[str, np.ndarray] | None:
+        """The checkpoint of an interrupted fit of the same input, if there is one."""
+        return self._results.load_checkpoint("fit", name, self._key)
+
+    def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a checkpoint, in place of an earlier one of this name."""
+        self._results.save_checkpoint("fit", name, self._key, arrays)
+
+
+def _written(folder: Path) -> list[Path]:
+    """Every path that a command writes to in a folder of results, and the existing folders of checkpoints."""
+    cache = folder / "cache"
+    names = ("run.json", "contours", "points2d.csv", "points3d.csv", NAME, *RESULTS)
+    return [*(folder / name for name in names), cache, *(cache.iterdir() if cache.is_dir() and not cache.is_symlink() else ())]
+
+
+def _inside(path: Path, folder: Path) -> bool:
+    """Whether a path, with its links resolved, lies in the folder."""
+    return not path.is_symlink() or path.resolve().is_relative_to(folder)
+
+
+def _not_from_a_run(folder: Path) -> list[str]:
+    """Files and folders that have the name of a result, or `cache`, although no run has written to the folder.
+
+    A run that was stopped early leaves a cache, and a killed one its lock.
+    """
+    cache = folder / "cache"
+    if (folder / "run.json").exists() or (folder / NAME).exists():
+        return []
+    if cache.is_dir() and all(p.is_dir() and all(f.suffix in (".npz", ".part") for f in p.iterdir()) for p in cache.iterdir()):
+        return []
+    return [name for name in ("cache", *RESULTS) if (folder / name).exists()]

@@ -1,0 +1,63 @@
+"""Reads run.json and validates it once, so that its users can rely on its layout. The file may come from an untrusted source."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..foundation import store
+from ..foundation.errors import InputError
+
+FORMAT, VERSION = "tricap-run", 1
+FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
+    "take": str, "frames": list, "fps": (int, float), "views": list, "settings": dict, "inputs": dict, "stages": dict, "warnings": list,
+}  # fmt: skip
+STAGE_FIGURES = {  # figures that a finished stage must have
+    "measure": ("frames", "points_per_frame", "residual_px", "sigma_mm"),
+    "track": ("trajectories", "mean_length_frames"),
+    "fit": ("joint_sigma_mm",),
+}
+LARGEST_FIGURE = 1e12  # far above every figure of a run
+
+
+def read_run(path: Path) -> dict[str, Any]:
+    """The table in a run.json, with fields of the types in `FIELD_TYPES` and the figures of each finished stage.
+
+    Raises:
+        InputError: it is missing, damaged, or of another version.
+    """
+    run = store.read_json(path)
+    if not isinstance(run, dict) or run.get("format") != FORMAT or run.get("version") != VERSION:
+        raise InputError(f"{path} was not written by this version of Tricap; choose another folder, or --restart.")
+    invalid = next((name for name, kind in FIELD_TYPES.items() if name in run and not isinstance(run[name], kind)), None)
+    invalid = invalid or _invalid_table(run) or _invalid_stage(run.get("stages", {}))
+    if invalid is not None:
+        raise InputError(f"{path} is damaged: “{invalid}” is invalid; remove the file and run again.")
+    return run
+
+
+def _invalid_table(run: Mapping[str, Any]) -> str | None:
+    if any(not isinstance(table, dict) for table in run.get("settings", {}).values()):
+        return "settings"
+    frames = run.get("frames", [0, 0])
+    if len(frames) != 2 or any(type(f) is not int for f in frames) or not 0 <= frames[1] - frames[0]:
+        return "frames"
+    texts = {"inputs": run.get("inputs", {}).values(), "warnings": run.get("warnings", []), "views": run.get("views", [])}
+    return next((name for name, values in texts.items() if any(not isinstance(v, str) for v in values)), None)
+
+
+def _invalid_stage(stages: Mapping[str, Any]) -> str | None:
+    """The first stage with an invalid entry."""
+    for stage, entry in stages.items():
+        if not isinstance(entry, dict) or not isinstance(entry.get("key", ""), str) or not isinstance(entry.get("not_done", ""), str):
+            return stage
+        if "not_done" not in entry and any(not is_figure(entry.get(name)) for name in STAGE_FIGURES.get(stage, ())):
+            return stage
+        counts = entry.get("frames", {}) if stage == "fit" else {}
+        if not isinstance(counts, dict) or any(not is_figure(n) for n in counts.values()):
+            return stage
+    return None
+
+
+def is_figure(value: Any) -> bool:
+    """Whether a value is a finite number of plausible size."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < LARGEST_FIGURE

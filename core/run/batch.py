@@ -1,0 +1,257 @@
+"""Many takes on a Dask cluster: worker processes on this machine, or any scheduler by its address.
+
+A take is one task. A take is not divided among workers: each frame is measured from the depths of the previous frame and tracked from its
+points, and the fit uses all frames, so the frames of a take cannot run in parallel with the same result.
+
+A worker that dies during a take is replaced, and the take resumes from its checkpoints with the same bytes. A take with invalid input does
+not stop the others; neither does a bug, whose traceback is written to a file.
+"""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..results.folder import check_separate_folder
+from . import pipeline
+
+FORMAT, VERSION = "tricap-batch", 1
+TOPIC = "tricap"  # of the workers' progress reports
+WAIT_S = 0.3  # interval at which the tasks are polled
+REPORT_S = 0.5  # between two progress reports of a worker
+CONNECT_S = 10.0  # timeout of the connection to a scheduler
+THREADS_PER_WORKER = 2  # at most: a run gains little from more
+RETRIES = 3  # a worker that dies more often than this probably lacks memory
+MISSING = '`tricap batch` needs Dask, which this Python does not have; install it with: pip install "tricap[batch]".'
+
+Progress = tuple[str, float, float]  # stage, done, total
+
+
+class Status(StrEnum):
+    """How a take ended. The values are those of batch.json."""
+
+    DONE = "done"
+    INVALID_INPUT = "needs mending"
+    BUG = "bug"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Outcome:
+    """How one take ended. `said`: the run in one line, or the sentence of its error."""
+
+    take: str
+    out: str
+    status: Status
+    said: str
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Engine:
+    """Where the takes run: at `scheduler`, or in `workers` local processes. A take whose worker dies is retried `retries` times."""
+
+    scheduler: str | None = None
+    workers: int = 1
+    retries: int = RETRIES
+
+
+def run_batch(
+    takes: Sequence[Path], folder: Path, engine: Engine, overrides: pipeline.Overrides, monitor: Monitor, *, restart: bool = False
+) -> list[Outcome]:
+    """Run all takes. FOLDER/NAME gets the results of the take NAME, FOLDER/batch.json the outcome of each.
+
+    Raises:
+        InputError: Dask is not installed, the scheduler cannot be reached, two takes have one name, or the folder cannot be written to.
+        Cancelled: finished work is saved; the same command resumes.
+    """
+    outs = out_folders(takes, folder)
+    outcomes: dict[int, Outcome] = {}
+    _write(folder, engine, takes, outs, outcomes)
+    progress: dict[str, Progress] = {}
+    with _client(engine) as client:
+        client.subscribe_topic(TOPIC, lambda event: _store_progress(event, progress))
+        plain = {group: dict(table) for group, table in overrides.items()}
+        futures = [
+            client.submit(run_take, str(take.resolve()), str(out), plain, restart, pure=False, retries=engine.retries)
+            for take, out in zip(takes, outs)
+        ]
+        for i, outcome in _as_completed(futures, takes, outs, progress, monitor):
+            outcomes[i] = outcome
+            _write(folder, engine, takes, outs, outcomes)
+    return [outcomes[i] for i in range(len(takes))]
+
+
+def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
+    """The folder of each take's results: named after the take, with its parent folder's name in front where two takes have the same name.
+
+    Raises:
+        InputError: two names are still the same, or results would go into a take.
+    """
+    folder, takes = Path(folder).resolve(), [Path(take).resolve() for take in takes]
+    names = [take.name for take in takes]
+    names = [f"{take.parent.name}_{take.name}" if names.count(take.name) > 1 else take.name for take in takes]
+    twice = next((take for take, name in zip(takes, names) if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"The take {twice} is listed twice, or has the name of another one; rename its folder, or leave it out.")
+    for out in (folder, *(folder / name for name in names)):
+        check_separate_folder(out)
+    return [folder / name for name in names]
+
+
+def run_take(take: str, out: str, overrides: pipeline.Overrides, restart: bool) -> dict[str, Any]:
+    """The task of a worker: run one take like `tricap run`. Returns an Outcome as a table; the task fails only if the worker dies."""
+    began = time.perf_counter()
+    try:
+        with pipeline.open_run(Path(take), Path(out), overrides, restart=restart) as job:
+            pipeline.all_stages(job, Monitor(_reporter(take)))
+            _scene(job)
+        status, said = Status.DONE, _summary_of(job)
+    except InputError as error:
+        status, said = Status.INVALID_INPUT, str(error)
+    except Exception as error:  # the edge of the worker: every error goes into the summary
+        path = Path(out).with_name(f"{Path(out).name}_error.txt")
+        store.write_text(path, traceback.format_exc())
+        status, said = Status.BUG, f"Tricap made a mistake ({type(error).__name__}); please report it with {path}."
+    return asdict(Outcome(take=take, out=out, status=status, said=said, seconds=round(time.perf_counter() - began, 1)))
+
+
+def _summary_of(job: pipeline.Run) -> str:
+    """The run in one line, with its first warning and the number of further ones."""
+    warnings = job.record["warnings"]
+    more = f" ({len(warnings) - 1} more in the report)" if len(warnings) > 1 else ""
+    return f"{job}. Warning: {warnings[0]}{more}" if warnings else str(job)
+
+
+def _scene(job: pipeline.Run) -> None:
+    """Build body.blend in a process of its own, because Blender needs the main thread; nothing without Blender."""
+    if importlib.util.find_spec("bpy") is None:
+        return
+    package = __name__.rpartition(".core.")[0]
+    blend = job.results.path("body.blend")
+    line = [sys.executable, "-m", package, "scene", str(job.results.folder), "--blend", str(blend), "--quiet"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    if done.returncode:
+        job.warn(f"No body.blend was written: {done.stderr.strip().splitlines()[-1].removeprefix('tricap: ')}")
+        job.results.write_run(job.record)
+
+
+def _reporter(take: str) -> Callable[[str, float, float], None] | None:
+    """Report the progress of a take to the client every REPORT_S; None outside of a Dask worker."""
+    from distributed import get_worker
+
+    try:
+        worker, last = get_worker(), [0.0]
+    except ValueError:
+        return None
+
+    def report(stage: str, done: float, total: float) -> None:
+        if time.monotonic() - last[0] >= REPORT_S:
+            last[0] = time.monotonic()
+            worker.log_event(TOPIC, {"take": take, "stage": stage, "done": float(done), "total": float(total)})
+
+    return report
+
+
+def _store_progress(event: tuple[float, Any], progress: dict[str, Progress]) -> None:
+    report = event[1]
+    progress[report["take"]] = (report["stage"], report["done"], report["total"])
+
+
+@contextmanager
+def _client(engine: Engine) -> Iterator[Any]:
+    """A Dask client; a local cluster ends with it."""
+    if importlib.util.find_spec("distributed") is None:
+        raise InputError(MISSING)
+    import dask
+    from distributed import Client, LocalCluster
+
+    if engine.scheduler is not None:
+        try:
+            client = Client(engine.scheduler, timeout=CONNECT_S)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError(f"No Dask scheduler answers at {engine.scheduler}; check the address, or leave --scheduler out.") from error
+        with client:
+            yield client
+        return
+    quiet = {"distributed.logging.distributed": "critical", "distributed.scheduler.allowed-failures": engine.retries}
+    with (
+        dask.config.set(quiet),
+        LocalCluster(
+            n_workers=engine.workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            memory_limit=0,
+            silence_logs=50,
+            env=thread_limits(engine.workers, os.cpu_count() or 1),
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def thread_limits(workers: int, cores: int) -> dict[str, str]:
+    """The environment of each worker: the threads of Tricap and OpenCV that its share of the cores allows."""
+    threads = str(max(1, min(THREADS_PER_WORKER, cores // workers)))
+    return {"TRICAP_THREADS": threads, "OPENCV_FOR_THREADS_NUM": threads}
+
+
+def _as_completed(
+    futures: Sequence[Any], takes: Sequence[Path], outs: Sequence[Path], progress: Mapping[str, Progress], monitor: Monitor
+) -> Iterator[tuple[int, Outcome]]:
+    """The index and the outcome of each take as soon as it has ended."""
+    waiting, reported = dict(enumerate(futures)), dict[str, Progress]()
+    while waiting:
+        ended = [i for i, future in waiting.items() if future.done()]
+        for i in ended:
+            yield i, _outcome(waiting.pop(i), takes[i], outs[i])
+        for take, state in list(progress.items()):
+            if reported.get(take) != state:
+                reported[take] = state
+                monitor.step(f"{Path(take).name}: {state[0]}", *state[1:])
+        monitor.step("takes", len(futures) - len(waiting), len(futures))
+        if waiting and not ended:
+            time.sleep(WAIT_S)
+
+
+def _outcome(future: Any, take: Path, out: Path) -> Outcome:
+    if future.status == "finished":
+        table = future.result()
+        return Outcome(**{**table, "status": Status(table["status"])})
+    error = future.exception()
+    said = f"Its worker died repeatedly ({type(error).__name__}): check that it has enough memory and that every worker has Tricap."
+    return Outcome(take=str(take), out=str(out), status=Status.LOST, said=said)
+
+
+def _write(folder: Path, engine: Engine, takes: Sequence[Path], outs: Sequence[Path], outcomes: Mapping[int, Outcome]) -> None:
+    waiting = [asdict(outcomes[i]) if i in outcomes else {"take": str(takes[i]), "out": str(outs[i]), "status": "waiting"}
+               for i in range(len(takes))]  # fmt: skip
+    where = {"scheduler": engine.scheduler} if engine.scheduler else {"workers": engine.workers}
+    store.write_json(Path(folder) / "batch.json", {"format": FORMAT, "version": VERSION, **where, "takes": waiting})
+
+
+def summary(outcomes: Sequence[Outcome]) -> list[str]:
+    """A table with a line for each take, and the number of takes by status."""
+    width = max(len(Path(o.out).name) for o in outcomes)
+    lines = [f"{Path(o.out).name:<{width}}  {o.status:<13}  {o.seconds:8.1f} s  {o.said}" for o in outcomes]
+    counts = {status: sum(o.status == status for o in outcomes) for status in Status}
+    return [*lines, f"{len(outcomes)} takes: " + ", ".join(f"{n} {status}" for status, n in counts.items() if n)]
+
+
+def as_json(outcomes: Sequence[Outcome]) -> str:
+    """The outcomes as JSON."""
+    return json.dumps([asdict(o) for o in outcomes], indent=1, ensure_ascii=False)

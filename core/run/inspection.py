@@ -1,0 +1,200 @@
+"""What a run found, read back to be looked at: matched points with their patches, trajectories with what became of them, outlines.
+
+Nothing is computed anew here but projections. What lies only in the checkpoints (patches, residuals) is missing once they are deleted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..geometry.camera import Camera
+from ..geometry.raster import rasterize
+from ..images.interlace import RowGrid
+from ..matching.patches import patch_offsets
+from ..matching.seeds import approximations_at_depth
+from ..motion.formats.ply import read_ply
+from ..tracking.settings import TrackStatus
+
+SAME_M = 2e-6  # a PLY file has single precision
+CHECKPOINT = {  # of a frame's surface: what is shown of it
+    "cloud_xyz_m": ("f", "N3"), "grid": ("iu", "4"), "field_xy": ("f", "NK2"), "field_shape": ("f", "NK22"), "field_cell": ("iu", "N"),
+    "field_residual_px": ("f", "N"), "field_correlation": ("f", "N"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FramePoints:
+    """The N points of a frame's cloud as K views saw them. Full-frame pixels."""
+
+    xyz_m: np.ndarray  # (N, 3)
+    sigma_m: np.ndarray  # (N,)
+    xy_px: np.ndarray  # (N, K, 2) where they were matched; their projections where the checkpoint is gone
+    middle_px: np.ndarray  # (N, K, 2) of the patches; NaN without checkpoint
+    shape: np.ndarray  # (N, K, 2, 2) of the patches, in rows' pixels; NaN without checkpoint
+    residual_px: np.ndarray  # (N,) NaN without checkpoint
+    correlation: np.ndarray  # (N,) NaN without checkpoint
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class TrackHistory:
+    """All trajectories before filters and corrections."""
+
+    frames: np.ndarray  # (T,)
+    xyz_m: np.ndarray  # (T, N, 3) NaN: not seen
+    status: np.ndarray  # (T, N) TrackStatus; MEASURED where it was kept
+
+    @property
+    def kept(self) -> np.ndarray:
+        """(T, N) positions that the filters and the user left."""
+        return (self.status == TrackStatus.MEASURED) & np.isfinite(self.xyz_m[..., 0])
+
+    @property
+    def removed(self) -> np.ndarray:
+        """(T, N) positions that they took out."""
+        return (self.status != TrackStatus.MEASURED) & np.isfinite(self.xyz_m[..., 0])
+
+    def tails(self, camera: Camera, frame: int, length: int, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What a camera sees of the last `length` frames: segments (M, 2, 2) between neighbouring frames, their trajectories (M,), and how
+        old they are, 0…1 (M,). A segment belongs when `which` (T, N) holds at its newer end."""
+        now = int(np.searchsorted(self.frames, frame))
+        if now >= len(self.frames) or self.frames[now] != frame:
+            return np.zeros((0, 2, 2)), np.zeros(0, dtype=np.int64), np.zeros(0)
+        first = max(0, now - length)
+        xy = camera.project(self.xyz_m[first : now + 1])
+        there = np.isfinite(xy[..., 0])
+        near = np.diff(self.frames[first : now + 1]) == 1
+        t, n = np.nonzero(there[1:] & there[:-1] & which[first + 1 : now + 1] & near[:, None])
+        return np.stack([xy[t, n], xy[t + 1, n]], axis=1), n, 1 - (t + 1) / max(now - first, 1)
+
+    def at(self, camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (N, 2) in a frame, NaN where not seen, and what became of them there (N,) TrackStatus."""
+        now = np.flatnonzero(self.frames == frame)
+        if not len(now):
+            return np.full((self.status.shape[1], 2), np.nan), np.zeros(self.status.shape[1], dtype=np.int8)
+        return camera.project(self.xyz_m[now[0]]), self.status[now[0]]
+
+
+def read_points(out: Path, frame: int, cameras: Sequence[Camera], rows: RowGrid) -> FramePoints | None:
+    """The points of a frame; None where it has no cloud.
+
+    Raises:
+        InputError: the cloud is damaged.
+    """
+    path = Path(out) / "clouds" / f"{frame:04d}.ply"
+    if not path.is_file():
+        return None
+    ply = read_ply(path)
+    xyz, sigma = ply.xyz_m, ply.vertex.get("sigma", np.zeros(len(ply.xyz_m))).astype(np.float64)
+    n, k = len(xyz), len(cameras)
+    values = dict(
+        xy_px=np.stack([camera.project(xyz) for camera in cameras], axis=1).reshape(n, k, 2), middle_px=np.full((n, k, 2), np.nan),
+        shape=np.full((n, k, 2, 2), np.nan), residual_px=np.full(n, np.nan), correlation=np.full(n, np.nan),
+    )  # fmt: skip
+    _add_matches(values, Path(out) / "cache" / "surface" / f"{frame:04d}.npz", xyz, rows)
+    return FramePoints(xyz_m=xyz, sigma_m=sigma, **values)
+
+
+def read_removed(out: Path, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the views (M, K, 2) saw what the surface's filters took out of a frame, and which of `FILTERS` did so, 1 for the first (M,).
+
+    Nothing where the checkpoint is deleted, damaged or of another version.
+    """
+    try:
+        path = Path(out) / "cache" / "surface" / f"{frame:04d}.npz"
+        saved, _ = store.load(path)
+        store.check_layout(path, saved, removed_px=("f", "MK2"), removed_why=("u", "M"))
+    except InputError:
+        return np.zeros((0, 0, 2)), np.zeros(0, dtype=np.uint8)
+    return saved["removed_px"].astype(np.float64), saved["removed_why"]
+
+
+def _add_matches(values: dict[str, np.ndarray], path: Path, xyz: np.ndarray, rows: RowGrid) -> None:
+    """Put in what the checkpoint knows of the same points; the user's corrections may have left fewer than it has."""
+    try:
+        saved, _ = store.load(path)
+        store.check_layout(path, saved, **CHECKPOINT)
+        found = saved["cloud_xyz_m"].astype(np.float32)
+        order = np.lexsort(found.T[::-1])
+        mine = np.searchsorted(_key(found[order]), _key(xyz.astype(np.float32)))
+        row = order[np.minimum(mine, len(order) - 1)] if len(order) else np.zeros(len(xyz), dtype=np.int64)
+        spacing, _, width, _ = (int(v) for v in saved["grid"])
+    except InputError:  # deleted, damaged or of another version: the cloud alone is shown
+        return
+    if not len(order) or saved["field_xy"].shape[1] != values["xy_px"].shape[1] or min(spacing, width) < 1:
+        return
+    known = np.flatnonzero(np.abs(found[row] - xyz).max(axis=1) < SAME_M)
+    row = row[known]
+    xy, shape, cell = saved["field_xy"][row], saved["field_shape"][row].astype(np.float64), saved["field_cell"][row]
+    step = np.array([spacing, max(1, round(spacing / rows.step))])
+    reference = int(np.abs(shape - np.eye(2)).max(axis=(0, 2, 3)).argmin()) if len(row) else 0
+    offset = xy[:, reference] - np.stack([cell % width, cell // width], axis=1) * step
+    values["xy_px"][known] = rows.to_frame(xy)
+    values["middle_px"][known] = rows.to_frame(xy - np.einsum("nkij,nj->nki", shape, offset))
+    values["shape"][known] = shape
+    values["residual_px"][known], values["correlation"][known] = saved["field_residual_px"][row], saved["field_correlation"][row]
+
+
+def _key(xyz: np.ndarray) -> np.ndarray:
+    """Rows (N, 3) float32 as one sortable value each."""
+    return np.ascontiguousarray(xyz).view([("x", "f4"), ("y", "f4"), ("z", "f4")]).reshape(-1)
+
+
+def patch_boxes(
+    points: FramePoints, row: int, cameras: Sequence[Camera], reference: int, rows: RowGrid, patch_px: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A point's patch in every view (K, 4, 2): where matching starts, as if the surface faced the reference camera; and as it was matched.
+
+    NaN without checkpoint.
+    """
+    _, _, (half_w, half_h) = patch_offsets(patch_px, rows.step)
+    corners = np.array([[-half_w, -half_h], [half_w, -half_h], [half_w, half_h], [-half_w, half_h]]) * 1.0
+    middle = rows.from_frame(points.middle_px[row])
+    found = middle[:, None] + np.einsum("kij,cj->kci", points.shape[row], corners)
+    depth = cameras[reference].to_camera(points.xyz_m[row])[2]
+    start = approximations_at_depth(cameras, reference, rows, middle[None, reference], np.array([depth]))
+    begun = start.xy[0][:, None] + np.einsum("kij,cj->kci", start.shape[0], corners)
+    return rows.to_frame(begun), rows.to_frame(found)
+
+
+def read_tracks(out: Path) -> TrackHistory | None:
+    """All trajectories of a run, None where there are none.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = Path(out) / "trajectories_raw.npz"
+    if not path.is_file():
+        return None
+    arrays, _ = store.load(path)
+    store.check_layout(path, arrays, frames=("iu", "T"), xyz_m=("f", "TN3"), status=("iu", "TN"))
+    if not np.isin(arrays["status"], list(TrackStatus)).all() or (np.diff(arrays["frames"].astype(np.int64)) < 1).any():
+        raise InputError(f"{path} is damaged: frames or states that cannot be; run the tracking again.")
+    return TrackHistory(frames=arrays["frames"], xyz_m=arrays["xyz_m"].astype(np.float64), status=arrays["status"])
+
+
+def body_outline(out: Path, frame: int, camera: Camera) -> list[np.ndarray]:
+    """The outline of the fitted body's skin in a camera's picture: closed polylines (M, 2); none where there is no skin.
+
+    Raises:
+        InputError: the skin's file is damaged.
+    """
+    path = Path(out) / "skin" / f"{frame:04d}.ply"
+    if not path.is_file():
+        return []
+    skin = read_ply(path)
+    raster = rasterize(camera, skin.xyz_m, skin.triangles, back_faces=True)
+    mask = np.zeros(raster.shape, dtype=np.uint8)
+    mask.reshape(-1)[raster.sample] = 1
+    contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    return [_smoothed(c[:, 0].astype(np.float64)) for c in contours if len(c) > 8]
+
+
+def _smoothed(loop: np.ndarray) -> np.ndarray:
+    """A closed chain of pixels (M, 2) without its stairs."""
+    weights = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
+    return sum(w * np.roll(loop, k, axis=0) for k, w in zip(range(-2, 3), weights))  # type: ignore[return-value]

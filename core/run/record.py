@@ -1,0 +1,168 @@
+"""The content of run.json: the take, settings and inputs of a run, the command that repeats it, and figures of its results.
+
+frames.csv: how good every frame is, in one row, for the panel's graph and for whoever looks for the bad ones.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..body.motion import FITTED, BodyFit
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.settings import to_table
+from ..surface.frames import FrameNote
+from ..take.take import Footage
+from ..tracking.settings import TrackStatus
+from ..tracking.trajectories import Trajectories
+from .stages import command_of
+
+
+def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The record of a run, without stages and warnings yet."""
+    take = footage.take
+    return {
+        "take": str(take.folder),
+        "frames": [footage.frames.start, footage.frames.stop],
+        "fps": take.fps,
+        "interlaced": take.interlaced,
+        "views": [v.name for v in take.views],
+        "reference_view": take.reference_view,
+        "model": take.body_model,
+        "settings": {name: to_table(value) for name, value in settings.items()},
+        "inputs": {"take.toml": store.digest(take.folder / "take.toml"), take.rig_path.name: store.digest(take.rig_path)},
+        "rig": {k: v for k, v in footage.rig.metadata.items() if isinstance(v, (str, int, float))},
+        "repeat": command_of(footage, settings),
+        "stages": {},
+        "warnings": [],
+    }
+
+
+def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[str, Any], list[str]]:
+    """Figures of the kept trajectories: number, length, sigma, counts of the reasons for removals; and warnings."""
+    seen, started = kept.seen, sum(reasons.values())
+    count = int(seen.shape[1] if kept.track is None else len(np.unique(kept.track[seen])))
+    why = {TrackStatus(r).words: n for r, n in sorted(reasons.items(), key=lambda found: -found[1])}
+    warnings = []
+    if kept.omitted:
+        warnings.append(
+            f"The {kept.omitted} shortest of {count + kept.omitted} trajectories are left out: the table of so many frames would be too "
+            "large; run the take in pieces (--frames) to get all."
+        )
+    if not count and started:
+        warnings.append(f"All {started} trajectories were removed, most of them as “{next(iter(why))}”.")
+    figures = {
+        "started": started,
+        "trajectories": count,
+        "points_per_frame": float(seen.sum(axis=1).mean()),
+        "mean_length_frames": float(seen.sum() / count) if count else 0.0,
+        "sigma_mm": 1e3 * median(kept.sigma_m[seen]),
+        "reasons": why,
+    }
+    return figures, warnings
+
+
+def median(values: Sequence[float] | np.ndarray) -> float:
+    """The median of the finite values, 0 if there are none."""
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    return float(np.median(finite)) if len(finite) else 0.0
+
+
+COLUMNS = ("points", "sigma_mm", "residual_px", "tracks", "track_sigma_mm", "fit_sigma0", "joint_sigma_mm")
+FEWER_IS_WORSE = ("points", "tracks")
+WORDS = {
+    "points": "few points",
+    "sigma_mm": "points uncertain",
+    "residual_px": "rays miss",
+    "tracks": "few tracks",
+    "track_sigma_mm": "tracks uncertain",
+    "fit_sigma0": "body beside the points",
+    "joint_sigma_mm": "joints uncertain",
+}
+BAD = 1.5  # times worse than in half of the frames
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameTable:
+    """T frames. NaN where a stage did not run or had nothing in a frame; medians over the frame's points."""
+
+    frames: np.ndarray  # (T,)
+    values: dict[str, np.ndarray]  # (T,) by COLUMNS
+    fit: tuple[str, ...]  # (T,) "" where no body was fitted, else a status of the fit
+
+    def badness(self) -> tuple[np.ndarray, tuple[str, ...]]:
+        """How many times worse than in half of the frames each frame is (T,), in what is worst about it, and what that is in words."""
+        ratio = np.ones((len(COLUMNS), len(self.frames)))
+        for i, name in enumerate(COLUMNS):
+            value = self.values[name]
+            known = np.isfinite(value) & (value > 0)
+            if known.any():
+                middle = float(np.median(value[known]))
+                worse = middle / np.maximum(value, 0.01 * middle) if name in FEWER_IS_WORSE else value / middle
+                ratio[i] = np.where(np.isfinite(value), worse, 1.0)
+        worst = ratio.argmax(axis=0) if len(self.frames) else np.zeros(0, dtype=int)
+        much = ratio.max(axis=0)
+        words = [WORDS[COLUMNS[k]] if r >= BAD else "" for k, r in zip(worst, much)]
+        for t, state in enumerate(self.fit):
+            if state not in ("", FITTED):
+                much[t], words[t] = max(much[t], 2 * BAD), f"fit {state}"
+        return much, tuple(words)
+
+
+def frame_table(notes: Sequence[FrameNote], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
+    """The table of a run, as far as it is; points count as measured, before corrections. Without measured frames, those of the body."""
+    frames = np.array([n.frame for n in notes] if notes or body is None else body.motion.frames, dtype=np.int64)
+    values = {name: np.full(len(frames), np.nan) for name in COLUMNS}
+    for i, note in enumerate(notes):
+        values["points"][i], values["sigma_mm"][i], values["residual_px"][i] = note.points, 1e3 * note.sigma_m, note.residual_px
+    if trajectories is not None:
+        for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
+            at = np.searchsorted(frames, trajectories.frames[t])
+            values["tracks"][at] = trajectories.seen[t].sum()
+            values["track_sigma_mm"][at] = 1e3 * _median(trajectories.sigma_m[t][trajectories.seen[t]])
+    fit = [""] * len(frames)
+    if body is not None:
+        motion = body.motion
+        for t in np.flatnonzero(np.isin(motion.frames, frames)):
+            at = int(np.searchsorted(frames, motion.frames[t]))
+            fit[at] = motion.status[t]
+            values["fit_sigma0"][at], values["joint_sigma_mm"][at] = motion.sigma0[t], 1e3 * _median(motion.joint_sigma_m[t])
+    return FrameTable(frames=frames, values=values, fit=tuple(fit))
+
+
+def write_frame_table(path: Path, table: FrameTable) -> None:
+    """Write frames.csv; an empty cell is what is not known."""
+    lines = [",".join(("frame", *COLUMNS, "fit"))]
+    for t, frame in enumerate(table.frames):
+        cells = [f"{v:.4g}" if np.isfinite(v) else "" for v in (table.values[name][t] for name in COLUMNS)]
+        lines.append(",".join((str(int(frame)), *cells, table.fit[t])))
+    store.write_text(path, "\n".join(lines) + "\n")
+
+
+def read_frame_table(path: Path) -> FrameTable:
+    """Read frames.csv.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    try:
+        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8"))))
+        return FrameTable(
+            frames=np.array([int(r["frame"]) for r in rows], dtype=np.int64),
+            values={name: np.array([float(r[name]) if r[name] else np.nan for r in rows]) for name in COLUMNS},
+            fit=tuple(r["fit"] or "" for r in rows),
+        )
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}; run the take again.") from error
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
+        raise InputError(f"{path} is damaged; run the take again.") from error
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else np.nan

@@ -1,0 +1,149 @@
+"""The inputs of each stage, defined once: a run removes, and the panel marks as outdated, exactly the results that a change affects.
+
+The key of a stage is a digest of everything that its result depends on, including the earlier stages. run.json stores the key with which
+each stage ran; a stage is outdated when its current key differs. Footage enters a key by file names, sizes and modification times (an
+export of the same size is another file); checkpoints compare its content.
+"""
+
+import json
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..body.model_file import model_files
+from ..fitting.settings import ALGORITHM
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.settings import to_table
+from ..surface import measure
+from ..take.take import NO_BODY, Footage, Seeds, Take, View
+from ..tracking import track
+
+STAGES = ("measure", "track", "fit")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageInput:
+    """The inputs and files of a stage that no earlier stage has."""
+
+    settings: tuple[str, ...]  # groups of knobs
+    take: Callable[[Footage], Any]  # the parts of take.toml, rig.toml and the footage, as values with a `repr`
+    files: tuple[str, ...]  # results in OUT, which a run removes once they are outdated
+
+
+def _measure_input(footage: Footage) -> Any:
+    """The images, the cameras, and the person's masks."""
+    take = footage.take
+    regions = [c for c in _corrections(take) if c[0] == "region"]
+    views = [(v.name, v.offset_frames) for v in take.views]
+    files = [[_stamp(path) for path in s.files()] for s in footage.sequences]
+    rig = store.digest(take.rig_path)
+    rows = take.interlaced, take.first_field
+    person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v)) for v in take.views]
+    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.seeds), regions, person, measure.ALGORITHM
+
+
+def _person_files(take: Take, view: View) -> Any:
+    pattern = view.mask or view.masks or view.background
+    return [_stamp(path) for path in sorted(take.folder.glob(pattern))] if pattern else []
+
+
+def _track_input(footage: Footage) -> Any:
+    return footage.take.fps, [c for c in _corrections(footage.take) if c[0] == "trajectory"], track.ALGORITHM
+
+
+def _fit_input(footage: Footage) -> Any:
+    take = footage.take
+    model = NO_BODY if take.no_body else take.body_model
+    own = store.digest(*model_files(model)) if model and model.endswith(".toml") else ""
+    named = Path(model).name if model and own else model
+    return named, own, take.locked, sorted(take.limits.items()), [_clicked(k) for k in take.keyframes], _keypoints(take), ALGORITHM
+
+
+STAGE_INPUTS: dict[str, StageInput] = {
+    "measure": StageInput(settings=("timing", "enhance", "matching", "growing", "surface"), take=_measure_input, files=()),
+    "track": StageInput(settings=("tracking",), take=_track_input, files=("trajectories.npz", "trajectories_raw.npz")),
+    "fit": StageInput(
+        settings=("fitting", "skin"),
+        take=_fit_input,
+        files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
+    ),
+}
+# Groups of settings in no stage's key: the outlines of `tricap contour` enter the fit's key by their content, chosen points enter none.
+WITHOUT_STAGE = ("contour", "key_points")
+STAGE_FILES = tuple(name for own in STAGE_INPUTS.values() for name in own.files)
+
+
+def stage_keys(footage: Footage, settings: Mapping[str, Any], out: Path) -> dict[str, str]:
+    """The key of every stage, for opened footage, the settings of a run, and the contours in its folder OUT, whose digest is the
+    second word of the fit's key.
+
+    Raises:
+        InputError: footage, rig or model are missing.
+    """
+    keys, before = {}, ""
+    try:
+        for stage, own in STAGE_INPUTS.items():
+            inputs = [settings[name] for name in own.settings], own.take(footage)
+            before = keys[stage] = store.digest(before, repr(inputs))
+        contours = sorted((out / "contours").glob("*.csv"))
+        keys["fit"] += f" {store.digest(*contours)}" if contours else ""
+    except OSError as error:
+        raise InputError(f"Cannot read {error.filename}: {error.strerror or error}.") from error
+    return keys
+
+
+def command_of(footage: Footage, settings: Mapping[str, Any]) -> str:
+    """The command that repeats the run; it also repeats the settings of take.toml, which is harmless."""
+    options = [
+        f"--set {group}.{name}={shlex.quote(json.dumps(value) if isinstance(value, bool) else str(value))}"
+        for group, chosen in settings.items()
+        for name, value in to_table(chosen).items()
+        if value != to_table(type(chosen)())[name]
+    ]
+    frames = f"--frames {footage.frames.start}:{footage.frames.stop}"
+    return " ".join(["tricap run", shlex.quote(str(footage.take.folder)), "--out OUT", frames, *options])
+
+
+def stage_of(group: str) -> str:
+    """The first stage that a group of settings affects."""
+    return next(stage for stage, own in STAGE_INPUTS.items() if group in own.settings)
+
+
+def valid_stages(run: Mapping[str, Any], keys: Mapping[str, str], *, ignore_contours: bool = False) -> dict[str, Any]:
+    """The stages in a run.json that ran with these keys; the report is valid if the fit is, and so are tracks that were guided by the body.
+
+    `ignore_contours`: also accept a body that was fitted with other contours, or none.
+    """
+    stages: dict[str, Any] = run.get("stages", {})
+    keys = {**keys, "report": keys["fit"]}
+
+    def is_valid(name: str, entry: Mapping[str, Any]) -> bool:
+        key, now = str(entry.get("key", "")), keys.get(name, "")
+        return bool(key) and (key == now or (ignore_contours and key.partition(" ")[0] == now.partition(" ")[0]))
+
+    valid = {name: entry for name, entry in stages.items() if is_valid(name, entry)}
+    if "fit" not in valid and "tracked_again" in stages.get("fit", {}):
+        valid.pop("track", None)
+    return valid
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    """Name, size, and modification time in whole seconds, the resolution of some file systems."""
+    state = path.stat()
+    return path.name, state.st_size, state.st_mtime_ns // 1_000_000_000
+
+
+def _keypoints(take: Take) -> Any:
+    return [(repr(s), [_stamp(path) for path in sorted(take.folder.glob(s.files))]) for s in take.keypoints]
+
+
+def _clicked(seeds: Seeds) -> Any:
+    clicks = [*seeds.joints.items(), *((f"surface {i}", at) for i, at in enumerate(seeds.surface))]
+    return seeds.frame, [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
+
+
+def _corrections(take: Take) -> list[Any]:
+    return [(c.kind, c.view, c.frames, c.xy_px.tolist()) for c in take.corrections]

@@ -1,0 +1,362 @@
+"""Surface measurement of a whole take: frame after frame from the frame of the clicks, each frame's depths from the one before.
+
+Every frame leaves a checkpoint whose key covers the images, the rig, the settings and the frame before, so that a killed run goes on where
+it stopped and ends with the same numbers.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from ..foundation import store
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..foundation.threads import in_threads
+from ..images.enhance import EnhanceSettings, enhanced
+from ..images.interlace import frame_time_s
+from ..images.retime import retimed
+from ..images.sampling import SplineImage
+from ..images.sequence import IMAGE_ENDINGS
+from ..matching import foreground as fg
+from ..matching.constraints import constrain
+from ..matching.grid import TemplateGrid, template_grid
+from ..matching.least_squares import MatchingSettings
+from ..matching.occlusion_check import in_doubt
+from ..matching.region_growing import GrowingSettings, TripletField, grow
+from ..matching.seeds import Approximations, sweep_seeds
+from ..matching.voronoi_scan import scan
+from ..results.folder import Results
+from ..take.clicked_points import clicked_depth, with_clicked
+from ..take.person_masks import silhouette_file, silhouettes, told_by
+from ..take.take import Footage, footage_frames
+from .cloud import IN_DOUBT, PointCloud, SurfaceSettings, point_cloud, why_removed
+
+ALGORITHM = "surface 18"  # part of every key: raise it when the same input gives other numbers
+MIN_MOVED = 20  # seeds
+FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
+
+
+class NothingMeasured(InputError):
+    """The first frame of a take gave no surface. `why` is what the footage says about it, if it was asked."""
+
+    def __init__(self, frame: int, why: str = "") -> None:
+        self.frame, self.why = frame, why
+        guess = "no texture is found alike in all views. Check that rig.toml belongs to this footage and that the views are not swapped, "
+        super().__init__(f"No surface could be measured in frame {frame}: {why or guess + 'or click surface seeds.'}")
+
+    def __reduce__(self) -> tuple[type, tuple[int, str]]:
+        return type(self), (self.frame, self.why)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameImages:
+    """The rows of one frame that are measured, of all views, ready for matching."""
+
+    grey: list[np.ndarray]
+    spline: list[SplineImage]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MeasuredFrame:
+    """The surface of one frame: the matched field, which tracking needs, and the cloud."""
+
+    frame: int
+    field: TripletField
+    cloud: PointCloud
+    foreground: fg.Foreground
+    key: str
+    removed_px: np.ndarray  # (M, K, 2) full-frame pixels of the points that the filters took out
+    removed_why: np.ndarray  # (M,) see `why_removed`
+
+
+def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
+    """The measured rows (h', w) float32 of all views at one frame, of views that are late at the moment of the others.
+
+    What a late view showed before and after is asked of the same rows of the images before and after.
+
+    Raises:
+        InputError: see `Footage.read`.
+    """
+    grid, step = footage.take.rows_at(frame), footage.take.field_layout.per_image
+
+    def neighbour(k: int, at: int) -> np.ndarray | None:
+        number = footage.number(k, at)
+        return grid.rows(footage.sequences[k].read(number)) if 0 <= number < footage.sequences[k].count else None
+
+    rows = [grid.rows(image) for image in footage.read(frame)]
+    for k, late in enumerate(footage.delay_images):
+        if late:
+            rows[k] = retimed(rows[k], neighbour(k, frame - step), neighbour(k, frame + step), late)
+    return rows
+
+
+def load_images(footage: Footage, frame: int, enhance: EnhanceSettings | None = None) -> FrameImages:
+    """Read a frame and prepare it; what is matched may be enhanced, the grey values stay as they were taken.
+
+    Raises:
+        InputError: see `Footage.read`.
+    """
+    grey = measured_rows(footage, frame)
+    matched = enhanced(grey, enhance, row_step=footage.take.rows_at(frame).step) if enhance is not None else grey
+    return FrameImages(grey=grey, spline=in_threads(SplineImage, matched))
+
+
+def measure_frames(
+    footage: Footage,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    surface: SurfaceSettings,
+    results: Results,
+    monitor: Monitor,
+    enhance: EnhanceSettings | None = None,
+) -> Iterator[MeasuredFrame]:
+    """Measure all frames: from the frame of the clicks to the end, then from it to the beginning.
+
+    Raises:
+        InputError: the images cannot be read.
+        NothingMeasured: nothing of a person can be measured in the first frame.
+    """
+    take = footage.take
+    first = take.seeds.frame if take.seeds.frame in footage.frames else footage.frames.start
+    order = [*range(first, footage.frames.stop), *range(first - 1, footage.frames.start - 1, -1)]
+    base = store.digest(
+        ALGORITHM,
+        repr((matching, growing, surface.of_measuring, enhance)),
+        take.rig_path,
+        repr((take.interlaced, take.first_field, take.reference_view, _seed_table(footage))),
+        repr([(v.name, v.offset_frames) for v in take.views]),
+        repr(footage.delay_images) if any(footage.delay_images) else "",
+    )
+    start = before = None
+    for done, frame in enumerate(order):
+        part = monitor.part("surface", done, len(order))
+        part.step("surface", 0, 1)
+        if frame == first - 1:
+            before = start
+        known = [before.key] if before else _image_digests(footage, _furthest_frame(footage, frame))  # the room is found with that frame
+        key = store.digest(base, *known, str(frame), *_image_digests(footage, frame), *_silhouette_digests(footage, frame))
+        measured = read_checkpoint(footage, results, frame, key)
+        if measured is None:
+            measured = _measure(footage, matching, growing, surface, frame, before, key, part, enhance)
+            _checkpoint(results, measured)
+        start = start or measured
+        before = measured
+        yield measured
+
+
+def _image_digests(footage: Footage, frame: int) -> list[str]:
+    """What identifies the images of a frame: the content of image files; the size and date of a movie. With views put to the others'
+    moment the frames before and after count as well."""
+    step = footage.take.field_layout.per_image
+    near = (frame - step, frame, frame + step) if any(footage.delay_images) else (frame,)
+    parts = []
+    for path in (path for f in near if f in footage.frames or f == frame for path in footage.files(f)):
+        try:
+            state = path.stat()
+            parts.append(store.digest(path) if path.suffix.lower() in IMAGE_ENDINGS else f"{state.st_size} {state.st_mtime_ns}")
+        except OSError as error:
+            raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
+    return parts
+
+
+def _silhouette_digests(footage: Footage, frame: int) -> list[str]:
+    """The content of the masks and backgrounds of a frame."""
+    told = (silhouette_file(footage, k, frame) for k in range(len(footage.take.views)))
+    return [store.digest(path) for path in told if path is not None and path.is_file()]
+
+
+def _seed_table(footage: Footage) -> list[tuple[str, list[tuple[str, list[float]]]]]:
+    seeds = footage.take.seeds
+    clicks = [*seeds.joints.items(), *((f"surface {i}", at) for i, at in enumerate(seeds.surface))]
+    return [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
+
+
+def _measure(
+    footage: Footage,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    surface: SurfaceSettings,
+    frame: int,
+    before: MeasuredFrame | None,
+    key: str,
+    monitor: Monitor,
+    enhance: EnhanceSettings | None,
+) -> MeasuredFrame:
+    take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
+    images = load_images(footage, frame, enhance)
+    grid = template_grid(images.spline[ref].shape, take.rows_at(frame), growing.spacing_px)
+    person = silhouettes(footage, images.grey, frame, first=before is None)
+    if before is None:
+        where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, person, monitor)
+    else:
+        where = fg.after(cameras[ref].to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
+        seeds = _swept(footage, images, grid, matching, growing, where.depth_range_m, monitor)
+    told = told_by(footage)
+    where = replace(where, silhouettes=person, method=f"{where.method}, {told}" if told else where.method)
+    cover = scan if growing.method == "published" else grow
+    field = cover(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
+    field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor, pairs=growing.pairs)
+    whole = _single(field)
+    why = why_removed(whole, cameras[ref], ref, surface)
+    clean = np.flatnonzero(why == 0)
+    why[clean[in_doubt(whole.select(clean), images.spline, cameras, ref, matching)]] = IN_DOUBT
+    field, removed = whole.select(why == 0), whole.grid.rows.to_frame(whole.xy[why > 0]).astype(np.float32)
+    cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
+    if before is None and not len(cloud.xyz_m):
+        raise NothingMeasured(frame)
+    return MeasuredFrame(
+        frame=frame,
+        field=field,
+        cloud=cloud,
+        foreground=replace(where, silhouettes=()),
+        key=key,
+        removed_px=removed,
+        removed_why=why[why > 0],
+    )
+
+
+def _swept(
+    footage: Footage,
+    images: FrameImages,
+    grid: TemplateGrid,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    depth_range_m: tuple[float, float] | None,
+    monitor: Monitor,
+) -> Approximations:
+    """The automatic seeds of a frame within a range of depths."""
+    return sweep_seeds(
+        images.spline,
+        footage.rig.cameras,
+        footage.take.reference,
+        grid,
+        matching,
+        spacing_px=growing.seed_spacing_px,
+        depth_range_m=depth_range_m,
+        monitor=monitor,
+        pairs=growing.pairs,
+    )
+
+
+def first_seeds(
+    footage: Footage,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    frame: int,
+    monitor: Monitor,
+    enhance: EnhanceSettings | None = None,
+) -> tuple[fg.Foreground, Approximations]:
+    """Where the person is in one frame, and the surface seeds there."""
+    images = load_images(footage, frame, enhance)
+    grid = template_grid(images.spline[footage.take.reference].shape, footage.take.rows_at(frame), growing.spacing_px)
+    person = silhouettes(footage, images.grey, frame, first=True)
+    return _first_foreground(footage, images, grid, matching, growing, frame, person, monitor)
+
+
+def _first_foreground(
+    footage: Footage,
+    images: FrameImages,
+    grid: TemplateGrid,
+    matching: MatchingSettings,
+    growing: GrowingSettings,
+    frame: int,
+    person: tuple[fg.Silhouette, ...],
+    monitor: Monitor,
+) -> tuple[fg.Foreground, Approximations]:
+    """Where the person is in the first frame, inside silhouettes if there are any, and the seeds there."""
+    cameras, ref, take = footage.rig.cameras, footage.take.reference, footage.take
+
+    def sweep(depth_range_m: tuple[float, float] | None) -> Approximations:
+        found = _swept(footage, images, grid, matching, growing, depth_range_m, monitor)
+        xyz = cameras[ref].points_at_depth(take.rows_at(frame).to_frame(found.xy[:, ref]), found.depth_m)
+        beside = fg.Foreground(depth_range_m=(0.0, np.inf), method="", silhouettes=person).excludes(xyz, np.zeros((len(xyz), 3, 3)))
+        return Approximations(**{f.name: getattr(found, f.name)[~beside] for f in fields(Approximations)})
+
+    swept = sweep(None)
+    room, moving = _room_and_person(footage, images, swept, frame)
+    clicks = [*take.seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface))]
+    depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
+    if clicks and frame == take.seeds.frame:
+        where = fg.around_clicks(depth)
+    elif clicks:
+        where = fg.since_clicks(depth, frame_time_s(abs(frame - take.seeds.frame), take.fps), moving)
+    elif len(moving):
+        where = fg.nearest_surface(moving)
+    else:
+        where = fg.Foreground(depth_range_m=(0.05, 1e3), method="everything")
+    where = replace(where, planes=room)
+    seeds = sweep(where.depth_range_m)
+    if take.seeds.surface and frame == take.seeds.frame:
+        seeds = with_clicked(footage, images.spline, seeds, matching)
+    return where, seeds
+
+
+def _furthest_frame(footage: Footage, frame: int) -> int:
+    """The frame of the take, on the same rows, that differs most in time, whether it is to be measured or not."""
+    step = footage.take.field_layout.per_image
+    return max((f for f in footage_frames(footage.take, footage.sequences) if (f - frame) % step == 0), key=lambda f: abs(f - frame))
+
+
+def _room_and_person(footage: Footage, images: FrameImages, seeds: Approximations, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Planes (P, 4) of floor and walls, and the depths of seeds that are not on them: those that moved, unless these are too few to tell.
+
+    What moved is what the frame furthest in time does not show at the same place.
+    """
+    ref, camera = footage.take.reference, footage.rig.cameras[footage.take.reference]
+    other = _furthest_frame(footage, frame)
+    if other == frame or not len(seeds.depth_m):
+        return np.zeros((0, 4)), seeds.depth_m
+    later = load_images(footage, other).grey[ref]
+    xyz = camera.points_at_depth(footage.take.rows_at(frame).to_frame(seeds.xy[:, ref]), seeds.depth_m)
+    still = fg.unchanged(images.grey[ref], later, seeds.xy[:, ref])
+    planes = fg.background_planes(xyz[still], xyz, [c.centre_m for c in footage.rig.cameras])
+    beside = ~fg.Foreground(depth_range_m=(0.0, np.inf), method="", planes=planes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
+    moved = beside & ~still
+    return planes, seeds.depth_m[moved if moved.sum() >= MIN_MOVED else beside]
+
+
+def _single(field: TripletField) -> TripletField:
+    """The field with its covariances in single precision, as a checkpoint keeps it: a resumed run continues with the same numbers."""
+    return replace(field, **{name: getattr(field, name).astype(np.float32).astype(np.float64) for name in FIELD_SINGLE})
+
+
+def _checkpoint(results: Results, m: MeasuredFrame) -> None:
+    arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(TripletField) if f.name not in ("grid", "tried", "limit_px")}
+    arrays = {k: v.astype(np.float32) if k.removeprefix("field_") in FIELD_SINGLE else v for k, v in arrays.items()}
+    arrays |= {f"cloud_{f.name}": getattr(m.cloud, f.name) for f in fields(PointCloud) if f.name not in ("frame", "xy_px", "residual_px")}
+    arrays |= {
+        "where": np.array(m.foreground.depth_range_m),
+        "planes": m.foreground.planes,
+        "method": np.array(m.foreground.method),
+        "grid": np.array([m.field.grid.spacing_px, *m.field.grid.shape, m.field.tried]),
+        "limit_px": np.array(m.field.limit_px),
+        "removed_px": m.removed_px,
+        "removed_why": m.removed_why,
+    }
+    results.save_checkpoint("surface", f"{m.frame:04d}", m.key, arrays)
+
+
+def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) -> MeasuredFrame | None:
+    """A frame that was measured before, from the same input; None where there is none, or it is damaged."""
+    a = results.load_checkpoint("surface", f"{frame:04d}", key)
+    if a is None:
+        return None
+    spacing, gh, gw, tried = (int(v) for v in a["grid"])
+    rows = footage.take.rows_at(frame)
+    values = {
+        k.removeprefix("field_"): v.astype(np.float64) if v.dtype == np.float32 else v for k, v in a.items() if k.startswith("field_")
+    }
+    field = TripletField(
+        grid=TemplateGrid(spacing_px=spacing, rows=rows, shape=(gh, gw)), tried=tried, limit_px=float(a["limit_px"]), **values
+    )
+    cloud = PointCloud(
+        frame=frame,
+        xy_px=rows.to_frame(field.xy),
+        residual_px=field.residual_px,
+        **{k.removeprefix("cloud_"): v for k, v in a.items() if k.startswith("cloud_")},
+    )
+    where = fg.Foreground(depth_range_m=(float(a["where"][0]), float(a["where"][1])), method=str(a["method"]), planes=a["planes"])
+    why = a.get("removed_why", np.zeros(0, dtype=np.uint8))  # earlier versions did not keep it
+    removed = a.get("removed_px", np.zeros((0, field.xy.shape[1], 2), dtype=np.float32))
+    return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key, removed_px=removed, removed_why=why)

@@ -1,0 +1,68 @@
+"""Where clicks lie in space, and the surface seeds that they give.
+
+A click is good to a few pixels; the depth at which its rays meet may be wrong by more than matching reaches. So the ray of the reference
+view is swept about that depth, as far as the clicks' own sigma says, and the seed starts where the views look most alike.
+"""
+
+from dataclasses import fields
+
+import numpy as np
+
+from ..foundation.errors import InputError
+from ..geometry.intersection import Intersection, forward_intersection
+from ..images.sampling import SplineImage
+from ..matching.least_squares import MatchingSettings
+from ..matching.seeds import Approximations, approximations_at_depth, settled_depths
+from .take import Clicks, Footage
+
+CLICK_SIGMA_PX = 4.0
+CLICK_MISS_PX = 3 * CLICK_SIGMA_PX  # from each click to where the rays meet: two clicks may be 24 px apart across their epipolar lines
+
+
+def clicked_depth(footage: Footage, name: str, at: Clicks) -> float:
+    """Depth [m] in the reference camera of a clicked point.
+
+    Raises:
+        InputError: it was clicked in fewer than two views, or its rays miss each other.
+    """
+    point = clicked_point(footage, name, at)
+    return float(footage.rig.cameras[footage.take.reference].to_camera(point.xyz_m)[0, 2])
+
+
+def clicked_point(footage: Footage, name: str, at: Clicks) -> Intersection:
+    """Where the rays of a click in several views meet (one point), before the reference camera.
+
+    Raises:
+        InputError: it was clicked in fewer than two views, or its rays miss each other.
+    """
+    cameras = footage.rig.cameras
+    xy = np.array([[at.get(c.name, np.full(2, np.nan)) for c in cameras]])
+    point = forward_intersection(cameras, xy, np.tile(np.eye(2) * CLICK_SIGMA_PX**2, (1, len(cameras), 1, 1)))
+    if not 0 < cameras[footage.take.reference].to_camera(point.xyz_m)[0, 2] < np.inf:
+        raise InputError(f"The click “{name}” is seen by {len(at)} view(s) and has no place in space; click it in two views at least.")
+    if float(point.rms_residual_px[0]) > CLICK_MISS_PX:
+        raise InputError(
+            f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px; click the same spot in every view, "
+            "and check that rig.toml belongs to this footage."
+        )
+    return point
+
+
+def with_clicked(footage: Footage, images: list[SplineImage], seeds: Approximations, matching: MatchingSettings) -> Approximations:
+    """The swept seeds and the clicked surface points, which need not be clicked in the reference view. `images`: the rows of all views.
+
+    Raises:
+        InputError: see `clicked_point`.
+    """
+    take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
+    rows = take.rows_at(take.seeds.frame)
+    points = [clicked_point(footage, f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface)]
+    xyz = np.concatenate([p.xyz_m for p in points])
+    K = np.concatenate([p.covariance_m2 for p in points])
+    axis, depth = cameras[ref].R_cam_world[2], cameras[ref].to_camera(xyz)[:, 2]
+    xy = rows.from_frame(cameras[ref].project(xyz))
+    sigma = np.sqrt(np.einsum("i,nij,j->n", axis, K, axis))
+    inside = images[ref].inside(xy, 0.0)
+    depth = settled_depths(images, cameras, ref, rows, xy[inside], depth[inside], sigma[inside], matching)
+    clicked = approximations_at_depth(cameras, ref, rows, xy[inside], depth)
+    return Approximations(**{f.name: np.concatenate([getattr(seeds, f.name), getattr(clicked, f.name)]) for f in fields(Approximations)})

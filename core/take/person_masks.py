@@ -1,0 +1,86 @@
+"""Where the views show the person, as the user said: by masks, white where she is, or by an image of the empty background.
+
+What is measured must lie inside the silhouette of every view that has one and sees the place. A view that differs from its background
+everywhere (black, lit otherwise) says nothing in that frame.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..foundation.errors import InputError
+from ..images.background import OTHER_ROOM, WINDOW_PX, empty_view
+from ..images.sequence import open_sequence
+from ..matching.foreground import Silhouette
+from .sources import PERSON_SOURCES, read_picture
+from .take import Footage
+
+WHITE = 127.0  # brighter pixels of a mask are the person
+HOLE_PX = 15  # in the person's silhouette, where she looks like the background
+
+
+def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, first: bool) -> tuple[Silhouette, ...]:
+    """The silhouettes of the views that have masks or backgrounds; `grey` are the rows (h', w) of all views in that frame.
+
+    Raises:
+        InputError: a file is missing, damaged, or of another size than its view; in the `first` frame also where a background's image shows
+            another room.
+    """
+    rows = footage.take.rows_at(frame)
+    found = []
+    for k, (view, camera, image) in enumerate(zip(footage.take.views, footage.rig.cameras, grey)):
+        path = silhouette_file(footage, k, frame)
+        if path is None:
+            continue
+        picture = rows.rows(read_picture(path, view.name, camera.size_px))
+        if view.background is not None:
+            mask = _unlike(picture, image, rows.step)
+        elif 0 < picture.max() <= WHITE:
+            raise InputError(f"The mask {path} is nowhere brighter than {picture.max():.0f} of 255; paint the person white.")
+        else:
+            mask = picture > WHITE
+        if mask is not None:
+            found.append(Silhouette(camera=camera, rows=rows, mask=mask))
+        elif first:
+            raise InputError(
+                f"The background image {path} looks nothing like view {view.name} in frame {frame}; take it with the same camera and light."
+            )
+    return tuple(found)
+
+
+def silhouette_file(footage: Footage, view: int, frame: int) -> Path | None:
+    """The mask or background image that holds for a frame of a view, if it has one.
+
+    Raises:
+        InputError: there are no masks, or too few.
+    """
+    said, folder = footage.take.views[view], footage.take.folder
+    if said.masks is None:
+        name = said.mask or said.background
+        return None if name is None else folder / name
+    files = open_sequence(folder, images=said.masks, movie=None, view=f"{said.name} (masks)").files()
+    number = footage.number(view, frame)
+    if not 0 <= number < len(files):
+        raise InputError(f"View {said.name} has {len(files)} masks, but none for frame {frame}; there must be one for every image.")
+    return files[number]
+
+
+def told_by(footage: Footage) -> str:
+    """How the person is told from the background, such as “mask of C”; "" where the user said nothing."""
+    views = footage.take.views
+    return " and ".join(
+        f"{key} of {', '.join(names)}" for key in PERSON_SOURCES if (names := [v.name for v in views if getattr(v, key) is not None])
+    )
+
+
+def _unlike(background: np.ndarray, image: np.ndarray, row_step: int) -> np.ndarray | None:
+    """Where an image differs from the background, without specks and holes; None where it does so everywhere."""
+    empty = empty_view(background, image)
+    if empty.noise > OTHER_ROOM:
+        return None
+    mask = (~empty.shown_by(image)).astype(np.uint8)
+    speck, hole = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (n, max(3, n // row_step | 1))) for n in (WINDOW_PX, HOLE_PX))
+    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, speck)
+    return np.asarray(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, hole, borderType=cv2.BORDER_REPLICATE) > 0)

@@ -1,0 +1,164 @@
+"""What take.toml says of where a view shows the person: a mask, a mask for every image, or an image of the empty background.
+
+[[keypoints]] of take.toml: files in which another system says where joints are, in the pixels of a view or in space.
+
+Values of take.toml, checked as they are read; every refusal is an InputError in one sentence.
+"""
+
+import glob
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from ..foundation.errors import InputError
+from ..foundation.settings import nearest_name
+from ..images.sequence import read_image
+
+
+def frame_pair(value: Any, where: str) -> tuple[int, int] | None:
+    """`frames`, half-open, or None where it is not there."""
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, int) for v in value) or not 0 <= value[0] < value[1]:
+        raise InputError(f"`frames` of {where} is {value!r}; write [first, one after the last].")
+    return value[0], value[1]
+
+
+def inside(folder: Path, name: Any, where: str, key: str = "rig") -> Path:
+    """The path of a file that must lie in the take's folder."""
+    if not isinstance(name, str) or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"`{key}` of {where} is {name!r}; it must be a file inside the take's folder. Copy it there.")
+    return folder / name
+
+
+def table_of(table: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
+    """A table of a table, empty where it is not there."""
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise InputError(f"[{key}] of {where} must be a table.")
+    return value
+
+
+def tables_of(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
+    """A list of tables, empty where it is not there."""
+    value = table.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise InputError(f"`{key}` of {where} must be written as [[{key}]] tables.")
+    return value
+
+
+def check_keys(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
+    """Refuse a key that is not known."""
+    for key in table:
+        if key not in known:
+            raise InputError(f"{where} has an unknown key “{key}”.{nearest_name(str(key), known)}")
+
+
+def is_pixel(value: Any) -> bool:
+    """Whether it is [x, y]."""
+    return isinstance(value, list) and len(value) == 2 and all(is_number(v) for v in value)
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether it is a finite number."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+PERSON_SOURCES = ("mask", "masks", "background")  # keys of [[views]]; a view has one of them at most
+
+
+def person_source(entry: Mapping[str, Any], label: str) -> dict[str, str]:
+    """The key and the file, or the pattern of files, of a view's table.
+
+    Raises:
+        InputError: there are several, or one is no file inside the take.
+    """
+    said = {key: entry[key] for key in PERSON_SOURCES if key in entry}
+    if len(said) > 1:
+        raise InputError(f"The {label} has {' and '.join(f'`{key}`' for key in said)}; keep one of them.")
+    for key, name in said.items():
+        inside(Path(), name, label, key)
+    return said
+
+
+def read_picture(path: Path, view: str, size_px: tuple[int, int]) -> np.ndarray:
+    """A mask or a background (h, w) of a view.
+
+    Raises:
+        InputError: it cannot be read, or is of another size than the view.
+    """
+    image = read_image(path)
+    if image.shape[::-1] != size_px:
+        size = f"{image.shape[1]}×{image.shape[0]} pixels, the view {size_px[0]}×{size_px[1]}"
+        raise InputError(f"{path} of view {view} has {size}; make it of the view's own size.")
+    return image
+
+
+def person_files(folder: Path, view: str, kind: str, picture: Path) -> tuple[str, tuple[Path, Path]]:
+    """What [[views]] says of a mask or background, or of the masks beside which `picture` lies, and the link into the take's folder.
+
+    What is there under the same name and is something else stays; the link gets a number.
+    """
+    source, ending = (picture.parent, "") if kind == "masks" else (picture, picture.suffix)
+    for number in count(1):
+        target = Path(folder) / f"{view}_{kind}{f'_{number}' if number > 1 else ''}{ending}"
+        if not target.exists() or target.samefile(source):
+            break
+    return f"{glob.escape(target.name)}/*{picture.suffix}" if kind == "masks" else target.name, (target, source)
+
+
+KEYS = ("files", "view", "offset_frames", "sigma", "names", "axes")
+PIXELS, SPACE = (".json",), (".trc", ".c3d", ".csv")
+SIGMA_PX, SIGMA_M = 8.0, 0.02
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class KeypointSource:
+    """A file, or a pattern of files in natural order, inside the take's folder."""
+
+    files: str
+    view: str = ""  # of keypoints in pixels
+    offset_frames: int = 0  # the file's frame of take frame t is t + offset_frames (and the view's own offset)
+    sigma: float = SIGMA_PX  # px, or m in space
+    names: Mapping[str, str] = field(default_factory=dict)  # the file's name -> our joint
+    axes: str | None = None  # of a file in space; None: what such files usually have
+
+
+def keypoint_sources(
+    tables: Sequence[Mapping[str, Any]], views: Sequence[str], joints: Sequence[str], where: str
+) -> tuple[KeypointSource, ...]:
+    """The sources that a take.toml names.
+
+    Raises:
+        InputError: a key, view or joint is unknown, or a value cannot be.
+    """
+    return tuple(_source(table, views, joints, f"[[keypoints]] of {where}") for table in tables)
+
+
+def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str], where: str) -> KeypointSource:
+    for key in table:
+        if key not in KEYS:
+            raise InputError(f"A {where} has an unknown key “{key}”.{nearest_name(key, KEYS)}")
+    files, view, names = table.get("files"), table.get("view", ""), table.get("names", {})
+    if not isinstance(files, str) or Path(files).is_absolute() or ".." in Path(files).parts:
+        raise InputError(f'`files` of a {where} is {files!r}; it must be files inside the take\'s folder, such as "kp/C/*.json".')
+    kind = Path(files).suffix.lower()
+    if kind not in PIXELS + SPACE:
+        raise InputError(f"`files` of a {where} is {files!r}; keypoints are read from {', '.join(PIXELS + SPACE)}.")
+    if (kind in PIXELS) != bool(view) or (view and view not in views):
+        need = f"must name its view.{nearest_name(str(view), tuple(views))}" if kind in PIXELS else "is in space and has no view."
+        raise InputError(f"The {where} with “{files}” {need}")
+    if not isinstance(names, dict):
+        raise InputError(f'`names` of a {where} must be a table, such as {{ RKnee = "knee.R" }}.')
+    for joint in names.values():
+        if joint not in joints:
+            raise InputError(f"A {where} has the joint {joint!r}, which is none.{nearest_name(str(joint), tuple(joints))}")
+    offset, sigma, axes = table.get("offset_frames", 0), table.get("sigma", SIGMA_PX if view else SIGMA_M), table.get("axes")
+    if not isinstance(offset, int) or not isinstance(sigma, (int, float)) or not 0 < sigma < 1e4 or not isinstance(axes, str | None):
+        raise InputError(f"The {where} with “{files}” needs a whole `offset_frames`, a positive `sigma` and a name as `axes`.")
+    return KeypointSource(files=files, view=view, offset_frames=offset, sigma=float(sigma), names=names, axes=axes)

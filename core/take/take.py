@@ -1,0 +1,436 @@
+"""A take: one recording of a person and what the user said about it. take.toml, in the folder that holds the footage.
+
+Joint and view names, and every key, are checked when the file is read; the images are not touched.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..foundation.arrays import frozen
+from ..foundation.errors import InputError
+from ..foundation.settings import nearest_name
+from ..geometry.rig import Rig, read_rig
+from ..images.interlace import BOTH, INTERLACE, FieldLayout, RowGrid, field_layout, frame_time_s
+from ..images.sequence import ImageSequence, open_sequence
+from .sources import (
+    PERSON_SOURCES,
+    KeypointSource,
+    check_keys,
+    frame_pair,
+    inside,
+    is_number,
+    is_pixel,
+    keypoint_sources,
+    person_source,
+    table_of,
+    tables_of,
+)
+
+FORMAT, VERSION = "tricap-take", 1
+MOST_FRAMES = 100_000_000
+SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
+JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
+KEYS = (
+    "format",
+    "version",
+    "fps",
+    "interlaced",
+    "first_field",
+    "rig",
+    "reference_view",
+    "frames",
+    "views",
+    "body",
+    "seeds",
+    "keyframes",
+    "corrections",
+    "keypoints",
+    "settings",
+)
+
+CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
+NO_BODY = "none"  # `model` under [body]
+UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
+Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class View:
+    """One camera's footage: image files (a pattern) or a movie. Image 0 of the take is its number `offset_frames`.
+
+    One of `mask`, `masks` (a pattern, an image for every image) and `background` may say where the person is.
+    """
+
+    name: str
+    images: str | None = None
+    movie: str | None = None
+    offset_frames: int = 0
+    mask: str | None = None
+    masks: str | None = None
+    background: str | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Seeds:
+    """What the user clicked, in full-frame pixels: surface points and joints, in one frame."""
+
+    frame: int = 0
+    surface: tuple[Clicks, ...] = ()
+    joints: Mapping[str, Clicks] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Correction:
+    """What the user saw to be wrong in one view, in full-frame pixels.
+
+    "trajectory": the trajectory nearest to `xy_px` (1, 2) in frame `frames.start` is removed.
+    "region": what is measured inside the polygon `xy_px` (n, 2), during `frames`, is left out.
+    """
+
+    kind: str
+    view: str
+    frames: range
+    xy_px: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xy_px", frozen(self.xy_px, (None, 2)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Take:
+    """A recording. `folder` holds take.toml and the footage; `frames` is half-open, None means all.
+
+    A frame of the take is an instant: an image, or one of its two fields where `interlaced` is "both".
+    """
+
+    folder: Path
+    fps: float  # instants per second
+    views: tuple[View, ...]
+    rig_path: Path
+    interlaced: str = "none"
+    first_field: str = "odd"  # of "both"
+    reference_view: str = ""
+    frames: tuple[int, int] | None = None
+    body_model: str | None = None  # the name of one of ours, or the absolute path of the take's own; None: no body
+    no_body: bool = False  # the take asks for surface and tracks only: model = "none"
+    locked: tuple[str, ...] = ()  # degrees of freedom that are held at their rest value
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by degree of freedom, in degrees
+    seeds: Seeds = field(default_factory=Seeds)
+    keyframes: tuple[Seeds, ...] = ()  # clicked joints of further frames, one entry per frame
+    corrections: tuple[Correction, ...] = ()
+    keypoints: tuple[KeypointSource, ...] = ()
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def field_layout(self) -> FieldLayout:
+        """Where in the images the take's frames are."""
+        return field_layout(self.interlaced, self.first_field)
+
+    def time_s(self, frames: np.ndarray) -> np.ndarray:
+        """When frames (T,) of the take were taken, in seconds after frame 0."""
+        return frame_time_s(frames, self.fps)
+
+    def rows_at(self, frame: int) -> RowGrid:
+        """The rows of the image that show a frame of the take."""
+        return self.field_layout.rows(frame)
+
+    def single(self) -> "Take":
+        """This take with one frame an image: of both fields the first, which then has the clicks of both."""
+        if self.interlaced != BOTH:
+            return self
+        seeds, *keys = (replace(s, frame=self.field_layout.image(s.frame)) for s in (self.seeds, *self.keyframes))
+        frames = None if self.frames is None else (self.frames[0] // 2, (self.frames[1] + 1) // 2)
+        return replace(self, fps=self.fps / 2, interlaced=self.first_field, frames=frames, seeds=seeds, keyframes=tuple(keys))
+
+    @property
+    def reference(self) -> int:
+        """Index of the reference view."""
+        return [v.name for v in self.views].index(self.reference_view)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Footage:
+    """An opened take: its cameras in the order of the views, and their sequences."""
+
+    take: Take
+    rig: Rig
+    sequences: tuple[ImageSequence, ...]
+    frames: range
+    delay_images: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
+
+    def number(self, view: int, frame: int) -> int:
+        """The number of the image in a view's sequence that shows a frame of the take."""
+        return self.take.field_layout.image(frame) + self.take.views[view].offset_frames
+
+    def single(self) -> "Footage":
+        """The footage with one frame an image, for what is asked of images and not of instants."""
+        take, per = self.take.single(), self.take.field_layout.per_image
+        return replace(self, take=take, frames=range(self.frames.start // per, -(-self.frames.stop // per)))
+
+    def read(self, frame: int) -> list[np.ndarray]:
+        """The grey images (h, w) float32 of all views at one frame of the take.
+
+        Raises:
+            InputError: an image is missing, damaged, or of another size than its camera.
+        """
+        images = [s.read(self.number(k, frame)) for k, s in enumerate(self.sequences)]
+        for image, camera, view in zip(images, self.rig.cameras, self.take.views):
+            if image.shape[::-1] != camera.size_px:
+                raise InputError(
+                    f"Frame {frame} of view {view.name} has {image.shape[1]}×{image.shape[0]} pixels, but its camera in "
+                    f"{self.take.rig_path.name} has {camera.size_px[0]}×{camera.size_px[1]}; use the footage as it was calibrated."
+                )
+        return images
+
+    def files(self, frame: int) -> list[Path]:
+        """The files behind one frame, a movie standing for all of its frames."""
+        return [f[self.number(k, frame)] if len(f := s.files()) > 1 or s.count == 1 else f[0] for k, s in enumerate(self.sequences)]
+
+
+def read_take(folder: Path) -> Take:
+    """Read FOLDER/take.toml.
+
+    Raises:
+        InputError: the file is missing or broken, has an unknown key, or a value that cannot be.
+    """
+    folder = Path(folder)
+    path = folder / "take.toml" if folder.name != "take.toml" else folder
+    try:
+        return take_of_text(path.read_text(encoding="utf-8-sig"), path)
+    except OSError as error:
+        said = f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
+        raise InputError(said) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text in UTF-8 ({error}); save it as UTF-8 (in Notepad under “Encoding”).") from error
+
+
+def take_of_text(text: str, path: Path) -> Take:
+    """The take that a take.toml of this text at `path` describes.
+
+    Raises:
+        InputError: the text is no TOML, has an unknown key, or a value that cannot be.
+    """
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a TOML file: {error}; mend that place.") from error
+    return _take(table, path.parent.resolve(), str(path))
+
+
+def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None) -> Footage:
+    """Open the footage (unless `sequences` are the opened views) and the rig of a take and check that they belong together.
+
+    Raises:
+        InputError: a view without camera or images, views of unequal length, frames or seeds outside the footage.
+    """
+    rig = read_rig(take.rig_path)
+    cameras = tuple(rig[v.name] for v in take.views)
+    sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
+    frames = footage_frames(take, sequences)
+    footage = Footage(take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=frames)
+    _check_seeds(footage)
+    return footage
+
+
+def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
+    """The frames of a take that are measured, by its own numbers.
+
+    Raises:
+        InputError: the views have no frames in common, or not those that the take names.
+    """
+    per = take.field_layout.per_image
+    counts = [per * (s.count - v.offset_frames) for s, v in zip(sequences, take.views)]
+    first = per * max(0, *(-v.offset_frames for v in take.views))
+    if take.frames is None:
+        if len(set(counts)) > 1:
+            said = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
+            mend = "Trim them, or set `offset_frames` or `frames` in take.toml."
+            raise InputError(f"The views of {take.folder.name} are not equally long: {said} frames. {mend}")
+        if counts[0] <= first:
+            raise InputError(f"With these `offset_frames` the views of {take.folder.name} have no frame in common; mend them in take.toml.")
+        return range(first, counts[0])
+    start, stop = take.frames
+    if start < first or stop > min(counts):
+        has = f"the footage has frames {first} to {min(counts)} (half-open)"
+        raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but {has}; mend it in take.toml.")
+    return range(start, stop)
+
+
+def _check_seeds(footage: Footage) -> None:
+    for seeds in (footage.take.seeds, *footage.take.keyframes):
+        clicks = [(f"joint “{name}”", at) for name, at in seeds.joints.items()]
+        clicks += [(f"surface seed {i + 1}", at) for i, at in enumerate(seeds.surface)]
+        for label, at in clicks:
+            _check_inside(footage, label, at)
+        if clicks and seeds.frame not in footage.frames:
+            raise InputError(
+                f"The clicks of {footage.take.folder.name} in frame {seeds.frame} are not among the frames "
+                f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` in take.toml."
+            )
+
+
+def _check_inside(footage: Footage, label: str, at: Clicks) -> None:
+    for view, xy in at.items():
+        if not footage.rig[view].sees(xy):
+            w, h = footage.rig[view].size_px
+            where = f"at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels"
+            raise InputError(f"The {label} in view {view} lies {where}; click it again.")
+
+
+def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
+    check_keys(table, KEYS, where)
+    if table.get("format") != FORMAT or table.get("version") != VERSION:
+        says = f"it says {table.get('format')!r} and {table.get('version')!r}"
+        raise InputError(f'{where} must say format = "{FORMAT}" and version = {VERSION}; {says}.')
+    views = _views(table.get("views"), where)
+    names = tuple(v.name for v in views)
+    reference = table.get("reference_view", names[len(names) // 2])
+    if reference not in names:
+        raise InputError(f"`reference_view` of {where} is {reference!r}.{nearest_name(str(reference), names)}")
+    interlaced = table.get("interlaced", "none")
+    if interlaced not in (*INTERLACE, BOTH):
+        raise InputError(f"`interlaced` of {where} is {interlaced!r}; write one of: {', '.join((*INTERLACE, BOTH))}.")
+    first_field = table.get("first_field", "odd")
+    if first_field not in ("odd", "even") or ("first_field" in table and interlaced != BOTH):
+        raise InputError(f'`first_field` of {where} is {first_field!r}; write "odd" or "even", and only beside interlaced = "both".')
+    fps = table.get("fps")
+    if not is_number(fps) or not 0.1 <= float(fps) <= 10_000:
+        raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
+    body = table_of(table, "body", where)
+    check_keys(body, ("model", "locked", "limits"), f"[body] of {where}")
+    if not isinstance(body.get("model", ""), str):
+        raise InputError(
+            f'`model` under [body] of {where} is {body["model"]!r}; write the name of a body model, such as "arm.R", or "none".'
+        )
+    return Take(
+        folder=folder,
+        fps=float(fps) * field_layout(interlaced).per_image,
+        views=views,
+        rig_path=inside(folder, table.get("rig", "rig.toml"), where),
+        interlaced=interlaced,
+        first_field=first_field,
+        reference_view=reference,
+        frames=frame_pair(table.get("frames"), where),
+        body_model=body_model(folder, body.get("model"), where),
+        no_body=body.get("model") == NO_BODY,
+        locked=_locked(body.get("locked", []), where),
+        limits=_limits(body.get("limits", {}), where),
+        seeds=_seeds(table_of(table, "seeds", where), names, where),
+        keyframes=_keyframes(tables_of(table, "keyframes", where), names, where),
+        corrections=tuple(_correction(c, names, where) for c in tables_of(table, "corrections", where)),
+        keypoints=keypoint_sources(tables_of(table, "keypoints", where), names, JOINTS, where),
+        settings=_settings(table_of(table, "settings", where), where),
+    )
+
+
+def _views(entries: Any, where: str) -> tuple[View, ...]:
+    if not isinstance(entries, list) or len(entries) < 2 or not all(isinstance(e, dict) for e in entries):
+        raise InputError(f"{where} needs at least two [[views]], in the order in which the cameras stand.")
+    views = []
+    for entry in entries:
+        label = f"view {entry.get('name')!r} of {where}"
+        check_keys(entry, ("name", "images", "movie", "offset_frames", *PERSON_SOURCES), label)
+        offset = entry.get("offset_frames", 0)
+        if not isinstance(entry.get("name"), str) or not entry["name"]:
+            raise InputError(f'A {label} needs a name (text), such as "L".')
+        if isinstance(offset, bool) or not isinstance(offset, int) or abs(offset) > MOST_FRAMES:
+            raise InputError(f"`offset_frames` of {label} is {str(offset)[:40]}; write a whole number of frames, such as -2.")
+        if UNFIT_FOR_NAMES.search(entry["name"]):
+            raise InputError(f'The {label} has a character in its name that file names cannot have; choose a plain name such as "L".')
+        if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
+            raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
+        files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
+        views.append(View(name=entry["name"], offset_frames=offset, **files))
+    if len({v.name for v in views}) < len(views):
+        raise InputError(f"Two views of {where} have the same name; give each its own.")
+    return tuple(views)
+
+
+def _locked(names: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise InputError(f'`locked` under [body] of {where} is {names!r}; write a list of degrees of freedom, such as ["elbow.R twist"].')
+    return tuple(names)
+
+
+def _limits(table: Any, where: str) -> Mapping[str, tuple[float, float]]:
+    if not isinstance(table, dict):
+        raise InputError(f'[body.limits] of {where} must be a table, such as "knee.R flexion" = [0, 140].')
+    for name, pair in table.items():
+        if not isinstance(pair, list) or len(pair) != 2 or not all(is_number(v) for v in pair) or not pair[0] < pair[1]:
+            raise InputError(f"The limits of “{name}” in {where} are {pair!r}; write [lowest, highest] in degrees.")
+    return {name: (float(low), float(high)) for name, (low, high) in table.items()}
+
+
+def _keyframes(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: str) -> tuple[Seeds, ...]:
+    for table in tables:
+        check_keys(table, ("frame", "joints"), f"a [[keyframes]] of {where}")
+    keyframes = tuple(_seeds(table, views, where) for table in tables)
+    if len({k.frame for k in keyframes}) < len(keyframes):
+        raise InputError(f"Two [[keyframes]] of {where} are for the same frame; write their joints into one.")
+    return tuple(sorted(keyframes, key=lambda k: k.frame))
+
+
+def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Correction:
+    kind, view, label = table.get("kind"), table.get("view"), f"a [[corrections]] of {where}"
+    if kind not in CORRECTIONS:
+        raise InputError(f"`kind` of {label} is {kind!r}; write one of: {', '.join(CORRECTIONS)}.")
+    check_keys(table, ("kind", "view", *CORRECTIONS[kind]), label)
+    if view not in views:
+        raise InputError(f"`view` of {label} is {view!r}.{nearest_name(str(view), views)}")
+    frame = table.get("frame")
+    if kind == "region":
+        frames, corners = frame_pair(table.get("frames"), label), table.get("polygon")
+    else:
+        frames, corners = (frame, frame + 1) if isinstance(frame, int) else None, [table.get("xy")]
+    wanted = 3 if kind == "region" else 1
+    if not isinstance(corners, list) or len(corners) < wanted or not all(is_pixel(xy) for xy in corners) or frames is None:
+        need = "frames = [first, one after the last] and a polygon of three or more" if kind == "region" else "a frame and xy, one"
+        raise InputError(f"The correction “{kind}” of {where} needs {need} pixel coordinates [x, y].")
+    return Correction(kind=kind, view=view, frames=range(*frames), xy_px=np.array(corners, dtype=np.float64))
+
+
+def _seeds(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Seeds:
+    check_keys(table, ("frame", "surface", "joints"), f"[seeds] of {where}")
+    frame, surface, joints = table.get("frame", 0), table.get("surface", []), table.get("joints", {})
+    if not isinstance(frame, int) or not isinstance(surface, list) or not isinstance(joints, dict):
+        raise InputError(f"[seeds] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
+    check_keys(joints, JOINTS, f"[seeds.joints] of {where}")
+    return Seeds(
+        frame=frame,
+        surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),
+        joints={name: _clicks(at, views, f"joint “{name}” of {where}") for name, at in joints.items()},
+    )
+
+
+def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
+    if not isinstance(at, dict):
+        raise InputError(f"The {label} must name views and pixels, such as {{ {views[0]} = [312.0, 180.5] }}.")
+    check_keys(at, views, label)
+    for view, xy in at.items():
+        if not is_pixel(xy):
+            raise InputError(f"The {label} in view {view} is {xy!r}; write two pixel coordinates [x, y].")
+    return {view: np.array(xy, dtype=np.float64) for view, xy in at.items()}
+
+
+def _settings(table: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str, Any]]:
+    for name, group in table.items():
+        if not isinstance(group, dict):
+            raise InputError(f"[settings] of {where} holds tables such as [settings.matching]; “{name}” is none.")
+    return table
+
+
+def body_model(folder: Path, name: str | None, where: str) -> str | None:
+    """`model` of [body] as `read_model` takes it: the name of one of ours, or the path of the take's own .toml file; None: no body.
+
+    Raises:
+        InputError: the file does not lie in the take's folder.
+    """
+    if name is None or name == NO_BODY:
+        return None
+    return str(inside(folder, name, where, "model")) if name.endswith(".toml") else name

@@ -1,0 +1,287 @@
+"""Tracking of a whole take: the points of each frame tracked into the next, in the order of time, with a checkpoint per frame.
+
+A frame in which next to no point is found, because one view is black or the recorder lost it, is left out: the points are tracked from
+the frame before it into the one after.
+
+Tracking the whole surface: which points are followed, where new ones start, and each frame's own surface as a control
+(D'Apuzzo et al. 2000, §3.2).
+
+At the outline of a limb half of a patch shows what lies behind it. Such a point is neither on the one nor on the other: it slides along
+the outline, well correlated. So a point is followed only while its patch lies on the surface that was measured in the same frame, faces the
+camera, and is no deeper or nearer than that surface. From it the points take the correction for curvature, too (surface/cloud.py).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..foundation import store
+from ..foundation.progress import Monitor
+from ..images.enhance import EnhanceSettings
+from ..matching.least_squares import MatchingSettings
+from ..matching.region_growing import TripletField
+from ..results.folder import Results
+from ..surface.cloud import PointCloud
+from ..surface.measure import FrameImages, MeasuredFrame, load_images
+from ..take.take import Footage
+from .curvature_correction import NEAREST_POINTS, CurvatureCorrection
+from .lost_points import Guide, LostPoints, none_lost
+from .published_step import STEPS
+from .settings import TrackingSettings, TrackStatus
+from .step import FramePair, TrackingView, over_the_body
+from .templates import Templates, Tiles, cut_tiles, no_templates
+from .tracked import TrackedFrame, born, joined, nothing
+
+BARE = 0.85  # a surface point with no tracked point within this many spacings starts a new trajectory
+STEEPEST_COSINE = 0.3  # between the normal and the ray
+DEPTH_SIGMAS, DEPTH_CELLS = 4.0, 1.0
+STEEPEST_SLOPE = 3.0  # change of depth per distance across, within one surface
+MOVED_CELLS = 0.8  # a cell whose texture lies further from its middle is at the outline
+
+
+def start_tracks(field: TripletField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
+    """The first tracked points: the measured surface, thinned to the tracking's spacing."""
+    rows = _thinned(field, view.tracking.spacing_px)
+    return _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], 0, view)
+
+
+def regenerate(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, view: TrackingView, next_identity: int) -> TrackedFrame:
+    """The tracked points of a frame and new ones from the frame's own surface, where it has no tracked point near."""
+    rows = _thinned(field, view.tracking.spacing_px)
+    if len(tracked.identity) and len(rows):
+        to_frame = field.grid.rows.to_frame
+        distance, _ = cKDTree(to_frame(tracked.xy[:, view.reference])).query(to_frame(field.xy[rows, view.reference]))
+        rows = rows[distance > BARE * view.tracking.spacing_px]
+    return joined(tracked, _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], next_identity, view))
+
+
+def on_surface(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
+    """The points that lie on the frame's own surface; the others end. A frame in which no surface was measured says nothing.
+
+    The track says where on the surface a point is, the surface how deep: it was measured with all neighbours, and corrected for
+    curvature, which a patch alone sees too flat.
+    """
+    if not len(field.cell) or not len(tracked.identity):
+        return tracked
+    camera, to_frame = view.cameras[view.reference], field.grid.rows.to_frame
+    at = to_frame(tracked.xy[:, view.reference])
+    ray, depth = camera.rays(at), camera.to_camera(tracked.xyz_m)[:, 2]
+    distance, near = cKDTree(to_frame(field.xy[:, view.reference])).query(at, k=min(NEAREST_POINTS, len(field.cell)))
+    distance, near = distance.reshape(len(at), -1), near.reshape(len(at), -1)
+    slope = np.einsum("nki,ni->nk", cloud.normals[near], ray)  # negative: towards the camera
+    facing = -slope[:, 0] / np.linalg.norm(ray, axis=1)
+    met = np.einsum("nki,nki->nk", cloud.normals[near], cloud.xyz_m[near] - camera.centre_m) / np.minimum(slope, -STEEPEST_COSINE)
+    weight = 1 / np.maximum(distance, 1.0) ** 2
+    found = (weight * met).sum(axis=1) / weight.sum(axis=1)  # depth at which the ray meets the tangent planes of the nearest points
+    cell_m = field.grid.spacing_px * depth / camera.focal_px
+    sigma = np.sqrt(np.einsum("ni,nij,nj->n", ray, tracked.covariance_m2 + cloud.covariance_m2[near[:, 0]], ray)) / (ray**2).sum(axis=1)
+    covered = _coverage(field, tracked.xy[:, view.reference], depth, view) >= view.tracking.min_coverage
+    reason = np.where(covered & (facing >= STEEPEST_COSINE), TrackStatus.MEASURED, TrackStatus.AT_OUTLINE)
+    far = np.abs(found - depth) > np.maximum(DEPTH_SIGMAS * sigma, DEPTH_CELLS * cell_m)
+    reason[(reason == TrackStatus.MEASURED) & far] = TrackStatus.OFF_SURFACE
+    strayed = over_the_body(view, tracked.xyz_m, tracked.key_drift + tracked.drift)
+    placed = replace(tracked, xyz_m=camera.centre_m + ray * found[:, None], covariance_m2=cloud.covariance_m2[near[:, 0]] + strayed)
+    return _with_local_surface(placed, view).without(reason != TrackStatus.MEASURED, reason)
+
+
+def _well_inside(field: TripletField, cloud: PointCloud, rows: np.ndarray, view: TrackingView) -> np.ndarray:
+    """Which of these rows of the field may become tracked points."""
+    camera, xyz = view.cameras[view.reference], field.xyz_m[rows]
+    back = camera.centre_m - xyz
+    facing = np.einsum("ni,ni->n", cloud.normals[rows], back) / np.linalg.norm(back, axis=1)
+    coverage = _coverage(field, field.xy[rows, view.reference], camera.to_camera(xyz)[:, 2], view)
+    rays = np.isfinite(field.xy[rows]).all(axis=2).sum(axis=1)
+    return (coverage >= view.tracking.min_coverage) & (facing >= STEEPEST_COSINE) & (rays >= min(3, len(view.cameras)))
+
+
+def _coverage(field: TripletField, xy: np.ndarray, depth: np.ndarray, view: TrackingView) -> np.ndarray:
+    """Part (N,) of the patch about each point that the measured surface covers at the point's depth."""
+    gh, gw = field.grid.shape
+    step, camera = field.grid.step, view.cameras[view.reference]
+    surface = np.full((gh + 2, gw + 2), np.nan)
+    moved = np.abs(field.xy[:, view.reference] - field.grid.xy(field.cell)) / step
+    inner = np.flatnonzero(moved.max(axis=1) <= MOVED_CELLS)
+    surface[field.cell[inner] // gw + 1, field.cell[inner] % gw + 1] = camera.to_camera(field.xyz_m[inner])[:, 2]
+    across, down = (max(1, int(p // s)) for p, s in zip(view.half_patch, step))
+    j, i = (d.ravel() for d in np.mgrid[-down : down + 1, -across : across + 1])
+    middle = np.rint(xy / step).astype(np.int64) + 1
+    there = surface[np.clip(middle[:, 1, None] + j, 0, gh + 1), np.clip(middle[:, 0, None] + i, 0, gw + 1)]
+    reach = STEEPEST_SLOPE * field.grid.spacing_px * np.hypot(i, j).max() / camera.focal_px * depth
+    with np.errstate(invalid="ignore"):
+        return (np.abs(there - depth[:, None]) <= reach[:, None]).mean(axis=1)
+
+
+def _born(field: TripletField, cloud: PointCloud, rows: np.ndarray, first: int, view: TrackingView) -> TrackedFrame:
+    identity = np.arange(first, first + len(rows))
+    return _with_local_surface(
+        born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows]), view
+    )
+
+
+def _with_local_surface(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
+    """The points with the frame's local surface under them, which is also that of the key templates cut in this frame."""
+    if view.curvature is None:
+        return points
+    here = view.curvature.local_surface(points.xy[:, view.reference])
+    return replace(points, local_surface=here, key_local_surface=np.where(points.renewed[:, None], here, points.key_local_surface))
+
+
+def _thinned(field: TripletField, spacing_px: int) -> np.ndarray:
+    """Rows of the field on every n-th column and row of the grid."""
+    n = max(1, round(spacing_px / field.grid.spacing_px))
+    j, i = field.cell // field.grid.shape[1], field.cell % field.grid.shape[1]
+    return np.flatnonzero((i % n == 0) & (j % n == 0))
+
+
+ALGORITHM = "tracking 14"  # part of every key: raise it when the same input gives other numbers
+MIN_PART_FOUND = 0.1  # of the points: where fewer are found in a frame, the frame is missing, and not the points
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrackingRules:
+    """How the points of a recording are tracked: the settings concerned, and what its calibration allows."""
+
+    matching: MatchingSettings
+    tracking: TrackingSettings
+    enhance: EnhanceSettings | None = None
+    limit_px: float = 0.0  # rays were allowed to miss by as much when the surface was measured
+
+    def view(self, footage: Footage) -> TrackingView:
+        """What a tracking step needs to know of the recording."""
+        return TrackingView(
+            cameras=footage.rig.cameras,
+            reference=footage.take.reference,
+            field_layout=footage.take.field_layout,
+            matching=self.matching,
+            tracking=self.tracking,
+            limit_px=max(self.tracking.max_residual_px, self.limit_px),
+            dt_s=1 / footage.take.fps,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _State:
+    """What the next step needs."""
+
+    before: TrackedFrame | None
+    current: TrackedFrame | None
+    templates: Templates
+    lost: LostPoints
+    next_identity: int
+
+    def after(self, tracked: TrackedFrame, cut: Tiles, view: TrackingView, guide: Guide | None) -> "_State":
+        """The state after a frame, with the templates that were cut in it; a frame that was left out changes nothing."""
+        if self.current is not None and not len(tracked.identity) and not len(tracked.ended):
+            return self
+        lost = self.lost if self.current is None else self.lost.after(self.current, tracked, view.tracking, guide)
+        wanted = np.concatenate([tracked.identity, lost.points.identity])
+        return _State(
+            before=self.current,
+            current=tracked,
+            templates=self.templates.only(wanted).with_tiles(cut, view.matching, view.rows.step),
+            lost=lost,
+            next_identity=max([self.next_identity, *(tracked.identity[-1:] + 1)]),
+        )
+
+
+def track_frames(
+    footage: Footage,
+    measured: Sequence[MeasuredFrame],
+    rules: TrackingRules,
+    results: Results,
+    monitor: Monitor,
+    guide: Guide | None = None,
+) -> Iterator[TrackedFrame]:
+    """Track points of the surface through the measured frames, in the order of time.
+
+    Frames with a valid checkpoint are not tracked again; the settings of the filters do not invalidate it. With a `guide` for lost points
+    the checkpoints are separate.
+    """
+    rules = replace(rules, tracking=rules.tracking.of_the_step)
+    view = rules.view(footage)
+    no_template = no_templates(view.matching, view.rows.step)
+    state = _State(before=None, current=None, templates=no_template, lost=none_lost(len(view.cameras)), next_identity=0)
+    key = store.digest(ALGORITHM, repr((rules.matching, rules.tracking, rules.limit_px, rules.enhance)), *([guide.key] if guide else []))
+    group = "guided" if guide else "tracks"
+    images: FrameImages | None = None
+    for i, surface in enumerate(measured):
+        monitor.step("tracks", i, len(measured))
+        key = store.digest(key, surface.key)
+        done = _from_checkpoint(results, group, surface.frame, key)
+        if done is None:
+            if state.current is not None and images is None:
+                images = load_images(footage, state.current.frame, rules.enhance)
+            next_images = load_images(footage, surface.frame, rules.enhance)
+            start_new = bool(view.tracking.regenerate_every) and i % view.tracking.regenerate_every == 0
+            tracked = _advance(view.at(surface.frame), state, _pair(images, next_images), surface, monitor, guide, start_new)
+            done = tracked, _cut(view, tracked, next_images)
+            _checkpoint(results, group, *done, key)
+        else:
+            next_images = None
+        after = state.after(*done, view, guide)
+        images = images if after is state else next_images
+        state = after
+        yield done[0]
+
+
+def _pair(images: FrameImages | None, after: FrameImages) -> FramePair | None:
+    if images is None:
+        return None
+    return FramePair(grey=images.grey, spline=images.spline, next_grey=after.grey, next_spline=after.spline)
+
+
+def _advance(
+    view: TrackingView,
+    state: _State,
+    images: FramePair | None,
+    surface: MeasuredFrame,
+    monitor: Monitor,
+    guide: Guide | None,
+    start_new: bool,
+) -> TrackedFrame:
+    """The tracked points in the frame of the view, whose surface is given; with `start_new` new ones where it has none."""
+    in_space = view.tracking.scheme == "space"
+    if in_space:
+        view = replace(view, curvature=_curvature(view, surface))
+    if state.current is None or images is None:
+        return start_tracks(surface.field, surface.cloud, view)
+    tracked = STEPS[view.tracking.scheme](view, state.before, state.current, state.templates, images, surface.frame, monitor)
+    few = len(tracked.identity) < MIN_PART_FOUND * len(state.current.identity)
+    if few and surface.frame - state.current.frame <= view.tracking.bridge_frames:
+        return nothing(surface.frame, len(view.cameras))
+    if in_space:
+        lost = state.lost.carried(state.current, tracked, view.tracking, guide).in_sight(guide)
+        reacquired = on_surface(lost.reacquired(view, state.templates, images.next_spline), surface.field, surface.cloud, view)
+        tracked = joined(on_surface(tracked, surface.field, surface.cloud, view), reacquired)
+    return regenerate(tracked, surface.field, surface.cloud, view, state.next_identity) if start_new else tracked
+
+
+def _curvature(view: TrackingView, surface: MeasuredFrame) -> CurvatureCorrection:
+    return CurvatureCorrection(
+        field=surface.field,
+        cloud=surface.cloud,
+        camera=view.cameras[view.reference],
+        reference=view.reference,
+        half_patch=view.half_patch,
+    )
+
+
+def _cut(view: TrackingView, tracked: TrackedFrame, images: FrameImages) -> Tiles:
+    """The tiles of the key templates that are cut in this frame: of new points, and of those that no longer match theirs."""
+    new = tracked.renewed
+    return cut_tiles(images.spline[view.reference], tracked.identity[new], tracked.xy[new, view.reference], view.matching, view.rows.step)
+
+
+def _checkpoint(results: Results, group: str, tracked: TrackedFrame, cut: Tiles, key: str) -> None:
+    arrays = tracked.arrays() | {f"cut_{f.name}": getattr(cut, f.name) for f in fields(Tiles)}
+    results.save_checkpoint(group, f"{tracked.frame:04d}", key, arrays)
+
+
+def _from_checkpoint(results: Results, group: str, frame: int, key: str) -> tuple[TrackedFrame, Tiles] | None:
+    arrays = results.load_checkpoint(group, f"{frame:04d}", key)
+    if arrays is None:
+        return None
+    cut = Tiles(**{f.name: arrays.pop(f"cut_{f.name}") for f in fields(Tiles)})
+    return TrackedFrame(frame=frame, **arrays), cut

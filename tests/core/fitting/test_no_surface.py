@@ -1,0 +1,104 @@
+"""Recordings whose surface cannot be measured: a blank scene in which an arm is known by keypoints or by its outlines."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.body.skin.contour_skin import limb_skin
+from tricap.core.fitting.inputs.no_surface import filled, outline_polygons, outside_outlines
+from tricap.core.foundation.errors import InputError
+from tricap.core.geometry.raster import rasterize
+from tricap.core.motion.formats.markers import Markers
+from tricap.core.motion.formats.trc import write_trc
+from tricap.core.run import pipeline
+from tricap.core.run.record import read_frame_table
+from tricap.core.take.take import open_take, read_take
+from tricap.core.tracking.contour import contour_of_mask, outward_normals
+
+from ..conftest import three_cameras, write_take
+
+SHAPE = default_shape(read_model("arm.R"))
+MOTION = np.zeros((3, len(SHAPE.skeleton.dofs)))
+MOTION[:, :3] = 0.15, 0.0, 2.6
+MOTION[:, SHAPE.skeleton.layout["elbow.R flexion"]] = np.radians([40.0, 45.0, 50.0])
+MODEL = '[body]\nmodel = "arm.R"\n'
+
+
+def _joints() -> np.ndarray:
+    return np.stack(list(joint_positions(SHAPE.skeleton, SHAPE.lengths_m, MOTION).values()), axis=1)
+
+
+def _with_keypoints(folder: Path) -> Path:
+    take = write_take(folder, three_cameras(), [[]] * 3, more=MODEL + '[[keypoints]]\nfiles = "kp.trc"\naxes = "Z up"\n')
+    names, X = SHAPE.skeleton.joint_names, _joints()
+    write_trc(folder / "kp.trc", Markers(names=names, fps=25.0, frames=np.arange(3), xyz_m=X, sigma_m=np.full(X.shape[:2], np.nan)),
+              axes="Z up")  # fmt: skip
+    return take
+
+
+def _outlines(out: Path) -> None:
+    (out / "contours").mkdir(parents=True)
+    for camera in three_cameras().cameras:
+        rows = []
+        for frame, motion in enumerate(MOTION):
+            skin = limb_skin(SHAPE, motion)
+            raster = rasterize(camera, skin.vertices_m, skin.triangles)
+            xy = contour_of_mask(raster.image(np.ones(len(raster.sample)), 0.0) > 0, 4.0)
+            rows += [f"{frame},{i},{x},{y},{u},{v},0.5,1" for i, ((x, y), (u, v)) in enumerate(zip(xy, outward_normals(xy)))]
+        text = "frame,vertex,x,y,normal_x,normal_y,sigma,on_edge\n" + "\n".join(rows) + "\n"
+        (out / "contours" / f"{camera.name}.csv").write_text(text)
+
+
+def _run(out: Path) -> dict[str, Any]:
+    return json.loads((out / "run.json").read_text())  # type: ignore[no-any-return]
+
+
+def test_keypoints_stand_for_a_surface_that_cannot_be_measured(tmp_path: Path) -> None:
+    take, out = _with_keypoints(tmp_path / "take"), tmp_path / "out"
+    job = pipeline.run(take, out)
+    assert job.body is not None and np.linalg.norm(job.body.motion.joints_m - _joints(), axis=2).max() < 0.02
+    run = _run(out)
+    assert run["stages"]["measure"]["not_done"] == run["stages"]["track"]["not_done"] == "nothing could be measured"
+    assert any("rests on outlines and keypoints" in w for w in run["warnings"]) and not (out / "clouds").exists()
+    assert read_frame_table(out / "frames.csv").frames.tolist() == [0, 1, 2] and "body fitted" in str(job)
+    assert (out / "report" / "report.html").exists() and pipeline.is_complete(job)
+
+
+def test_outlines_alone_and_nothing_is_measured_where_it_is_not_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    take, out, joints = tmp_path / "take", tmp_path / "out", _joints()[0]
+    clicks = {name: {c.name: c.project(X).round(1).tolist() for c in three_cameras().cameras}
+              for name, X in zip(SHAPE.skeleton.joint_names, joints)}  # fmt: skip
+    said = "".join(f'"{n}" = {{ ' + ", ".join(f"{v} = {xy}" for v, xy in at.items()) + " }\n" for n, at in clicks.items())
+    write_take(take, three_cameras(), [[]] * 3, more=MODEL + "[seeds.joints]\n" + said)
+    with pytest.raises(InputError, match="No surface could be measured|nowhere|texture|alike"):
+        pipeline.run(take, out)
+    _outlines(out)
+    monkeypatch.setattr(pipeline, "measure_frames", lambda *args: pytest.fail("measured"))
+    job = pipeline.run(take, out, {"fitting": {"use_surface": False}})
+    assert job.body is not None and np.linalg.norm(job.body.motion.joints_m - _joints(), axis=2).max() < 0.02
+    assert _run(out)["stages"]["measure"]["not_done"] == "fitting.use_surface is false"
+
+
+def test_what_lies_outside_an_outline_is_empty(tmp_path: Path) -> None:
+    footage = open_take(read_take(_with_keypoints(tmp_path / "take")))
+    _outlines(tmp_path / "out")
+    job = pipeline.Results(tmp_path / "out")
+    polygons = outline_polygons(footage, job)
+    assert set(polygons) == {"L", "C", "R"} and set(polygons["C"]) == {0, 1, 2}
+    empty = next(e for e in outside_outlines(footage, polygons) if e.view == "C")
+    inside = filled(polygons["C"][1], footage.rig["C"].size_px)
+    skin = limb_skin(SHAPE, MOTION[1])
+    raster = rasterize(footage.rig["C"], skin.vertices_m, skin.triangles)
+    true = raster.image(np.ones(len(raster.sample)), 0.0) > 0
+    assert (inside & true).sum() / (inside | true).sum() > 0.93
+    far = cv2.distanceTransform((~true).astype(np.uint8), cv2.DIST_L2, 5)
+    distance = empty.of_frame(1)
+    assert distance is not None and abs(distance[2, 3] * empty.unit_px - min(far[10, 14], 127)) < 3.0
+    assert distance[far[2::4, 2::4][: distance.shape[0], : distance.shape[1]] == 0].mean() < 2.0

@@ -1,0 +1,137 @@
+"""The published scan: regions, directions, retries, holes, the filter, and the same surface as the growth."""
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from tricap.core.foundation.progress import Cancelled, Monitor
+from tricap.core.images.interlace import RowGrid
+from tricap.core.images.sampling import SplineImage
+from tricap.core.matching.foreground import Foreground
+from tricap.core.matching.grid import fit_neighbours, neighbours_of, template_grid, unlike_neighbours
+from tricap.core.matching.least_squares import MatchingSettings
+from tricap.core.matching.region_growing import GrowingSettings
+from tricap.core.matching.seeds import Approximations, approximations_at_depth
+from tricap.core.matching.voronoi_scan import CASES, _Scan, limits_of, scan
+
+EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
+
+
+@pytest.fixture(scope="module")
+def scene(surfaces: ModuleType):
+    surface = surfaces.plane(0.3)
+    rig, grey = surfaces.render(surface, "strong")
+    images = [SplineImage(g) for g in grey]
+    grid = template_grid(images[1].shape, RowGrid(), 6)
+    xy = np.array([[110.0, 90.0], [210.0, 130.0]])
+    depth = surface.hit(rig[1].centre_m, rig[1].rays(xy))[0]
+    return surface, rig, images, grid, approximations_at_depth(rig, 1, RowGrid(), xy, depth)
+
+
+def run(scene, seeds: Approximations | None = None, matching: MatchingSettings | None = None, **growing):
+    _, rig, images, grid, found = scene
+    return scan(
+        images,
+        rig,
+        1,
+        grid,
+        seeds or found,
+        matching or MatchingSettings(),
+        GrowingSettings(**growing),
+        foreground=EVERYWHERE,
+        monitor=Monitor(),
+    )
+
+
+def test_two_seeds_cover_the_surface(scene) -> None:
+    surface, rig, _, grid, _ = scene
+    field = run(scene)
+    error = surface.distance_m(field.xyz_m)
+    every = grid.xy(np.arange(grid.shape[0] * grid.shape[1]))
+    on = np.isfinite(surface.hit(rig[1].centre_m, rig[1].rays(every))[0])
+    assert (np.abs(error) < 0.005).sum() > 0.8 * on.sum()  # measured 0.87; the rest lies within half a patch of the outline
+    assert np.mean(np.abs(error) > 0.005) < 0.01
+    assert np.median(field.residual_px) < 0.1
+    assert (np.diff(field.cell) > 0).all()
+
+
+def test_search_images_are_independent(scene) -> None:
+    """A search image without content costs its own matches, and so the triplets; the other's scan goes on."""
+    _, rig, images, grid, seeds = scene
+    blind = [images[0], images[1], SplineImage(np.full(images[2].shape, 80.0))]
+    field = scan(blind, rig, 1, grid, seeds, MatchingSettings(), GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
+    assert len(field.cell) == 0
+    assert field.tried > 0.5 * grid.shape[0] * grid.shape[1]
+
+
+def begun(scene, settings: MatchingSettings) -> _Scan:
+    _, _, images, grid, seeds = scene
+    cells = grid.nearest(seeds.xy[:, 1])
+    one = _Scan(images[1], images[0], grid, cells, settings, Monitor())
+    one.begin(seeds.xy[:, 0] + np.einsum("nij,nj->ni", seeds.shape[:, 0], grid.xy(cells) - seeds.xy[:, 1]), seeds.shape[:, 0])
+    return one
+
+
+def test_regions_are_voronoi_and_holes_close(scene) -> None:
+    grid, settings = scene[3], MatchingSettings()
+    one = begun(scene, settings)
+    every = grid.xy(np.arange(len(one.found)))
+    nearest = np.linalg.norm(every[:, None] - grid.xy(one._seeds), axis=2).argmin(axis=1)
+    assert (one._region == nearest).mean() > 0.99
+    one.cover()
+    covered = one.found.sum()
+    hole = np.flatnonzero(one.found)[100:400:30]
+    one.found[hole] = False
+    one.close_holes()
+    assert one.found[hole].mean() >= 0.9  # some lie at the outline, where another start may fail
+    assert one.found.sum() >= 0.99 * covered
+
+
+def test_filter_removes_what_is_unlike_and_matches_it_again(scene) -> None:
+    one = begun(scene, MatchingSettings())
+    one.cover()
+    wrong = np.flatnonzero(one.found)[50:500:45]
+    truth = one.middle[wrong].copy()
+    one.middle[wrong] += 2.5
+    one.shape[wrong, 0, 1] += 0.4
+    one.filter_and_repeat()
+    assert one.found[wrong].mean() > 0.85
+    assert np.median(np.abs(one.middle[wrong] - truth)) < 0.05
+
+
+@pytest.mark.slow
+def test_texture_cases_are_ordered(scene) -> None:
+    counts = [len(run(scene, texture=t).cell) for t in ("strong", "clothing", "skin")]
+    assert counts[0] <= counts[1] <= counts[2] * 1.02
+    assert limits_of("own", MatchingSettings(max_sigma_px=0.11)).max_sigma_px == 0.11
+    assert limits_of("strong", MatchingSettings()).max_sigma0 == CASES["strong"].max_sigma0
+
+
+def test_no_seed_gives_no_point_and_cancelling_works(scene) -> None:
+    none = Approximations(xy=np.zeros((0, 3, 2)), shape=np.zeros((0, 3, 2, 2)), depth_m=np.zeros(0))
+    assert len(run(scene, none).cell) == 0
+    _, rig, images, grid, seeds = scene
+    monitor = Monitor()
+    monitor.cancel()
+    with pytest.raises(Cancelled):
+        scan(images, rig, 1, grid, seeds, replace(MatchingSettings()), GrowingSettings(), foreground=EVERYWHERE, monitor=monitor)
+
+
+def test_neighbours_fit_a_quadric_in_spite_of_outliers() -> None:
+    grid = template_grid((80, 100), RowGrid(), 4)
+    cell = np.arange(grid.shape[0] * grid.shape[1])
+    xy = grid.xy(cell)
+    x, y = (xy - 40).T
+    z = 3 + 0.02 * x - 0.01 * y + 0.5 * 1e-3 * x * x + 2e-4 * x * y
+    noisy = z + np.where(np.random.default_rng(0).random(len(z)) < 0.1, 5.0, 0.0)
+    inner = cell[(np.abs(x) < 20) & (np.abs(y) < 20)]
+    fit = fit_neighbours(
+        neighbours_of(grid, cell, inner), xy, noisy, xy[inner], degree=2, min_scale=np.full(len(inner), 0.01), radius_px=12.0
+    )
+    assert fit.coefficients[:, 0] == pytest.approx(z[inner], abs=2e-3)
+    assert fit.coefficients[:, 3] == pytest.approx(1e-3, abs=1e-5)
+    assert np.median(fit.support) > 0.8
+    bad = unlike_neighbours(grid, cell, noisy[:, None], sigmas=3.0, least=np.array([0.3]))
+    assert bad[noisy != z].mean() > 0.95

@@ -1,0 +1,121 @@
+"""The folder of a run: checkpoints that agree or are made anew, run.json, and folders that belong to somebody else."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.foundation import store
+from tricap.core.foundation.errors import InputError
+from tricap.core.motion.formats.ply import read_ply
+from tricap.core.results.folder import Results
+from tricap.core.surface.cloud import PointCloud
+from tricap.core.tracking.trajectories import Filtered, Trajectories
+
+ARRAYS = dict(x=np.arange(6.0).reshape(2, 3))
+
+
+def test_a_checkpoint_is_found_by_its_key_only(tmp_path: Path) -> None:
+    results = Results(tmp_path / "é out")
+    assert results.load_checkpoint("surface", "0000", "k") is None
+    results.save_checkpoint("surface", "0000", "k", ARRAYS)
+    found = results.load_checkpoint("surface", "0000", "k")
+    assert found is not None and np.array_equal(found["x"], ARRAYS["x"])
+    for stage, name, key in (("surface", "0000", "other"), ("surface", "0001", "k"), ("tracks", "0000", "k")):
+        assert results.load_checkpoint(stage, name, key) is None
+
+
+def test_a_damaged_checkpoint_is_made_anew(tmp_path: Path) -> None:
+    results = Results(tmp_path)
+    results.save_checkpoint("surface", "0000", "k", ARRAYS)
+    path = tmp_path / "cache" / "surface" / "0000.npz"
+    whole = path.read_bytes()
+    for content in (b"", whole[: len(whole) // 2], b"text", whole.replace(b"x.npy", b"y.npy")):
+        path.write_bytes(content)
+        assert results.load_checkpoint("surface", "0000", "k") is None
+
+
+def test_what_was_there_and_is_not_ours(tmp_path: Path) -> None:
+    (tmp_path / "take").mkdir()
+    assert Results(tmp_path).folder == tmp_path.resolve()  # other files are left alone
+    for name in ("clouds", "report", "body.blend", "cache"):
+        folder = tmp_path / f"with {name}"
+        (folder / name).mkdir(parents=True)
+        (folder / name / "thesis.txt").write_text("x")
+        with pytest.raises(InputError, match=f"contains “{name}”, which was not written by Tricap"):
+            Results(folder)
+        Results(folder.parent / "ours").write_run({})
+    (tmp_path / "ours" / "clouds").mkdir()
+    Results(tmp_path / "ours")
+    stopped = Results(tmp_path / "stopped early")
+    stopped.save_checkpoint("surface", "0000", "k", ARRAYS)
+    (tmp_path / "stopped early" / "clouds").mkdir()
+    Results(tmp_path / "stopped early")
+
+
+def test_folders_that_cannot_be(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="is a file; choose a folder"):
+        Results(tmp_path / "file")
+    with pytest.raises(InputError, match="Cannot make the folder"):
+        Results(tmp_path / "file" / "out")
+
+
+def test_run_json(tmp_path: Path) -> None:
+    results = Results(tmp_path)
+    assert results.read_run() == {}
+    results.write_run({"fps": 25.0, "sigma0": float("nan"), "name": "é"})
+    assert results.read_run() == {"format": "tricap-run", "version": 1, "fps": 25.0, "sigma0": None, "name": "é"}
+    for content, said in (("{", "is not a JSON file"), ("[]", "was not written by"), ('{"format": "x"}', "was not written by")):
+        (tmp_path / "run.json").write_text(content)
+        with pytest.raises(InputError, match=said):
+            results.read_run()
+    store.write_json(tmp_path / "run.json", {"format": "tricap-run", "version": 2})
+    with pytest.raises(InputError, match="was not written by this version of Tricap"):
+        results.read_run()
+
+
+@pytest.mark.parametrize(("name", "value", "said"), [
+    ("stages", [], "stages"), ("stages", {"measure": 1}, "measure"), ("stages", {"track": {"key": 3}}, "track"), ("frames", [0], "frames"),
+    ("stages", {"track": {"trajectories": "many", "mean_length_frames": 2.0}}, "track"), ("frames", [3, 1], "frames"),
+    ("stages", {"fit": {"joint_sigma_mm": None}}, "fit"), ("stages", {"fit": {"joint_sigma_mm": 1.0, "frames": [3]}}, "fit"),
+    ("stages", {"fit": {"joint_sigma_mm": 10**400}}, "fit"), ("settings", [], "settings"), ("settings", {"skin": 3}, "settings"),
+    ("warnings", [1], "warnings"), ("inputs", {"rig.toml": 5}, "inputs"), ("views", "LCR", "views"), ("take", None, "take"),
+])  # fmt: skip
+def test_a_run_json_that_no_run_wrote(tmp_path: Path, name: str, value: object, said: str) -> None:
+    store.write_json(tmp_path / "run.json", {"format": "tricap-run", "version": 1, name: value})
+    with pytest.raises(InputError, match=f"run.json is damaged: “{said}” is invalid; remove the file and run again"):
+        Results(tmp_path).read_run()
+
+
+def test_clouds_and_trajectories(tmp_path: Path) -> None:
+    random, results = np.random.default_rng(0), Results(tmp_path)
+    K = np.tile(np.diag([1e-6, 4e-6, 4e-6]), (5, 1, 1))
+    cloud = PointCloud(frame=7, xyz_m=random.standard_normal((5, 3)), covariance_m2=K, normals=np.tile([0, 0, -1.0], (5, 1)),
+                       intensity=np.arange(5), xy_px=np.zeros((5, 3, 2)), residual_px=np.zeros(5))  # fmt: skip
+    results.write_cloud(cloud)
+    ply = read_ply(tmp_path / "clouds" / "0007.ply")
+    assert np.allclose(ply.xyz_m, cloud.xyz_m, atol=1e-6) and np.allclose(ply.vertex["sigma"], 3e-3)
+    xyz = random.standard_normal((3, 4, 3))
+    xyz[0, 1] = np.nan
+    sigma = np.where(np.isnan(xyz[..., 0]), np.nan, 1e-3)
+    tracks = Trajectories(frames=np.arange(3), time_s=np.arange(3) / 25, xyz_m=xyz, velocity_m_s=xyz, acceleration_m_s2=xyz,
+                          sigma_m=sigma, status=np.isfinite(sigma))  # fmt: skip
+    results.write_trajectories(Filtered(kept=tracks, source=np.arange(4), raw=tracks), 25.0)
+    arrays, header = store.load(tmp_path / "trajectories.npz")
+    assert header["format"] == "tricap-trajectories" and arrays["xyz_m"].shape == (3, 4, 3)
+    assert np.array_equal(np.isnan(arrays["xyz_m"][..., 0]), np.isnan(xyz[..., 0])) and arrays["time_s"].dtype == np.float64
+    with np.load(tmp_path / "trajectories.npz", allow_pickle=False) as promised:
+        assert {"time_s", "frames", "xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status"} <= set(promised.files)
+    with np.load(tmp_path / "trajectories_raw.npz", allow_pickle=False) as removed:
+        assert {"frames", "xyz_m", "status", "reason"} <= set(removed.files) and removed["reason"].shape == (4,)
+    with pytest.raises(ValueError, match="sigma_m|covariance"):
+        PointCloud(**{n: getattr(cloud, n) for n in PointCloud.__dataclass_fields__} | dict(covariance_m2=K[:4]))
+
+
+def test_removing(tmp_path: Path) -> None:
+    results = Results(tmp_path)
+    results.save_checkpoint("surface", "0000", "k", ARRAYS)
+    (tmp_path / "body.toml").write_text("x")
+    results.remove("body.toml", "cache", "missing")
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,154 @@
+"""Many takes on Dask: the results of one by one, whatever happens to the others or to a worker, and a summary that says so."""
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from tricap.core.cli import main
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.lock import NAME
+from tricap.core.foundation.progress import Cancelled, Monitor
+from tricap.core.run import batch, pipeline
+from tricap.core.run.batch import Engine, Outcome, Status, out_folders, run_batch, run_take, summary
+
+COARSE = {"growing": {"spacing_px": 8}}
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def killing() -> ModuleType:
+    """How the files of two runs are compared."""
+    spec = importlib.util.spec_from_file_location("killing_for_batch", Path(__file__).parents[1] / "killing.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["killing_for_batch"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def takes(plane_take: Path, tmp_path: Path) -> list[Path]:
+    """A take, one without rig, and another take."""
+    folders = [Path(shutil.copytree(plane_take, tmp_path / "takes" / name)) for name in ("kick é", "no rig", "throw")]
+    (folders[1] / "rig.toml").unlink()
+    return folders
+
+
+def without_blend(files: dict[str, bytes]) -> dict[str, bytes]:
+    """One by one, in this test, makes no body.blend."""
+    return {name: data for name, data in files.items() if name != "body.blend"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="SIGKILL")
+def test_a_worker_killed_in_mid_take(takes: list[Path], tmp_path: Path, killing: ModuleType, capfd: Capture) -> None:
+    """The first take's worker dies when two of its frames are measured; all takes end as one by one, and the bad one is told."""
+    out, killed = tmp_path / "out", list[int]()
+
+    def kill() -> None:
+        while not (out / takes[0].name / "cache" / "surface" / "0001.npz").exists():
+            time.sleep(0.01)
+        killed.append(json.loads((out / takes[0].name / NAME).read_text())["pid"])
+        os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    code = main.main(["batch", *map(str, takes), "--out", str(out), "--workers", "2", "--set", "growing.spacing_px=8"])
+    assert killed and killed[0] != os.getpid() and code == 2
+    printed = capfd.readouterr()
+    assert "3 takes: 2 done, 1 needs mending" in printed.out and "kick é: surface" in printed.err
+    told = json.loads((out / "batch.json").read_text())["takes"]
+    assert [t["status"] for t in told] == [Status.DONE, Status.INVALID_INPUT, Status.DONE] and "rig.toml" in told[1]["said"]
+    for take in (takes[0], takes[2]):
+        pipeline.run(take, tmp_path / "single" / take.name, COARSE)
+        single, many = (without_blend(killing.contents(folder / take.name)) for folder in (tmp_path / "single", out))
+        assert killing.differences(single, many) == []
+    assert not (out / "no rig").exists()
+
+
+def test_a_scheduler_by_its_address(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers as threads of this process, so that they see what is patched here: a run that is short, and a bug."""
+    from distributed import LocalCluster
+
+    def stages(job: pipeline.Run, monitor: Monitor) -> None:
+        monitor.step("surface", 1, 2)
+        if job.footage.take.folder.name == "throw":
+            raise ZeroDivisionError("ours")
+
+    monkeypatch.setattr(pipeline, "all_stages", stages)
+    monkeypatch.setattr(batch, "_scene", lambda job: None)
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        engine = Engine(scheduler=cluster.scheduler_address)
+        outcomes = run_batch(takes, tmp_path / "out", engine, COARSE, Monitor())
+        assert [o.status for o in outcomes] == [Status.DONE, Status.INVALID_INPUT, Status.BUG]
+        assert "throw_error.txt" in outcomes[2].said and "ZeroDivisionError: ours" in (tmp_path / "out" / "throw_error.txt").read_text()
+        monitor = Monitor()
+        monitor.cancel()
+        with pytest.raises(Cancelled):
+            run_batch(takes, tmp_path / "other", engine, {}, monitor)
+    assert {t["status"] for t in json.loads((tmp_path / "other" / "batch.json").read_text())["takes"]} <= {
+        "waiting",
+        Status.INVALID_INPUT,
+        Status.DONE,
+        Status.BUG,
+    }
+
+
+def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch.importlib.util, "find_spec", lambda name: None)  # no Blender
+    told = run_take(str(takes[0]), str(tmp_path / "out"), COARSE, False)
+    assert told["status"] == Status.DONE and "4 frames" in told["said"] and (tmp_path / "out" / "report" / "report.html").exists()
+    (tmp_path / "file").write_text("")
+    assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == Status.INVALID_INPUT
+
+
+@pytest.mark.parametrize(("workers", "cores", "threads"), [(1, 2, "2"), (2, 2, "1"), (2, 8, "2"), (16, 8, "1")])
+def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, threads: str) -> None:
+    environment = os.environ | batch.thread_limits(workers, cores)
+    code = "from tricap.core import threads; print(threads.THREADS)"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [threads]
+
+
+def test_what_is_doubtful_stands_in_the_summary() -> None:
+    job = SimpleNamespace(record={"warnings": []}, __str__=lambda: "")
+    assert batch._summary_of(job) == str(job)
+    job.record["warnings"] = ["View R stood still.", "Another.", "A third."]
+    assert batch._summary_of(job).endswith(". Warning: View R stood still. (2 more in the report)")
+
+
+def test_without_dask(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture) -> None:
+    monkeypatch.setattr(batch.importlib.util, "find_spec", lambda name: None)
+    assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out")]) == 2
+    assert capfd.readouterr().err == f"tricap: {batch.MISSING}\n"
+
+
+def test_no_scheduler_there(takes: list[Path], tmp_path: Path, capfd: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "CONNECT_S", 0.5)
+    assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9", "--quiet"]) == 2
+    assert "No Dask scheduler answers at tcp://127.0.0.1:9" in capfd.readouterr().err.splitlines()[-1]
+    assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--workers", "0"]) == 2
+
+
+def test_names_of_results(tmp_path: Path) -> None:
+    a, b, c = tmp_path / "monday" / "kick", tmp_path / "tuesday" / "kick", tmp_path / "throw"
+    assert [p.name for p in out_folders([a, b, c], tmp_path)] == ["monday_kick", "tuesday_kick", "throw"]
+    with pytest.raises(InputError, match="is listed twice"):
+        out_folders([a, a], tmp_path)
+
+
+def test_the_summary() -> None:
+    fine = Outcome(take="/t/a", out="/o/a", status=Status.DONE, said="fine", seconds=61.0)
+    lost = Outcome(take="/t/bb", out="/o/bb", status=Status.LOST, said="")
+    lines = summary([fine, lost])
+    assert lines[0].startswith("a   done") and "61.0 s  fine" in lines[0] and lines[-1] == "2 takes: 1 done, 1 lost"

@@ -1,0 +1,60 @@
+"""frames.csv: what stands in it, and which frames it calls bad."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.foundation.errors import InputError
+from tricap.core.run.record import COLUMNS, FrameTable, frame_table, read_frame_table, write_frame_table
+from tricap.core.surface.frames import FrameNote
+from tricap.core.tracking.trajectories import with_kinematics
+
+
+def note(frame: int, points: int, sigma_m: float, residual: float) -> FrameNote:
+    return FrameNote(frame=frame, key="", points=points, limit_px=1.0, residual_px=residual, sigma_m=sigma_m)
+
+
+def table() -> FrameTable:
+    notes = [note(4, 100, 1e-3, 0.1), note(5, 90, 1e-3, 0.4), note(6, 0, np.nan, np.nan), note(7, 110, 1.1e-3, 0.12)]
+    notes.append(note(8, 100, 1e-3, 0.1))
+    xyz = np.zeros((4, 3, 3))
+    xyz[2, :2] = np.nan
+    tracks = with_kinematics(np.arange(4, 8), np.arange(4, 8) / 25, xyz, np.where(np.isfinite(xyz[..., 0]), 2e-3, np.nan),
+                             np.ones((4, 3), dtype=np.int8), 0)  # fmt: skip
+    return frame_table(notes, tracks, None)
+
+
+def test_what_stands_in_it() -> None:
+    made = table()
+    assert made.frames.tolist() == [4, 5, 6, 7, 8] and made.values["points"].tolist() == [100, 90, 0, 110, 100]
+    assert np.allclose(made.values["sigma_mm"], [1, 1, np.nan, 1.1, 1], equal_nan=True)
+    assert np.allclose(made.values["tracks"], [3, 3, 1, 3, np.nan], equal_nan=True)
+    assert np.allclose(made.values["track_sigma_mm"], [2, 2, 2, 2, np.nan], equal_nan=True) and made.fit == ("",) * 5
+
+
+def test_bad_frames_and_why() -> None:
+    much, why = table().badness()
+    assert why == ("", "rays miss", "few points", "", "") and much.argmax() == 2 and much[0] < 1.2
+    fitted = FrameTable(frames=np.arange(2), values={name: np.ones(2) for name in COLUMNS}, fit=("fitted", "bridged"))
+    assert fitted.badness()[1] == ("", "fit bridged")
+    nothing = FrameTable(frames=np.zeros(0, dtype=int), values={name: np.zeros(0) for name in COLUMNS}, fit=())
+    assert nothing.badness()[1] == ()
+
+
+def test_there_and_back(tmp_path: Path) -> None:
+    path, made = tmp_path / "frames.csv", table()
+    write_frame_table(path, made)
+    again = read_frame_table(path)
+    assert again.frames.tolist() == made.frames.tolist() and again.fit == made.fit
+    for name in COLUMNS:
+        assert np.allclose(again.values[name], made.values[name], rtol=1e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize("text", ["frame\n1\n", "frame,points\n1,2\n", f"frame,{','.join(COLUMNS)},fit\n1,many,1,1,1,1,1,1,\n"])
+def test_a_damaged_table_is_told(tmp_path: Path, text: str) -> None:
+    (tmp_path / "frames.csv").write_text(text)
+    with pytest.raises(InputError, match="damaged"):
+        read_frame_table(tmp_path / "frames.csv")
+    with pytest.raises(InputError, match="Cannot read"):
+        read_frame_table(tmp_path / "missing.csv")

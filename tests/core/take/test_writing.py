@@ -1,0 +1,71 @@
+"""Writing take.toml: what TOML reads comes back exactly, nothing is written in vain, and nothing wrong is written."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tricap.core.foundation.errors import InputError
+from tricap.core.take.writing import new_table, read_table, renumbered, take_of_table, toml_text, write_table
+
+FULL = {
+    "format": "tricap-take", "version": 1, "fps": 29.97, "interlaced": "odd", "rig": "rig.toml", "reference_view": "C", "frames": [2, 40],
+    "views": [{"name": "L", "images": "L/*.png", "offset_frames": -3}, {"name": "C", "movie": 'C "ü".mp4'}],
+    "body": {"model": "arm.R", "locked": ["elbow.R twist"], "limits": {"elbow.R flexion": [0.0, 140.5]}},
+    "seeds": {"frame": 5, "surface": [{"L": [1.5, 2.0], "C": [3.0, 4.25]}],
+              "joints": {"elbow.R": {"L": [612.125, 180.5], "C": [0.1, 1e-7]}, "wrist.R": {}}},
+    "keyframes": [{"frame": 9, "joints": {"elbow.R": {"L": [6.0, 1.0]}}}],
+    "corrections": [{"kind": "region", "view": "L", "frames": [3, 5], "polygon": [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]}],
+    "settings": {"matching": {"patch_px": 17, "robust": True}, "surface": {}},
+}  # fmt: skip
+
+
+def test_every_kind_of_value_comes_back_exactly() -> None:
+    assert tomllib.loads(toml_text(FULL)) == FULL
+
+
+def test_people_can_read_it() -> None:
+    text = toml_text(FULL)
+    assert '[[views]]\nname = "L"\n' in text and '\n[seeds.joints]\n"elbow.R" = { L = [612.125, 180.5]' in text
+    assert "\n[settings.matching]\npatch_px = 17\nrobust = true\n" in text and text.endswith("\n")
+
+
+def test_a_file_that_says_it_already_is_left_alone(tmp_path: Path) -> None:
+    assert write_table(tmp_path, FULL)
+    path = tmp_path / "take.toml"
+    path.write_text("# my own words\n" + path.read_text(encoding="utf-8"), encoding="utf-8")
+    assert not write_table(tmp_path, FULL) and path.read_text(encoding="utf-8").startswith("# my own words")
+    assert write_table(tmp_path, FULL | {"fps": 25.0}) and read_table(tmp_path) == FULL | {"fps": 25.0}
+
+
+def test_what_is_no_take_is_not_written(tmp_path: Path) -> None:
+    write_table(tmp_path, FULL)
+    with pytest.raises(InputError, match="fps"):
+        write_table(tmp_path, FULL | {"fps": -1.0})
+    with pytest.raises(InputError, match="Did you mean “seeds”"):
+        write_table(tmp_path, FULL | {"sedes": {}})
+    assert read_table(tmp_path) == FULL and len(list(tmp_path.iterdir())) == 1
+
+
+def test_no_file_is_an_empty_table_and_a_broken_one_is_told(tmp_path: Path) -> None:
+    assert read_table(tmp_path) == {}
+    (tmp_path / "take.toml").write_text("format = ", encoding="utf-8")
+    with pytest.raises(InputError, match="is not a TOML file"):
+        read_table(tmp_path)
+
+
+def test_a_new_table_is_a_take(tmp_path: Path) -> None:
+    take = take_of_table(tmp_path, new_table([{"name": n, "movie": f"{n}.mp4"} for n in "LCR"], fps=50.0, model="arm.R"))
+    assert (take.fps, take.reference_view, take.body_model) == (50.0, "C", "arm.R")
+
+
+def test_frames_are_renumbered_when_an_image_becomes_two() -> None:
+    """Whole images to fields and back; where two frames become one, the earlier one's clicks stay."""
+    table = {"frames": [2, 40], "seeds": {"frame": 3}, "keyframes": [{"frame": 4, "joints": {}}, {"frame": 9, "joints": {}}],
+             "corrections": [{"kind": "trajectory", "frame": 5}, {"kind": "region", "frames": [1, 4]}], "fps": 25.0}  # fmt: skip
+    double = renumbered(table, 2, 1)
+    assert double == {"frames": [4, 80], "seeds": {"frame": 6}, "keyframes": [{"frame": 8, "joints": {}}, {"frame": 18, "joints": {}}],
+                      "corrections": [{"kind": "trajectory", "frame": 10}, {"kind": "region", "frames": [2, 8]}], "fps": 25.0}  # fmt: skip
+    assert renumbered(double, 1, 2) == table and renumbered({"fps": 25.0}, 2, 1) == {"fps": 25.0}
+    both = {"keyframes": [{"frame": 4, "joints": {"a": 1}}, {"frame": 5, "joints": {"a": 2}}], "frames": [3, 9]}
+    assert renumbered(both, 1, 2) == {"keyframes": [{"frame": 2, "joints": {"a": 1}}], "frames": [1, 5]}
