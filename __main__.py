@@ -16,10 +16,8 @@ def main(argv: list[str] | None = None) -> int:
     _leave_out_working_folder()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is there: its own threads would fight ours over small matrices
     from .addon import command
-    from .addon.retarget import command as retargeting
-    from .core.cli import main as commands
 
-    return commands.main(argv, (command.add_commands, retargeting.add_commands))
+    return command.main(argv)
 
 
 if __name__ == "__main__":

@@ -5,17 +5,21 @@ Importing this module does not need bpy; running the command does.
 
 import argparse
 import importlib.util
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ..core.body.fields import EXPONENTIAL, POTENTIALS
 from ..core.body.skin.closed_skin import DETAIL
+from ..core.cli import main as commands
+from ..core.cli.arguments import check_simplify, standard_output_kept_clean
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
+from .retarget import command as retargeting
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command of the `tricap` command line, of the core's or of those that need Blender; its exit code (docs/formats.md)."""
+    return commands.main(argv, (add_commands, retargeting.add_commands))
 
 
 def add_commands(subparsers: Any) -> None:
@@ -112,38 +116,10 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(f"{flag} {path} is no {ending}; let its name end so.")
 
 
-def check_simplify(degrees: float) -> None:
-    """Whether keys can be left out within so many degrees.
-
-    Raises:
-        InputError: they cannot.
-    """
-    if not 0 <= degrees <= 180:
-        raise InputError(f"--simplify {degrees:g} is no tolerance; write degrees, such as 0.5.")
-
-
-@contextmanager
-def standard_output_kept_clean(args: argparse.Namespace) -> Iterator[None]:
-    """Blender and its exporters write notes to standard output, also below Python; they go to standard error, so that ours can be read by
-    machines, and nowhere with --quiet."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    away = os.open(os.devnull, os.O_WRONLY) if getattr(args, "quiet", False) else os.dup(2)
-    os.dup2(away, 1)
-    os.close(away)
-    try:
-        yield
-    finally:
-        sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
-
-
 def register() -> None:
     """Make `blender --command tricap …` known."""
     import bpy
 
-    from ..__main__ import main
     from .session import get_session
 
     get_session().cli_command = bpy.utils.register_cli_command("tricap", main)

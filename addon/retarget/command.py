@@ -6,14 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ...core.cli.arguments import check_not_read
+from ...core.cli.arguments import check_not_read, check_simplify, standard_output_kept_clean
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
 from ...core.motion.formats.markers import UNITS_M
 from ...core.results.folder import check_not_result
-from ..command import check_simplify, standard_output_kept_clean
 from .programs import PROGRAMS, is_imported_by_blender
 
 FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")

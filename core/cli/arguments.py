@@ -3,7 +3,10 @@
 import argparse
 import os
 import re
+import sys
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -71,3 +74,30 @@ def check_not_read(flag: str, out: Path, *read: Path | None) -> None:
     for path in read:
         if path is not None and path.exists() and out.exists() and os.path.samefile(path, out):
             raise InputError(f"{flag} {out} is also an input; choose another name, so that it is not overwritten.")
+
+
+def check_simplify(degrees: float) -> None:
+    """Whether keys can be left out within so many degrees.
+
+    Raises:
+        InputError: they cannot.
+    """
+    if not 0 <= degrees <= 180:
+        raise InputError(f"--simplify {degrees:g} is no tolerance; write degrees, such as 0.5.")
+
+
+@contextmanager
+def standard_output_kept_clean(args: argparse.Namespace) -> Iterator[None]:
+    """Blender and its exporters write notes to standard output, also below Python; they go to standard error, so that ours can be read by
+    machines, and nowhere with --quiet."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    away = os.open(os.devnull, os.O_WRONLY) if getattr(args, "quiet", False) else os.dup(2)
+    os.dup2(away, 1)
+    os.close(away)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)

@@ -15,9 +15,6 @@ import numpy as np
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.lock import NAME, locked
-from ..motion.formats.ply import write_cloud
-from ..surface.cloud import PointCloud
-from ..tracking.trajectories import Filtered
 from . import run_json
 from .run_json import FORMAT, VERSION
 
@@ -139,24 +136,6 @@ class Results:
         for path in self.path("clouds").glob("*.ply"):
             if not path.stem.isdecimal() or int(path.stem) not in frames:
                 path.unlink()
-
-    def write_cloud(self, cloud: PointCloud) -> None:
-        """clouds/NNNN.ply"""
-        write_cloud(
-            self.cloud_path(cloud.frame),
-            xyz_m=cloud.xyz_m,
-            sigma_m=cloud.sigma_m,
-            normals=cloud.normals,
-            intensity=cloud.intensity,
-            rays=cloud.rays,
-        )
-
-    def write_trajectories(self, filtered: Filtered, fps: float) -> None:
-        """trajectories.npz, and trajectories_raw.npz with those that the filters or the user removed."""
-        kept = filtered.kept.arrays() | ({"source": filtered.source} if filtered.kept.track is None else {})
-        for name, arrays in (("", kept), ("_raw", filtered.arrays())):
-            single = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in arrays.items()}
-            store.save(self.path(f"trajectories{name}.npz"), single, {"format": f"tricap-trajectories{name}", "version": 1, "fps": fps})
 
     def read_run(self) -> dict[str, Any]:
         """run.json, or an empty table where there is none yet.

@@ -37,7 +37,7 @@ from ..motion.tables import write_joints, write_motion
 from ..report.pages import Report, check_pictured, write_report
 from ..report.silhouettes import Silhouettes, by_view, silhouettes_of
 from ..results.folder import FitCheckpoints, Results, check_separate_folder
-from ..surface.cloud import PointCloud, SurfaceSettings, as_written
+from ..surface.cloud import PointCloud, SurfaceSettings, as_written, write_cloud
 from ..surface.frames import MeasuredFrames, note_of
 from ..surface.measure import NothingMeasured, measure_frames
 from ..take.clicked_points import clicked_depth
@@ -48,7 +48,7 @@ from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
 from ..tracking.settings import KeyPointSettings, TrackingSettings
 from ..tracking.track import TrackingRules, track_frames
-from ..tracking.trajectories import Filtered, Trajectories
+from ..tracking.trajectories import Filtered, Trajectories, write_trajectories
 from .record import frame_table, median, new_record, track_figures, write_frame_table
 from .stages import STAGE_FILES, STAGE_INPUTS, STAGES, stage_keys, valid_stages
 
@@ -201,7 +201,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         run.footage, run.record["offsets"] = synchronised(run.footage, monitor)
     try:
         for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
-            run.results.write_cloud(as_written(run.corrected(m.cloud), s["surface"]))
+            write_cloud(run.results.cloud_path(m.frame), as_written(run.corrected(m.cloud), s["surface"]))
             done.append(note_of(m))
             room = room or m.foreground
     except Cancelled as stop:
@@ -266,7 +266,7 @@ def _follow(run: Run, monitor: Monitor, guide: Guide | None = None) -> dict[str,
     except Cancelled as stop:
         raise Cancelled("Stopped: the surface of all frames is kept, and the tracks as far as they are; run it again to go on.") from stop
     run.trajectories = filtered.kept
-    run.results.write_trajectories(filtered, take.fps)
+    write_trajectories(run.results.folder, filtered, take.fps)
     figures, warnings = track_figures(filtered.kept, reasons)
     run.warn(*(*missed_clicks(take.corrections, hit), *warnings))
     return figures

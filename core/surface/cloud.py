@@ -13,6 +13,7 @@ The patches of neighbouring points overlap, so their errors are alike: K is what
 """
 
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import label
@@ -21,6 +22,7 @@ from ..foundation.arrays import frozen
 from ..foundation.settings import knob
 from ..geometry.camera import Camera
 from ..matching.region_growing import TripletField
+from ..motion.formats import ply
 from .local_surface import LocalSurface, local_surface
 
 FILTERS = ("other surface", "small island", "depth in doubt")  # what they find; why a point went is 1 + its filter's number
@@ -181,3 +183,8 @@ def voxel_filtered(cloud: PointCloud, edge_m: float, fewest: int) -> PointCloud:
         xy_px=mean(cloud.xy_px),
         residual_px=mean(cloud.residual_px),
     )
+
+
+def write_cloud(path: Path, cloud: PointCloud) -> None:
+    """Write a cloud as clouds/NNNN.ply (docs/formats.md), whole or not at all."""
+    ply.write_cloud(path, xyz_m=cloud.xyz_m, sigma_m=cloud.sigma_m, normals=cloud.normals, intensity=cloud.intensity, rays=cloud.rays)

@@ -15,10 +15,12 @@ they have in common (calibration, the place on the body) does not move.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..foundation import store
 from ..foundation.arrays import frozen
 from ..foundation.progress import Monitor
 from ..images.interlace import frame_time_s
@@ -251,3 +253,11 @@ def with_kinematics(
         raw=raw,
         smooth=smoothed(xyz_m, sigma_m, dt, smooth_frames) if smooth_frames else raw,
     )
+
+
+def write_trajectories(out: Path, filtered: Filtered, fps: float) -> None:
+    """Write OUT/trajectories.npz, and OUT/trajectories_raw.npz with those that the filters or the user removed."""
+    kept = filtered.kept.arrays() | ({"source": filtered.source} if filtered.kept.track is None else {})
+    for name, arrays in (("", kept), ("_raw", filtered.arrays())):
+        single = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in arrays.items()}
+        store.save(out / f"trajectories{name}.npz", single, {"format": f"tricap-trajectories{name}", "version": 1, "fps": fps})

@@ -9,40 +9,40 @@ import os
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
-import argparse  # noqa: E402
-import json  # noqa: E402
-import resource  # noqa: E402
-import subprocess  # noqa: E402
-import sys  # noqa: E402
-import tempfile  # noqa: E402
-import time  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
 
-import numpy as np  # noqa: E402
+import numpy as np
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "core" / "calibration"))
 
-from truth import TEST_BARS, bound, error_m, observed, rigid  # noqa: E402
+from truth import TEST_BARS, bound, error_m, observed, rigid
 
-from tricap.core.calibration.bars import enough_rays, with_bars  # noqa: E402
-from tricap.core.calibration.bundle import Network, adjust  # noqa: E402
-from tricap.core.calibration.precision import predicted_error  # noqa: E402
+from tricap.core.calibration.bars import enough_rays, with_bars
+from tricap.core.calibration.bundle import Network, adjust
+from tricap.core.calibration.precision import predicted_error
 from tricap.core.calibration.reference_bar import (
-    initial_network,  # noqa: E402
-    lens_knowledge,  # noqa: E402
+    initial_network,
+    lens_knowledge,
 )
-from tricap.core.calibration.self_calibration import GROSS, PART, calibrate  # noqa: E402
-from tricap.core.calibration.targets import find_blobs, find_targets  # noqa: E402
-from tricap.core.foundation.progress import Monitor  # noqa: E402
-from tricap.core.geometry.camera import INTERIOR, camera_of  # noqa: E402
-from tricap.core.synthetic.bar import (  # noqa: E402
+from tricap.core.calibration.self_calibration import GROSS, PART, calibrate
+from tricap.core.calibration.targets import find_blobs, find_targets
+from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.camera import INTERIOR, camera_of
+from tricap.core.synthetic.bar import (
     RIG_KINDS,
     BarNoise,
     WavedBar,
     benchmark_cameras,
-    draw_disc,  # noqa: E402
+    draw_disc,
     random_cameras,
     waved_bar,
 )

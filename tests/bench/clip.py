@@ -21,13 +21,13 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from tricap.core.foundation.progress import Monitor  # noqa: E402
-from tricap.core.run import pipeline  # noqa: E402
-from tricap.core.synthetic import arm  # noqa: E402
-from tricap.core.synthetic.film import digitize, expose, paint  # noqa: E402
-from tricap.core.take.take import Take, open_take  # noqa: E402
+from tricap.core.foundation.progress import Monitor
+from tricap.core.run import pipeline
+from tricap.core.synthetic import arm
+from tricap.core.synthetic.film import digitize, expose, paint
+from tricap.core.take.take import Take, open_take
 
 FPS, WIDTH_PX = 25.0, 192
 SWING = round(arm.SWING_S * FPS)  # frames

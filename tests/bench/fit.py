@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "core" / "fitting"))
-import limb_scene  # noqa: E402  the scenes of the tests
+import limb_scene  # the scenes of the tests
 
 from tricap.core.body.complete import complete_shape
 from tricap.core.body.metaballs import field, field_and_derivatives

@@ -23,16 +23,15 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from tricap.core.fitting.stages.long_sequence import AT_ONCE  # noqa: E402
-from tricap.core.results.folder import Results  # noqa: E402
-from tricap.core.run.record import track_figures  # noqa: E402
-from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E402
-from tricap.core.tracking.long_tracks import trajectories_of  # noqa: E402
-from tricap.core.tracking.settings import TrackingSettings, TrackStatus  # noqa: E402
-from tricap.core.tracking.tracked import TrackedFrame, born  # noqa: E402
-from tricap.core.tracking.trajectories import Filtered, Trajectories, filter_trajectories  # noqa: E402
+from tricap.core.fitting.stages.long_sequence import AT_ONCE
+from tricap.core.run.record import track_figures
+from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
+from tricap.core.tracking.long_tracks import trajectories_of
+from tricap.core.tracking.settings import TrackingSettings, TrackStatus
+from tricap.core.tracking.tracked import TrackedFrame, born
+from tricap.core.tracking.trajectories import Filtered, Trajectories, filter_trajectories, write_trajectories
 
 CLIP_FRAMES = 30_000
 COARSE = ("growing.spacing_px=6", "tracking.spacing_px=12")
@@ -124,7 +123,7 @@ def long_table(frames: int) -> None:
     settings = TrackingSettings()
     filtered, reasons = trajectories_of(steps(), 25.0, settings, decide)
     with tempfile.TemporaryDirectory() as name:
-        Results(Path(name)).write_trajectories(filtered, 25.0)
+        write_trajectories(Path(name), filtered, 25.0)
     print(f"{frames} frames: {track_figures(filtered.kept, reasons)[0]}, {filtered.kept.omitted} left out", file=sys.stderr)
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take  # noqa: E402
+from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
 CHILD = """
 import json, pathlib, sys, time

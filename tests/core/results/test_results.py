@@ -9,8 +9,8 @@ from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 from tricap.core.motion.formats.ply import read_ply
 from tricap.core.results.folder import Results
-from tricap.core.surface.cloud import PointCloud
-from tricap.core.tracking.trajectories import Filtered, Trajectories
+from tricap.core.surface.cloud import PointCloud, write_cloud
+from tricap.core.tracking.trajectories import Filtered, Trajectories, write_trajectories
 
 ARRAYS = dict(x=np.arange(6.0).reshape(2, 3))
 
@@ -93,7 +93,7 @@ def test_clouds_and_trajectories(tmp_path: Path) -> None:
     K = np.tile(np.diag([1e-6, 4e-6, 4e-6]), (5, 1, 1))
     cloud = PointCloud(frame=7, xyz_m=random.standard_normal((5, 3)), covariance_m2=K, normals=np.tile([0, 0, -1.0], (5, 1)),
                        intensity=np.arange(5), xy_px=np.zeros((5, 3, 2)), residual_px=np.zeros(5))  # fmt: skip
-    results.write_cloud(cloud)
+    write_cloud(results.cloud_path(cloud.frame), cloud)
     ply = read_ply(tmp_path / "clouds" / "0007.ply")
     assert np.allclose(ply.xyz_m, cloud.xyz_m, atol=1e-6) and np.allclose(ply.vertex["sigma"], 3e-3)
     xyz = random.standard_normal((3, 4, 3))
@@ -101,7 +101,7 @@ def test_clouds_and_trajectories(tmp_path: Path) -> None:
     sigma = np.where(np.isnan(xyz[..., 0]), np.nan, 1e-3)
     tracks = Trajectories(frames=np.arange(3), time_s=np.arange(3) / 25, xyz_m=xyz, velocity_m_s=xyz, acceleration_m_s2=xyz,
                           sigma_m=sigma, status=np.isfinite(sigma))  # fmt: skip
-    results.write_trajectories(Filtered(kept=tracks, source=np.arange(4), raw=tracks), 25.0)
+    write_trajectories(results.folder, Filtered(kept=tracks, source=np.arange(4), raw=tracks), 25.0)
     arrays, header = store.load(tmp_path / "trajectories.npz")
     assert header["format"] == "tricap-trajectories" and arrays["xyz_m"].shape == (3, 4, 3)
     assert np.array_equal(np.isnan(arrays["xyz_m"][..., 0]), np.isnan(xyz[..., 0])) and arrays["time_s"].dtype == np.float64

@@ -28,7 +28,7 @@ Capture = pytest.CaptureFixture[str]
 @pytest.fixture(scope="module")
 def killing() -> ModuleType:
     """How the files of two runs are compared."""
-    spec = importlib.util.spec_from_file_location("killing_for_batch", Path(__file__).parents[1] / "killing.py")
+    spec = importlib.util.spec_from_file_location("killing_for_batch", Path(__file__).parents[2] / "killing.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules["killing_for_batch"] = module
