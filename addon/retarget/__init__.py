@@ -1,1 +1,1 @@
-"""Retargeting in Blender: armatures read into plain values, results written as actions, files opened and saved."""
+"""Retargeting: a motion onto any rig, and its export to other programs."""

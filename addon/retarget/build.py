@@ -1,4 +1,4 @@
-"""An armature with its motion made from plain values: what exporters need of a motion that is no armature yet."""
+"""Builds an armature with an action from plain values, for exporters of a motion that is not an armature yet."""
 
 import bpy
 import numpy as np
@@ -10,7 +10,7 @@ from ...core.motion.retarget.rig import Motion, channels, head_of
 from .apply import set_range
 from .write import write_action
 
-SHORTEST_M = 1e-4
+SHORTEST_M = 1e-4  # of a bone that an armature can have
 
 
 def build_armature(motion: Motion, name: str) -> bpy.types.Object:
@@ -63,7 +63,7 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
 
 
 def loose_bones(motion: Motion) -> list[str]:
-    """Bones whose heads move against their parents, by more than 0.1 mm: an armature built here would not show that."""
+    """Bones whose heads move relative to their parents by more than 0.1 mm, which an armature built here does not show."""
     rig = motion.rig
     return [
         name

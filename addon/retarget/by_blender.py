@@ -1,9 +1,9 @@
-"""FBX, glTF, USD and Alembic by Blender's exporters, with options that were checked by reading the files back
+"""FBX, glTF, USD and Alembic by Blender's exporters, with options that were verified by reading the files back
 (tests/addon/test_retarget_export.py).
 
-Everything is exported from a scene of its own, which is gone afterwards: the open file stays as it was. Units: an FBX file in centimetres
-has centimetres in its armature and says so, since a scaled armature object is what users of game engines complain of; USD and Alembic are
-scaled by their exporters; glTF knows metres alone. Axes: FBX and USD as the program wants them, glTF and Alembic know Y up alone.
+Everything is exported from a temporary scene, so that the open file does not change. Units: an FBX file in centimetres has centimetres in
+its armature and its header, because game engines handle scaled armature objects badly; USD and Alembic are scaled by their exporters; glTF
+is always in metres. Axes: FBX and USD use those of the program, glTF and Alembic are always Y up.
 """
 
 import os
@@ -27,24 +27,26 @@ from .apply import set_range
 from .build import build_armature, loose_bones
 from .programs import Program, bone_names
 
-FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # where Blender's Y points to in a file with these axes
+FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # the axis of the file that is Blender's Y
 UP = {"Y up": "Y", "Z up": "Z", "OpenSim": "Y"}
-MADE = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "collections")
+TEMPORARY = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "collections")
 
 
 def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Motion) -> str:
-    """Write a motion as an armature, with the skin of the run that it comes from; a sentence about what was written.
+    """Write a motion as an armature, with the skin of its run; returns a summary.
 
     Raises:
-        InputError: the format cannot show the motion, or the file cannot be written.
+        InputError: the format cannot store the motion, or the file cannot be written.
     """
     loose = loose_bones(motion)
     if loose:
-        raise InputError(f"{len(loose)} bones of the motion shift against their parents (“{loose[0]}”), which {kind} cannot show; use bvh.")
+        raise InputError(
+            f"{len(loose)} bones of the motion move relative to their parents (such as “{loose[0]}”), which {kind} cannot store; use bvh."
+        )
     if kind == "abc" and not out.is_dir():
-        raise InputError("Alembic holds meshes, and this motion has none; choose fbx, glb or usd.")
+        raise InputError("Alembic stores meshes, and this motion has none; choose fbx, glb or usd.")
     unit_m = metres_per(program.unit or "m", "the preset") if kind == "fbx" else 1.0
-    with scene_of_its_own() as scene:
+    with temporary_scene() as scene:
         scene.unit_settings.scale_length = unit_m
         armature_object = build_armature(scaled(motion, 1.0 / unit_m), file.stem)
         if out.is_dir():
@@ -55,16 +57,16 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
 
 
 def export_opened(kind: str, file: Path, program: Program, motion: Motion) -> str:
-    """Write the one moving armature of the open file, whose motion was read, with the meshes that it moves; lengths stay in metres.
+    """Write the one animated armature of the open file, with the meshes that it deforms; lengths stay in metres.
 
     Raises:
-        InputError: the format cannot show it, or the file cannot be written.
+        InputError: the format cannot store it, or the file cannot be written.
     """
     armature_object = next(o for o in bpy.data.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action)
     skins = [o for o in bpy.data.objects if o.type == "MESH" and armature_object in (m.object for m in o.modifiers if m.type == "ARMATURE")]
     if kind == "abc" and not skins:
-        raise InputError("Alembic holds meshes, and this motion has none; choose fbx, glb or usd.")
-    with scene_of_its_own() as scene:
+        raise InputError("Alembic stores meshes, and this motion has none; choose fbx, glb or usd.")
+    with temporary_scene() as scene:
         for thing in (armature_object, *skins):
             scene.collection.objects.link(thing)
         set_range(scene, motion)
@@ -79,9 +81,9 @@ def scaled(motion: Motion, factor: float) -> Motion:
 
 
 @contextmanager
-def scene_of_its_own() -> Iterator[bpy.types.Scene]:
-    """A new scene in the window. Afterwards the scene before is back, and whatever was made meanwhile is gone."""
-    window, before = bpy.context.window, {kind: set(getattr(bpy.data, kind)) for kind in MADE}
+def temporary_scene() -> Iterator[bpy.types.Scene]:
+    """A new scene in the window. Afterwards the earlier scene is shown again, and all data made meanwhile is removed."""
+    window, before = bpy.context.window, {kind: set(getattr(bpy.data, kind)) for kind in TEMPORARY}
     former = window.scene
     scene = bpy.data.scenes.new("Tricap export")
     window.scene = scene
@@ -89,7 +91,7 @@ def scene_of_its_own() -> Iterator[bpy.types.Scene]:
         yield scene
     finally:
         window.scene = former
-        bpy.data.batch_remove([thing for kind in MADE for thing in getattr(bpy.data, kind) if thing not in before[kind]])
+        bpy.data.batch_remove([thing for kind in TEMPORARY for thing in getattr(bpy.data, kind) if thing not in before[kind]])
 
 
 def _write(kind: str, file: Path, program: Program, armature_object: bpy.types.Object, names: dict[str, str]) -> None:
@@ -101,7 +103,7 @@ def _write(kind: str, file: Path, program: Program, armature_object: bpy.types.O
 
 
 def write_whole(file: Path, export: Callable[[str], Any]) -> None:
-    """Let an exporter write beside `file` and move the result over, so that it is there in full or not at all.
+    """Let an exporter write to a temporary file next to `file` and rename it, so that `file` is complete or unchanged.
 
     Raises:
         InputError: the exporter failed.
@@ -115,8 +117,8 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
             raise InputError(f"Blender wrote nothing to {file}; choose another folder.")
         os.replace(part, file)
     except (OSError, RuntimeError, shutil.Error) as error:
-        said = getattr(error, "strerror", None) or str(error).strip()[:200]
-        raise InputError(f"Cannot write {file}: {said}. Choose another name or folder, or free some space.") from error
+        reason = getattr(error, "strerror", None) or str(error).strip()[:200]
+        raise InputError(f"Cannot write {file}: {reason}. Choose another name or folder, or free some space.") from error
     finally:
         if part.exists():
             part.unlink()

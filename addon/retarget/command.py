@@ -20,15 +20,15 @@ FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
 
 def add_commands(subparsers: Any) -> None:
     """Add `retarget` and `export` to an argparse sub-parsers object."""
-    about = "put a motion onto a rig"
+    about = "retarget a motion onto a rig"
     parser: argparse.ArgumentParser = subparsers.add_parser("retarget", help=about, description=about.capitalize())
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
     parser.add_argument("--rig", metavar="FILE", type=Path, required=True, help="the rig: .blend, .glb, .gltf, .vrm, .fbx or .bvh")
     parser.add_argument("--out", dest="blend", metavar="FILE.blend", type=Path, required=True, help="the file to write")
-    parser.add_argument("--map", metavar="FILE.json", type=Path, help="which bones are which; default: found by names and shape")
-    parser.add_argument("--armature", metavar="NAME", default="", help="which armature, if the rig's file has several")
-    parser.add_argument("--root", choices=("travel", "in place", "still"), default="travel", help="how the body moves through the room")
-    parser.add_argument("--feet", choices=("off", "auto", "always"), default="auto", help="when feet are held on the floor")
+    parser.add_argument("--map", metavar="FILE.json", type=Path, help="the mapping of the bones; default: recognised by names and shape")
+    parser.add_argument("--armature", metavar="NAME", default="", help="the armature, if the rig's file has several")
+    parser.add_argument("--root", choices=("travel", "in place", "still"), default="travel", help="how the body travels")
+    parser.add_argument("--feet", choices=("off", "auto", "always"), default="auto", help="when feet are planted on the floor")
     parser.add_argument(
         "--hands",
         choices=("free", "keep"),
@@ -41,24 +41,30 @@ def add_commands(subparsers: Any) -> None:
         default="bones",
         help="spread twist over twist bones, or half of a hand's also over a forearm that has none",
     )
-    parser.add_argument("--scale", metavar="F", type=float, default=0.0, help="size of the steps against the source's; default: the legs'")
+    parser.add_argument(
+        "--scale",
+        metavar="F",
+        type=float,
+        default=0.0,
+        help="size of the steps relative to the source's; default: by the length of the legs",
+    )
     _add_axes(parser)
-    parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0, help="leave out keys within this tolerance")
-    parser.add_argument("--report", action="store_true", help="also write figures (JSON) and a picture beside FILE.blend")
+    parser.add_argument("--simplify", metavar="DEG", type=float, default=0.0, help="remove keys within this tolerance")
+    parser.add_argument("--report", action="store_true", help="also write figures (JSON) and a picture next to FILE.blend")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     parser.set_defaults(run=_clean(retarget))
-    about = "write a run's motion or points in another format"
+    about = "export a run's motion or points to another format"
     parser = subparsers.add_parser("export", help=about, description=about.capitalize())
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--out", dest="file", metavar="FILE", type=Path, required=True, help="the file to write (for ply: a folder)")
-    parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain", help="names, units and axes for a program")
+    parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain", help="names, units and axes of a program")
     _add_axes(parser)
     parser.set_defaults(run=_clean(export))
 
 
 def _clean(run: Callable[[argparse.Namespace, Monitor], list[str]]) -> Callable[[argparse.Namespace, Monitor], list[str]]:
-    """A command on whose standard output nothing of Blender's own is written."""
+    """A command that keeps Blender's own messages off standard output."""
 
     def kept_clean(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         with standard_output_kept_clean(args):
@@ -68,8 +74,8 @@ def _clean(run: Callable[[argparse.Namespace, Monitor], list[str]]) -> Callable[
 
 
 def _add_axes(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--up", choices=("Y", "Z"), default="", help="the axis that is up in a BVH, TRC, C3D or CSV file")
-    parser.add_argument("--unit", choices=tuple(UNITS_M), default="", help="the unit of such a file, if not the one that it says")
+    parser.add_argument("--up", choices=("Y", "Z"), default="", help="the up axis of a BVH, TRC, C3D or CSV file")
+    parser.add_argument("--unit", choices=tuple(UNITS_M), default="", help="the unit of such a file, if not the one stated in it")
 
 
 def _need_blender(what: str) -> None:
@@ -81,7 +87,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Retarget args.out onto args.rig and save args.blend; the lines to show.
 
     Raises:
-        InputError: there is no Blender in this Python, or the input needs mending.
+        InputError: there is no Blender in this Python, or the input is invalid.
         Cancelled: the monitor was cancelled; no file was written.
     """
     _need_blender("retarget")
@@ -94,12 +100,12 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from . import apply, files
 
     if args.blend.suffix != ".blend":
-        raise InputError(f"{args.blend.name} is no name of a Blender file; let it end in .blend.")
+        raise InputError(f"{args.blend.name} is not the name of a Blender file; let it end in .blend.")
     check_simplify(args.simplify)
     check_not_result(args.blend, args.out)
     check_not_read("--out", args.blend, args.rig)
     if args.report:
-        check_not_read("--report would write over what is read:", args.blend.with_suffix(".json"), args.map)
+        check_not_read("--report would overwrite an input:", args.blend.with_suffix(".json"), args.map)
     table = {"root": args.root, "hands": args.hands, "twist": args.twist, "scale": args.scale}
     settings = from_table(RetargetSettings, table, "--root, --hands, --twist, --scale")
     feet = from_table(FeetSettings, {"mode": args.feet}, "--feet")
@@ -127,7 +133,7 @@ def retarget(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def outcome_table(outcome: Any, source_map: Any, target_map: Any) -> dict[str, Any]:
-    """What a retargeting made, as the table of --json and --report. `outcome`: apply.Outcome; maps: RigMap."""
+    """The outcome of a retargeting, as the table of --json and --report. `outcome`: apply.Outcome; maps: RigMap."""
     figures, result = outcome.figures, outcome.result
     return {
         "format": "tricap-retarget",
@@ -154,7 +160,7 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Write args.file (with the format's ending) in args.format; the lines to show.
 
     Raises:
-        InputError: what is asked for is not in OUT, or the input needs mending.
+        InputError: OUT lacks the data, or the input is invalid.
         Cancelled: the monitor was cancelled.
     """
     from .export import BY_BLENDER, export_file, named_for

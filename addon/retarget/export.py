@@ -1,4 +1,4 @@
-"""Motions for other programs: text and points by core's writers, the rest by Blender's exporters."""
+"""Exports motions for other programs: BVH and points by core's writers, the other formats by Blender's exporters."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,35 +19,34 @@ from ...core.results.folder import check_not_result
 from .programs import PROGRAMS, Program, bone_names, is_imported_by_blender, joint_names
 
 BY_BLENDER = ("fbx", "glb", "usd", "abc")
-POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")}  # axes and unit that are the format's own
+POINTS = {"trc": ("OpenSim", "m"), "c3d": ("Z up", "mm"), "csv": ("Z up", "m")}  # usual axes and unit of the format
 WRITE_POINTS = {"trc": write_trc, "c3d": write_c3d, "csv": write_points_csv}
 ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "fbx", "abc", *POINTS)} | {
     "glb": (".glb", ".gltf"), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
 
 
 def named_for(kind: str, file: Path, out: Path) -> Path:
-    """The file to write in a format, of what is in `out`: with the format's ending, where the name has none. Skins go into a folder of any
-    name.
+    """The file to write, with the ending of the format where the name has none. Skins go into a folder of any name.
 
     Raises:
-        InputError: the name ends as files of another format do, or is that of what is read.
+        InputError: the name has the ending of another format, or the file is an input.
     """
     ending = file.suffix.lower()
     if kind != "ply" and ending not in ENDINGS[kind]:
         if any(ending in others for others in ENDINGS.values()):
-            raise InputError(f"{file.name} ends as files of another format do; let it end with {ENDINGS[kind][0]}, or choose that format.")
+            raise InputError(f"{file.name} has the ending of another format; let it end in {ENDINGS[kind][0]}, or choose that format.")
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
     check_not_result(file, out)
     return file
 
 
 def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor, *, up: str = "", unit: str = "") -> str:
-    """Write the motion or the points in OUT to `file`; a sentence about what was written. For BY_BLENDER on the main thread only.
+    """Write the motion or the points in OUT to `file`; returns a summary. For BY_BLENDER on the main thread only.
 
     `up`, `unit`: of OUT, for `read_motion_source`.
 
     Raises:
-        InputError: OUT lacks what the format needs, or the file cannot be written.
+        InputError: OUT lacks data that the format needs, or the file cannot be written.
         Cancelled: the monitor was cancelled.
     """
     program = PROGRAMS[preset]

@@ -28,14 +28,14 @@ def open_rig(path: Path) -> None:
     """Open or import a file into an empty scene: afterwards it is the open file.
 
     Raises:
-        InputError: there is no such file, it is of an unknown kind, or Blender cannot read it.
+        InputError: there is no such file, its format is unknown, or Blender cannot read it.
     """
     path = Path(path).resolve()
     if not path.is_file():
         raise InputError(f"There is no file {path}; check its name.")
     kind = path.suffix.lower()
     if kind not in RIG_FILES:
-        raise InputError(f"{path.name} is no file with a rig that can be read; choose one of {', '.join(RIG_FILES)}.")
+        raise InputError(f"{path.name} is not a rig in a known format; choose one of {', '.join(RIG_FILES)}.")
     if kind == ".blend":
         _try(lambda: bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False), path)
         return
@@ -60,7 +60,7 @@ def open_motion(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -
 
 
 def import_rig(path: Path) -> list[bpy.types.Object]:
-    """Import a file into the open scene; the armatures that came in.
+    """Import a file into the open scene; returns the imported armatures.
 
     Raises:
         InputError: Blender cannot read it.
@@ -83,14 +83,14 @@ def import_rig(path: Path) -> list[bpy.types.Object]:
         _rig_of_bvh(path)
     armatures = [o for o in bpy.data.objects if o not in before and o.type == "ARMATURE"]
     for armature_object in armatures:
-        known = {role: name for role, name in humanoid.items() if name in armature_object.data.bones}
-        if known:
-            armature_object.data[ROLES_KEY] = known
+        roles = {role: name for role, name in humanoid.items() if name in armature_object.data.bones}
+        if roles:
+            armature_object.data[ROLES_KEY] = roles
     return armatures
 
 
 def _rig_of_bvh(path: Path) -> None:
-    """A BVH file's skeleton as an armature at rest, by our own reader: in metres, and in a person's pose if its zero pose is none."""
+    """A BVH file's skeleton as an armature at rest, by our own reader: in metres; a zero pose that no person takes is replaced."""
     motion = read_bvh(path)
     motion = with_person_like_rest(MappedMotion(motion=motion, map=find_map(motion.rig)))[0].motion
     armature_object = build_armature(replace(motion, frames=motion.frames[:1], R=motion.R[:1], head_m=motion.head_m[:1]), path.stem)
@@ -102,13 +102,13 @@ def _rig_of_bvh(path: Path) -> None:
 
 
 def _try(load: Callable[[], object], path: Path) -> None:
-    """Importers fail in their own ways; whatever they raise over a file is the file's fault."""
+    """Run an importer; any error that it raises becomes an InputError about the file."""
     try:
         load()
     except Exception as error:  # noqa: BLE001  importers raise anything, from struct.error to RuntimeError with a traceback as text
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[-1][:200] if lines else type(error).__name__
-        raise InputError(f"Blender cannot read {path} ({reason}); it is damaged or of another kind, export it again.") from error
+        raise InputError(f"Blender cannot read {path} ({reason}); it is damaged or in another format; export it again.") from error
 
 
 def the_armature(name: str, what: str) -> bpy.types.Object:

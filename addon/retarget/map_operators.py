@@ -14,7 +14,7 @@ from .read import read_rig
 
 
 def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Path | None) -> set[str]:
-    """Fill the editor with the target's mapping: found, or from a file."""
+    """Fill the editor with the target's mapping, recognised or from a file."""
     props = context.scene.tricap_retarget
     try:
         target = armature_of("", props.target, "target")
@@ -23,13 +23,13 @@ def show_map(operator: bpy.types.Operator, context: bpy.types.Context, file: Pat
         operator.report({"ERROR"}, str(error))
         return {"CANCELLED"}
     properties.fill_rows(props, rig_map, target)
-    for line in (*rig_map.missing, *rig_map.notes):
+    for line in (*rig_map.missing_notes, *rig_map.notes):
         operator.report({"INFO"}, line)
     return {"FINISHED"}
 
 
 class FindMap(bpy.types.Operator):
-    """Recognise the target's bones by their names and the rig's shape, and show the mapping for editing"""
+    """Recognise the target's bones by their names and the shape of the rig, and show the mapping for editing"""
 
     bl_idname = "tricap.retarget_find_map"
     bl_label = "Recognise"
@@ -41,7 +41,7 @@ class FindMap(bpy.types.Operator):
 
 
 class LoadMap(bpy.types.Operator):
-    """Read the target's mapping from a file, and show it for editing"""
+    """Load the target's mapping from a file, and show it for editing"""
 
     bl_idname = "tricap.retarget_load_map"
     bl_label = "Load Mapping"
@@ -51,7 +51,7 @@ class LoadMap(bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the file."""
+        """Open the file browser."""
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
@@ -61,7 +61,7 @@ class LoadMap(bpy.types.Operator):
 
 
 class SaveMap(bpy.types.Operator):
-    """Save the mapping as a file that can be edited, shared and used again"""
+    """Save the mapping to a file, to edit, share or reuse it"""
 
     bl_idname = "tricap.retarget_save_map"
     bl_label = "Save Mapping"
@@ -69,7 +69,7 @@ class SaveMap(bpy.types.Operator):
     filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the file."""
+        """Open the file browser."""
         self.filepath = self.filepath or "mapping.json"
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
@@ -80,7 +80,7 @@ class SaveMap(bpy.types.Operator):
         try:
             rig_map = properties.edited_map(props, props.rows_of)
             if rig_map is None:
-                raise InputError("There is no mapping to save; recognise the target first.")
+                raise InputError("There is no mapping to save; press Recognise first.")
             write_map(Path(bpy.path.abspath(self.filepath)), rig_map, Path(self.filepath).stem)
         except InputError as error:
             self.report({"ERROR"}, str(error))
@@ -89,7 +89,7 @@ class SaveMap(bpy.types.Operator):
 
 
 class AddLine(bpy.types.Operator):
-    """Add a line to the mapping, for the next part of the body that has none"""
+    """Add a line to the mapping, for the next part of the body without one"""
 
     bl_idname = "tricap.retarget_add_line"
     bl_label = "Add Line"
@@ -97,11 +97,11 @@ class AddLine(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """A mapping needs a target."""
+        """Only with a target."""
         return context.scene.tricap_retarget.target is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Add it and select it."""
+        """Add a line and select it."""
         props = context.scene.tricap_retarget
         if props.rows_of != props.target:
             props.rows.clear()
@@ -114,7 +114,7 @@ class AddLine(bpy.types.Operator):
 
 
 class RemoveLine(bpy.types.Operator):
-    """Take the selected line out of the mapping: the part is left to its parent"""
+    """Remove the selected line from the mapping: the part then follows its parent"""
 
     bl_idname = "tricap.retarget_remove_line"
     bl_label = "Remove Line"
@@ -122,12 +122,12 @@ class RemoveLine(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """There must be one."""
+        """Only with a selected line."""
         props = context.scene.tricap_retarget
         return 0 <= props.row < len(props.rows)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Remove it and select the one before."""
+        """Remove the line and select the one before."""
         props = context.scene.tricap_retarget
         props.rows.remove(props.row)
         props.row = max(0, min(props.row, len(props.rows) - 1))

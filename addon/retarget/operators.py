@@ -25,36 +25,36 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Made:
-    """What the worker hands back."""
+class Computed:
+    """The result of the worker thread."""
 
     source: MappedMotion
     result: Retargeted
 
 
 class Retarget(JobOperator, bpy.types.Operator):
-    """Put the motion of an armature or a file onto the target, as a new action; the source is left alone"""
+    """Put the motion of an armature or a file onto the target, as a new action. The source does not change"""
 
     bl_idname = "tricap.retarget"
     bl_label = "Retarget"
     bl_options = {"UNDO"}
 
-    source: bpy.props.StringProperty(name="Source", description="Armature that moves; empty: the panel's")  # type: ignore[valid-type]
+    source: bpy.props.StringProperty(name="Source", description="Armature with the motion; empty: the one in the panel")  # type: ignore[valid-type]
     file: bpy.props.StringProperty(
         name="Motion",
         subtype="FILE_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="A run's folder, BVH, TRC, C3D or CSV instead of an armature; empty: the panel's",
+        description="A motion file instead of an armature: a folder with results, BVH, TRC, C3D or CSV; empty: the one in the panel",
     )
-    target: bpy.props.StringProperty(name="Target", description="Armature that shall move; empty: the panel's")  # type: ignore[valid-type]
+    target: bpy.props.StringProperty(name="Target", description="Armature that gets the motion; empty: the one in the panel")  # type: ignore[valid-type]
     map: bpy.props.StringProperty(
         name="Mapping",
         subtype="FILE_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Mapping of the target (JSON); empty: the panel's, or found",
+        description="Mapping of the target (JSON); empty: the one in the panel, or automatic",
     )
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Made]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Computed]:
         """Read both rigs and, from an armature, its motion."""
         props = context.scene.tricap_retarget
         settings, feet = snapshot(props.settings, RetargetSettings), snapshot(props.feet, FeetSettings)
@@ -63,26 +63,29 @@ class Retarget(JobOperator, bpy.types.Operator):
         if moving is not None:
             apply.check_distinct(moving, self._target)
         edited = properties.edited_map(props, self._target) if not self.map else None
-        self._unused = properties.other_lines(props, self._target) if not self.map else ""
-        self._goal = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None, edited)
-        goal, scene = self._goal, context.scene
+        self._unused_mapping = properties.foreign_mapping_note(props, self._target) if not self.map else ""
+        self._mapped_target = apply.read_target(self._target, Path(bpy.path.abspath(self.map)) if self.map else None, edited)
+        target, scene = self._mapped_target, context.scene
         fps, start = scene.render.fps / scene.render.fps_base, scene.frame_start
         if moving is not None:
             self._name = f"{moving.name} on {self._target.name}"
             motion = with_residual_motion(moving, read_motion(moving, read_rig(moving), action_frames(moving)))
-            return lambda monitor: compute(lambda: motion, goal, settings, feet, monitor)
-        path, said = Path(bpy.path.abspath(self.file or props.file)), properties.said(props)
+            return lambda monitor: compute(lambda: motion, target, settings, feet, monitor)
+        path, file_axes = Path(bpy.path.abspath(self.file or props.file)), properties.axes_of_file(props)
         self._name = path.stem
-        return lambda monitor: compute(lambda: resampled(read_motion_source(path, **said), fps, start), goal, settings, feet, monitor)
+        return lambda monitor: compute(
+            lambda: resampled(read_motion_source(path, **file_axes), fps, start), target, settings, feet, monitor
+        )
 
-    def finish(self, context: bpy.types.Context, result: Made) -> set[str]:
-        """Write the action."""
+    def finish(self, context: bpy.types.Context, result: Computed) -> set[str]:
+        """Write the action and report how good it is."""
         props = context.scene.tricap_retarget
         preview.remove_preview(self._target)
-        outcome = apply.apply(self._target, result.source, self._goal, result.result, self._name, props.tolerance_deg)
+        outcome = apply.apply(self._target, result.source, self._mapped_target, result.result, self._name, props.tolerance_deg)
         if props.strip:
             push_to_strip(self._target, outcome.written.action)
-        notes = [*filter(None, [self._unused]), *outcome.notes]
+        notes = [*filter(None, [self._unused_mapping]), *outcome.notes]
+        props.last_export = ""
         props.last = "\n".join([str(outcome.figures), *notes])
         for note in notes:
             self.report({"INFO"}, note)
@@ -90,11 +93,11 @@ class Retarget(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def compute(read: Callable[[], Motion], goal: apply.Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor) -> Made:
-    """The computation, free of bpy."""
+def compute(read: Callable[[], Motion], target: apply.Target, settings: RetargetSettings, feet: FeetSettings, monitor: Monitor) -> Computed:
+    """The computation, without bpy."""
     motion = read()
     source = MappedMotion(motion=motion, map=apply.map_of(motion.rig))
-    return Made(source=source, result=apply.transfer(source, goal, settings, feet, monitor))
+    return Computed(source=source, result=apply.transfer(source, target, settings, feet, monitor))
 
 
 def armature_of(name: str, chosen: bpy.types.Object | None, which: str, *, needed: bool = True) -> Any:
@@ -105,12 +108,12 @@ def armature_of(name: str, chosen: bpy.types.Object | None, which: str, *, neede
     """
     found = bpy.data.objects.get(name) if name else chosen
     if found is None and (needed or name):
-        raise InputError(f"There is no armature “{name}” for the {which}." if name else f"Choose the {which}: an armature.")
+        raise InputError(f"There is no armature “{name}” to be the {which}." if name else f"Choose an armature as the {which}.")
     return found
 
 
 class Preview(bpy.types.Operator):
-    """Let the target follow the source live, by constraints; feet are pinned only by Retarget"""
+    """Let the target follow the source live, by constraints; only Retarget plants the feet"""
 
     bl_idname = "tricap.retarget_preview"
     bl_label = "Preview"
@@ -122,8 +125,8 @@ class Preview(bpy.types.Operator):
         try:
             source, target = armature_of("", props.source, "source"), armature_of("", props.target, "target")
             apply.check_distinct(source, target)
-            rig, goal = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
-            count = preview.add_preview(source, MappedRig(rig=rig, map=apply.map_of(rig)), target, goal.mapped)
+            rig, mapped = read_rig(source), apply.read_target(target, edited=properties.edited_map(props, target))
+            count = preview.add_preview(source, MappedRig(rig=rig, map=apply.map_of(rig)), target, mapped.mapped)
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -132,7 +135,7 @@ class Preview(bpy.types.Operator):
 
 
 class EndPreview(bpy.types.Operator):
-    """Take the constraints of the preview away"""
+    """Remove the constraints of the preview"""
 
     bl_idname = "tricap.retarget_end_preview"
     bl_label = "End Preview"

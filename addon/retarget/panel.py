@@ -1,4 +1,4 @@
-"""The section “Onto a Character” of the panel. draw() only draws."""
+"""The controls of retargeting in step Retarget. draw() only draws."""
 
 import dataclasses
 from pathlib import Path
@@ -14,19 +14,19 @@ from . import preview, properties
 
 
 class TRICAP_UL_map(bpy.types.UIList):
-    """The mapping's lines."""
+    """The lines of the mapping."""
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
         """Part and bones."""
         row = layout.row(align=True)
         row.prop(item, "role", text="", emboss=False)
         row.prop(item, "bones", text="", emboss=False)
-        if item.twist:  # shown and edited below the list
+        if item.twist:  # edited below the list
             row.label(text="", icon="CON_ROTLIKE")
 
 
 def _draw_map(layout: bpy.types.UILayout, props: Any) -> None:
-    """The mapping's lines, which can be edited, and what was not found."""
+    """The editor of the mapping, with the parts that were not found."""
     row = layout.row()
     row.template_list("TRICAP_UL_map", "", props, "rows", props, "row", rows=6)
     buttons = row.column(align=True)
@@ -38,8 +38,8 @@ def _draw_map(layout: bpy.types.UILayout, props: Any) -> None:
     buttons.operator("tricap.retarget_find_map", icon="VIEWZOOM")
     buttons.operator("tricap.retarget_load_map", icon="FILE_FOLDER", text="Load")
     buttons.operator("tricap.retarget_save_map", icon="FILE_TICK", text="Save")
-    if props.target is not None and (said := properties.other_lines(props, props.target)):
-        sentence(layout, bpy.context, said, "ERROR")
+    if props.target is not None and (note := properties.foreign_mapping_note(props, props.target)):
+        sentence(layout, bpy.context, note, "ERROR")
     for line in props.missing.splitlines():
         sentence(layout, bpy.context, line, "INFO")
 
@@ -57,7 +57,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
             row.prop(props, "unit")
     column.prop(props, "target")
     header, body = layout.panel("tricap_retarget_map", default_closed=True)
-    header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (found by itself)")
+    header.label(text=f"Mapping ({len(props.rows)} parts)" if props.rows else "Mapping (automatic)")
     if body is not None:
         _draw_map(body, props)
     for title, group, settings in (("Motion", props.settings, RetargetSettings), ("Feet", props.feet, FeetSettings)):
@@ -76,7 +76,7 @@ def draw_retarget(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     buttons.operator("tricap.retarget_preview", text="Preview", icon="HIDE_OFF")
     if bpy.data.collections.get(preview.NAME) is not None:
         buttons.operator("tricap.retarget_end_preview", text="", icon="X")
-    for line in props.last.splitlines() if not props.last.startswith("Exported") else ():  # the step says that itself
+    for line in props.last.splitlines():
         sentence(layout, context, line, "DOT")
 
 

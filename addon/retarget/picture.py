@@ -1,4 +1,4 @@
-"""Source and target side by side, as a picture: lines from joint to joint, the target with the points of its skin."""
+"""A picture that compares source and target: lines from joint to joint, the target with points of its skin."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,16 +14,17 @@ from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.roles import ARM, LEG, SIDES, sided
 from ...core.motion.retarget.transfer import body_axes
 
-COLUMNS = 8
+COLUMNS = 8  # frames
 CELL_PX = (190, 270)
-MOST_POINTS = 15000
-ROOM = 1.3  # for heads and titles above the highest joint
-APART = 0.2  # of a line's length: gaps between its bones
+MOST_POINTS = 15000  # of the skin
+HEADROOM = 1.3  # height of a cell by that of the highest joint, for heads and titles
+MAX_GAPS = 0.2  # of a chain's length: gaps between its bones; with larger ones, tails are not drawn
+VIEW_DEG = 40.0  # from the front
 PAPER, INK, LEFT, RIGHT, SKIN, FLOOR = (255, 255, 255), (60, 60, 60), (40, 90, 220), (210, 120, 30), (185, 185, 185), (160, 160, 160)
 
 
 def draw(path: Path, source: Motion, source_map: RigMap, target: bpy.types.Object, motion: Motion, target_map: RigMap) -> None:
-    """Write a PNG: a row of frames of the source, below it the target, obliquely from the front, with frame numbers; left limbs are red,
+    """Write a PNG: a row of frames of the source, below it the target, obliquely from the front, with frame numbers. Left limbs are red,
     right ones blue.
 
     Raises:
@@ -32,7 +33,7 @@ def draw(path: Path, source: Motion, source_map: RigMap, target: bpy.types.Objec
     some = np.unique(np.linspace(0, len(motion.frames) - 1, COLUMNS).round().astype(int))
     rows = []
     for moved, rig_map, skinned, title in ((source, source_map, None, "source"), (motion, target_map, target, "target")):
-        size = max(float(moved.head_m[some, :, 2].max() - min(moved.head_m[..., 2].min(), 0.0)) * ROOM, 1e-3)
+        size = max(float(moved.head_m[some, :, 2].max() - min(moved.head_m[..., 2].min(), 0.0)) * HEADROOM, 1e-3)
         view = _view(moved, rig_map)
         cells = [_cell(moved, rig_map, int(i), size, view, skinned) for i in some]
         for k, (i, cell) in enumerate(zip(some, cells)):
@@ -40,7 +41,7 @@ def draw(path: Path, source: Motion, source_map: RigMap, target: bpy.types.Objec
         rows.append(np.concatenate(cells, axis=1))
     done, data = cv2.imencode(".png", np.concatenate(rows, axis=0))
     if not done:
-        raise InputError(f"The picture {path} could not be made; leave --report out.")
+        raise InputError(f"The picture {path} could not be made; leave out --report.")
     store.write_bytes(path, data.tobytes())
 
 
@@ -49,13 +50,13 @@ def _write(image: np.ndarray, place: tuple[int, int], words: str) -> None:
 
 
 def _view(motion: Motion, rig_map: RigMap) -> np.ndarray:
-    """Right and up (2, 3) of the picture, from where the body faces at first: 40° from its front."""
+    """Right and up (2, 3) of the picture, VIEW_DEG from the front of the body in the first frame."""
     hips = rig_map.first("hips")
     axes = body_axes(motion.rig, rig_map)
     if hips is not None:
         b = motion.rig.index[hips]
         axes = motion.R[0, b] @ motion.rig.R_rest[b].T @ axes
-    heading = np.arctan2(-axes[1, 1], -axes[0, 1]) + np.radians(40.0)
+    heading = np.arctan2(-axes[1, 1], -axes[0, 1]) + np.radians(VIEW_DEG)
     right = np.array([-np.sin(heading), np.cos(heading), 0.0])
     return np.stack([right, np.array([0.12 * np.cos(heading), 0.12 * np.sin(heading), -1.0])])
 
@@ -85,12 +86,12 @@ def _cell(motion: Motion, rig_map: RigMap, i: int, size: float, view: np.ndarray
 
 
 def _tip(motion: Motion, i: int, line: list[str]) -> list[np.ndarray]:
-    """Where the last bone of a line ends, of a rig whose bones end where the next ones begin; other ends tell nothing."""
+    """The tail of the last bone of a chain, in a rig whose bones end where the next ones begin; other tails mean nothing."""
     rig, bones = motion.rig, [motion.rig.index[name] for name in line]
     gaps = np.linalg.norm(rig.tail_m[bones[1:-1]] - rig.head_m[bones[2:]], axis=1)
     steps = np.linalg.norm(rig.head_m[bones[2:]] - rig.head_m[bones[1:-1]], axis=1)
     last = bones[-1]
-    if gaps.sum() > APART * steps.sum():
+    if gaps.sum() > MAX_GAPS * steps.sum():
         return []
     return [motion.head_m[i, last] + motion.R[i, last] @ (rig.R_rest[last].T @ (rig.tail_m[last] - rig.head_m[last]))]
 
@@ -110,7 +111,7 @@ def _chain(bones: Mapping[str, tuple[str, ...]], roles: list[str]) -> list[str]:
 
 
 def _skin_points(armature_object: bpy.types.Object, frame: float) -> np.ndarray:
-    """Some vertices (N, 3) of what the armature moves, in a frame."""
+    """Vertices (N, 3) of the meshes that the armature deforms, in a frame, thinned to about MOST_POINTS."""
     scene = bpy.context.scene
     scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1.0))
     graph, found = bpy.context.evaluated_depsgraph_get(), [np.zeros((0, 3))]

@@ -1,10 +1,10 @@
 """A live preview: the target follows the source by constraints, before anything is baked.
 
-Each part of the target follows an empty that hangs on the source's bone, turned by what lies between the two rest poses:
+Each part of the target follows an empty parented to the source's bone, rotated by the difference of the two rest poses:
 
     R_t = R_s · K,   K = R_s,restᵀ · A · R_t,rest                      (2) of core.motion.retarget.transfer
 
-The hips follow an empty driven by the source's hips, scaled. Feet are not pinned in the preview; taking it away leaves the rig as it was.
+The hips follow an empty driven by the source's hips, scaled. Feet are not planted in the preview. Removing it restores the rig.
 """
 
 import bpy
@@ -18,14 +18,14 @@ from ...core.motion.retarget.roles import part_of
 from ...core.motion.retarget.transfer import alignments, untwisted_bone
 
 NAME = "Tricap preview"
-KEPT = "tricap_before_preview"  # of the target: the earlier values of properties of its controls
+EARLIER_KEY = "tricap_before_preview"  # custom property of the target: the earlier values of its controls' properties
 
 
 def add_preview(source: bpy.types.Object, source_rig: MappedRig, target: bpy.types.Object, target_rig: MappedRig) -> int:
     """Constrain the target to the source; the number of bones that follow.
 
     Raises:
-        InputError: source and target have no part in common.
+        InputError: source and target have no part of the body in common.
     """
     remove_preview(target)
     aligned = alignments(source_rig, target_rig)
@@ -44,20 +44,20 @@ def add_preview(source: bpy.types.Object, source_rig: MappedRig, target: bpy.typ
             count += 1
     if "hips" in aligned:
         hips = source_rig.map.bones["hips"][0], target_rig.map.bones["hips"][0]
-        _carry(collection, source, hips[0], target, hips[1], leg_ratio(source_rig, target_rig))
+        _drive_hips(collection, source, hips[0], target, hips[1], leg_ratio(source_rig, target_rig))
     _set_control_properties(target, target_rig.map)
     collection.hide_viewport = collection.hide_render = True
     return count
 
 
 def remove_preview(target: bpy.types.Object) -> int:
-    """Take the preview's constraints and empties away; how many constraints there were."""
+    """Remove the preview's constraints and empties; returns the number of constraints."""
     count = 0
     for bone in target.pose.bones:
         for constraint in [c for c in bone.constraints if c.name.startswith(NAME)]:
             bone.constraints.remove(constraint)
             count += 1
-    for name, values in target.pop(KEPT, {}).items():
+    for name, values in target.pop(EARLIER_KEY, {}).items():
         for key, value in values.items() if name in target.pose.bones else ():
             target.pose.bones[name][key] = value
     if not any(c.name.startswith(NAME) for o in bpy.data.objects if o.type == "ARMATURE" for b in o.pose.bones for c in b.constraints):
@@ -69,20 +69,20 @@ def remove_preview(target: bpy.types.Object) -> int:
 
 def _set_control_properties(target: bpy.types.Object, rig_map: RigMap) -> None:
     """Set the properties with which the controls drive the rig (FK instead of IK), and store their values."""
-    kept: dict[str, dict[str, float]] = {}
+    earlier: dict[str, dict[str, float]] = {}
     for name, values in rig_map.control_rig.properties.items() if rig_map.control_rig is not None else ():
         bone = target.pose.bones.get(name)
         for key, value in values.items() if bone is not None else ():
             if key in bone:
-                kept.setdefault(name, {})[key] = bone[key]
+                earlier.setdefault(name, {})[key] = bone[key]
                 bone[key] = type(bone[key])(value)
-    if kept:
-        target[KEPT] = kept
+    if earlier:
+        target[EARLIER_KEY] = earlier
         target.update_tag()
 
 
 def _empty(collection: bpy.types.Collection, source: bpy.types.Object, bone: str, K: np.ndarray, name: str) -> bpy.types.Object:
-    """An empty on a bone of the source. What is parented to a bone sits at its tail."""
+    """An empty parented to a bone of the source, where it sits at the tail."""
     empty = bpy.data.objects.new(name, None)
     collection.objects.link(empty)
     empty.parent, empty.parent_type, empty.parent_bone = source, "BONE", bone
@@ -96,10 +96,10 @@ def _follow(bone: bpy.types.PoseBone, empty: bpy.types.Object) -> None:
     constraint.target_space = constraint.owner_space = "WORLD"
 
 
-def _carry(
+def _drive_hips(
     collection: bpy.types.Collection, source: bpy.types.Object, source_hips: str, target: bpy.types.Object, hips: str, scale: float
 ) -> None:
-    """The hips' place: the source's, times the ratio of the legs, by drivers."""
+    """The location of the hips: the source's, times the ratio of the leg lengths, by drivers."""
     empty = bpy.data.objects.new(f"{NAME} place", None)
     collection.objects.link(empty)
     for i, axis in enumerate("XYZ"):

@@ -1,4 +1,4 @@
-"""What other programs want of a file: names of bones, unit, axes, and the order of rotations."""
+"""The conventions of other programs: names of bones, unit, axes, and the order of rotations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ PRESETS = Path(__file__).resolve().parent.parent / "presets"
 
 @dataclass(frozen=True, kw_only=True)
 class Program:
-    """`names`: a file in presets/, with `prefix` before them, or the file's own; `unit` and `axes` (of core.motion.markers): empty for the
-    format's own; `bvh_order`: in which BVH's rotation channels stand."""
+    """`names`: a file in presets/ with the names of bones; `prefix`: in front of them, None for the prefix in that file; `unit` and `axes`
+    (see core.motion.markers): empty for those of the format; `bvh_order`: the order of BVH's rotation channels."""
 
     names: str = ""
     prefix: str | None = None
@@ -29,8 +29,8 @@ PROGRAMS = {
     "mixamo": Program(names="mixamo", unit="cm", axes="Y up"),
     "unreal": Program(names="unreal", unit="cm", axes="Z up"),
     "unity": Program(names="unity", unit="m", axes="Y up"),
-    "maya": Program(names="mixamo", prefix="", unit="cm", axes="Y up", bvh_order="ZYX"),  # HumanIK's names; a colon is a name space
-    "motionbuilder": Program(names="mixamo", prefix="", unit="cm", axes="Y up", bvh_order="ZYX"),  # its own order: x turns first
+    "maya": Program(names="mixamo", prefix="", unit="cm", axes="Y up", bvh_order="ZYX"),  # HumanIK's names; a colon would be a name space
+    "motionbuilder": Program(names="mixamo", prefix="", unit="cm", axes="Y up", bvh_order="ZYX"),  # its own order: x rotates first
     "opensim": Program(axes="OpenSim"),
 }
 
@@ -45,7 +45,7 @@ def presets(controls: bool = False) -> list[Preset]:
 
 
 def bone_names(rig: Rig, program: Program) -> dict[str, str]:
-    """Names of a program by the rig's own; bones that the program has no name for keep theirs."""
+    """The program's names by the rig's own names, for bones that the program has a name for."""
     if not program.names:
         return {}
     wanted_by_role, prefix = _wanted(program)
@@ -59,7 +59,7 @@ def bone_names(rig: Rig, program: Program) -> dict[str, str]:
 
 
 def joint_names(joints: Sequence[str], program: Program) -> tuple[str, ...]:
-    """The joints by the names of the bones that begin at them; joints at which none begins keep theirs."""
+    """The joints' names: each gets that of the bone that begins at it, if there is one."""
     if not program.names:
         return tuple(joints)
     wanted, prefix = _wanted(program)

@@ -1,4 +1,4 @@
-"""What the panel of retargeting remembers, in the scene: `scene.tricap_retarget`."""
+"""The settings of retargeting in the scene: `scene.tricap_retarget`."""
 
 import json
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ from ...core.motion.retarget.retarget import RetargetSettings
 from ...core.motion.retarget.roles import ROLES
 from ..properties import group_class
 
-USUAL = "USUAL"
+AUTOMATIC = "USUAL"  # the identifier in saved files
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
@@ -23,21 +23,21 @@ def _is_armature(_: bpy.types.PropertyGroup, thing: bpy.types.Object) -> bool:
     return bool(thing.type == "ARMATURE")
 
 
-def _with_usual(names: Iterable[str]) -> list[tuple[str, str, str]]:
-    return [(USUAL, "As Usual", "As the file says, or as is the custom of its kind"), *((name, name, "") for name in names)]
+def _with_automatic(names: Iterable[str]) -> list[tuple[str, str, str]]:
+    return [(AUTOMATIC, "Automatic", "As stated in the file, or as is usual for its format"), *((name, name, "") for name in names)]
 
 
-def said(props: Any) -> dict[str, str]:
-    """Up axis and unit of the file, for `read_motion_source`."""
-    return {name: "" if getattr(props, name) == USUAL else getattr(props, name) for name in ("up", "unit")}
+def axes_of_file(props: Any) -> dict[str, str]:
+    """Up axis and unit of the motion file, for `read_motion_source`."""
+    return {name: "" if getattr(props, name) == AUTOMATIC else getattr(props, name) for name in ("up", "unit")}
 
 
 class MapRow(bpy.types.PropertyGroup):
-    """One line of the mapping: a part of the body, and the bones of the target that are it, separated by commas."""
+    """One line of the mapping: a part of the body, and its bones in the target, separated by commas."""
 
     role: bpy.props.EnumProperty(name="Part", items=[(role, role, "") for role in ROLES])  # type: ignore[valid-type]
-    bones: bpy.props.StringProperty(name="Bones", description="Bones from the body outwards, separated by commas")  # type: ignore[valid-type]
-    twist: bpy.props.StringProperty(name="Twist", description="Bones that share the part's twist")  # type: ignore[valid-type]
+    bones: bpy.props.StringProperty(name="Bones", description="Bones of this part from the body outwards, separated by commas")  # type: ignore[valid-type]
+    twist: bpy.props.StringProperty(name="Twist", description="Twist bones of this part, separated by commas")  # type: ignore[valid-type]
 
 
 Settings: type = group_class("retarget", RetargetSettings)
@@ -45,52 +45,53 @@ Feet: type = group_class("retarget_feet", FeetSettings)
 
 
 class Retargeting(bpy.types.PropertyGroup):
-    """Source, target, settings and the mapping that is being edited."""
+    """Source, target, settings, and the mapping in the editor."""
 
     source: bpy.props.PointerProperty(
         type=bpy.types.Object,
         name="Source",
         poll=_is_armature,  # type: ignore[valid-type]
-        description="The armature that moves",
+        description="The armature with the motion",
     )
     file: bpy.props.StringProperty(
         name="Motion",
         subtype="FILE_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Instead of an armature: a run's folder, BVH, TRC, C3D or CSV",
+        description="A motion file instead of an armature: a folder with results, BVH, TRC, C3D or CSV",
     )
     up: bpy.props.EnumProperty(
         name="Up",
-        items=_with_usual(("Y", "Z")),  # type: ignore[valid-type]
-        description="The axis that is up in the file, if the body lies down otherwise",
+        items=_with_automatic(("Y", "Z")),  # type: ignore[valid-type]
+        description="The up axis of the file; change it if the body lies down",
     )
     unit: bpy.props.EnumProperty(
         name="Unit",
-        items=_with_usual(UNITS_M),  # type: ignore[valid-type]
-        description="The unit of the file, if it is not the one that it says",
+        items=_with_automatic(UNITS_M),  # type: ignore[valid-type]
+        description="The unit of the file; change it if the one stated in the file is wrong",
     )
     target: bpy.props.PointerProperty(
         type=bpy.types.Object,
         name="Target",
         poll=_is_armature,  # type: ignore[valid-type]
-        description="The armature that shall move",
+        description="The armature that gets the motion",
     )
     tolerance_deg: bpy.props.FloatProperty(
         name="Simplify [°]",
         min=0.0,
         max=10.0,
         default=0.0,  # type: ignore[valid-type]
-        description="Leave out keys as long as no rotation is off by more; 0: a key in every frame",
+        description="Remove keys as long as no rotation changes by more than this; 0: a key in every frame",
     )
-    strip: bpy.props.BoolProperty(name="As NLA Strip", description="Put the action into a strip, to layer corrections over it")  # type: ignore[valid-type]
+    strip: bpy.props.BoolProperty(name="As NLA Strip", description="Push the action down to an NLA strip, to layer corrections over it")  # type: ignore[valid-type]
     settings: bpy.props.PointerProperty(type=Settings)  # type: ignore[valid-type]
     feet: bpy.props.PointerProperty(type=Feet)  # type: ignore[valid-type]
     rows: bpy.props.CollectionProperty(type=MapRow)  # type: ignore[valid-type]
     row: bpy.props.IntProperty()  # type: ignore[valid-type]
-    rows_of: bpy.props.PointerProperty(type=bpy.types.Object)  # type: ignore[valid-type]  # the armature whose bones the lines name
-    steering: bpy.props.StringProperty()  # type: ignore[valid-type]  # JSON: how the lines' controls steer the rig
+    rows_of: bpy.props.PointerProperty(type=bpy.types.Object)  # type: ignore[valid-type]  # the armature of the mapping
+    steering: bpy.props.StringProperty()  # type: ignore[valid-type]  # JSON: the control rig of the mapping
     missing: bpy.props.StringProperty()  # type: ignore[valid-type]
-    last: bpy.props.StringProperty()  # type: ignore[valid-type]
+    last: bpy.props.StringProperty()  # type: ignore[valid-type]  # figures and notes of the last retargeting
+    last_export: bpy.props.StringProperty()  # type: ignore[valid-type]  # what was exported since
 
 
 def fill_rows(props: Any, rig_map: RigMap, target: bpy.types.Object) -> None:
@@ -101,7 +102,7 @@ def fill_rows(props: Any, rig_map: RigMap, target: bpy.types.Object) -> None:
         row.role, row.bones, row.twist = role, ", ".join(chain), ", ".join(rig_map.twist.get(role, ()))
     props.rows_of, props.row = target, 0
     props.steering = json.dumps(rig_map.control_rig.table()) if rig_map.control_rig is not None else ""
-    props.missing = "\n".join((*rig_map.missing, *rig_map.notes))
+    props.missing = "\n".join((*rig_map.missing_notes, *rig_map.notes))
 
 
 def edited_map(props: Any, target: bpy.types.Object | None) -> RigMap | None:
@@ -126,26 +127,26 @@ def edited_map(props: Any, target: bpy.types.Object | None) -> RigMap | None:
     return RigMap(bones=bones, twist=twist, origin="the panel", control_rig=control_rig and control_rig.of_controls(bones, twist))
 
 
-def other_lines(props: Any, target: bpy.types.Object) -> str:
-    """A sentence if the editor's lines are another armature's."""
+def foreign_mapping_note(props: Any, target: bpy.types.Object) -> str:
+    """A note if the mapping in the editor belongs to another armature, else ""."""
     if not props.rows or props.rows_of == target:
         return ""
-    whose = f"“{props.rows_of.name}”" if props.rows_of is not None else "a rig that is gone"
-    return f"the mapping's lines are those of {whose} and were not used; recognise “{target.name}” to edit its own"
+    whose = f"“{props.rows_of.name}”" if props.rows_of is not None else "a deleted armature"
+    return f"the mapping is that of {whose} and was not used; press Recognise to edit the one of “{target.name}”"
 
 
 CLASSES = (MapRow, Settings, Feet, Retargeting)
 
 
 def register() -> None:
-    """Register the groups and hang them onto the scene."""
+    """Register the property groups and add them to the scene."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.tricap_retarget = bpy.props.PointerProperty(type=Retargeting)
 
 
 def unregister() -> None:
-    """Take them away again."""
+    """Remove them."""
     del bpy.types.Scene.tricap_retarget
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

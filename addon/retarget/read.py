@@ -1,6 +1,6 @@
-"""Armatures and their actions as plain values, in the world. Main thread only.
+"""Reads armatures and their actions as plain values, in world space. Main thread only.
 
-Frames are read by playing the scene once (constraints, drivers and layers included); all the rest is done on arrays.
+Motion is read by playing the scene once, with constraints, drivers and layers; everything else is done on arrays.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ from ...core.motion.retarget.rig import Motion, Rig
 from ...core.motion.retarget.roles import role_of
 from ..scene.armature import ROLES_KEY
 
-UNIFORM = 1e-3  # scales along the axes may differ by this part
+UNIFORM = 1e-3  # relative tolerance between the scales along the axes
 RESIDUAL_KEY = "tricap_unshown"  # custom property of an action: its residual motion, and a digest of the keys that it belongs to
 
 
@@ -26,10 +26,10 @@ def read_rig(armature_object: bpy.types.Object) -> Rig:
     """The rest pose of an armature object in the world, parents first.
 
     Raises:
-        InputError: it is no armature, has no bones, or is scaled unevenly.
+        InputError: it is not an armature, has no bones, or is scaled unevenly.
     """
     if armature_object is None or armature_object.type != "ARMATURE":
-        raise InputError(f"{getattr(armature_object, 'name', 'Nothing')} is no armature; choose an armature.")
+        raise InputError(f"{getattr(armature_object, 'name', 'Nothing')} is not an armature; choose an armature.")
     bones = in_order(armature_object)
     if not bones:
         raise InputError(f"The armature “{armature_object.name}” has no bones; choose another.")
@@ -70,7 +70,7 @@ def scale_of(armature_object: bpy.types.Object) -> float:
     """The object's scale.
 
     Raises:
-        InputError: it differs along the axes, is none, or mirrors.
+        InputError: it differs along the axes, is zero, or is negative.
     """
     M = world_matrix(armature_object)[:3, :3]
     lengths = np.linalg.norm(M, axis=0)
@@ -134,7 +134,7 @@ VRM = {"hips": "hips", "head": "head"} | {
 
 
 def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> Rig:
-    """The rig with the points under its feet, from the skins that it moves: where they would touch a floor tilted this way and that."""
+    """The rig with the sole points of its feet, from the skins that it deforms: the points that would touch a floor at various tilts."""
     wanted = [name for side in "LR" for part in ("foot", "toe") for name in rig_map.bones.get(f"{part}.{side}", ())]
     instead = rig_map.control_rig.skin if rig_map.control_rig is not None else {}
     meant = {instead.get(name, name): name for name in wanted}
@@ -148,14 +148,14 @@ def with_soles(rig: Rig, armature_object: bpy.types.Object, rig_map: RigMap) -> 
         place = np.empty(3 * len(skin.data.vertices))
         skin.data.vertices.foreach_get("co", place)
         place = _moved(world_matrix(skin), place.reshape(-1, 3))
-        for name, vertices in _mostly(skin, groups).items():
+        for name, vertices in _by_dominant_group(skin, groups).items():
             points.setdefault(name, []).append(place[vertices])
-    soles = {name: undermost(np.concatenate(parts)) for name, parts in points.items()}
+    soles = {name: sole_points(np.concatenate(parts)) for name, parts in points.items()}
     return Rig(**{f: getattr(rig, f) for f in rig.__dataclass_fields__ if f != "sole_m"}, sole_m=soles)
 
 
-def _mostly(skin: bpy.types.Object, groups: dict[int, str]) -> dict[str, list[int]]:
-    """Vertices by the group that holds more than half of their weight."""
+def _by_dominant_group(skin: bpy.types.Object, groups: dict[int, str]) -> dict[str, list[int]]:
+    """Vertices by the group that has more than half of their weight."""
     found: dict[str, list[int]] = {}
     for vertex in skin.data.vertices:
         weights = {g.group: g.weight for g in vertex.groups}
@@ -165,7 +165,7 @@ def _mostly(skin: bpy.types.Object, groups: dict[int, str]) -> dict[str, list[in
     return found
 
 
-def undermost(points: np.ndarray) -> np.ndarray:
+def sole_points(points: np.ndarray) -> np.ndarray:
     """The points (K, 3) of a cloud that a plane touches from below, at tilts of up to 75° in all directions."""
     tilt, heading = np.meshgrid(np.radians([0, 15, 30, 45, 60, 75]), np.radians(np.arange(0, 360, 30)))
     down = -np.stack([np.sin(tilt) * np.cos(heading), np.sin(tilt) * np.sin(heading), np.cos(tilt)], axis=-1).reshape(-1, 3)
@@ -173,7 +173,7 @@ def undermost(points: np.ndarray) -> np.ndarray:
 
 
 def read_motion(armature_object: bpy.types.Object, rig: Rig, frames: Sequence[int], monitor: Monitor | None = None) -> Motion:
-    """The motion of an armature as it plays in its scene, constraints and all. The scene's frame is put back."""
+    """The motion of an armature as it plays in its scene, constraints and all. The scene's current frame is restored."""
     scene = bpy.context.scene
     now, names, monitor = scene.frame_current, rig.names, monitor or Monitor()
     pose = np.empty((len(frames), len(names), 4, 4))
@@ -205,7 +205,7 @@ def action_frames(armature_object: bpy.types.Object) -> range:
     """
     data = armature_object.animation_data
     if data is None or (data.action is None and not data.nla_tracks):
-        raise InputError(f"The armature “{armature_object.name}” has no action; choose one that moves.")
+        raise InputError(f"The armature “{armature_object.name}” has no action; choose one with an action.")
     if data.action is None:
         scene = bpy.context.scene
         return range(scene.frame_start, scene.frame_end + 1)

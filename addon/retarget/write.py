@@ -1,4 +1,4 @@
-"""A retargeted motion as an action of the target: all keys of a curve at once, in the bones' own rotation modes."""
+"""Writes a retargeted motion as an action of the target: all keys of an F-curve at once, in the bones' own rotation modes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ REST = {
     "scale": (1, 1, 1),
 }
 
-Resting = tuple[str, str, np.ndarray]  # bone, path and values of a channel at rest
+RestChannel = tuple[str, str, np.ndarray]  # bone, path and rest values of a channel
 
 
 @dataclass(frozen=True, kw_only=True)
 class Written:
-    """The new action, the one with a key in every frame if that is another, the number of keys, and the constraints that had to be muted
-    because they would overrule it."""
+    """The new action; `raw`, the action with a key in every frame if the new one has fewer; the number of keys; and the constraints that
+    were muted because they would override the action."""
 
     action: bpy.types.Action
     raw: bpy.types.Action | None
@@ -43,29 +43,29 @@ def write_action(
     tolerance_deg: float = 0.0,
     properties: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Written:
-    """Give the target a new action with the motion; its former one is kept in the file. Main thread only.
+    """Give the target a new action with the motion; the earlier one stays in the file. Main thread only.
 
-    `tolerance_deg`: leave out keys as long as no rotation is off by more, and keep an action with all of them, too; 0 keys every frame.
+    `tolerance_deg`: remove keys as long as no rotation changes by more, and add an action with all keys, too; 0 keys every frame.
     `properties`: by bone, custom properties that the action sets once, such as FK instead of IK.
     """
-    former = target.animation_data_create().action
-    if former is not None:
-        former.use_fake_user = True
-    resting, properties = _put_to_rest(target, result), properties or {}
+    earlier = target.animation_data_create().action
+    if earlier is not None:
+        earlier.use_fake_user = True
+    resting, properties = _reset_undriven(target, result), properties or {}
     raw = None
     if tolerance_deg > 0:
-        raw, _ = _filled(target, result, f"{name} (every frame)", 0.0, resting, properties)
+        raw, _ = _new_action(target, result, f"{name} (every frame)", 0.0, resting, properties)
         raw.use_fake_user = True
-    action, keys = _filled(target, result, name, tolerance_deg, resting, properties)
-    return Written(action=action, raw=raw, keys=keys, muted=_mute(target, result))
+    action, keys = _new_action(target, result, name, tolerance_deg, resting, properties)
+    return Written(action=action, raw=raw, keys=keys, muted=_mute_constraints(target, result))
 
 
-def _filled(
+def _new_action(
     target: bpy.types.Object,
     result: Retargeted,
     name: str,
     tolerance_deg: float,
-    resting: Sequence[Resting],
+    resting: Sequence[RestChannel],
     properties: Mapping[str, Mapping[str, float]],
 ) -> tuple[bpy.types.Action, int]:
     """A new action of the target with the motion, and its number of keys."""
@@ -78,14 +78,14 @@ def _filled(
         channel, values = rotation_values(bone, result.basis[:, b])
         keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2)
         keys += _key(action, target, f"{bone.path_from_id()}.{channel}", frames[keep], values[keep], bone.name)
-    carried = dict(result.loose_m) | ({result.carrier: result.shift_m} if result.carrier >= 0 else {})
-    for b, shift_m in carried.items():
+    shifts = dict(result.loose_m) | ({result.carrier: result.shift_m} if result.carrier >= 0 else {})
+    for b, shift_m in shifts.items():
         bone = target.pose.bones[rig.names[b]]
         values = location_values(target, bone, result, b, shift_m)
         keep = needed_keys(frames, values, np.radians(tolerance_deg) / 2 * float(np.ptp(rig.head_m, axis=0).max()) / scale_of(target))
         keys += _key(action, target, f"{bone.path_from_id()}.location", frames[keep], values[keep], bone.name)
     keys += sum(_key(action, target, path, frames[:1], rest[None], bone) for bone, path, rest in resting)
-    return action, keys + _set_properties(action, target, properties, frames[:1])
+    return action, keys + _key_properties(action, target, properties, frames[:1])
 
 
 def rotation_values(bone: bpy.types.PoseBone, basis: np.ndarray) -> tuple[str, np.ndarray]:
@@ -122,16 +122,16 @@ def _key(action: bpy.types.Action, owner: bpy.types.Object, path: str, frames: n
     return len(frames) * values.shape[1]
 
 
-def _put_to_rest(target: bpy.types.Object, result: Retargeted) -> list[Resting]:
-    """Put to rest what the motion does not drive but an earlier pose has left turned or shifted; what an action must say of it, once."""
-    rig, resting = result.motion.rig, list[Resting]()
-    steered = {driver.data_path for driver in target.animation_data.drivers}
+def _reset_undriven(target: bpy.types.Object, result: Retargeted) -> list[RestChannel]:
+    """Reset channels that the motion does not drive but that an earlier pose has changed; returns them for a key each."""
+    rig, resting = result.motion.rig, list[RestChannel]()
+    driven_paths = {driver.data_path for driver in target.animation_data.drivers}
     for bone in target.pose.bones:
-        b = rig.index.get(bone.name, -1)  # of a control rig, the controls alone
+        b = rig.index.get(bone.name, -1)  # −1: a control rig has only its controls
         rotation = CHANNEL.get(bone.rotation_mode, ("rotation_euler", 3))[0]
         for channel in (rotation, "location", "scale"):
             keyed = (channel == rotation and result.driven[b]) or (channel == "location" and (b == result.carrier or b in result.loose_m))
-            if (b >= 0 and keyed) or f"{bone.path_from_id()}.{channel}" in steered:
+            if (b >= 0 and keyed) or f"{bone.path_from_id()}.{channel}" in driven_paths:
                 continue
             now, rest = np.array(getattr(bone, channel)), np.array(REST[channel], dtype=float)
             moved = abs(now[0]) > 1e-6 if channel == "rotation_axis_angle" else np.abs(now - rest).max() > 1e-6
@@ -141,10 +141,10 @@ def _put_to_rest(target: bpy.types.Object, result: Retargeted) -> list[Resting]:
     return resting
 
 
-def _set_properties(
+def _key_properties(
     action: bpy.types.Action, target: bpy.types.Object, properties: Mapping[str, Mapping[str, float]], at: np.ndarray
 ) -> int:
-    """One key for each custom property that the rig has."""
+    """Key each of these custom properties that the rig has, once."""
     keys = 0
     for name, values in properties.items():
         bone = target.pose.bones.get(name)
@@ -156,8 +156,8 @@ def _set_properties(
     return keys
 
 
-def _mute(target: bpy.types.Object, result: Retargeted) -> tuple[str, ...]:
-    """Constraints on driven bones would bend the motion: mute them."""
+def _mute_constraints(target: bpy.types.Object, result: Retargeted) -> tuple[str, ...]:
+    """Mute the constraints of driven bones, which would change the motion."""
     muted = []
     for b in np.flatnonzero(result.driven):
         for constraint in target.pose.bones[result.motion.rig.names[b]].constraints:
@@ -173,7 +173,7 @@ def store_residual_motion(action: bpy.types.Action, residual: ResidualMotion) ->
 
 
 def push_to_strip(target: bpy.types.Object, action: bpy.types.Action) -> bpy.types.NlaStrip:
-    """Put the action into a strip of its own on a new NLA track, so that corrections can be layered over it."""
+    """Push the action down to a strip on a new NLA track, so that corrections can be layered over it."""
     data = target.animation_data
     slot = getattr(data, "action_slot", None)
     data.action = None

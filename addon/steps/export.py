@@ -73,7 +73,7 @@ class Export(JobOperator, bpy.types.Operator):
         """Tell what was written; what Blender's exporters write is written here."""
         if isinstance(result, Motion):
             result = export_motion(self.kind, self._out, self._file, PROGRAMS[self.preset], result)
-        context.scene.tricap_retarget.last = f"Exported {self._file.name}: {result}."
+        context.scene.tricap_retarget.last_export = f"Exported {self._file.name}: {result}."
         self.report({"INFO"}, f"{self._file}: {result}")
         return {"FINISHED"}
 

@@ -265,10 +265,10 @@ def built_less(built: bpy.types.Collection, found: _Found) -> bool:
 def _retarget(scene: bpy.types.Scene, rig: State) -> State:
     if rig.word == "empty" or rig.word == "ready":
         return State(word="empty", why="Comes after the rig.")
-    said = scene.tricap_retarget.last
-    if said:
+    retarget = scene.tricap_retarget
+    if retarget.last or retarget.last_export:
         word = "stale" if rig.word == "stale" else "done"
-        return State(word=word, why=said if said.startswith("Exported") else "The character plays the motion.")
+        return State(word=word, why=retarget.last_export or "The character plays the motion.")
     return State(word="ready", why="Put the motion onto your own character, or export it.")
 
 

@@ -182,7 +182,7 @@ def test_a_blend_file_goes_out(empty: ModuleType, tmp_path: Path, kind: str) -> 
 def test_a_file_is_named_as_its_format(blender: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     named = {("bvh", "a"): "a.bvh", ("usd", "a.usda"): "a.usda", ("glb", "a.GLTF"): "a.GLTF", ("csv", "a.txt"): "a.txt", ("ply", "a"): "a"}
     assert {key: named_for(key[0], Path(key[1]), tmp_path).name for key in named} == named
-    with pytest.raises(InputError, match="a.fbx ends as files of another format do; let it end with .trc"):
+    with pytest.raises(InputError, match="a.fbx has the ending of another format; let it end in .trc"):
         named_for("trc", Path("a.fbx"), tmp_path)
     file, out = tmp_path / "moved", str(small_run.out)
     assert blender.ops.tricap.export(kind="bvh", out=out, filepath=str(file)) == {"FINISHED"} and file.with_suffix(".bvh").is_file()
@@ -236,7 +236,7 @@ def test_the_panel_exports_and_leaves_the_scene(blender: ModuleType, small_run: 
         assert file.stat().st_size > 1000
     assert {kind: list(getattr(blender.data, kind).keys()) for kind in kinds} == before
     assert blender.context.scene.name == before["scenes"][0] and mine.name in blender.context.scene.objects
-    assert blender.context.scene.tricap_retarget.last.startswith("Exported ")
+    assert blender.context.scene.tricap_retarget.last_export.startswith("Exported ")
 
 
 @pytest.mark.slow

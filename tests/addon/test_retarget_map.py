@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
-from tricap.addon.retarget.apply import folded
 from tricap.addon.retarget.build import build_armature
 from tricap.core.motion.formats.bvh import write_bvh
-from tricap.core.motion.retarget.mapping import read_preset
+from tricap.core.motion.retarget.mapping import RigMap, read_preset
 from tricap.core.motion.retarget.rig import Rig
 
 from ..core.motion.persons import flail, person, squat
@@ -42,9 +41,9 @@ def steered() -> dict[str, Any]:
     }
 
 
-def test_notes_of_the_same_are_told_in_one_sentence() -> None:
-    notes = ["hips: no bone was recognised", "shin.L: no bone was recognised", "it does not travel: no hips", "2 other bones follow"]
-    assert folded([*notes, notes[0]]) == ("hips, shin.L: no bone was recognised", *notes[2:])
+def test_parts_that_are_missing_for_the_same_reason_are_one_note() -> None:
+    reasons = {"hips": "no bone was recognised", "toe.L": "no bone “ball_l”", "shin.L": "no bone was recognised"}
+    assert RigMap(bones={}, twist={}, missing=reasons).missing_notes == ("hips, shin.L: no bone was recognised", "toe.L: no bone “ball_l”")
 
 
 def test_a_saved_mapping_keeps_its_steering(blender: ModuleType, props: Any, tmp_path: Path) -> None:
@@ -92,7 +91,7 @@ def test_lines_of_another_target_are_not_used(blender: ModuleType, props: Any) -
     ops.retarget_find_map()
     props.target = armature(person(names={role: f"Bip001 {role}" for role in person().names}), "Other")
     assert ops.retarget() == {"FINISHED"}
-    assert "lines are those of “Target” and were not used" in props.last and props.target.animation_data.action.name == "Source on Other"
+    assert "the mapping is that of “Target” and was not used" in props.last and props.target.animation_data.action.name == "Source on Other"
     ops.retarget_add_line()
     assert props.rows_of == props.target and len(props.rows) == 1
 
@@ -112,7 +111,7 @@ def test_the_editor_is_drawn(blender: ModuleType, props: Any, tmp_path: Path) ->
     assert blender.ops.tricap.retarget_find_map() == {"FINISHED"}
     assert [layout.properties.count("twist") for layout in (empty, drawn())] == [1, 2], "the setting alone; and that of the selected line"
     props.target, props.source, props.file = props.source, None, str(tmp_path / "a.trc")
-    assert "those of “Target”" in " ".join(drawn().texts) and {"up", "unit"} <= set(drawn().properties)
+    assert "that of “Target”" in " ".join(drawn().texts) and {"up", "unit"} <= set(drawn().properties)
 
 
 def test_a_preview_can_be_ended_while_there_is_one(blender: ModuleType, props: Any) -> None:

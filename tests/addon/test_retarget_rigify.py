@@ -49,7 +49,7 @@ def test_controls_are_keyed_and_the_deform_bones_follow(generated: Any, tmp_path
     moved_before.location = (0.3, 0.0, 0.2)  # left from an earlier pose: put to rest
     result = apply.transfer(moving, goal, RetargetSettings(), FeetSettings(), Monitor())
     outcome = apply.apply(generated, moving, goal, result, "Squat")
-    assert not [note for note in outcome.notes if "steers" in note] and outcome.figures.direction_rms_deg < 1.0
+    assert not [note for note in outcome.notes if "drives the rig" in note] and outcome.figures.direction_rms_deg < 1.0
     assert outcome.figures.slide_mm < 5.0
     whole = read_rig(generated)
     deforming = apply.map_of(whole)

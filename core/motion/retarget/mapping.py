@@ -32,7 +32,7 @@ class RigMap:
 
     bones: Map[str, tuple[str, ...]]
     twist: Map[str, tuple[str, ...]] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
+    missing: Map[str, str] = field(default_factory=dict)  # by role, why it has no bones
     notes: tuple[str, ...] = ()
     origin: str = "names"
     control_rig: ControlRig | None = None  # of a rig whose mapped bones are controls
@@ -41,6 +41,14 @@ class RigMap:
     def first(self, role: str) -> str | None:
         """The bone at whose head the part begins."""
         return self.bones[role][0] if role in self.bones else None
+
+    @property
+    def missing_notes(self) -> tuple[str, ...]:
+        """A sentence for each reason why parts are missing."""
+        roles: dict[str, list[str]] = {}
+        for role, reason in self.missing.items():
+            roles.setdefault(reason, []).append(role)
+        return tuple(f"{', '.join(missing)}: {reason}" for reason, missing in roles.items())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -165,7 +173,7 @@ def apply_preset(rig: Rig, preset: Preset) -> RigMap:
     bones = {role: chain for role, chain in found.items() if chain}
     if not bones:
         raise InputError(f"None of the bones of the mapping “{preset.name}” are in this rig; choose another mapping, or Recognise.")
-    missing = tuple(f"{role}: no bone “{preset.bones[role][0]}”" for role in preset.bones if role not in bones)
+    missing = {role: f"no bone “{preset.bones[role][0]}”" for role in preset.bones if role not in bones}
     return RigMap(
         bones=bones,
         twist={role: chain for role, chain in twist.items() if chain and role in bones},
@@ -382,15 +390,11 @@ def _completed(rig: Rig, found: RigMap) -> RigMap:
                 twist[role] = (*twist.get(role, ()), *beside)
     bones |= _up_to_the_head(rig, bones)
     known = {name for chain in bones.values() for name in chain}
-    missing = found.missing + tuple(
-        f"{role}: no bone was recognised"
-        for role in NEEDED
-        if role not in bones and not any(text.startswith(role) for text in found.missing)
-    )
+    unrecognised = {role: "no bone was recognised" for role in NEEDED if role not in bones and role not in found.missing}
     return RigMap(
         bones={role: bones[role] for role in ROLES if role in bones},
         twist=twist,
-        missing=missing,
+        missing={**found.missing, **unrecognised},
         notes=found.notes + ((f"{len(rig.names) - len(known)} other bones follow their parents",) if len(rig.names) > len(known) else ()),
         origin=found.origin,
     )
