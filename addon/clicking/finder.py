@@ -11,6 +11,7 @@ import numpy as np
 from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.images.sampling import SplineImage
+from ...core.matching.grid import Views
 from ...core.matching.least_squares import MatchingSettings
 from ...core.matching.proposals import Proposal, propose
 from ...core.take.take import Footage
@@ -90,7 +91,8 @@ class Finder:
         try:
             images = self._load(question.frame)
             rows, asked = self._footage.take.rows_at(question.frame), question
-            found = propose(images, self.cameras, rows, asked.view, asked.xy_px, self._settings, asked.depth_range_m)
+            views = Views(images=images, cameras=self.cameras, reference=asked.view, rows=rows)
+            found = propose(views, asked.xy_px, self._settings, asked.depth_range_m)
         except InputError as error:
             return Answer(question=question, proposals=nothing, problem=str(error))
         except Exception as error:  # the edge of the thread: a mistake of ours takes no click away

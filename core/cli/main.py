@@ -149,12 +149,12 @@ def _summary(job: pipeline.Run, as_json: bool) -> list[str]:
 
 
 def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    from ..surface.measure import first_seeds
+    from ..surface.measure import MeasureSettings, first_seeds
 
     footage = open_take(read_take(args.take))
     settings = pipeline.settings_of(footage.take.settings, overrides(args.set), str(args.take))
     frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
-    where, seeds = first_seeds(footage, settings["matching"], settings["growing"], frame, monitor, settings["enhance"])
+    where, seeds = first_seeds(footage, MeasureSettings.of(settings), frame, monitor)
     near, far = where.depth_range_m
     args.always_shown = [
         f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (depths from {where.method}), "

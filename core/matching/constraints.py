@@ -14,7 +14,6 @@ own variance (of a first adjustment in which these shifts are free). Where σ_c 
 field is kept as it was matched.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -22,48 +21,51 @@ import numpy as np
 
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
-from ..images.sampling import SplineImage
 from .foreground import Foreground
-from .grid import RADIUS_CELLS, NeighbourFit, TemplateGrid, fit_neighbours, neighbours_of
+from .grid import RADIUS_CELLS, NeighbourFit, TemplateGrid, Views, fit_neighbours, neighbours_of
 from .least_squares import MatchingSettings, MatchStatus
-from .multi_image import MultiImageMatches, match_multi_image
-from .object_space import Epipolar, SurfacePatch, SurfacePrior, match_surface, normal_to
+from .multi_image import MultiImageMatches, MultiImageStarts, match_multi_image
+from .object_space import Epipolar, SurfacePatch, SurfacePrior, SurfaceStarts, match_surface, normal_to, px_per_inverse_metre
 from .patches import monomials, patch_offsets
-from .region_growing import RETRY_SMOOTHING_PX, TripletField, loosened
-from .seeds import fewest_views
+from .region_growing import RETRY_SMOOTHING_PX, MatchedField, loosened
 
-WINDOW_EXTRA_PX, WINDOW_SIGMA = 4, 0.38  # how much wider than `patch_px`; in units of `patch_px`
-SLOPE_SIGMA, CURVATURE_SIGMA, CURVATURE_SHARE = 0.1, 0.001, 1.0  # px/px and px/px² in the search view that moves fastest; of itself
-SLOPE_ERROR, CURVATURE_ERROR = 0.8, 3.0  # of a quadric over −1…1 by 49 neighbours of scatter 1, of which five are independent
-SAME_PLACE, UNSURE_PX, SAME_PLACE_M = 0.25, 0.08, 0.003  # of the patch's width, half of it at this sigma; and never less
-SMOOTH_EXTRA_PX = 4  # wider where texture is weak
-STIFF = 0.1  # of these sigmas in the second try
-FREE_SIGMA_PX, MIN_SIGMA_C_PX = 1.0, 0.03
-RAY_SIGMA_PX = 0.01  # the point lies on its pixel's ray; this keeps the covariance regular
-MAX_RIG_SIGMA_PX = 1.0  # a rig that is worse is not that of these images; one that is not says less, the worse it is
-SAMPLE = 1000  # points that tell the rig's quality
-NEIGHBOUR_NOISE_PX = 0.05
-MEDIAN_OF_CHI2 = 0.4549
-# Limits of a piece of surface: held by all views and its neighbours, it may look less alike in each; and its sigma is honest,
-# on skin up to four times the naive one.
-LOOSER = 2.0
+WINDOW_EXTRA_PX = 4  # px by which the window is wider than `patch_px`
+WINDOW_SIGMA = 0.38  # sigma of the Gaussian window, in units of `patch_px`
+SLOPE_SIGMA = 0.1  # px/px in the search view that moves fastest: prior of the slopes
+CURVATURE_SIGMA = 0.001  # px/px² in that view: prior of the curvatures, and
+CURVATURE_SHARE = 1.0  # of the curvature itself in addition
+SLOPE_ERROR = 0.8  # error of the slopes of a quadric over −1…1 by 49 neighbours of scatter 1, of which five are independent
+CURVATURE_ERROR = 3.0  # error of its curvatures
+SAME_PLACE = 0.25  # of the patch's width: distance allowed from the point that was matched without constraint,
+UNSURE_PX = 0.08  # px, half of it where the patch's sigma is this,
+SAME_PLACE_M = 0.003  # m, and never less than this
+SMOOTH_EXTRA_PX = 4  # px by which the window is wider still where texture is weak
+STIFF = 0.1  # of the prior's sigmas in the second try
+FREE_SIGMA_PX = 1.0  # rows' px, σ_c of the sample whose shifts are to be free
+MIN_SIGMA_C_PX = 0.03  # px, smallest σ_c
+RAY_SIGMA_PX = 0.01  # px across the ray, on which the point lies by definition: keeps the covariance regular
+MAX_RIG_SIGMA_PX = 1.0  # px; a worse rig does not belong to these images, and up to there its weight decreases
+SAMPLE = 1000  # points from which the rig's quality is estimated
+NEIGHBOUR_NOISE_PX = 0.05  # px: smaller residuals of neighbours have full weight
+MEDIAN_OF_CHI2 = 0.4549  # of one degree of freedom
+LOOSER_SIGMA0 = 2.0  # times the largest sigma0: a piece of surface that all views and its neighbours determine may fit each view less well
 MAX_STEEPNESS = 5.0  # change of depth per distance across
-OUTLINE_ACROSS_PX, OUTLINE_ALONG_PX = 1.6, 0.6  # across the ray and along it, where all of a patch's window hung over an outline
+OUTLINE_ACROSS_PX = 1.6  # px across the ray, error where all of a patch's window hangs over an outline
+OUTLINE_ALONG_PX = 0.6  # px along the ray
 
 Found = TypeVar("Found", SurfacePatch, MultiImageMatches)
+Measured = tuple[MatchedField, np.ndarray]  # and (N,) which points are good
 
 
 def constrain(
-    field: TripletField,
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
+    field: MatchedField,
+    views: Views,
     settings: MatchingSettings,
     *,
     foreground: Foreground,
     monitor: Monitor,
     pairs: bool = False,
-) -> TripletField:
+) -> MatchedField:
     """The field measured again under `settings.constraint`; points that fail are left out. "none" returns the field as it is.
 
     A point needs three rays, or both of two views; with `pairs` two.
@@ -71,116 +73,98 @@ def constrain(
     if settings.constraint == "none" or not len(field.cell):
         return field
     measure = _object_space if settings.constraint == "object" else _epipolar
-    return measure(field, images, cameras, reference, settings, foreground, monitor, fewest_views(len(cameras), pairs))
+    measured = measure(field, views, settings, monitor, views.required_matches(pairs))
+    if measured is None:
+        return field
+    result, ok = measured
+    return result.select(ok & _in_foreground(result, foreground, views.base))
 
 
-def _surface_of(field: TripletField, camera: Camera, reference: int, speed: float) -> NeighbourFit:
+def _surface_of(field: MatchedField, views: Views) -> NeighbourFit:
     """The quadric of inverse depth about every cell of the field."""
-    w = 1 / camera.to_camera(field.xyz_m)[:, 2]
+    w = 1 / views.base.to_camera(field.xyz_m)[:, 2]
     return fit_neighbours(
         neighbours_of(field.grid, field.cell, field.cell),
-        field.xy[:, reference],
+        field.xy[:, views.reference],
         w,
         field.grid.xy(field.cell),
         degree=2,
-        min_scale=np.full(len(w), NEIGHBOUR_NOISE_PX / speed),
+        min_scale=np.full(len(w), NEIGHBOUR_NOISE_PX / px_per_inverse_metre(views)),
         radius_px=RADIUS_CELLS * field.grid.spacing_px,
     )
 
 
-def _px_per_inverse_metre(cameras: Sequence[Camera], reference: int) -> float:
-    """How fast the fastest search view moves with inverse depth [px m], for cameras that look alike."""
-    base = cameras[reference]
-    return max(base.focal_px * float(np.linalg.norm(c.centre_m - base.centre_m)) for c in cameras if c is not base)
+def _object_space(field: MatchedField, views: Views, settings: MatchingSettings, monitor: Monitor, required: int) -> Measured | None:
+    """The field by pieces of surface; None where the calibration contradicts the images."""
+    around = _surface_of(field, views)
+    theta = around.coefficients[:, : 6 if settings.neighbours else 3]
+    visible = _visible(field, views.reference)
+    prior = _prior(theta, px_per_inverse_metre(views), around.scatter, RADIUS_CELLS * field.grid.spacing_px)
+    wide = replace(loosened(settings), patch_px=settings.patch_px + WINDOW_EXTRA_PX, max_sigma0=LOOSER_SIGMA0 * settings.max_sigma0)
+    starts = SurfaceStarts(
+        xy=field.grid.xy(field.cell),
+        theta=theta,
+        visible=visible,
+        prior=prior,
+    )
 
+    def match(which: np.ndarray, starts: SurfaceStarts, sigma_c: float, images: Views = views, extra_px: int = 0) -> SurfacePatch:
+        weight = _window(wide.patch_px + extra_px, views.rows.step)
+        chosen = replace(starts.select(which), window=np.broadcast_to(weight, (len(which), len(weight))))
+        larger = replace(wide, patch_px=wide.patch_px + extra_px)
+        return match_surface(images, chosen, larger, sigma_across_px=sigma_c, monitor=monitor)
 
-def _object_space(
-    field: TripletField,
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
-    settings: MatchingSettings,
-    foreground: Foreground,
-    monitor: Monitor,
-    fewest: int,
-) -> TripletField:
-    rows, speed = field.grid.rows, _px_per_inverse_metre(cameras, reference)
-    around = _surface_of(field, cameras[reference], reference, speed)
-    xy, start = field.grid.xy(field.cell), around.coefficients[:, : 6 if settings.neighbours else 3]
-    seen = _seen(field, reference)
-    prior = _prior(start, speed, around.scatter, RADIUS_CELLS * field.grid.spacing_px)
-    wide = replace(loosened(settings), patch_px=settings.patch_px + WINDOW_EXTRA_PX, max_sigma0=LOOSER * settings.max_sigma0)
-
-    def match(
-        which: np.ndarray, prior: SurfacePrior, sigma_c: float, views: Sequence[SplineImage] = images, extra_px: int = 0
-    ) -> SurfacePatch:
-        weight = _window(wide.patch_px + extra_px, rows.step)
-        return match_surface(
-            views,
-            cameras,
-            reference,
-            rows,
-            xy[which],
-            start[which],
-            replace(wide, patch_px=wide.patch_px + extra_px),
-            sigma_across_px=sigma_c,
-            prior=prior.select(which),
-            weight=np.broadcast_to(weight, (len(which), len(weight))),
-            seen=seen[which],
-            monitor=monitor,
-        )
-
-    every = np.arange(len(xy))
     inner = np.flatnonzero(around.support >= np.median(around.support))  # at an outline a patch shifts for other reasons than the rig's
-    sample = match(inner[:: max(1, len(inner) // SAMPLE)], prior, FREE_SIGMA_PX)
-    known = sample.ok[:, None] & sample.seen
-    rig_sigma_px = _rig_sigma(sample.across_px[known], sample.across_sigma_px[known])
+    sample = match(inner[:: max(1, len(inner) // SAMPLE)], starts, FREE_SIGMA_PX)
+    measured = sample.ok[:, None] & sample.visible
+    rig_sigma_px = _rig_sigma(sample.across_px[measured], sample.across_sigma_px[measured])
     if rig_sigma_px > MAX_RIG_SIGMA_PX:
-        return field
+        return None
     sigma_c = max(MIN_SIGMA_C_PX, rig_sigma_px)
-    found = match(every, prior, sigma_c)
-    again = _without_unlike(seen, found.ok, found.correlation, settings.min_correlation, fewest)
+    found = match(np.arange(len(field.cell)), starts, sigma_c)
+    visible, again = _without_unlike(visible, found, settings.min_correlation, required)
+    starts = replace(starts, visible=visible)
     if len(again):
-        _replace(found, again, match(again, prior, sigma_c))
+        _replace(found, again, match(again, starts, sigma_c))
     if settings.neighbours:
-        stiff = replace(prior, sigma=prior.sigma * np.array([1, STIFF, STIFF, STIFF, STIFF, STIFF]))
+        stiff = replace(starts, prior=replace(prior, sigma=prior.sigma * np.array([1, STIFF, STIFF, STIFF, STIFF, STIFF])))
         again = np.flatnonzero(~found.ok)
         _replace(found, again, match(again, stiff, sigma_c))
         again = np.flatnonzero(~found.ok & field.smoothed)
         if len(again):
-            smooth = [image.smoothed(RETRY_SMOOTHING_PX, rows.step) for image in images]
-            _replace(found, again, match(again, stiff, sigma_c, smooth, SMOOTH_EXTRA_PX))
-    agrees = _agrees(field, found, cameras[reference], reference, settings.patch_px)
-    outline = _over_outline(around, field.grid, settings.patch_px)
-    result = _from_surface(field, found, outline, cameras, reference, rig_sigma_px)
-    return _kept(result, found.ok & agrees, foreground, cameras[reference])
+            _replace(found, again, match(again, stiff, sigma_c, views.smoothed(RETRY_SMOOTHING_PX), SMOOTH_EXTRA_PX))
+    agrees = _agrees(field, found, views, settings.patch_px)
+    result = _from_surface(field, found, _over_outline(around, field.grid, settings.patch_px), views, rig_sigma_px)
+    return result, found.ok & agrees
 
 
-def _agrees(field: TripletField, found: SurfacePatch, base: Camera, reference: int, patch_px: int) -> np.ndarray:
+def _agrees(field: MatchedField, found: SurfacePatch, views: Views, patch_px: int) -> np.ndarray:
     """(N,) where the piece of surface runs through the point that was matched without constraint.
 
     Over one surface both ways measure the same; where a patch holds two (an outline before a background, a border of occlusion), each
     settles on a mixture of its own. The grey values fit neither surface there, so that the patch's sigma is large as well: the larger it
     is, the closer must both agree.
     """
-    u, v = (field.xy[:, reference] - field.grid.xy(field.cell)).T
+    base = views.base
+    u, v = (field.xy[:, views.reference] - field.grid.xy(field.cell)).T
     w = np.einsum("ni,ni->n", monomials(u, v, 2 if found.theta.shape[1] == 6 else 1), found.theta)
     depth = base.to_camera(field.xyz_m)[:, 2]
     allowed = SAME_PLACE / (1 + found.sigma_px / UNSURE_PX) * patch_px * depth / base.focal_px
     return np.abs(1 / np.maximum(w, 1e-6) - depth) < np.maximum(allowed, SAME_PLACE_M)
 
 
-def _seen(field: TripletField, reference: int) -> np.ndarray:
-    """(N, S) which search views found the points."""
+def _visible(field: MatchedField, reference: int) -> np.ndarray:
+    """(N, S) which search views matched the points."""
     return np.delete(np.isfinite(field.xy).all(axis=2), reference, axis=1)
 
 
-def _without_unlike(seen: np.ndarray, ok: np.ndarray, correlation: np.ndarray, smallest: float, fewest: int) -> np.ndarray:
-    """Rows (m,) of points that failed though enough of their views look alike; the others are taken out of `seen` (N, S), in place."""
-    alike = seen & (correlation >= smallest)
-    rows = np.flatnonzero(~ok & (alike.sum(axis=1) >= fewest) & (alike.sum(axis=1) < seen.sum(axis=1)))
-    seen[rows] = alike[rows]
-    return rows
+def _without_unlike(visible: np.ndarray, found: Found, smallest: float, required: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (m,) of points that failed though enough of their views correlate, and `visible` (N, S) without the other views of these."""
+    alike = visible & (found.correlation >= smallest)
+    rows = np.flatnonzero(~found.ok & (alike.sum(axis=1) >= required) & (alike.sum(axis=1) < visible.sum(axis=1)))
+    visible = visible.copy()
+    visible[rows] = alike[rows]
+    return visible, rows
 
 
 def _prior(start: np.ndarray, speed: float, scatter: np.ndarray, radius_px: int) -> SurfacePrior:
@@ -220,14 +204,12 @@ def _replace(found: Found, rows: np.ndarray, other: Found) -> None:
     found.status[rows[other.ok]] = other.status[other.ok]
 
 
-def _from_surface(
-    field: TripletField, found: SurfacePatch, outline: np.ndarray, cameras: Sequence[Camera], reference: int, rig_sigma_px: float
-) -> TripletField:
+def _from_surface(field: MatchedField, found: SurfacePatch, outline: np.ndarray, views: Views, rig_sigma_px: float) -> MatchedField:
     """The field with the positions, shapes and covariances of pieces of surface, at the texture's centre of gravity.
 
     `outline` (N,) is the share of each patch that hangs over the edge.
     """
-    base, rows, o = cameras[reference], field.grid.rows, found.offset
+    base, rows, o = views.base, views.rows, found.offset
     curved = found.theta.shape[1] == 6
     m = monomials(o[:, 0], o[:, 1], 2 if curved else 1).astype(np.float64)
     w = np.maximum(np.einsum("ni,ni->n", m, found.theta), 1e-6)
@@ -237,20 +219,19 @@ def _from_surface(
     steepness = np.linalg.norm(slope / (1.0, rows.step), axis=1) * base.focal_px / w
     variance = np.einsum("ni,nij,nj->n", m, found.covariance, m)
     xy, shape, K = field.xy.copy(), field.shape.copy(), field.covariance.copy()
-    xy[:, reference] = at
+    xy[:, views.reference] = at
     square, speed = np.zeros(len(w)), np.zeros(len(w))
-    views = [k for k in range(len(cameras)) if k != reference]
-    for i, k in enumerate(views):
-        c, e, A, _ = Epipolar(base, cameras[k], rows, at).centre(np.column_stack([w, slope]))
+    for i, k in enumerate(views.search):
+        c, e, A, _ = Epipolar(base, views.cameras[k], rows, at).centre(np.column_stack([w, slope]))
         n = normal_to(e)
-        seen = found.seen[:, i]
-        xy[:, k], shape[:, k] = np.where(seen[:, None], c + found.across_px[:, i, None] * n, np.nan), A
+        visible = found.visible[:, i]
+        xy[:, k], shape[:, k] = np.where(visible[:, None], c + found.across_px[:, i, None] * n, np.nan), A
         K[:, k] = (
             variance[:, None, None] * e[:, :, None] * e[:, None]
             + (found.across_sigma_px[:, i] ** 2)[:, None, None] * n[:, :, None] * n[:, None]
         )
-        square += np.where(seen, np.sum((found.across_px[:, i, None] * n * (1.0, rows.step)) ** 2, axis=1), 0.0)
-        speed = np.where(seen, np.maximum(speed, np.linalg.norm(e, axis=1)), speed)
+        square += np.where(visible, np.sum((found.across_px[:, i, None] * n * (1.0, rows.step)) ** 2, axis=1), 0.0)
+        speed = np.where(visible, np.maximum(speed, np.linalg.norm(e, axis=1)), speed)
     found.status[(found.status == MatchStatus.OK) & (steepness > MAX_STEEPNESS)] = MatchStatus.SHAPE_TOO_LARGE
     ray = base.rays(rows.to_frame(at))
     excess = found.across_px / np.sqrt(found.across_sigma_px**2 + max(rig_sigma_px, MIN_SIGMA_C_PX) ** 2)
@@ -263,8 +244,8 @@ def _from_surface(
         xyz_m=base.centre_m + ray / w[:, None],
         covariance_m2=ray[:, :, None] * ray[:, None] * (variance / w**4)[:, None, None]
         + _model_covariance(ray, w, speed, outline, rig_sigma_px, base),
-        residual_px=np.sqrt(square / (1 + found.seen.sum(axis=1))),
-        sigma0=np.sqrt(np.sum(excess**2, axis=1) / found.seen.sum(axis=1)),
+        residual_px=np.sqrt(square / (1 + found.visible.sum(axis=1))),
+        sigma0=np.sqrt(np.sum(excess**2, axis=1) / found.visible.sum(axis=1)),
         spread=np.zeros_like(field.spread) if curved else found.spread,  # with curvatures adjusted nothing is left to correct
     )
 
@@ -291,45 +272,36 @@ def _over_outline(around: NeighbourFit, grid: TemplateGrid, patch_px: int) -> np
     return (1 - around.weights) @ (window / window.sum())
 
 
-def _epipolar(
-    field: TripletField,
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
-    settings: MatchingSettings,
-    foreground: Foreground,
-    monitor: Monitor,
-    fewest: int,
-) -> TripletField:
-    rows, base, xy = field.grid.rows, cameras[reference], field.grid.xy(field.cell)
-    views = [k for k in range(len(cameras)) if k != reference]
-    speed = _px_per_inverse_metre(cameras, reference)
-    around = _surface_of(field, base, reference, speed)
+def _epipolar(field: MatchedField, views: Views, settings: MatchingSettings, monitor: Monitor, required: int) -> Measured:
+    """The field by affine patches with collinearity observations."""
+    rows, base, search, xy = views.rows, views.base, views.search, field.grid.xy(field.cell)
+    around = _surface_of(field, views)
     theta, ray = around.coefficients[:, :3], base.rays(rows.to_frame(xy))
-    lines = [Epipolar(base, cameras[k], rows, xy).centre(theta) for k in views]
-    middle, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
-    X, seen = base.points_at_depth(rows.to_frame(xy), 1 / theta[:, 0]), _seen(field, reference)
+    lines = [Epipolar(base, views.cameras[k], rows, xy).centre(theta) for k in search]
+    centre, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
+    xyz_m = base.points_at_depth(rows.to_frame(xy), 1 / theta[:, 0])
+    visible = _visible(field, views.reference)
+    starts = MultiImageStarts(xy=xy, centre=centre, shape=shape, xyz_m=xyz_m, visible=visible)
 
-    def match(which: np.ndarray, sigma_c: float) -> MultiImageMatches:
-        a, b, c, d = xy[which], middle[which], shape[which], X[which]
-        part, near = seen[which], settings.neighbours
-        return match_multi_image(
-            images, cameras, reference, rows, a, b, c, d, settings, sigma_c_px=sigma_c, neighbours=near, seen=part, monitor=monitor
-        )
+    def match(which: np.ndarray, starts: MultiImageStarts, sigma_c: float) -> MultiImageMatches:
+        return match_multi_image(views, starts.select(which), settings, sigma_c_px=sigma_c, neighbours=settings.neighbours, monitor=monitor)
 
-    sample = match(np.arange(len(xy))[:: max(1, len(xy) // SAMPLE)], FREE_SIGMA_PX)
-    known = sample.ok[:, None] & sample.seen
-    rig_sigma_px = _rig_sigma(sample.residual_px[:, 1:, 1][known], np.sqrt(sample.covariance[:, :, 1, 1][known]) * rows.step)
-    found = match(np.arange(len(xy)), max(MIN_SIGMA_C_PX, rig_sigma_px))
-    again = _without_unlike(seen, found.ok, found.correlation, settings.min_correlation, fewest)
+    every = np.arange(len(xy))
+    sample = match(every[:: max(1, len(xy) // SAMPLE)], starts, FREE_SIGMA_PX)
+    measured = sample.ok[:, None] & sample.visible
+    rig_sigma_px = _rig_sigma(sample.residual_px[:, 1:, 1][measured], np.sqrt(sample.covariance[:, :, 1, 1][measured]) * rows.step)
+    sigma_c = max(MIN_SIGMA_C_PX, rig_sigma_px)
+    found = match(every, starts, sigma_c)
+    visible, again = _without_unlike(visible, found, settings.min_correlation, required)
     if len(again):
-        _replace(found, again, match(again, max(MIN_SIGMA_C_PX, rig_sigma_px)))
-    rays = 1 + found.seen.sum(axis=1)
+        _replace(found, again, match(again, replace(starts, visible=visible), sigma_c))
+    rays = 1 + found.visible.sum(axis=1)
     at, A, K = field.xy.copy(), field.shape.copy(), field.covariance.copy()
-    at[:, reference] = xy + found.offset
-    at[:, views], A[:, views], K[:, views] = np.where(found.seen[..., None], found.xy, np.nan), found.shape, found.covariance
+    at[:, views.reference] = xy + found.offset
+    at[:, search], A[:, search], K[:, search] = np.where(found.visible[..., None], found.xy, np.nan), found.shape, found.covariance
     square = np.sum(found.residual_px**2, axis=(1, 2))
     outline = _over_outline(around, field.grid, settings.patch_px)
+    of_model = _model_covariance(ray, theta[:, 0], px_per_inverse_metre(views), outline, rig_sigma_px, base)
     result = replace(
         field,
         xy=at,
@@ -337,23 +309,22 @@ def _epipolar(
         covariance=K,
         correlation=found.correlation.min(axis=1),
         xyz_m=found.xyz_m,
-        covariance_m2=found.covariance_m2 + _model_covariance(ray, theta[:, 0], speed, outline, rig_sigma_px, base),
+        covariance_m2=found.covariance_m2 + of_model,
         residual_px=np.sqrt(square / rays),
-        sigma0=np.sqrt(square / (2 * rays - 3)) / max(MIN_SIGMA_C_PX, rig_sigma_px),
+        sigma0=np.sqrt(square / (2 * rays - 3)) / sigma_c,
         spread=found.spread,
     )
-    return _kept(result, found.ok, foreground, base)
+    return result, found.ok
 
 
-def _kept(field: TripletField, ok: np.ndarray, foreground: Foreground, base: Camera) -> TripletField:
-    """The points that were found, whose rays meet, and that lie where the foreground is."""
+def _in_foreground(field: MatchedField, foreground: Foreground, base: Camera) -> np.ndarray:
+    """(N,) which points' rays meet, and lie where the foreground is."""
     near, far = foreground.depth_range_m
     depth = base.to_camera(field.xyz_m)[:, 2]
     with np.errstate(invalid="ignore"):
-        inside = (
+        return np.asarray(
             (depth >= near)
             & (depth <= far)
             & (field.residual_px <= field.limit_px)
             & ~foreground.excludes(field.xyz_m, field.covariance_m2)
         )
-    return field.select(ok & inside)

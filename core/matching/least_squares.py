@@ -35,7 +35,7 @@ then stays that of the start. The parameters are those of `least_squares` (3): d
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
 import numpy as np
@@ -173,50 +173,60 @@ class Matches:
         return self.status == MatchStatus.OK
 
 
-def match_patches(
-    template: SplineImage,
-    xy: np.ndarray,
-    searches: Sequence[SplineImage],
-    starts: Sequence[np.ndarray],
-    shapes: Sequence[np.ndarray],
-    settings: MatchingSettings,
-    *,
-    row_step: int = 1,
-    template_shape: np.ndarray | None = None,
-    of_texture: bool = True,
-    monitor: Monitor | None = None,
-) -> list[Matches]:
-    """Find the patches about `xy` (N, 2) of the template image in each search image.
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class TemplatePoints:
+    """N points of a template image whose patches are to be matched."""
 
-    `starts` are the approximate positions (N, 2) and `shapes` the approximate affine shapes (N, 2, 2), one of each per search image.
-    `template_shape` (N, 2, 2) warps the patch in the template itself (a patch that was itself matched). NaN starts are OUT_OF_IMAGE.
-    Without `of_texture` the patch's middle stands for the texture's centre of gravity (5). Cost: 5 µs per patch of 13×13 and image.
-    """
-    n = len(xy)
+    image: SplineImage
+    xy: np.ndarray  # (N, 2) pixels of the image
+    shape: np.ndarray | None = None  # (N, 2, 2) warps the patches in the template itself (they were matched there); None: upright squares
+    row_step: int = 1  # frame rows from one row of the image to the next: 2 in a field
+    texture_centre: bool = True  # transfer the texture's centre of gravity (5); False: the patch's centre
+
+    def select(self, rows: slice) -> "TemplatePoints":
+        """Only these points."""
+        return replace(self, xy=self.xy[rows], shape=None if self.shape is None else self.shape[rows])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SearchImage:
+    """An image in which N patches are searched for, and their approximate warps there."""
+
+    image: SplineImage
+    start: np.ndarray  # (N, 2) approximate positions; NaN ends as OUT_OF_IMAGE
+    shape: np.ndarray  # (N, 2, 2) approximate affine shapes
+
+    def select(self, rows: slice) -> "SearchImage":
+        """Only these patches."""
+        return SearchImage(image=self.image, start=self.start[rows], shape=self.shape[rows])
+
+
+def match_patches(
+    template: TemplatePoints, searches: Sequence[SearchImage], settings: MatchingSettings, *, monitor: Monitor | None = None
+) -> list[Matches]:
+    """Match the patches about the template points in each search image. Cost: 5 µs per patch of 13×13 and image."""
+    n = len(template.xy)
 
     def work(span: slice) -> list[Matches]:
         if monitor is not None and monitor.cancelled:
             monitor.step("matching", span.start, n)
-        drawn = None if template_shape is None else template_shape[span]
-        patches = PatchTemplates(template, xy[span], settings, row_step, drawn, of_texture=of_texture)
-        return patches.find(searches, [s[span] for s in starts], [A[span] for A in shapes])
+        return PatchTemplates(template.select(span), settings).find([search.select(span) for search in searches])
 
     parts = in_threads(work, _pieces(n))
     return [join_matches([part[k] for part in parts]) for k in range(len(searches))]
 
 
-def prepare_templates(image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int) -> "PatchTemplates":
-    """The template side of the patches about `xy` (N, 2), to be matched many times by their middles."""
-    parts = in_threads(lambda span: PatchTemplates(image, xy[span], settings, row_step, None, of_texture=False), _pieces(len(xy)))
-    return PatchTemplates.joined(parts)
+def prepare_templates(template: TemplatePoints, settings: MatchingSettings) -> "PatchTemplates":
+    """The template side of the patches about these points, to be matched many times."""
+    return PatchTemplates.joined(in_threads(lambda span: PatchTemplates(template.select(span), settings), _pieces(len(template.xy))))
 
 
-def match_prepared(templates: "PatchTemplates", rows: np.ndarray, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
-    """Find the prepared templates `rows` (N,) in an image, from positions `start` (N, 2) and shapes (N, 2, 2)."""
+def match_prepared(templates: "PatchTemplates", rows: np.ndarray, search: SearchImage) -> Matches:
+    """Match the prepared templates `rows` (N,) in an image."""
     all_in_order = np.array_equal(rows, np.arange(len(templates.inside)))  # most often: slices then, no copies
 
     def work(span: slice) -> Matches:
-        return templates.select(span if all_in_order else rows[span]).find([image], [start[span]], [shape[span]])[0]
+        return templates.select(span if all_in_order else rows[span]).find([search.select(span)])[0]
 
     return join_matches(in_threads(work, _pieces(len(rows))))
 
@@ -234,14 +244,13 @@ def join_matches(parts: Sequence[Matches]) -> Matches:
 class PatchTemplates:
     """The template side of a piece: patches, gradients, and the inverse of the reduced normal matrix."""
 
-    def __init__(
-        self, image: SplineImage, xy: np.ndarray, settings: MatchingSettings, row_step: int, shape: np.ndarray | None, *, of_texture: bool
-    ) -> None:
-        self._settings, self._of_texture = settings, of_texture
-        u, _, self.half = patch_offsets(settings.patch_px, row_step)
+    def __init__(self, template: TemplatePoints, settings: MatchingSettings) -> None:
+        image, xy = template.image, template.xy
+        self._settings, self._texture_centre = settings, template.texture_centre
+        u, _, self.half = patch_offsets(settings.patch_px, template.row_step)
         self.n_pixels = len(u)
         self.inside = image.inside(xy, np.array(self.half) + 1.0)
-        p = template_pixels(image, np.where(self.inside[:, None], xy, 0.0), shape, self.half)
+        p = template_pixels(image, np.where(self.inside[:, None], xy, 0.0), template.shape, self.half)
         self.f, self.fx, self.fy, self.contrast, self.q = p.f, p.fx, p.fy, p.contrast, p.q
         H = self._normal_matrix(p.second, p.mean)
         scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-9))
@@ -250,7 +259,7 @@ class PatchTemplates:
         self.inverse, self.parameters = reduced_sets(H, self.inverse, image.noise, settings.patch_px / 2, settings.max_rim_sigma_px)
         self.offset: np.ndarray = np.zeros((len(xy), 2))
         self.spread = self.offset
-        if of_texture:
+        if template.texture_centre:
             energy = p.energy.astype(np.float64)
             self.offset, self.spread = energy[:, :2], energy[:, 2:] - energy[:, :2] ** 2  # (5)
         patch = (-1, 2 * self.half[1] + 1, 2 * self.half[0] + 1)
@@ -279,18 +288,22 @@ class PatchTemplates:
         mean, q = mean.astype(np.float64), self.q.astype(np.float64)
         return H - mean[:, :, None] * mean[:, None, :] / self.n_pixels - q[:, :, None] * q[:, None, :]
 
-    def find(self, images: Sequence[SplineImage], starts: Sequence[np.ndarray], shapes: Sequence[np.ndarray]) -> list[Matches]:
+    def find(self, searches: Sequence[SearchImage]) -> list[Matches]:
         """Iterate (2) and (3) for all patches in every image, then judge them. Rows go image after image."""
         N, transferred = len(self.inside), self._transferred()
-        start, shape = (np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images]) for of_images in (starts, shapes))
-        settled = self._settled(images, start, shape, self._usable(images, starts))
+        start, shape = (
+            np.concatenate([np.asarray(a, dtype=np.float64) for a in of_images])
+            for of_images in ([search.start for search in searches], [search.shape for search in searches])
+        )
+        settled = self._settled([search.image for search in searches], start, shape, self._usable(searches))
+        spans = [slice(k * N, (k + 1) * N) for k in range(len(searches))]
         return [
-            self._judge(image, start[r], shape[r], transferred, *(a[r] for a in settled))
-            for image, r in ((image, slice(k * N, (k + 1) * N)) for k, image in enumerate(images))
+            self._judge(SearchImage(image=search.image, start=start[r], shape=shape[r]), settled.select(r), transferred)
+            for search, r in zip(searches, spans)
         ]
 
-    def _settled(self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Positions, shapes, statuses, correlations and iterations at the end of (2) and (3), of those that begin as NOT_CONVERGED."""
+    def _settled(self, images: Sequence[SplineImage], start: np.ndarray, shape: np.ndarray, status: np.ndarray) -> "_Settled":
+        """The results of (2) and (3) for the patches that begin as NOT_CONVERGED."""
         most, limit_px = self._settings.max_iterations, 2 * self._settings.max_shift_px
         c, A, correlation, iterations = start.copy(), shape.copy(), np.zeros(len(start)), np.zeros(len(start), dtype=np.int16)
         alive = status == MatchStatus.NOT_CONVERGED
@@ -304,22 +317,22 @@ class PatchTemplates:
                 work = _AtWork(self, images, place)
             step, rho, gain = work.step(at, warp)
             at, warp, moved = compose(at, warp, step)
-            gone = (largest(at - start[place]) > limit_px) | ~np.isfinite(moved)
+            lost = (largest(at - start[place]) > limit_px) | ~np.isfinite(moved)
             near, spared = self._converged(step, moved, work.sigma(rho))
-            ended = np.flatnonzero(alive & (near | spared | gone | (iteration == most)))
-            here = place[ended]
+            finished = np.flatnonzero(alive & (near | spared | lost | (iteration == most)))
+            here = place[finished]
             rho = np.where(spared, np.sqrt(np.minimum(rho**2 + gain, 1.0)), rho)
-            c[here], A[here], correlation[here], iterations[here] = at[ended], warp[ended], rho[ended], iteration
-            status[here] = np.where((near | spared)[ended], MatchStatus.OK, MatchStatus.NOT_CONVERGED)
-            status[place[alive & gone]] = MatchStatus.SHIFT_TOO_LARGE
-            alive[ended] = False
-            at[gone], warp[gone] = 0.0, np.eye(2)  # what has ended may go on, but nowhere
-        return c, A, status, correlation, iterations
+            c[here], A[here], correlation[here], iterations[here] = at[finished], warp[finished], rho[finished], iteration
+            status[here] = np.where((near | spared)[finished], MatchStatus.OK, MatchStatus.NOT_CONVERGED)
+            status[place[alive & lost]] = MatchStatus.SHIFT_TOO_LARGE
+            alive[finished] = False
+            at[lost], warp[lost] = 0.0, np.eye(2)  # finished patches still take part in steps, at a harmless place
+        return _Settled(c=c, A=A, status=status, correlation=correlation, iterations=iterations)
 
-    def _usable(self, images: Sequence[SplineImage], starts: Sequence[np.ndarray]) -> np.ndarray:
+    def _usable(self, searches: Sequence[SearchImage]) -> np.ndarray:
         """The statuses that patches have before they move; NOT_CONVERGED are those that can be matched."""
-        lost = ~np.concatenate([image.inside(start, 0.0) & self.inside for image, start in zip(images, starts)])
-        status = np.where(np.tile(self.textured, len(images)), MatchStatus.NOT_CONVERGED, MatchStatus.NO_TEXTURE).astype(np.int8)
+        lost = ~np.concatenate([search.image.inside(search.start, 0.0) & self.inside for search in searches])
+        status = np.where(np.tile(self.textured, len(searches)), MatchStatus.NOT_CONVERGED, MatchStatus.NO_TEXTURE).astype(np.int8)
         status[lost] = MatchStatus.OUT_OF_IMAGE
         return status
 
@@ -332,23 +345,14 @@ class PatchTemplates:
 
     def _transferred(self) -> np.ndarray | None:
         """E H⁻¹ Eᵀ of (5) (N, 2, 2)."""
-        if not self._of_texture:
+        if not self._texture_centre:
             return None
         E = np.concatenate([np.ones((len(self.offset), 1)), self.offset], axis=1)
         return np.einsum("nabj,nj->nab", np.einsum("naibj,ni->nabj", self.inverse.reshape(-1, 2, 3, 2, 3), E), E)
 
-    def _judge(
-        self,
-        image: SplineImage,
-        start: np.ndarray,
-        start_shape: np.ndarray,
-        transferred: np.ndarray | None,
-        c: np.ndarray,
-        A: np.ndarray,
-        status: np.ndarray,
-        correlation: np.ndarray,
-        iterations: np.ndarray,
-    ) -> Matches:
+    def _judge(self, search: SearchImage, settled: "_Settled", transferred: np.ndarray | None) -> Matches:
+        """The matches in one image, with covariances (4) and (5), and the first limit that each exceeds as its status."""
+        c, A, status, correlation = settled.c, settled.A, settled.status, settled.correlation
         s = self._settings
         dof = max(1, self.n_pixels - PARAMETERS)
         lost = np.clip(1 - correlation**2, 0, 1)
@@ -359,9 +363,9 @@ class PatchTemplates:
         sigma0 = 50 * np.sqrt(lost * self.n_pixels / dof)
         sigma = np.sqrt(np.maximum(np.maximum(K[:, 0, 0], K[:, 1, 1]), 0))
         for bad, why in (
-            (largest(c - start) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
-            (~image.inside(c, np.array(self.half) * 0.5), MatchStatus.OUT_OF_IMAGE),
-            (largest((A - start_shape).reshape(-1, 4)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
+            (largest(c - search.start) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
+            (~search.image.inside(c, np.array(self.half) * 0.5), MatchStatus.OUT_OF_IMAGE),
+            (largest((A - search.shape).reshape(-1, 4)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
             (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
             (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE),
             (sigma0 > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE),
@@ -376,10 +380,25 @@ class PatchTemplates:
             transfer_covariance=K_o,
             sigma0=sigma0,
             correlation=correlation,
-            iterations=iterations,
+            iterations=settled.iterations,
             parameters=self.parameters,
             status=status,
         )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Settled:
+    """Where the iterations left M patches, all of one image or image after image."""
+
+    c: np.ndarray  # (M, 2)
+    A: np.ndarray  # (M, 2, 2)
+    status: np.ndarray  # (M,) MatchStatus
+    correlation: np.ndarray  # (M,)
+    iterations: np.ndarray  # (M,)
+
+    def select(self, rows: slice) -> "_Settled":
+        """Only these patches."""
+        return _Settled(**{f.name: getattr(self, f.name)[rows] for f in fields(_Settled)})
 
 
 class _AtWork:

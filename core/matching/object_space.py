@@ -27,7 +27,6 @@ the prior's errors where these are known.
 Where a search view sees what lies on the reference view's rays: equation (2) of `object_space`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,9 +36,15 @@ from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from ..geometry.small_matrices import invert_spd
 from ..images.interlace import RowGrid
-from ..images.sampling import SplineImage
+from .grid import Views
 from .least_squares import MatchingSettings, MatchStatus
 from .patches import TemplatePatches, monomials, pieces
+
+
+def px_per_inverse_metre(views: Views) -> float:
+    """How fast the fastest search view moves with inverse depth [px m], for cameras of similar focal lengths."""
+    base = views.base
+    return max(base.focal_px * float(np.linalg.norm(views.cameras[k].centre_m - base.centre_m)) for k in views.search)
 
 
 class Epipolar:
@@ -88,7 +93,8 @@ class Epipolar:
 LARGEST, SHARED_FROM = 2048, 513  # points of a piece; from so many on threads share them
 MIN_NOISE = 0.4  # grey values, of a difference of two images: no image is better than its quantisation
 CONVERGED_SIGMAS = 0.2  # of the sigma that N says, which noise of the gradients makes too small where texture is weak
-MAX_STEP_PX = 1.5
+MOST_CONVERGED_PX = 0.01  # px, upper limit of the knob `converged_px` here: constrained matches are more precise
+MAX_STEP_PX = 1.5  # px, longer steps are shortened
 MIN_REMAINING = 0.1  # of the gradients' energy is always texture
 
 
@@ -116,7 +122,7 @@ class SurfacePatch:
     covariance: np.ndarray  # (N, P, P)
     across_px: np.ndarray  # (N, S) δ of the S search views, rows' pixels
     across_sigma_px: np.ndarray  # (N, S)
-    seen: np.ndarray  # (N, S) which views took part
+    visible: np.ndarray  # (N, S) which views took part
     correlation: np.ndarray  # (N, S), 1 in views that did not
     sigma_px: np.ndarray  # (N,) of the inverse depth at the texture's centre, as the largest shift in a search view
     offset: np.ndarray  # (N, 2) the texture's centre of gravity, from the patch's middle
@@ -130,46 +136,41 @@ class SurfacePatch:
         return self.status == MatchStatus.OK
 
 
-def match_surface(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
-    rows: RowGrid,
-    xy: np.ndarray,
-    start: np.ndarray,
-    settings: MatchingSettings,
-    *,
-    sigma_across_px: float,
-    prior: SurfacePrior | None = None,
-    weight: np.ndarray | None = None,
-    seen: np.ndarray | None = None,
-    monitor: Monitor | None = None,
-) -> SurfacePatch:
-    """Fit the surface (1) at the reference view's points `xy` (N, 2) (rows' pixels) to all images at once.
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SurfaceStarts:
+    """N pieces of surface to be matched about points of the reference view, and what is known of them before."""
 
-    `start` (N, 3) or (N, 6) holds approximate θ; its width chooses planes or quadrics. `sigma_across_px` is σ_c, in rows' pixels: 0.001
-    holds the patches on their epipolar lines. `weight` (N, n) is that of the patch's pixels. `seen` (N, S) says which search views take
-    part in each point, by default all; one that does but does not hold the point makes it OUT_OF_IMAGE.
-    Cost: about 30 µs per point of 13×13 and search image.
+    xy: np.ndarray  # (N, 2) rows' pixels of the reference view
+    theta: np.ndarray  # (N, 3) or (N, 6) approximate θ of (1); the width chooses planes or quadrics
+    visible: np.ndarray | None = None  # (N, S) which search views take part; None: all
+    prior: SurfacePrior | None = None
+    window: np.ndarray | None = None  # (N, n) weights of the patches' pixels; None: equal
+
+    def select(self, rows: np.ndarray | slice) -> "SurfaceStarts":
+        """Only these points."""
+        return SurfaceStarts(
+            xy=self.xy[rows],
+            theta=self.theta[rows],
+            visible=None if self.visible is None else self.visible[rows],
+            prior=None if self.prior is None else self.prior.select(rows),
+            window=None if self.window is None else self.window[rows],
+        )
+
+
+def match_surface(
+    views: Views, starts: SurfaceStarts, settings: MatchingSettings, *, sigma_across_px: float, monitor: Monitor | None = None
+) -> SurfacePatch:
+    """Fit the surface (1) about points of the reference view to all images at once.
+
+    `sigma_across_px` is σ_c, in rows' pixels: 0.001 forces the patches onto their epipolar lines. A point that lies outside a view that
+    takes part is OUT_OF_IMAGE. Cost: about 30 µs per point of 13×13 and search image.
     """
-    n = len(xy)
-    taking_part = np.ones((n, len(cameras) - 1), dtype=bool) if seen is None else seen
+    n = len(starts.xy)
 
     def work(span: slice) -> SurfacePatch:
         if monitor is not None and monitor.cancelled:
             monitor.step("surface", span.start, n)
-        part = None if prior is None else prior.select(span)
-        patches = TemplatePatches(
-            images[reference],
-            xy[span],
-            settings.patch_px,
-            rows.step,
-            degree=1 if start.shape[1] == 3 else 2,
-            weight=None if weight is None else weight[span],
-        )
-        lines = [Epipolar(cameras[reference], c, rows, xy[span]) for k, c in enumerate(cameras) if k != reference]
-        views = [image for k, image in enumerate(images) if k != reference]
-        return _Adjustment(patches, views, lines, part, settings, sigma_across_px, taking_part[span]).solve(start[span])
+        return _Adjustment(views, starts.select(span), settings, sigma_across_px).solve()
 
     parts = in_threads(work, equal_pieces(n, LARGEST, SHARED_FROM))
     return SurfacePatch(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in SurfacePatch.__dataclass_fields__})
@@ -184,12 +185,14 @@ class _Linear:
     weight: np.ndarray  # (m, S) P_k
     correlation: np.ndarray  # (m, S)
     speed: np.ndarray  # (m,) largest |∂x_k/∂w|
-    held: np.ndarray  # (m,) by all search views that take part
+    inside: np.ndarray  # (m,) the images of all search views that take part
 
     @classmethod
     def empty(cls, m: int, S: int) -> "_Linear":
         z = np.zeros
-        return cls(along=z((m, S, 2)), side=z((m, S, 2)), weight=z((m, S)), correlation=z((m, S)), speed=z(m), held=np.ones(m, dtype=bool))
+        return cls(
+            along=z((m, S, 2)), side=z((m, S, 2)), weight=z((m, S)), correlation=z((m, S)), speed=z(m), inside=np.ones(m, dtype=bool)
+        )
 
     def put(self, rows: np.ndarray, other: "_Linear") -> None:
         for name in self.__slots__:
@@ -199,21 +202,20 @@ class _Linear:
 class _Adjustment:
     """The adjustment (4) of a chunk of points."""
 
-    def __init__(
-        self,
-        patches: TemplatePatches,
-        images: Sequence[SplineImage],
-        lines: Sequence[Epipolar],
-        prior: SurfacePrior | None,
-        settings: MatchingSettings,
-        sigma_across_px: float,
-        seen: np.ndarray,
-    ) -> None:
-        self._patches, self._images, self._lines, self._prior, self._seen = patches, images, lines, prior, seen
+    def __init__(self, views: Views, starts: SurfaceStarts, settings: MatchingSettings, sigma_across_px: float) -> None:
+        xy, S = starts.xy, len(views.search)
+        self._patches = TemplatePatches(
+            views.template, xy, settings.patch_px, views.rows.step, degree=1 if starts.theta.shape[1] == 3 else 2, weight=starts.window
+        )
+        self._images = [views.images[k] for k in views.search]
+        self._lines = [Epipolar(views.base, views.cameras[k], views.rows, xy) for k in views.search]
+        self._start, self._prior = starts.theta, starts.prior
+        self._visible = np.ones((len(xy), S), dtype=bool) if starts.visible is None else starts.visible
         self._settings, self._across_weight = settings, 1 / sigma_across_px**2
-        self._S, self._P = len(images), patches.monomials.shape[1]
+        self._S, self._P = S, self._patches.monomials.shape[1]
 
-    def solve(self, start: np.ndarray) -> SurfacePatch:
+    def solve(self) -> SurfacePatch:
+        start = self._start
         s, n, P, S = self._settings, len(start), self._P, self._S
         theta, across = np.array(start, dtype=np.float64), np.zeros((n, S))
         status = np.full(n, MatchStatus.NOT_CONVERGED, dtype=np.int8)
@@ -236,45 +238,47 @@ class _Adjustment:
             iterations[active] = iteration
             state.put(active, linear)
             away = (np.abs(theta[active, 0] - start[active, 0]) * linear.speed > 2 * s.max_shift_px) | ~np.isfinite(length)
-            done = length < np.maximum(min(s.converged_px, 0.01), CONVERGED_SIGMAS * linear.speed / np.sqrt(np.maximum(N[:, 0, 0], 1e-30)))
+            done = length < np.maximum(
+                min(s.converged_px, MOST_CONVERGED_PX), CONVERGED_SIGMAS * linear.speed / np.sqrt(np.maximum(N[:, 0, 0], 1e-30))
+            )
             status[active[done]] = MatchStatus.OK
             status[active[away]] = MatchStatus.SHIFT_TOO_LARGE
-            status[active[~linear.held]] = MatchStatus.OUT_OF_IMAGE
-            active = active[~(done | away | ~linear.held)]
-        return self._judge(start, theta, across, state, iterations, status)
+            status[active[~linear.inside]] = MatchStatus.OUT_OF_IMAGE
+            active = active[~(done | away | ~linear.inside)]
+        return self._judge(theta, across, state, iterations, status)
 
     def _linearise(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray | slice) -> tuple["_Linear", np.ndarray]:
         """The directions, weights and correlations at θ, and the right side (m, P + S) of (4) without pseudo-observations."""
         P, patches = self._P, self._patches
         state, rhs = _Linear.empty(len(theta), self._S), np.zeros((len(theta), P + self._S))
         for k, (image, line) in enumerate(zip(self._images, self._lines)):
-            seen = self._seen[rows, k]
+            visible = self._visible[rows, k]
             c, e, A, L = line.centre(theta, rows)
-            if not seen.all():  # a point may lie behind a camera that does not see it
-                c, e, A, L = (np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 1.0) for a in (c, e, A, L))
+            if not visible.all():  # a point may lie behind a camera whose view takes no part
+                c, e, A, L = (np.where(visible.reshape(-1, *[1] * (a.ndim - 1)), a, 1.0) for a in (c, e, A, L))
             normal = normal_to(e)
             c = c + across[:, k, None] * normal
-            visible = image.inside(c, np.array(patches.half) * 0.5)
-            rho, (gx, gy) = self._compare(k, theta, np.where(visible[:, None], c, 0.0), L, rows)
+            inside = image.inside(c, np.array(patches.half) * 0.5)
+            rho, (gx, gy) = self._compare(k, theta, np.where(inside[:, None], c, 0.0), L, rows)
             s, t = _apply_inverse(A, e), _apply_inverse(A, normal)
-            weight = seen / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
+            weight = visible / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
             rhs[:, :P] -= weight[:, None] * (s[:, :1] * gx + s[:, 1:] * gy)
             rhs[:, P + k] -= weight * (t[:, 0] * gx[:, 0] + t[:, 1] * gy[:, 0])
-            state.along[:, k], state.side[:, k], state.weight[:, k], state.correlation[:, k] = s, t, weight, np.where(seen, rho, 1.0)
-            np.maximum(state.speed, seen * np.linalg.norm(e, axis=1), out=state.speed)
-            state.held &= visible | ~seen
+            state.along[:, k], state.side[:, k], state.weight[:, k], state.correlation[:, k] = s, t, weight, np.where(visible, rho, 1.0)
+            np.maximum(state.speed, visible * np.linalg.norm(e, axis=1), out=state.speed)
+            state.inside &= inside | ~visible
         return state, rhs
 
     def _compare(
         self, k: int, theta: np.ndarray, at: np.ndarray, slope: np.ndarray, rows: np.ndarray | slice
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Correlation (m,) and the products with the design matrix, of the patches where search view k sees the surface θ (m, P)."""
-        patches, seen, parts = self._patches, self._seen[rows, k], []
+        patches, visible, parts = self._patches, self._visible[rows, k], []
         for piece in pieces(len(theta), len(patches.monomials)):
             own = piece if isinstance(rows, slice) else rows[piece]
             x, y = self._lines[k].warp(theta[piece], patches.monomials, own, at[piece], slope[piece])
-            if not seen[piece].all():
-                x[~seen[piece]] = y[~seen[piece]] = 0
+            if not visible[piece].all():
+                x[~visible[piece]] = y[~visible[piece]] = 0
             parts.append(patches.compare(self._images[k].sample(x, y), own))
         rho, gx, gy = (np.concatenate(a) for a in zip(*((rho, *both) for rho, both in parts)))
         return rho, (gx, gy)
@@ -299,7 +303,7 @@ class _Adjustment:
         total = np.einsum("nk,nki->ni", a.weight, a.along)
         common[:, :P, :P] = squared.normal(total, total)
         for k in range(self._S):
-            s, t = a.along[:, k] * self._seen[:, [k]], a.side[:, k] * self._seen[:, [k]]
+            s, t = a.along[:, k] * self._visible[:, [k]], a.side[:, k] * self._visible[:, [k]]
             noise[:, :P, :P] += np.einsum("ni,ni->n", s, s)[:, None, None] * patches.noise_moment
             self._cross(noise, k, np.einsum("ni,ni->n", s, t)[:, None] * patches.noise_moment[:, 0])
             noise[:, P + k, P + k] = np.einsum("ni,ni->n", t, t) * patches.noise_moment[:, 0, 0]
@@ -331,16 +335,10 @@ class _Adjustment:
             ratio[:, : self._P] = np.where(taking_part, pseudo[:, : self._P] * np.where(taking_part, self._prior.error, 0.0) ** 2, 1.0)
         return ratio
 
-    def _judge(
-        self,
-        start: np.ndarray,
-        theta: np.ndarray,
-        across: np.ndarray,
-        state: "_Linear",
-        iterations: np.ndarray,
-        status: np.ndarray,
-    ) -> SurfacePatch:
+    def _judge(self, theta: np.ndarray, across: np.ndarray, state: "_Linear", iterations: np.ndarray, status: np.ndarray) -> SurfacePatch:
+        """The result with its covariance (5), and the first limit that each point exceeds as its status."""
         s, P, patches, speed, correlation = self._settings, self._P, self._patches, state.speed, state.correlation
+        start = self._start
         K = self._covariance(state, self._pseudo(theta, across, slice(None))[0])
         at = monomials(patches.offset[:, 0], patches.offset[:, 1], 1 if P == 3 else 2)
         sigma = speed * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", at, K[:, :P, :P], at), 0.0))
@@ -361,7 +359,7 @@ class _Adjustment:
             covariance=K[:, :P, :P],
             across_px=across,
             across_sigma_px=side,
-            seen=self._seen,
+            visible=self._visible,
             correlation=correlation,
             sigma_px=sigma,
             offset=patches.offset,

@@ -15,14 +15,15 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
-from ..images.interlace import RowGrid
-from ..images.sampling import SplineImage
-from .least_squares import MatchingSettings, match_patches
+from .grid import Views
+from .least_squares import MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .seeds import approximations_at_depth, sweep_ray
 
 CURVE_STEP_PX = 6.0
 NEAREST_M = 0.05  # of the ray, when nothing is known
 FIELD_MARGIN = 1.05  # of the frame corner's radius: the lens is not calibrated further out
+LARGEST_PATCH_PX = 51  # side of a patch, the limit of its knob
+PIXEL_SIGMA_PX = 0.1  # of the clicked pixel itself in an intersection with matches of it: it defines the point
 LARGER_PX = (0, 8, 16)  # patches tried one after the other
 DEPTH_SHARE = 0.4  # of a joint's depth below the skin is unknown: bodies differ
 MAX_MISS_PX = 2.5  # distance of a match from its epipolar curve
@@ -89,32 +90,27 @@ def _in_disc(a: np.ndarray, b: np.ndarray, radius: float) -> tuple[np.ndarray, n
 
 
 def propose(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    rows: RowGrid,
-    view: int,
-    xy_px: np.ndarray,
-    settings: MatchingSettings,
-    depth_range_m: tuple[float, float] | None = None,
+    views: Views, xy_px: np.ndarray, settings: MatchingSettings, depth_range_m: tuple[float, float] | None = None
 ) -> tuple[Proposal | None, ...]:
-    """The surface point at pixel `xy_px` (2,) of view number `view` in every view; None where it cannot be told, and in `view` itself.
+    """The surface point at pixel `xy_px` (2,) of the reference view in every view; None where it was not found, and in the reference.
 
-    All other views are asked together, with larger and larger patches; where only some answer, the rays tell the place in the rest. If none
-    answers, they are asked one by one, with large patches only: a small one has doubles on its curve. `depth_range_m` (in `view`) narrows
-    the search. Cost: about 10 ms for three views of 768×576.
+    All other views are searched together, with larger and larger patches; where only some match, the rest follows from the intersection of
+    the rays. If none matches, they are searched one by one, with large patches only: a small patch has repetitions along its curve.
+    `depth_range_m` (in the reference camera) narrows the search. Cost: about 10 ms for three views of 768×576.
     """
+    cameras, rows, view, others = views.cameras, views.rows, views.reference, views.search
     at = rows.from_frame(np.asarray(xy_px, dtype=np.float64))
-    others = [k for k in range(len(cameras)) if k != view]
     together = [(others, larger) for larger in LARGER_PX]
     alone = [([k], larger) for k in others for larger in LARGER_PX[1:]] if len(others) > 1 else []
     found: dict[int, Proposal] = {}
     for group, larger in together + alone:
         if found and (group == others or group[0] in found):
             continue
-        which, patch = (view, *group), replace(settings, patch_px=min(settings.patch_px + larger, 51))
-        found |= _find([images[k] for k in which], [cameras[k] for k in which], rows, at, patch, depth_range_m, group)
+        patch = replace(settings, patch_px=min(settings.patch_px + larger, LARGEST_PATCH_PX))
+        matched = _find(views.select((view, *group)), at, patch, depth_range_m)
+        found |= {group[k - 1]: proposal for k, proposal in matched.items()}
         if found and group == others:
-            found = _where_rays_meet(cameras, {view: Proposal(xy_px=rows.to_frame(at), sigma_px=0.1, correlation=1.0)} | found)
+            found = _where_rays_meet(cameras, {view: Proposal(xy_px=rows.to_frame(at), sigma_px=PIXEL_SIGMA_PX, correlation=1.0)} | found)
             break
     return tuple(found.get(k) if k != view else None for k in range(len(cameras)))
 
@@ -141,7 +137,7 @@ def below_surface(
     if not known:
         return tuple(surface)
     xy, K = np.full((1, len(cameras), 2), np.nan), np.tile(np.eye(2), (1, len(cameras), 1, 1))
-    for k, place in {view: Proposal(xy_px=xy_px, sigma_px=0.1, correlation=1.0), **known}.items():
+    for k, place in {view: Proposal(xy_px=xy_px, sigma_px=PIXEL_SIGMA_PX, correlation=1.0), **known}.items():
         xy[0, k], K[0, k] = place.xy_px, np.eye(2) * place.sigma_px**2
     depth = float(cameras[view].to_camera(forward_intersection(cameras, xy, K).xyz_m)[0, 2])
     ray = cameras[view].rays(np.asarray(xy_px, dtype=np.float64))
@@ -171,30 +167,21 @@ def _where_rays_meet(cameras: Sequence[Camera], known: Mapping[int, Proposal]) -
     return found
 
 
-def _find(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    rows: RowGrid,
-    at: np.ndarray,
-    settings: MatchingSettings,
-    depth_range_m: tuple[float, float] | None,
-    names: Sequence[int],
-) -> dict[int, Proposal]:
-    """Sweep and matching of the patch about `at` (rows' pixels) of the first image in the others."""
-    depth = sweep_ray(images, cameras, rows, at, settings, depth_range_m)
+def _find(views: Views, at: np.ndarray, settings: MatchingSettings, depth_range_m: tuple[float, float] | None) -> dict[int, Proposal]:
+    """Sweep and matching of the reference view's patch about `at` (rows' pixels): the proposals by the number of the search view."""
+    base, rows = views.base, views.rows
+    depth = sweep_ray(views, at, settings, depth_range_m)
     if depth is None:
         return {}
-    start = approximations_at_depth(cameras, 0, rows, at[None], np.array([depth]))
-    every = range(1, len(images))
-    matches = match_patches(
-        images[0], at[None], images[1:], [start.xy[:, k] for k in every], [start.shape[:, k] for k in every], settings, row_step=rows.step
-    )
+    start = approximations_at_depth(views.cameras, views.reference, rows, at[None], np.array([depth]))
+    template = TemplatePoints(image=views.template, xy=at[None], row_step=rows.step)
+    searches = [SearchImage(image=views.images[k], start=start.xy[:, k], shape=start.shape[:, k]) for k in views.search]
     found = {}
-    for k, match in zip(every, matches):
+    for k, match in zip(views.search, match_patches(template, searches, settings)):
         xy = rows.to_frame(match.xy[0])
-        if match.ok[0] and cameras[k].sees(xy) and _miss(cameras[0], rows.to_frame(at), cameras[k], xy) <= MAX_MISS_PX:
+        if match.ok[0] and views.cameras[k].sees(xy) and _miss(base, rows.to_frame(at), views.cameras[k], xy) <= MAX_MISS_PX:
             sigma = np.sqrt(np.diag(rows.covariance_to_frame(match.covariance[0])))
-            found[names[k - 1]] = Proposal(xy_px=xy, sigma_px=float(sigma.max()), correlation=float(match.correlation[0]))
+            found[k] = Proposal(xy_px=xy, sigma_px=float(sigma.max()), correlation=float(match.correlation[0]))
     return found
 
 

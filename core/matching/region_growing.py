@@ -8,37 +8,38 @@ array, and a point is accepted only when enough views find it, its rays meet, an
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import gammaincinv
 
 from ..foundation.progress import Monitor
 from ..foundation.settings import knob
-from ..foundation.threads import in_threads
 from ..geometry.camera import Camera
 from ..geometry.intersection import Intersection, forward_intersection
-from ..images.sampling import SplineImage
 from .foreground import Foreground
-from .grid import TemplateGrid
-from .least_squares import Matches, MatchingSettings, match_patches
-from .seeds import Approximations, fewest_views
+from .grid import TemplateGrid, Views
+from .least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
+from .seeds import Approximations
 
 NEIGHBOURS = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
-TEMPLATE_SIGMA_PX = 0.02  # of the template point itself, so that it may move along with the adjustment
-NOISE_SIGMAS = 4.0
-EQUAL_SIGMA_PX = 1.0  # far above matching's own: all rays weigh alike
-PATCH_STEP_PX = 4
-SMOOTH_FROM = 2
-RAY_TEST = 0.999
-NARROW = -1  # the last round: fingers, and what shows beside an outline, are narrower than the patch
-SMALLEST_PX, NARROW_SURE = 5, 0.5  # px; of the largest sigma: few pixels must have much texture
-RETRY_SMOOTHING_PX = 1.0  # what fails is weak texture: noise that is finer than its details is kept out
-# Limits where sigmas are honest, on skin up to four times the naive one, and the texture is little more than the noise.
-LESS_SURE, LESS_ALIKE = 4.0, 0.15
-LARGEST_PATCH_M = 0.03
-SEED_MEDIANS, MAX_LIMIT_PX = 3.0, 2.5
+TEMPLATE_SIGMA_PX = 0.02  # px, of the template point itself, so that the adjustment can move it
+NOISE_SIGMAS = 4.0  # sigmas of a depth by which it may differ from its parent's, beyond the steepest slope
+EQUAL_SIGMA_PX = 1.0  # px, far above matching's own: all rays have the same weight
+PATCH_STEP_PX = 4  # px by which the patch grows from round to round
+SMOOTHED_FROM_LEVEL = 2  # rounds of larger patches, from which on the images are smoothed
+RAY_TEST = 0.999  # probability of the χ² test of rays
+NARROW = -1  # level of the last round: fingers, and what shows next to an outline, are narrower than the patch
+SMALLEST_PATCH_PX = 5  # px, side of a patch
+NARROW_SIGMA_SHARE = 0.5  # of the largest sigma, in the last round: few pixels must have much texture
+RETRY_SMOOTHING_PX = 1.0  # px, sigma of the Gaussian: what fails is weak texture, and noise finer than its details is removed
+LOOSE_SIGMA = 4.0  # times the largest sigma: on skin calibrated sigmas are up to four times JᵀWJ's
+LOOSE_CORRELATION = 0.15  # below the smallest correlation: weak texture is little more than the noise
+LARGEST_PATCH_M = 0.03  # m on the surface
+SEED_MEDIANS = 3.0  # medians of the seeds' residuals that a residual may reach
+MAX_LIMIT_PX = 2.5  # px, and never more than this
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -82,7 +83,7 @@ class GrowingSettings:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class TripletField:
+class MatchedField:
     """The points that were matched: one row per accepted cell of the grid. Rows' pixels, metres; NaN in views that do not see it."""
 
     grid: TemplateGrid
@@ -105,17 +106,19 @@ class TripletField:
         """(N,) which points all views see."""
         return np.isfinite(self.xy).all(axis=(1, 2))
 
-    def select(self, rows: np.ndarray) -> "TripletField":
+    def select(self, rows: np.ndarray) -> "MatchedField":
         """The field with only these rows (a mask or indices)."""
-        names = [n for n in TripletField.__dataclass_fields__ if n not in ("grid", "tried", "limit_px")]
-        return TripletField(grid=self.grid, tried=self.tried, limit_px=self.limit_px, **{n: getattr(self, n)[rows] for n in names})
+        names = [n for n in MatchedField.__dataclass_fields__ if n not in ("grid", "tried", "limit_px")]
+        return MatchedField(grid=self.grid, tried=self.tried, limit_px=self.limit_px, **{n: getattr(self, n)[rows] for n in names})
 
 
-class _State:
-    """What is known of every cell while the field grows."""
+class _Cells:
+    """The state of every cell of the grid while the field grows."""
 
-    def __init__(self, cells: int, views: int) -> None:
-        self.middle = np.zeros((cells, views, 2))  # of the patches: what the growth goes on from
+    def __init__(self, grid: TemplateGrid, views: int) -> None:
+        cells = grid.shape[0] * grid.shape[1]
+        self.grid = grid
+        self.centre = np.zeros((cells, views, 2))  # of the patches; the starts of the neighbours follow from it
         self.xy = np.zeros((cells, views, 2))
         self.shape = np.zeros((cells, views, 2, 2))
         self.covariance = np.zeros((cells, views, 2, 2))
@@ -126,11 +129,107 @@ class _State:
         self.accepted, self.tried = np.zeros(cells, dtype=bool), np.zeros(cells, dtype=bool)
         self.attempts = np.zeros(cells, dtype=np.int16)  # of this round
 
+    def accept(self, front: "Front", measured: "_Measured", views: Views) -> None:
+        """Store what was measured at the cells of a front."""
+        cell, reference, matched, point = front.cell, views.reference, measured.matched, measured.point
+        xy = self.grid.xy(cell)
+        self.accepted[cell] = True
+        self.centre[cell, reference], self.xy[cell, reference] = xy, xy + matched[0].offset
+        self.shape[cell, reference], self.spread[cell] = np.eye(2), matched[0].spread
+        self.covariance[cell, reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
+        for k, m in zip(views.search, matched):
+            # in a view where the match failed, neighbours start from the point's projection, with the shape predicted there
+            projected = views.rows.from_frame(views.cameras[k].project(point.xyz_m))
+            self.centre[cell, k] = np.where(m.ok[:, None], m.xy, projected)
+            self.xy[cell, k] = np.where(m.ok[:, None], m.transfer_xy, np.nan)
+            self.shape[cell, k] = np.where(m.ok[:, None, None], m.shape, front.shape[:, k])
+            self.covariance[cell, k] = m.transfer_covariance
+        self.correlation[cell] = np.min([np.where(m.ok, m.correlation, 1.0) for m in matched], axis=0)
+        self.xyz[cell], self.covariance_m2[cell] = point.xyz_m, point.covariance_m2
+        self.residual[cell], self.sigma0[cell] = point.rms_residual_px, point.sigma0
 
-def grow(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
+    def next_front(self, fresh: np.ndarray, attempts: int, base: Camera) -> "Front":
+        """The neighbours of freshly accepted cells that are still open, with the predictions (1) of their parents."""
+        cell, parent = self._open_neighbours(fresh, attempts)
+        step = self.grid.xy(cell) - self.grid.xy(parent)
+        start = self.centre[parent] + np.einsum("nkij,nj->nki", self.shape[parent], step)  # (1)
+        return Front(cell=cell, start=start, shape=self.shape[parent], parent_depth_m=base.to_camera(self.xyz[parent])[:, 2])
+
+    def _open_neighbours(self, fresh: np.ndarray, attempts: int) -> tuple[np.ndarray, np.ndarray]:
+        """The open neighbours of the fresh cells, each with its best fresh parent (smallest variance)."""
+        gh, gw = self.grid.shape
+        i = (fresh % gw)[:, None] + NEIGHBOURS[:, 0]
+        j = (fresh // gw)[:, None] + NEIGHBOURS[:, 1]
+        cells, parents = (j * gw + i).ravel(), np.repeat(fresh, len(NEIGHBOURS))
+        usable = ((i >= 0) & (i < gw) & (j >= 0) & (j < gh)).ravel()
+        cells, parents = cells[usable], parents[usable]
+        open_ = ~self.accepted[cells] & (self.attempts[cells] < attempts)
+        cells, parents = cells[open_], parents[open_]
+        quality = np.trace(self.covariance_m2[parents], axis1=1, axis2=2)
+        order = np.lexsort((parents, quality, cells))
+        cells, first = np.unique(cells[order], return_index=True)
+        return cells, parents[order][first]
+
+    def field(self, limit_px: float) -> MatchedField:
+        """The accepted cells."""
+        cell = np.flatnonzero(self.accepted)
+        return MatchedField(
+            grid=self.grid,
+            cell=cell,
+            xy=self.xy[cell],
+            shape=self.shape[cell],
+            covariance=self.covariance[cell],
+            correlation=self.correlation[cell],
+            xyz_m=self.xyz[cell],
+            covariance_m2=self.covariance_m2[cell],
+            residual_px=self.residual[cell],
+            sigma0=self.sigma0[cell],
+            spread=self.spread[cell],
+            smoothed=self.smoothed[cell],
+            limit_px=limit_px,
+            tried=int(self.tried.sum()),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Front:
+    """Cells that are matched next, and what their parents predict for them."""
+
+    cell: np.ndarray  # (n,) flat cell numbers
+    start: np.ndarray  # (n, K, 2) (1), rows' pixels
+    shape: np.ndarray  # (n, K, 2, 2)
+    parent_depth_m: np.ndarray  # (n,) depth that the point should continue; NaN for seeds, which have no parent
+
+    def select(self, rows: np.ndarray) -> "Front":
+        """Only these rows (a mask or indices)."""
+        return Front(cell=self.cell[rows], start=self.start[rows], shape=self.shape[rows], parent_depth_m=self.parent_depth_m[rows])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Measured:
+    """The points of a front: matches in every search view, and where their rays meet."""
+
+    matched: list[Matches]
+    point: Intersection
+    depth_m: np.ndarray  # (n,) in the reference camera
+
+    def select(self, rows: np.ndarray) -> "_Measured":
+        """Only these rows (a mask)."""
+        return _Measured(matched=[_rows(m, rows) for m in self.matched], point=_rows(self.point, rows), depth_m=self.depth_m[rows])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Round:
+    """One pass over the image: which images and patches are matched, and how many views must match."""
+
+    views: Views
+    matching: MatchingSettings
+    pairs: bool
+    smoothed: bool
+
+
+def grow_regions(
+    views: Views,
     grid: TemplateGrid,
     seeds: Approximations,
     matching: MatchingSettings,
@@ -138,54 +237,91 @@ def grow(
     *,
     foreground: Foreground,
     monitor: Monitor,
-) -> TripletField:
-    """Grow the field from the seeds until no neighbour can be matched any more; again with larger patches, and at last with a smaller one.
+) -> MatchedField:
+    """Grow the field from the seeds until no neighbour can be matched; again with larger patches, and finally with a smaller one.
 
-    A point needs three rays, of the views that see it, or both where there are two views; with `pairs`, two rays will do for what is then
-    left. Only points that the foreground allows are accepted.
+    A point needs three rays, or both where there are two views; with `pairs`, two rays are enough for cells that are still open then.
+    Only points that the foreground allows are accepted.
     """
-    n_cells = grid.shape[0] * grid.shape[1]
-    state = _State(n_cells, len(cameras))
-    camera = cameras[reference]
-    seed_front = cells, start, shape, parent_depth = _seed_front(grid, seeds, reference)
-    matched, point, _ = _measure(images, cameras, reference, grid, grid.xy(cells), start, shape, matching, EQUAL_SIGMA_PX, pairs=False)
-    limit_px, rig_sigma_px = _rig_quality(matched, point, growing)
-    depths = camera.to_camera(point.xyz_m)[:, 2]
-    levels = (*range(rounds_of_larger_patches(matching, growing, depths, camera) + 1), NARROW)
-    for pairs, level in product((False, True) if growing.pairs and len(cameras) > 2 else (False,), levels):
-        views, settings = images, replace(matching, patch_px=max(SMALLEST_PX, matching.patch_px + PATCH_STEP_PX * level))
-        if level or pairs:
-            state.attempts[:] = 0
-            front = _front_from(state, np.flatnonzero(state.accepted), grid, growing.attempts, camera)
-            cells, start, shape, parent_depth = _with_seeds(state, seed_front, front) if pairs and not level else front
-        if level == NARROW:
-            settings = replace(settings, max_sigma_px=NARROW_SURE * settings.max_sigma_px)
-        if level >= SMOOTH_FROM:
-            settings = loosened(settings)
-            views = in_threads(lambda image: image.smoothed(RETRY_SMOOTHING_PX, grid.rows.step), images)
-        while len(cells):
-            monitor.step("surface", int(state.accepted.sum()), n_cells)
-            state.attempts[cells] += 1
-            state.tried[cells] = True
-            xy = grid.xy(cells)
-            matched, point, depth = _measure(views, cameras, reference, grid, xy, start, shape, settings, rig_sigma_px, pairs)
-            good = _acceptable(matched, point, depth, parent_depth, grid, camera, replace(growing, pairs=pairs), limit_px, foreground)
-            _store(state, cells[good], [_rows(m, good) for m in matched], point, good, xy[good], shape[good], grid, cameras, reference)
-            state.smoothed[cells[good]] = level >= SMOOTH_FROM
-            cells, start, shape, parent_depth = _front_from(state, cells[good], grid, growing.attempts, camera)
-    return _field(state, grid, limit_px)
+    seed_front = _seed_front(grid, seeds, views.reference)
+    first = _measure(views, grid.xy(seed_front.cell), seed_front, matching, EQUAL_SIGMA_PX, pairs=False)
+    growth = _Growth(views, grid, growing, first, foreground, monitor)
+    larger = rounds_of_larger_patches(matching, growing, first.depth_m, views.base)
+    levels = (*range(larger + 1), NARROW)
+    for pairs, level in product((False, True) if growing.pairs and len(views.cameras) > 2 else (False,), levels):
+        growth.run(_round(views, matching, level, pairs), seed_front, with_seeds=level == 0, restart=bool(level or pairs))
+    return growth.cells.field(growth.limit_px)
+
+
+def _round(views: Views, matching: MatchingSettings, level: int, pairs: bool) -> _Round:
+    """The round with patches `level` steps larger than those set; NARROW is the one with smaller patches."""
+    settings = replace(matching, patch_px=max(SMALLEST_PATCH_PX, matching.patch_px + PATCH_STEP_PX * level))
+    smoothed = level >= SMOOTHED_FROM_LEVEL
+    if level == NARROW:
+        settings = replace(settings, max_sigma_px=NARROW_SIGMA_SHARE * settings.max_sigma_px)
+    if smoothed:
+        settings, views = loosened(settings), views.smoothed(RETRY_SMOOTHING_PX)
+    return _Round(views=views, matching=settings, pairs=pairs, smoothed=smoothed)
+
+
+class _Growth:
+    """The growth of one field: its cells, and the limits that the seeds' residuals set."""
+
+    def __init__(
+        self, views: Views, grid: TemplateGrid, growing: GrowingSettings, seeds: _Measured, foreground: Foreground, monitor: Monitor
+    ) -> None:
+        self._base, self._grid, self._growing, self._foreground, self._monitor = views.base, grid, growing, foreground, monitor
+        self.cells = _Cells(grid, len(views.cameras))
+        self.limit_px, self._rig_sigma_px = _rig_quality(seeds.matched, seeds.point, growing)
+
+    def run(self, this: _Round, seeds: Front, *, with_seeds: bool, restart: bool) -> None:
+        """One round: from the seeds, or, on a `restart`, from everything accepted so far."""
+        cells, attempts, front = self.cells, self._growing.attempts, seeds
+        if restart:
+            cells.attempts[:] = 0
+            front = cells.next_front(np.flatnonzero(cells.accepted), attempts, self._base)
+            front = _joined(cells, seeds, front) if with_seeds else front
+        while len(front.cell):
+            self._monitor.step("surface", int(cells.accepted.sum()), len(cells.accepted))
+            cells.attempts[front.cell] += 1
+            cells.tried[front.cell] = True
+            xy = self._grid.xy(front.cell)
+            measured = _measure(this.views, xy, front, this.matching, self._rig_sigma_px, pairs=this.pairs)
+            good = self._acceptable(measured, front.parent_depth_m, this.views.required_matches(this.pairs))
+            front = front.select(good)
+            cells.accept(front, measured.select(good), this.views)
+            cells.smoothed[front.cell] = this.smoothed
+            front = cells.next_front(front.cell, attempts, self._base)
+
+    def _acceptable(self, measured: _Measured, parent_depth_m: np.ndarray, matches: int) -> np.ndarray:
+        """(n,) which points have enough matches, rays that meet, a depth that continues their parent's, and lie in the foreground."""
+        growing, point, depth = self._growing, measured.point, measured.depth_m
+        near, far = self._foreground.depth_range_m
+        sigma = np.sqrt(np.nan_to_num(np.trace(point.covariance_m2, axis1=1, axis2=2), nan=0.0))
+        across = depth * self._grid.spacing_px * np.sqrt(2) / self._base.focal_px
+        with np.errstate(invalid="ignore"):  # NaN depths of seeds' parents pass
+            continues = ~(np.abs(depth - parent_depth_m) > growing.max_slope * across + NOISE_SIGMAS * sigma)
+            return (
+                _enough(measured.matched, matches)
+                & (point.rms_residual_px <= self.limit_px)
+                & (point.sigma0 <= (growing.max_ray_sigma0 or chi2_limit(point.rays)))
+                & (depth >= near)
+                & (depth <= far)
+                & continues
+                & ~self._foreground.excludes(point.xyz_m, point.covariance_m2)
+            )
 
 
 def loosened(matching: MatchingSettings) -> MatchingSettings:
-    """The settings with the limits for matches whose sigmas are honest."""
-    less_alike = max(0.0, matching.min_correlation - LESS_ALIKE)
-    return replace(matching, max_sigma_px=LESS_SURE * matching.max_sigma_px, min_correlation=less_alike)
+    """The settings with the limits for matches whose sigmas are calibrated."""
+    min_correlation = max(0.0, matching.min_correlation - LOOSE_CORRELATION)
+    return replace(matching, max_sigma_px=LOOSE_SIGMA * matching.max_sigma_px, min_correlation=min_correlation)
 
 
 def rounds_of_larger_patches(matching: MatchingSettings, growing: GrowingSettings, depth_m: np.ndarray, camera: Camera) -> int:
-    """How many rounds of larger patches follow: as many as are asked for, but from the second on none wider than LARGEST_PATCH_M there.
+    """How many rounds of larger patches follow: as many as are set, but from the second on none wider than LARGEST_PATCH_M on the body.
 
-    A limb is round; over a wider patch it turns away.
+    A limb is round; over a wider patch its surface turns away.
     """
     if not np.isfinite(depth_m).any():
         return 0
@@ -196,112 +332,56 @@ def rounds_of_larger_patches(matching: MatchingSettings, growing: GrowingSetting
 def _rig_quality(matched: Sequence[Matches], seeds: Intersection, growing: GrowingSettings) -> tuple[float, float]:
     """The residual to allow, and the sigma of an image point that the rig and the affine patch add to matching, both from the seeds.
 
-    A rig whose rays miss each other by 0.6 px everywhere must not lose its points for that, and its sigmas must say so: with K equally
+    A rig whose rays miss each other by 0.6 px everywhere must not lose its points for that, and its sigmas must contain it: with K equally
     weighted rays the mean square residual is σ² (2 K − 3) / K, of which matching explains its own part.
     """
-    known = np.isfinite(seeds.rms_residual_px)
-    if not known.any():
+    finite = np.isfinite(seeds.rms_residual_px)
+    if not finite.any():
         return growing.max_residual_px, 0.0
-    typical = float(np.median(seeds.rms_residual_px[known]))
-    rays = float(np.median(seeds.rays[known]))
-    explained = float(np.median(np.concatenate([np.trace(m.transfer_covariance[known & m.ok], axis1=1, axis2=2) / 2 for m in matched])))
+    typical = float(np.median(seeds.rms_residual_px[finite]))
+    rays = float(np.median(seeds.rays[finite]))
+    explained = float(np.median(np.concatenate([np.trace(m.transfer_covariance[finite & m.ok], axis1=1, axis2=2) / 2 for m in matched])))
     unexplained = typical**2 * rays / (2 * rays - 3) - explained
     return max(growing.max_residual_px, min(SEED_MEDIANS * typical, MAX_LIMIT_PX)), float(np.sqrt(max(0.0, unexplained)))
 
 
-Front = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
-def _with_seeds(state: "_State", seeds: Front, front: Front) -> Front:
-    """The seeds that are not yet taken, and the rest of a front."""
-    fresh = ~state.accepted[seeds[0]]
-    rest = ~np.isin(front[0], seeds[0][fresh])
-    cells, start, shape, depth = (np.concatenate([a[fresh], b[rest]]) for a, b in zip(seeds, front))
-    return cells, start, shape, depth
-
-
-def _front_from(state: "_State", fresh: np.ndarray, grid: TemplateGrid, attempts: int, camera: Camera) -> Front:
-    """The next cells to try, their starts and shapes in every view, and the depth that they should continue."""
-    cells, parents = _next_front(state, fresh, grid, attempts)
-    step = grid.xy(cells) - grid.xy(parents)
-    start = state.middle[parents] + np.einsum("nkij,nj->nki", state.shape[parents], step)  # (1)
-    return cells, start, state.shape[parents], camera.to_camera(state.xyz[parents])[:, 2]
+def _joined(cells: _Cells, seeds: Front, front: Front) -> Front:
+    """The seeds that are not yet accepted, and the rest of a front."""
+    fresh = ~cells.accepted[seeds.cell]
+    rest = ~np.isin(front.cell, seeds.cell[fresh])
+    a, b = seeds.select(fresh), front.select(rest)
+    return Front(**{f.name: np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Front)})
 
 
 def _seed_front(grid: TemplateGrid, seeds: Approximations, reference: int) -> Front:
-    """The seeds moved to their nearest cells, one per cell; their depth is not yet bound to anything (NaN)."""
-    cells = grid.nearest(seeds.xy[:, reference])
-    cells, first = np.unique(cells, return_index=True)
-    step = grid.xy(cells) - seeds.xy[first, reference]
+    """The seeds moved to their nearest cells, one per cell."""
+    cell = grid.nearest(seeds.xy[:, reference])
+    cell, first = np.unique(cell, return_index=True)
+    step = grid.xy(cell) - seeds.xy[first, reference]
     start = seeds.xy[first] + np.einsum("nkij,nj->nki", seeds.shape[first], step)
-    return cells, start, seeds.shape[first], np.full(len(cells), np.nan)
+    return Front(cell=cell, start=start, shape=seeds.shape[first], parent_depth_m=np.full(len(cell), np.nan))
 
 
-def _measure(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
-    grid: TemplateGrid,
-    xy: np.ndarray,
-    start: np.ndarray,
-    shape: np.ndarray,
-    matching: MatchingSettings,
-    rig_sigma_px: float,
-    pairs: bool,
-) -> tuple[list[Matches], Intersection, np.ndarray]:
-    """Match points in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
-    views = [k for k in range(len(cameras)) if k != reference]
-    matched = match_patches(
-        images[reference],
-        xy,
-        [images[k] for k in views],
-        [start[:, k] for k in views],
-        [shape[:, k] for k in views],
-        matching,
-        row_step=grid.rows.step,
-    )
-    image_xy = np.full((len(xy), len(cameras), 2), np.nan)
-    rig = np.diag([1.0, 1 / grid.rows.step**2]) * rig_sigma_px**2
-    K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(cameras), 1, 1))
-    image_xy[:, reference] = xy + matched[0].offset
-    for k, m in zip(views, matched):
+def _measure(views: Views, xy: np.ndarray, front: Front, matching: MatchingSettings, rig_sigma_px: float, *, pairs: bool) -> _Measured:
+    """Match a front's points `xy` (n, 2) in every search view and intersect; `rig_sigma_px` is added to every image point's covariance."""
+    template = TemplatePoints(image=views.template, xy=xy, row_step=views.rows.step)
+    searches = [SearchImage(image=views.images[k], start=front.start[:, k], shape=front.shape[:, k]) for k in views.search]
+    matched = match_patches(template, searches, matching)
+    image_xy = np.full((len(xy), len(views.cameras), 2), np.nan)
+    rig = np.diag([1.0, 1 / views.rows.step**2]) * rig_sigma_px**2
+    K = np.tile(np.eye(2) * TEMPLATE_SIGMA_PX**2 + rig, (len(xy), len(views.cameras), 1, 1))
+    image_xy[:, views.reference] = xy + matched[0].offset
+    for k, m in zip(views.search, matched):
         image_xy[m.ok, k] = m.transfer_xy[m.ok]
         K[m.ok, k] = m.transfer_covariance[m.ok] + rig
-    image_xy[~_enough_rays(matched, pairs)] = np.nan
-    point = forward_intersection(cameras, grid.rows.to_frame(image_xy), grid.rows.covariance_to_frame(K))
-    return matched, point, cameras[reference].to_camera(point.xyz_m)[:, 2]
+    image_xy[~_enough(matched, views.required_matches(pairs))] = np.nan
+    point = forward_intersection(views.cameras, views.rows.to_frame(image_xy), views.rows.covariance_to_frame(K))
+    return _Measured(matched=matched, point=point, depth_m=views.base.to_camera(point.xyz_m)[:, 2])
 
 
-def _enough_rays(matched: Sequence[Matches], pairs: bool) -> np.ndarray:
-    """(N,) whether as many views as are needed find the point."""
-    return np.asarray(np.sum([m.ok for m in matched], axis=0) >= fewest_views(1 + len(matched), pairs))
-
-
-def _acceptable(
-    matched: Sequence[Matches],
-    point: Intersection,
-    depth: np.ndarray,
-    parent_depth: np.ndarray,
-    grid: TemplateGrid,
-    camera: Camera,
-    growing: GrowingSettings,
-    limit_px: float,
-    foreground: Foreground,
-) -> np.ndarray:
-    near, far = foreground.depth_range_m
-    sigma = np.sqrt(np.nan_to_num(np.trace(point.covariance_m2, axis1=1, axis2=2), nan=0.0))
-    across = depth * grid.spacing_px * np.sqrt(2) / camera.focal_px
-    with np.errstate(invalid="ignore"):
-        continues = ~(np.abs(depth - parent_depth) > growing.max_slope * across + NOISE_SIGMAS * sigma)  # NaN parents bind nothing
-        return (
-            _enough_rays(matched, growing.pairs)
-            & (point.rms_residual_px <= limit_px)
-            & (point.sigma0 <= (growing.max_ray_sigma0 or chi2_limit(point.rays)))
-            & (depth >= near)
-            & (depth <= far)
-            & continues
-            & ~foreground.excludes(point.xyz_m, point.covariance_m2)
-        )
+def _enough(matched: Sequence[Matches], required: int) -> np.ndarray:
+    """(N,) whether as many views match the point as are required."""
+    return np.asarray(np.sum([m.ok for m in matched], axis=0) >= required)
 
 
 def chi2_limit(rays: np.ndarray) -> np.ndarray:
@@ -310,70 +390,9 @@ def chi2_limit(rays: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(2 * gammaincinv(redundant / 2, RAY_TEST) / redundant))
 
 
-def _rows(m: Matches, rows: np.ndarray) -> Matches:
-    return Matches(**{name: getattr(m, name)[rows] for name in Matches.__dataclass_fields__})
+PerPoint = TypeVar("PerPoint", Matches, Intersection)
 
 
-def _store(
-    state: _State,
-    cells: np.ndarray,
-    matched: Sequence[Matches],
-    point: Intersection,
-    good: np.ndarray,
-    xy: np.ndarray,
-    shape: np.ndarray,
-    grid: TemplateGrid,
-    cameras: Sequence[Camera],
-    reference: int,
-) -> None:
-    views = [k for k in range(state.xy.shape[1]) if k != reference]
-    state.accepted[cells] = True
-    state.middle[cells, reference], state.xy[cells, reference] = xy, xy + matched[0].offset
-    state.shape[cells, reference], state.spread[cells] = np.eye(2), matched[0].spread
-    state.covariance[cells, reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
-    for k, m in zip(views, matched):
-        # a view that does not see the point goes on from where the point would be, with the shape that was expected there
-        unseen = grid.rows.from_frame(cameras[k].project(point.xyz_m[good]))
-        state.middle[cells, k] = np.where(m.ok[:, None], m.xy, unseen)
-        state.xy[cells, k] = np.where(m.ok[:, None], m.transfer_xy, np.nan)
-        state.shape[cells, k] = np.where(m.ok[:, None, None], m.shape, shape[:, k])
-        state.covariance[cells, k] = m.transfer_covariance
-    state.correlation[cells] = np.min([np.where(m.ok, m.correlation, 1.0) for m in matched], axis=0)
-    state.xyz[cells], state.covariance_m2[cells] = point.xyz_m[good], point.covariance_m2[good]
-    state.residual[cells], state.sigma0[cells] = point.rms_residual_px[good], point.sigma0[good]
-
-
-def _next_front(state: _State, fresh: np.ndarray, grid: TemplateGrid, attempts: int) -> tuple[np.ndarray, np.ndarray]:
-    """The untaken neighbours of the fresh cells, each with its best fresh parent (smallest variance)."""
-    gh, gw = grid.shape
-    i = (fresh % gw)[:, None] + NEIGHBOURS[:, 0]
-    j = (fresh // gw)[:, None] + NEIGHBOURS[:, 1]
-    cells, parents = (j * gw + i).ravel(), np.repeat(fresh, len(NEIGHBOURS))
-    usable = ((i >= 0) & (i < gw) & (j >= 0) & (j < gh)).ravel()
-    cells, parents = cells[usable], parents[usable]
-    open_ = ~state.accepted[cells] & (state.attempts[cells] < attempts)
-    cells, parents = cells[open_], parents[open_]
-    quality = np.trace(state.covariance_m2[parents], axis1=1, axis2=2)
-    order = np.lexsort((parents, quality, cells))
-    cells, first = np.unique(cells[order], return_index=True)
-    return cells, parents[order][first]
-
-
-def _field(state: _State, grid: TemplateGrid, limit_px: float) -> TripletField:
-    cell = np.flatnonzero(state.accepted)
-    return TripletField(
-        grid=grid,
-        cell=cell,
-        xy=state.xy[cell],
-        shape=state.shape[cell],
-        covariance=state.covariance[cell],
-        correlation=state.correlation[cell],
-        xyz_m=state.xyz[cell],
-        covariance_m2=state.covariance_m2[cell],
-        residual_px=state.residual[cell],
-        sigma0=state.sigma0[cell],
-        spread=state.spread[cell],
-        smoothed=state.smoothed[cell],
-        limit_px=limit_px,
-        tried=int(state.tried.sum()),
-    )
+def _rows(values: PerPoint, rows: np.ndarray) -> PerPoint:
+    """A value of arrays per point with only these rows (a mask)."""
+    return type(values)(**{f.name: getattr(values, f.name)[rows] for f in fields(values)})

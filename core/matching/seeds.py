@@ -22,7 +22,7 @@ from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
-from .grid import TemplateGrid
+from .grid import TemplateGrid, Views
 from .least_squares import MatchingSettings
 from .patches import patch_offsets
 
@@ -69,9 +69,7 @@ def _image_of(camera: Camera, rows: RowGrid, corners: np.ndarray) -> tuple[np.nd
 
 
 def sweep_seeds(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
+    views: Views,
     grid: TemplateGrid,
     settings: MatchingSettings,
     *,
@@ -83,71 +81,55 @@ def sweep_seeds(
     """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
 
     `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig. With
-    `pairs`, one view beside the reference is enough.
+    `pairs`, one search view is enough.
     """
-    rows = grid.rows
-    xy = _textured(images[reference], settings, rows, grid.every(max(1, round(spacing_px / grid.spacing_px))))
-    smooth = in_threads(lambda image: image.smoothed(SWEEP_SMOOTHING_PX, rows.step), images)
-    near, far = depth_range_m or _default_range(cameras)
-    inverse = _inverse_depths(cameras, reference, near, far)
+    xy = _textured(views, settings, grid.every(max(1, round(spacing_px / grid.spacing_px))))
+    smooth = views.smoothed(SWEEP_SMOOTHING_PX)
+    near, far = depth_range_m or _default_range(views.cameras)
+    inverse = _inverse_depths(views, near, far)
 
     def work(part: slice) -> tuple[np.ndarray, np.ndarray]:
         if monitor.cancelled:
             monitor.step("seeds", part.start, len(xy))
-        rho = _sweep_correlations(smooth, cameras, reference, rows, settings, xy[part], inverse)
-        return _best_depths(rho, inverse, fewest_views(len(cameras), pairs))
+        rho = _sweep_correlations(smooth, settings, xy[part], inverse)
+        return _best_depths(rho, inverse, views.required_matches(pairs))
 
     monitor.step("seeds", 0, len(xy))
-    block = max(1, LOOK_UP // max(1, len(inverse) * settings.patch_px**2 * len(cameras)))
+    block = max(1, LOOK_UP // max(1, len(inverse) * settings.patch_px**2 * len(views.cameras)))
     parts = in_threads(work, equal_pieces(len(xy), block, 2))
     depth, good = (np.concatenate(a) for a in zip(*parts))
-    return approximations_at_depth(cameras, reference, rows, xy[good], depth[good])
+    return approximations_at_depth(views.cameras, views.reference, views.rows, xy[good], depth[good])
 
 
-def sweep_ray(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    rows: RowGrid,
-    xy: np.ndarray,
-    settings: MatchingSettings,
-    depth_range_m: tuple[float, float] | None = None,
-) -> float | None:
-    """Depth [m] at which the patch about `xy` (2,) (rows' pixels) of the FIRST image is in all others; None where that is not clear."""
-    at = _textured(images[0], settings, rows, np.asarray(xy, dtype=np.float64)[None])
+def sweep_ray(views: Views, xy: np.ndarray, settings: MatchingSettings, depth_range_m: tuple[float, float] | None = None) -> float | None:
+    """Depth [m] at which the reference view's patch about `xy` (2,) (rows' pixels) matches in all search views; None where ambiguous."""
+    at = _textured(views, settings, np.asarray(xy, dtype=np.float64)[None])
     if not len(at):
         return None
-    inverse = _inverse_depths(cameras, 0, *(depth_range_m or _default_range(cameras)))
-    depth, good = _best_depths(_sweep_correlations(images, cameras, 0, rows, settings, at, inverse), inverse, len(cameras) - 1)
+    inverse = _inverse_depths(views, *(depth_range_m or _default_range(views.cameras)))
+    depth, good = _best_depths(_sweep_correlations(views, settings, at, inverse), inverse, len(views.search))
     return float(depth[0]) if good[0] else None
 
 
-def settled_depths(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
-    rows: RowGrid,
-    xy: np.ndarray,
-    depth_m: np.ndarray,
-    sigma_m: np.ndarray,
-    settings: MatchingSettings,
-) -> np.ndarray:
-    """Depths (M,) near `depth_m` ± `sigma_m` at which the patches about `xy` (M, 2) (rows' pixels of the reference) look most alike in
-    as many views as see them; the given depth where that is not clear."""
-    smooth = [image.smoothed(SWEEP_SMOOTHING_PX, rows.step) for image in images]
+def settled_depths(views: Views, xy: np.ndarray, depth_m: np.ndarray, sigma_m: np.ndarray, settings: MatchingSettings) -> np.ndarray:
+    """Depths (M,) near `depth_m` ± `sigma_m` at which the reference view's patches about `xy` (M, 2) (rows' pixels) correlate best in as
+    many views as show them; the given depth where that is ambiguous."""
+    smooth = views.smoothed(SWEEP_SMOOTHING_PX)
     settled = np.array(depth_m, dtype=np.float64)
     for i, (depth, sigma) in enumerate(zip(depth_m, sigma_m)):
-        at = _textured(images[reference], settings, rows, xy[i : i + 1])
+        at = _textured(views, settings, xy[i : i + 1])
         if len(at):
             reach = min(CLICK_SIGMAS * sigma, CLICK_SHARE * depth)
-            inverse = _inverse_depths(cameras, reference, depth - reach, depth + reach)
-            rho = _sweep_correlations(smooth, cameras, reference, rows, settings, at, inverse)
-            best, clear = _best_depths(rho, inverse, 1)
+            inverse = _inverse_depths(views, depth - reach, depth + reach)
+            best, clear = _best_depths(_sweep_correlations(smooth, settings, at, inverse), inverse, 1)
             settled[i] = best[0] if clear[0] else depth
     return settled
 
 
-def _textured(image: SplineImage, settings: MatchingSettings, rows: RowGrid, xy: np.ndarray) -> np.ndarray:
-    u, v, half = patch_offsets(settings.patch_px, rows.step)
+def _textured(views: Views, settings: MatchingSettings, xy: np.ndarray) -> np.ndarray:
+    """The points (m, 2) of `xy` (N, 2) about which the reference image has more texture than noise."""
+    image = views.template
+    u, v, half = patch_offsets(settings.patch_px, views.rows.step)
     xy = xy[image.inside(xy, np.array(half) + 3.0)]
     patch = image.sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32))
     return xy[patch.std(axis=1) > max(MIN_CONTRAST, CONTRAST_OVER_NOISE * image.noise)]
@@ -159,43 +141,28 @@ def _default_range(cameras: Sequence[Camera]) -> tuple[float, float]:
     return NEAREST_BASES * base, FARTHEST_BASES * base
 
 
-def _inverse_depths(cameras: Sequence[Camera], reference: int, near: float, far: float) -> np.ndarray:
+def _inverse_depths(views: Views, near: float, far: float) -> np.ndarray:
     """Inverse depths from far to near, so that the fastest search image moves by about SWEEP_STEP_PX."""
-    centres = np.stack([c.centre_m for c in cameras])
-    speed = np.linalg.norm(centres - centres[reference], axis=1).max() * cameras[reference].focal_px
+    centres = np.stack([c.centre_m for c in views.cameras])
+    speed = np.linalg.norm(centres - centres[views.reference], axis=1).max() * views.base.focal_px
     count = int(np.clip(speed * (1 / near - 1 / far) / SWEEP_STEP_PX, 8, MAX_SAMPLES))
     return np.linspace(1 / far, 1 / near, count)
 
 
-def fewest_views(cameras: int, pairs: bool) -> int:
-    """How many views beside the reference must see a point: two, or all there are; with `pairs` one."""
-    return 1 if pairs else min(2, cameras - 1)
-
-
-def _sweep_correlations(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
-    rows: RowGrid,
-    settings: MatchingSettings,
-    xy: np.ndarray,
-    inverse: np.ndarray,
-) -> np.ndarray:
-    """Correlations (S, m, D) of the patches in the S search views, NaN where a view does not hold them."""
+def _sweep_correlations(views: Views, settings: MatchingSettings, xy: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Correlations (S, m, D) of the patches in the S search views, NaN where a view does not contain them."""
     m, D = len(xy), len(inverse)
-    u, v, half = patch_offsets(settings.patch_px, rows.step)
-    keep = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > 9 else np.ones(len(u), dtype=bool)
-    u, v = u[keep], v[keep]
-    f = _normalised(images[reference].sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
-    corners = _corners(cameras[reference], rows, xy, 1 / inverse[None])
+    u, v, half = patch_offsets(settings.patch_px, views.rows.step)
+    sampled = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > 9 else np.ones(len(u), dtype=bool)
+    u, v = u[sampled], v[sampled]
+    f = _normalised(views.template.sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
+    corners = _corners(views.base, views.rows, xy, 1 / inverse[None])
     found = []
-    for k in range(len(cameras)):
-        if k == reference:
-            continue
-        c, A = (a.reshape(m * D, *a.shape[2:]) for a in _image_of(cameras[k], rows, corners))
-        inside = images[k].inside(c, np.array(half))
+    for k in views.search:
+        c, A = (a.reshape(m * D, *a.shape[2:]) for a in _image_of(views.cameras[k], views.rows, corners))
+        inside = views.images[k].inside(c, np.array(half))
         rho = np.full(m * D, np.nan)
-        rho[inside] = _correlations(images[k], c[inside], A[inside], f, np.repeat(np.arange(m), D)[inside], u, v)
+        rho[inside] = _correlations(views.images[k], c[inside], A[inside], f, np.repeat(np.arange(m), D)[inside], u, v)
         found.append(rho.reshape(m, D))
     return np.stack(found)
 

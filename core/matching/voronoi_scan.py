@@ -20,14 +20,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..foundation.progress import Monitor
-from ..geometry.camera import Camera
 from ..geometry.intersection import forward_intersection
 from ..images.sampling import SplineImage
 from .foreground import Foreground
-from .grid import TemplateGrid, neighbours_of, unlike_neighbours
-from .least_squares import Matches, MatchingSettings, match_patches
-from .region_growing import MAX_LIMIT_PX, SEED_MEDIANS, TEMPLATE_SIGMA_PX, GrowingSettings, TripletField
-from .seeds import Approximations, fewest_views
+from .grid import TemplateGrid, Views, neighbours_of, unlike_neighbours
+from .least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
+from .region_growing import MAX_LIMIT_PX, SEED_MEDIANS, TEMPLATE_SIGMA_PX, GrowingSettings, MatchedField
+from .seeds import Approximations
 
 HORIZONTAL, VERTICAL = np.array([(-1, 0), (1, 0)]), np.array([(0, -1), (0, 1)])
 AROUND = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
@@ -66,10 +65,8 @@ def limits_of(texture: str, matching: MatchingSettings) -> MatchingSettings:
     )
 
 
-def scan(
-    images: Sequence[SplineImage],
-    cameras: Sequence[Camera],
-    reference: int,
+def voronoi_scan(
+    views: Views,
     grid: TemplateGrid,
     seeds: Approximations,
     matching: MatchingSettings,
@@ -77,18 +74,17 @@ def scan(
     *,
     foreground: Foreground,
     monitor: Monitor,
-) -> TripletField:
-    """The field of triplets by scanning the regions of the seeds. Arguments and result as of `growing.grow`.
+) -> MatchedField:
+    """The matched field by scanning the Voronoi regions of the seeds. Arguments and result as of `growing.grow_regions`.
 
-    Only triplets that the foreground allows, and whose rays meet, are kept.
+    Only points that the foreground allows, and whose rays meet, are accepted.
     """
     settings = limits_of(growing.texture, matching)
-    cells, first = np.unique(grid.nearest(seeds.xy[:, reference]), return_index=True)
-    views = [k for k in range(len(cameras)) if k != reference]
+    cells, first = np.unique(grid.nearest(seeds.xy[:, views.reference]), return_index=True)
     scans = []
-    for k in views:
-        one = _Scan(images[reference], images[k], grid, cells, settings, monitor)
-        step = grid.xy(cells) - seeds.xy[first, reference]
+    for k in views.search:
+        one = _Scan(views.template, views.images[k], grid, cells, settings, monitor)
+        step = grid.xy(cells) - seeds.xy[first, views.reference]
         shape = seeds.shape[first, k]
         one.begin(seeds.xy[first, k] + np.einsum("nij,nj->ni", shape, step), shape)
         one.cover()
@@ -96,7 +92,7 @@ def scan(
         for _ in range(FILTER_PASSES):
             one.filter_and_repeat()
         scans.append(one)
-    return _merged(scans, cameras, reference, grid, growing, foreground)
+    return _merged(scans, views, grid, growing, foreground)
 
 
 class _Scan:
@@ -213,7 +209,8 @@ class _Scan:
         return np.where(m.ok[:, None], onward, np.nan), np.where(m.ok[:, None, None], m.shape, shape)
 
     def _match(self, xy: np.ndarray, start: np.ndarray, shape: np.ndarray, settings: MatchingSettings) -> Matches:
-        return match_patches(self._template, xy, [self._image], [start], [shape], settings, row_step=self._grid.rows.step)[0]
+        template = TemplatePoints(image=self._template, xy=xy, row_step=self._grid.rows.step)
+        return match_patches(template, [SearchImage(image=self._image, start=start, shape=shape)], settings)[0]
 
     def _try(self, cells: np.ndarray, start: np.ndarray, shape: np.ndarray, *, patch_px: int | None = None) -> np.ndarray:
         """Match cells from these starts; note what was found. Which (n,) were."""
@@ -244,18 +241,17 @@ class _Scan:
         self.offset[cells], self.spread[cells] = m.offset[rows], m.spread[rows]
 
 
-def _merged(
-    scans: Sequence[_Scan], cameras: Sequence[Camera], reference: int, grid: TemplateGrid, growing: GrowingSettings, foreground: Foreground
-) -> TripletField:
-    """Triplets: the cells found in as many search images as are needed, intersected."""
+def _merged(scans: Sequence[_Scan], views: Views, grid: TemplateGrid, growing: GrowingSettings, foreground: Foreground) -> MatchedField:
+    """The cells found in as many search images as are required, intersected."""
+    cameras, reference = views.cameras, views.reference
     count = np.sum([s.found for s in scans], axis=0)
-    cell = np.flatnonzero(count >= fewest_views(len(cameras), growing.pairs))
-    n, views = len(cell), [k for k in range(len(cameras)) if k != reference]
+    cell = np.flatnonzero(count >= views.required_matches(growing.pairs))
+    n = len(cell)
     xy, shape, K = np.zeros((n, len(cameras), 2)), np.zeros((n, len(cameras), 2, 2)), np.zeros((n, len(cameras), 2, 2))
-    seen = np.stack([s.found[cell] for s in scans])
-    offset = np.sum([s.offset[cell] * f[:, None] for s, f in zip(scans, seen)], axis=0) / count[cell, None]
+    matched = np.stack([s.found[cell] for s in scans])
+    offset = np.sum([s.offset[cell] * f[:, None] for s, f in zip(scans, matched)], axis=0) / count[cell, None]
     xy[:, reference], shape[:, reference], K[:, reference] = grid.xy(cell) + offset, np.eye(2), np.eye(2) * TEMPLATE_SIGMA_PX**2
-    for k, s, found in zip(views, scans, seen):
+    for k, s, found in zip(views.search, scans, matched):
         # a bigger patch has another centre of gravity: the images of the same template point are intersected
         xy[:, k] = s.xy[cell] + np.einsum("nij,nj->ni", s.shape[cell], offset - s.offset[cell])
         xy[~found, k] = np.nan
@@ -263,24 +259,24 @@ def _merged(
     point = forward_intersection(cameras, grid.rows.to_frame(xy), grid.rows.covariance_to_frame(K))
     typical = float(np.nanmedian(point.rms_residual_px)) if n else 0.0
     limit_px = max(growing.max_residual_px, min(SEED_MEDIANS * typical, MAX_LIMIT_PX))  # a poor rig must not lose its points
-    field = TripletField(
+    field = MatchedField(
         grid=grid,
         cell=cell,
         xy=xy,
         shape=shape,
         covariance=K,
-        correlation=np.min([np.where(f, s.correlation[cell], 1.0) for s, f in zip(scans, seen)], axis=0),
+        correlation=np.min([np.where(f, s.correlation[cell], 1.0) for s, f in zip(scans, matched)], axis=0),
         xyz_m=point.xyz_m,
         covariance_m2=point.covariance_m2,
         residual_px=point.rms_residual_px,
         sigma0=point.sigma0,
-        spread=np.stack([s.spread[cell] for s in scans])[seen.argmax(axis=0), np.arange(n)],
+        spread=np.stack([s.spread[cell] for s in scans])[matched.argmax(axis=0), np.arange(n)],
         smoothed=np.zeros(n, dtype=bool),
         tried=int(np.any([s.tried for s in scans], axis=0).sum()),
         limit_px=limit_px,
     )
     near, far = foreground.depth_range_m
-    depth = cameras[reference].to_camera(point.xyz_m)[:, 2]
+    depth = views.base.to_camera(point.xyz_m)[:, 2]
     with np.errstate(invalid="ignore"):
-        kept = (depth >= near) & (depth <= far) & (field.residual_px <= limit_px)
-        return field.select(kept & ~foreground.excludes(point.xyz_m, point.covariance_m2))
+        good = (depth >= near) & (depth <= far) & (field.residual_px <= limit_px)
+        return field.select(good & ~foreground.excludes(point.xyz_m, point.covariance_m2))

@@ -39,7 +39,7 @@ from ..report.silhouettes import Silhouettes, by_view, silhouettes_of
 from ..results.folder import FitCheckpoints, Results, check_separate_folder
 from ..surface.cloud import PointCloud, SurfaceSettings, as_written, write_cloud
 from ..surface.frames import MeasuredFrames, note_of
-from ..surface.measure import NothingMeasured, measure_frames
+from ..surface.measure import MeasureSettings, NothingMeasured, measure_frames
 from ..take.clicked_points import clicked_depth
 from ..take.take import Footage, open_take, read_take
 from ..tracking.contour import ContourSettings
@@ -200,7 +200,7 @@ def measure(run: Run, monitor: Monitor) -> None:
     if s["timing"].correct and not run.footage.delay_images:
         run.footage, run.record["offsets"] = synchronised(run.footage, monitor)
     try:
-        for m in measure_frames(run.footage, s["matching"], s["growing"], s["surface"], run.results, monitor, s["enhance"]):
+        for m in measure_frames(run.footage, MeasureSettings.of(s), run.results, monitor):
             write_cloud(run.results.cloud_path(m.frame), as_written(run.corrected(m.cloud), s["surface"]))
             done.append(note_of(m))
             room = room or m.foreground

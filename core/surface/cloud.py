@@ -21,12 +21,12 @@ from scipy.ndimage import label
 from ..foundation.arrays import frozen
 from ..foundation.settings import knob
 from ..geometry.camera import Camera
-from ..matching.region_growing import TripletField
+from ..matching.region_growing import MatchedField
 from ..motion.formats import ply
 from .local_surface import LocalSurface, local_surface
 
 FILTERS = ("other surface", "small island", "depth in doubt")  # what they find; why a point went is 1 + its filter's number
-IN_DOUBT = 3  # told by the images (matching/occlusion_check.py)
+OCCLUDED = 3  # what failed the occlusion check (matching/occlusion_check.py)
 REMAINING_BIAS = 0.5  # of the curvature correction
 LIMB_SCATTER = 0.06  # of the spacing on the surface: what a round limb's own shape makes neighbours scatter about a quadric
 ROUGHNESS = 0.7  # of the variance by which they scatter beyond that and beyond their own
@@ -85,12 +85,12 @@ class PointCloud:
         return PointCloud(frame=self.frame, **{f.name: getattr(self, f.name)[rows] for f in fields(PointCloud) if f.name != "frame"})
 
 
-def clean_field(field: TripletField, camera: Camera, reference: int, settings: SurfaceSettings) -> TripletField:
+def clean_field(field: MatchedField, camera: Camera, reference: int, settings: SurfaceSettings) -> MatchedField:
     """The field without the points that disagree with their neighbours and without small islands."""
     return field.select(why_removed(field, camera, reference, settings) == 0)
 
 
-def why_removed(field: TripletField, camera: Camera, reference: int, settings: SurfaceSettings) -> np.ndarray:
+def why_removed(field: MatchedField, camera: Camera, reference: int, settings: SurfaceSettings) -> np.ndarray:
     """Which of the first two `FILTERS` removes each point (N,) uint8, 1 for the first; 0 where neither does."""
     why = np.zeros(len(field.cell), dtype=np.uint8)
     if not len(why):
@@ -104,7 +104,7 @@ def why_removed(field: TripletField, camera: Camera, reference: int, settings: S
     return why
 
 
-def point_cloud(field: TripletField, grey: np.ndarray, camera: Camera, reference: int, frame: int, settings: SurfaceSettings) -> PointCloud:
+def point_cloud(field: MatchedField, grey: np.ndarray, camera: Camera, reference: int, frame: int, settings: SurfaceSettings) -> PointCloud:
     """The cloud of a cleaned field. `grey` (h', w) is the reference image in rows."""
     n, k = field.xy.shape[:2]
     xyz, K, normal = field.xyz_m, field.covariance_m2, np.zeros((0, 3))
@@ -141,7 +141,7 @@ def _correction_m(surface: LocalSurface, focal_px: float) -> np.ndarray:
     return np.clip(surface.flattening_m, -limit, limit)
 
 
-def _island_size(field: TripletField) -> np.ndarray:
+def _island_size(field: MatchedField) -> np.ndarray:
     """(N,) how many points hang together with each."""
     taken = np.zeros(field.grid.shape, dtype=bool)
     taken.ravel()[field.cell] = True

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
-from ..matching.region_growing import TripletField
+from ..matching.region_growing import MatchedField
 
 RADIUS_CELLS = 3
 LARGEST = 512  # points whose neighbours stay in the cache
@@ -36,7 +36,7 @@ class LocalSurface:
     normal: np.ndarray  # (N, 3) unit, towards the reference camera
 
 
-def local_surface(field: TripletField, camera: Camera, reference: int) -> LocalSurface:
+def local_surface(field: MatchedField, camera: Camera, reference: int) -> LocalSurface:
     """Fit (1) about every point of the field, from the cells within RADIUS_CELLS."""
     coefficients, scatter, support = _quadrics(field, camera, reference, np.arange(len(field.cell)))
     depth = camera.to_camera(field.xyz_m)[:, 2]
@@ -51,13 +51,13 @@ def local_surface(field: TripletField, camera: Camera, reference: int) -> LocalS
     )
 
 
-def curvatures(field: TripletField, camera: Camera, reference: int, rows: np.ndarray) -> np.ndarray:
+def curvatures(field: MatchedField, camera: Camera, reference: int, rows: np.ndarray) -> np.ndarray:
     """Daa and Dbb (n, 2) of (1) about these rows (n,) of the field, the depth in pixels of the reference view as well [1/px]."""
     coefficients, _, _ = _quadrics(field, camera, reference, rows)
     return coefficients[:, [3, 5]] * (camera.focal_px / camera.to_camera(field.xyz_m[rows])[:, 2])[:, None]
 
 
-def _quadrics(field: TripletField, camera: Camera, reference: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _quadrics(field: MatchedField, camera: Camera, reference: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(1) about these rows: coefficients (n, 6), the neighbours' scatter (n,) about it and how many support it (n,)."""
     depth, at = camera.to_camera(field.xyz_m)[:, 2], field.grid.rows.to_frame(field.xy[:, reference])
     neighbour, spacing_m = _neighbourhoods(field, rows), field.grid.spacing_px * depth / camera.focal_px
@@ -76,7 +76,7 @@ def _quadrics(field: TripletField, camera: Camera, reference: int, rows: np.ndar
     return coefficients, scatter, support
 
 
-def _neighbourhoods(field: TripletField, rows: np.ndarray) -> np.ndarray:
+def _neighbourhoods(field: MatchedField, rows: np.ndarray) -> np.ndarray:
     """Rows of the points in the cells about these rows (n, m), −1 where there is none."""
     gh, gw = field.grid.shape
     r = RADIUS_CELLS
@@ -112,7 +112,7 @@ def _masked_median(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.where(mask.any(axis=1), ordered[np.arange(len(values)), middle], 0.0)
 
 
-def _normals(field: TripletField, camera: Camera, reference: int, depth: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+def _normals(field: MatchedField, camera: Camera, reference: int, depth: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Unit normals from the tangents ∂X/∂a, ∂X/∂b of the fitted depth, turned towards the camera."""
     xy = field.grid.rows.to_frame(field.xy[:, reference])
     rays, along_a, along_b = camera.rays(xy), camera.rays(xy + (1.0, 0.0)), camera.rays(xy + (0.0, 1.0))

@@ -4,8 +4,9 @@ Every frame leaves a checkpoint whose key covers the images, the rig, the settin
 it stopped and ends with the same numbers.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,20 +21,21 @@ from ..images.sampling import SplineImage
 from ..images.sequence import IMAGE_ENDINGS
 from ..matching import foreground as fg
 from ..matching.constraints import constrain
-from ..matching.grid import TemplateGrid, template_grid
+from ..matching.grid import TemplateGrid, Views, template_grid
 from ..matching.least_squares import MatchingSettings
-from ..matching.occlusion_check import in_doubt
-from ..matching.region_growing import GrowingSettings, TripletField, grow
+from ..matching.occlusion_check import fails_occlusion_check
+from ..matching.region_growing import GrowingSettings, MatchedField, grow_regions
 from ..matching.seeds import Approximations, sweep_seeds
-from ..matching.voronoi_scan import scan
+from ..matching.voronoi_scan import voronoi_scan
 from ..results.folder import Results
 from ..take.clicked_points import clicked_depth, with_clicked
-from ..take.person_masks import silhouette_file, silhouettes, told_by
+from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from ..take.take import Footage, footage_frames
-from .cloud import IN_DOUBT, PointCloud, SurfaceSettings, point_cloud, why_removed
+from .cloud import OCCLUDED, PointCloud, SurfaceSettings, point_cloud, why_removed
 
 ALGORITHM = "surface 18"  # part of every key: raise it when the same input gives other numbers
-MIN_MOVED = 20  # seeds
+MIN_MOVED = 20  # seeds that moved, from which the person is looked for among them alone
+ANY_DEPTH_M = (0.05, 1e3)  # m
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
 
 
@@ -62,7 +64,7 @@ class MeasuredFrame:
     """The surface of one frame: the matched field, which tracking needs, and the cloud."""
 
     frame: int
-    field: TripletField
+    field: MatchedField
     cloud: PointCloud
     foreground: fg.Foreground
     key: str
@@ -102,15 +104,22 @@ def load_images(footage: Footage, frame: int, enhance: EnhanceSettings | None = 
     return FrameImages(grey=grey, spline=in_threads(SplineImage, matched))
 
 
-def measure_frames(
-    footage: Footage,
-    matching: MatchingSettings,
-    growing: GrowingSettings,
-    surface: SurfaceSettings,
-    results: Results,
-    monitor: Monitor,
-    enhance: EnhanceSettings | None = None,
-) -> Iterator[MeasuredFrame]:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MeasureSettings:
+    """All knobs on which the surface of a frame depends."""
+
+    matching: MatchingSettings
+    growing: GrowingSettings
+    surface: SurfaceSettings
+    enhance: EnhanceSettings | None = None
+
+    @staticmethod
+    def of(settings: Mapping[str, Any]) -> "MeasureSettings":
+        """Those of a run's settings, by the names of their tables."""
+        return MeasureSettings(**{f.name: settings[f.name] for f in fields(MeasureSettings)})
+
+
+def measure_frames(footage: Footage, settings: MeasureSettings, results: Results, monitor: Monitor) -> Iterator[MeasuredFrame]:
     """Measure all frames: from the frame of the clicks to the end, then from it to the beginning.
 
     Raises:
@@ -122,7 +131,7 @@ def measure_frames(
     order = [*range(first, footage.frames.stop), *range(first - 1, footage.frames.start - 1, -1)]
     base = store.digest(
         ALGORITHM,
-        repr((matching, growing, surface.of_measuring, enhance)),
+        repr((settings.matching, settings.growing, settings.surface.of_measuring, settings.enhance)),
         take.rig_path,
         repr((take.interlaced, take.first_field, take.reference_view, _seed_table(footage))),
         repr([(v.name, v.offset_frames) for v in take.views]),
@@ -138,7 +147,7 @@ def measure_frames(
         key = store.digest(base, *known, str(frame), *_image_digests(footage, frame), *_silhouette_digests(footage, frame))
         measured = read_checkpoint(footage, results, frame, key)
         if measured is None:
-            measured = _measure(footage, matching, growing, surface, frame, before, key, part, enhance)
+            measured = _measure(_frame_views(footage, frame, settings, first=before is None), settings, before, key, part)
             _checkpoint(results, measured)
         start = start or measured
         before = measured
@@ -172,66 +181,76 @@ def _seed_table(footage: Footage) -> list[tuple[str, list[tuple[str, list[float]
     return [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
 
 
-def _measure(
-    footage: Footage,
-    matching: MatchingSettings,
-    growing: GrowingSettings,
-    surface: SurfaceSettings,
-    frame: int,
-    before: MeasuredFrame | None,
-    key: str,
-    monitor: Monitor,
-    enhance: EnhanceSettings | None,
-) -> MeasuredFrame:
-    take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
-    images = load_images(footage, frame, enhance)
-    grid = template_grid(images.spline[ref].shape, take.rows_at(frame), growing.spacing_px)
-    person = silhouettes(footage, images.grey, frame, first=before is None)
-    if before is None:
-        where, seeds = _first_foreground(footage, images, grid, matching, growing, frame, person, monitor)
-    else:
-        where = fg.after(cameras[ref].to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
-        seeds = _swept(footage, images, grid, matching, growing, where.depth_range_m, monitor)
-    told = told_by(footage)
-    where = replace(where, silhouettes=person, method=f"{where.method}, {told}" if told else where.method)
-    cover = scan if growing.method == "published" else grow
-    field = cover(images.spline, cameras, ref, grid, seeds, matching, growing, foreground=where, monitor=monitor)
-    field = constrain(field, images.spline, cameras, ref, matching, foreground=where, monitor=monitor, pairs=growing.pairs)
-    whole = _single(field)
-    why = why_removed(whole, cameras[ref], ref, surface)
-    clean = np.flatnonzero(why == 0)
-    why[clean[in_doubt(whole.select(clean), images.spline, cameras, ref, matching)]] = IN_DOUBT
-    field, removed = whole.select(why == 0), whole.grid.rows.to_frame(whole.xy[why > 0]).astype(np.float32)
-    cloud = point_cloud(field, images.grey[ref], cameras[ref], ref, frame, surface)
-    if before is None and not len(cloud.xyz_m):
-        raise NothingMeasured(frame)
-    return MeasuredFrame(
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _FrameViews:
+    """One frame, ready to be measured."""
+
+    footage: Footage
+    frame: int
+    grey: list[np.ndarray]  # (h', w) of every view, as they were taken
+    views: Views
+    grid: TemplateGrid
+    silhouettes: tuple[fg.Silhouette, ...]
+
+
+def _frame_views(footage: Footage, frame: int, settings: MeasureSettings, *, first: bool) -> _FrameViews:
+    """Read a frame. Raises InputError; see `Footage.read`, and `silhouettes` for what is checked in the `first` frame alone."""
+    images = load_images(footage, frame, settings.enhance)
+    rows = footage.take.rows_at(frame)
+    views = Views(images=images.spline, cameras=footage.rig.cameras, reference=footage.take.reference, rows=rows)
+    return _FrameViews(
+        footage=footage,
         frame=frame,
-        field=field,
+        grey=images.grey,
+        views=views,
+        grid=template_grid(views.template.shape, rows, settings.growing.spacing_px),
+        silhouettes=silhouettes(footage, images.grey, frame, first=first),
+    )
+
+
+def _measure(now: _FrameViews, settings: MeasureSettings, before: MeasuredFrame | None, key: str, monitor: Monitor) -> MeasuredFrame:
+    """The surface of a frame, in the depths where the frame before was, or else where the person is."""
+    views, ref = now.views, now.views.reference
+    if before is None:
+        where, seeds = _first_foreground(now, settings, monitor)
+    else:
+        where = fg.after(views.base.to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
+        seeds = _swept(now, settings, where.depth_range_m, monitor)
+    sources = silhouette_sources(now.footage)
+    where = replace(where, silhouettes=now.silhouettes, method=f"{where.method}, {sources}" if sources else where.method)
+    field = _matched(now, seeds, settings, where, monitor)
+    why = why_removed(field, views.base, ref, settings.surface)
+    clean = np.flatnonzero(why == 0)
+    why[clean[fails_occlusion_check(field.select(clean), views, settings.matching)]] = OCCLUDED
+    cloud = point_cloud(field.select(why == 0), now.grey[ref], views.base, ref, now.frame, settings.surface)
+    if before is None and not len(cloud.xyz_m):
+        raise NothingMeasured(now.frame)
+    return MeasuredFrame(
+        frame=now.frame,
+        field=field.select(why == 0),
         cloud=cloud,
         foreground=replace(where, silhouettes=()),
         key=key,
-        removed_px=removed,
+        removed_px=views.rows.to_frame(field.xy[why > 0]).astype(np.float32),
         removed_why=why[why > 0],
     )
 
 
-def _swept(
-    footage: Footage,
-    images: FrameImages,
-    grid: TemplateGrid,
-    matching: MatchingSettings,
-    growing: GrowingSettings,
-    depth_range_m: tuple[float, float] | None,
-    monitor: Monitor,
-) -> Approximations:
+def _matched(now: _FrameViews, seeds: Approximations, settings: MeasureSettings, where: fg.Foreground, monitor: Monitor) -> MatchedField:
+    """The matched field of a frame, under the constraint that was chosen, before the filters."""
+    matching, growing = settings.matching, settings.growing
+    cover = voronoi_scan if growing.method == "published" else grow_regions
+    field = cover(now.views, now.grid, seeds, matching, growing, foreground=where, monitor=monitor)
+    return _single(constrain(field, now.views, matching, foreground=where, monitor=monitor, pairs=growing.pairs))
+
+
+def _swept(now: _FrameViews, settings: MeasureSettings, depth_range_m: tuple[float, float] | None, monitor: Monitor) -> Approximations:
     """The automatic seeds of a frame within a range of depths."""
+    growing = settings.growing
     return sweep_seeds(
-        images.spline,
-        footage.rig.cameras,
-        footage.take.reference,
-        grid,
-        matching,
+        now.views,
+        now.grid,
+        settings.matching,
         spacing_px=growing.seed_spacing_px,
         depth_range_m=depth_range_m,
         monitor=monitor,
@@ -239,57 +258,45 @@ def _swept(
     )
 
 
-def first_seeds(
-    footage: Footage,
-    matching: MatchingSettings,
-    growing: GrowingSettings,
-    frame: int,
-    monitor: Monitor,
-    enhance: EnhanceSettings | None = None,
-) -> tuple[fg.Foreground, Approximations]:
+def first_seeds(footage: Footage, settings: MeasureSettings, frame: int, monitor: Monitor) -> tuple[fg.Foreground, Approximations]:
     """Where the person is in one frame, and the surface seeds there."""
-    images = load_images(footage, frame, enhance)
-    grid = template_grid(images.spline[footage.take.reference].shape, footage.take.rows_at(frame), growing.spacing_px)
-    person = silhouettes(footage, images.grey, frame, first=True)
-    return _first_foreground(footage, images, grid, matching, growing, frame, person, monitor)
+    return _first_foreground(_frame_views(footage, frame, settings, first=True), settings, monitor)
 
 
-def _first_foreground(
-    footage: Footage,
-    images: FrameImages,
-    grid: TemplateGrid,
-    matching: MatchingSettings,
-    growing: GrowingSettings,
-    frame: int,
-    person: tuple[fg.Silhouette, ...],
-    monitor: Monitor,
-) -> tuple[fg.Foreground, Approximations]:
+def _first_foreground(now: _FrameViews, settings: MeasureSettings, monitor: Monitor) -> tuple[fg.Foreground, Approximations]:
     """Where the person is in the first frame, inside silhouettes if there are any, and the seeds there."""
-    cameras, ref, take = footage.rig.cameras, footage.take.reference, footage.take
+    footage, take = now.footage, now.footage.take
 
     def sweep(depth_range_m: tuple[float, float] | None) -> Approximations:
-        found = _swept(footage, images, grid, matching, growing, depth_range_m, monitor)
-        xyz = cameras[ref].points_at_depth(take.rows_at(frame).to_frame(found.xy[:, ref]), found.depth_m)
-        beside = fg.Foreground(depth_range_m=(0.0, np.inf), method="", silhouettes=person).excludes(xyz, np.zeros((len(xyz), 3, 3)))
-        return Approximations(**{f.name: getattr(found, f.name)[~beside] for f in fields(Approximations)})
+        found = _swept(now, settings, depth_range_m, monitor)
+        xyz = _seed_points(now, found)
+        outside = fg.Foreground(depth_range_m=(0.0, np.inf), method="", silhouettes=now.silhouettes).excludes(
+            xyz, np.zeros((len(xyz), 3, 3))
+        )
+        return Approximations(**{f.name: getattr(found, f.name)[~outside] for f in fields(Approximations)})
 
-    swept = sweep(None)
-    room, moving = _room_and_person(footage, images, swept, frame)
+    planes, moving = _background_and_person(now, sweep(None))
     clicks = [*take.seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface))]
     depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
-    if clicks and frame == take.seeds.frame:
+    if clicks and now.frame == take.seeds.frame:
         where = fg.around_clicks(depth)
     elif clicks:
-        where = fg.since_clicks(depth, frame_time_s(abs(frame - take.seeds.frame), take.fps), moving)
+        where = fg.since_clicks(depth, frame_time_s(abs(now.frame - take.seeds.frame), take.fps), moving)
     elif len(moving):
         where = fg.nearest_surface(moving)
     else:
-        where = fg.Foreground(depth_range_m=(0.05, 1e3), method="everything")
-    where = replace(where, planes=room)
+        where = fg.Foreground(depth_range_m=ANY_DEPTH_M, method="everything")
+    where = replace(where, planes=planes)
     seeds = sweep(where.depth_range_m)
-    if take.seeds.surface and frame == take.seeds.frame:
-        seeds = with_clicked(footage, images.spline, seeds, matching)
+    if take.seeds.surface and now.frame == take.seeds.frame:
+        seeds = with_clicked(footage, now.views, seeds, settings.matching)
     return where, seeds
+
+
+def _seed_points(now: _FrameViews, seeds: Approximations) -> np.ndarray:
+    """The seeds in space (N, 3)."""
+    views = now.views
+    return views.base.points_at_depth(views.rows.to_frame(seeds.xy[:, views.reference]), seeds.depth_m)
 
 
 def _furthest_frame(footage: Footage, frame: int) -> int:
@@ -298,31 +305,30 @@ def _furthest_frame(footage: Footage, frame: int) -> int:
     return max((f for f in footage_frames(footage.take, footage.sequences) if (f - frame) % step == 0), key=lambda f: abs(f - frame))
 
 
-def _room_and_person(footage: Footage, images: FrameImages, seeds: Approximations, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """Planes (P, 4) of floor and walls, and the depths of seeds that are not on them: those that moved, unless these are too few to tell.
+def _background_and_person(now: _FrameViews, seeds: Approximations) -> tuple[np.ndarray, np.ndarray]:
+    """Planes (P, 4) of floor and walls, and the depths of the seeds off them: of those that moved, unless these are too few.
 
-    What moved is what the frame furthest in time does not show at the same place.
+    A seed moved if the frame furthest in time shows something else at its place.
     """
-    ref, camera = footage.take.reference, footage.rig.cameras[footage.take.reference]
-    other = _furthest_frame(footage, frame)
-    if other == frame or not len(seeds.depth_m):
+    ref, other = now.views.reference, _furthest_frame(now.footage, now.frame)
+    if other == now.frame or not len(seeds.depth_m):
         return np.zeros((0, 4)), seeds.depth_m
-    later = load_images(footage, other).grey[ref]
-    xyz = camera.points_at_depth(footage.take.rows_at(frame).to_frame(seeds.xy[:, ref]), seeds.depth_m)
-    still = fg.unchanged(images.grey[ref], later, seeds.xy[:, ref])
-    planes = fg.background_planes(xyz[still], xyz, [c.centre_m for c in footage.rig.cameras])
-    beside = ~fg.Foreground(depth_range_m=(0.0, np.inf), method="", planes=planes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
-    moved = beside & ~still
-    return planes, seeds.depth_m[moved if moved.sum() >= MIN_MOVED else beside]
+    later = load_images(now.footage, other).grey[ref]
+    xyz = _seed_points(now, seeds)
+    still = fg.unchanged(now.grey[ref], later, seeds.xy[:, ref])
+    planes = fg.background_planes(xyz[still], xyz, [c.centre_m for c in now.views.cameras])
+    off_planes = ~fg.Foreground(depth_range_m=(0.0, np.inf), method="", planes=planes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
+    moved = off_planes & ~still
+    return planes, seeds.depth_m[moved if moved.sum() >= MIN_MOVED else off_planes]
 
 
-def _single(field: TripletField) -> TripletField:
+def _single(field: MatchedField) -> MatchedField:
     """The field with its covariances in single precision, as a checkpoint keeps it: a resumed run continues with the same numbers."""
     return replace(field, **{name: getattr(field, name).astype(np.float32).astype(np.float64) for name in FIELD_SINGLE})
 
 
 def _checkpoint(results: Results, m: MeasuredFrame) -> None:
-    arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(TripletField) if f.name not in ("grid", "tried", "limit_px")}
+    arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(MatchedField) if f.name not in ("grid", "tried", "limit_px")}
     arrays = {k: v.astype(np.float32) if k.removeprefix("field_") in FIELD_SINGLE else v for k, v in arrays.items()}
     arrays |= {f"cloud_{f.name}": getattr(m.cloud, f.name) for f in fields(PointCloud) if f.name not in ("frame", "xy_px", "residual_px")}
     arrays |= {
@@ -347,7 +353,7 @@ def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) ->
     values = {
         k.removeprefix("field_"): v.astype(np.float64) if v.dtype == np.float32 else v for k, v in a.items() if k.startswith("field_")
     }
-    field = TripletField(
+    field = MatchedField(
         grid=TemplateGrid(spacing_px=spacing, rows=rows, shape=(gh, gw)), tried=tried, limit_px=float(a["limit_px"]), **values
     )
     cloud = PointCloud(

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from ..geometry.intersection import Intersection, forward_intersection
-from ..images.sampling import SplineImage
+from ..matching.grid import Views
 from ..matching.least_squares import MatchingSettings
 from ..matching.seeds import Approximations, approximations_at_depth, settled_depths
 from .take import Clicks, Footage
@@ -48,21 +48,20 @@ def clicked_point(footage: Footage, name: str, at: Clicks) -> Intersection:
     return point
 
 
-def with_clicked(footage: Footage, images: list[SplineImage], seeds: Approximations, matching: MatchingSettings) -> Approximations:
-    """The swept seeds and the clicked surface points, which need not be clicked in the reference view. `images`: the rows of all views.
+def with_clicked(footage: Footage, views: Views, seeds: Approximations, matching: MatchingSettings) -> Approximations:
+    """The swept seeds and those of the clicked surface points, which need not be clicked in the reference view.
 
     Raises:
         InputError: see `clicked_point`.
     """
-    take, cameras, ref = footage.take, footage.rig.cameras, footage.take.reference
-    rows = take.rows_at(take.seeds.frame)
-    points = [clicked_point(footage, f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface)]
+    surface, base = footage.take.seeds.surface, views.base
+    points = [clicked_point(footage, f"surface seed {i + 1}", at) for i, at in enumerate(surface)]
     xyz = np.concatenate([p.xyz_m for p in points])
     K = np.concatenate([p.covariance_m2 for p in points])
-    axis, depth = cameras[ref].R_cam_world[2], cameras[ref].to_camera(xyz)[:, 2]
-    xy = rows.from_frame(cameras[ref].project(xyz))
+    axis, depth = base.R_cam_world[2], base.to_camera(xyz)[:, 2]
+    xy = views.rows.from_frame(base.project(xyz))
     sigma = np.sqrt(np.einsum("i,nij,j->n", axis, K, axis))
-    inside = images[ref].inside(xy, 0.0)
-    depth = settled_depths(images, cameras, ref, rows, xy[inside], depth[inside], sigma[inside], matching)
-    clicked = approximations_at_depth(cameras, ref, rows, xy[inside], depth)
+    inside = views.template.inside(xy, 0.0)
+    depth = settled_depths(views, xy[inside], depth[inside], sigma[inside], matching)
+    clicked = approximations_at_depth(views.cameras, views.reference, views.rows, xy[inside], depth)
     return Approximations(**{f.name: np.concatenate([getattr(seeds, f.name), getattr(clicked, f.name)]) for f in fields(Approximations)})

@@ -67,8 +67,8 @@ def silhouette_file(footage: Footage, view: int, frame: int) -> Path | None:
     return files[number]
 
 
-def told_by(footage: Footage) -> str:
-    """How the person is told from the background, such as “mask of C”; "" where the user said nothing."""
+def silhouette_sources(footage: Footage) -> str:
+    """Where the silhouettes come from, such as “mask of C”; "" where the user gave none."""
     views = footage.take.views
     return " and ".join(
         f"{key} of {', '.join(names)}" for key in PERSON_SOURCES if (names := [v.name for v in views if getattr(v, key) is not None])

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.camera import Camera
 from ..matching.least_squares import Matches
-from ..matching.region_growing import TripletField
+from ..matching.region_growing import MatchedField
 from ..surface.cloud import PointCloud
 from ..surface.local_surface import curvatures
 
@@ -41,7 +41,7 @@ class CurvatureCorrection:
     The local surface (3,) at a place consists of the slopes g of its depth and its sag f of (1), in full-frame pixels.
     """
 
-    field: TripletField
+    field: MatchedField
     cloud: PointCloud
     camera: Camera
     reference: int

@@ -18,7 +18,7 @@ import numpy as np
 from ..foundation.progress import Monitor
 from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
-from ..matching.least_squares import Matches, MatchingSettings, match_patches
+from ..matching.least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .settings import TrackingSettings, TrackStatus
 from .templates import REACQUIRE_CORRELATION, Templates, TemplateState, atlas, control_drift, cut_tiles, no_templates, search_box
 
@@ -206,7 +206,8 @@ def _attempt(
     """
     matching, tracking, row_step = step.rules.matching, step.rules.tracking, step.rules.row_step
     xy, eye = points.xy[rows], np.tile(np.eye(2), (len(rows), 1, 1))
-    match = match_patches(step.now.spline, xy, [step.after.spline], [start], [eye], matching, row_step=row_step, of_texture=False)[0]
+    template = TemplatePoints(image=step.now.spline, xy=xy, row_step=row_step, texture_centre=False)
+    match = match_patches(template, [SearchImage(image=step.after.spline, start=start, shape=eye)], matching)[0]
     good = match.ok & _returns(match, xy, step)
     key_match = partial(step.templates.match, rows, step.after.spline)
     controlled = control_drift(match, good, points.state(rows), key_match, tracking.drift_correlation)
@@ -222,7 +223,8 @@ def _returns(match: Matches, xy: np.ndarray, step: _Step) -> np.ndarray:
     inverse = np.linalg.inv(np.where(np.abs(np.linalg.det(match.shape)) > MIN_DETERMINANT, 1.0, np.nan)[:, None, None] * match.shape)
     inverse = np.where(np.isfinite(inverse), inverse, np.eye(2))
     matching, row_step = step.rules.matching, step.rules.row_step
-    back = match_patches(step.after.spline, match.xy, [step.now.spline], [xy], [inverse], matching, row_step=row_step, of_texture=False)[0]
+    template = TemplatePoints(image=step.after.spline, xy=match.xy, row_step=row_step, texture_centre=False)
+    back = match_patches(template, [SearchImage(image=step.now.spline, start=xy, shape=inverse)], matching)[0]
     sigma = np.sqrt(np.maximum(np.trace(match.covariance + back.covariance, axis1=1, axis2=2), 0.0))
     return back.ok & (np.linalg.norm(back.xy - xy, axis=1) <= np.maximum(RETURN_PX, RETURN_SIGMAS * sigma))
 

@@ -28,7 +28,7 @@ from ..geometry.intersection import forward_intersection
 from ..geometry.small_matrices import invert_spd
 from ..images.interlace import FieldLayout, RowGrid
 from ..images.sampling import SplineImage
-from ..matching.least_squares import Matches, MatchingSettings, match_patches
+from ..matching.least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
 from ..matching.patches import patch_offsets
 from .curvature_correction import CurvatureCorrection
 from .neighbours import common_motion, nearest_neighbours
@@ -197,16 +197,8 @@ def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray
     matches = []
     for k in range(len(view.cameras)):
         begin = np.where((status[:, k] == TrackStatus.MEASURED)[:, None], start[:, k], np.nan)
-        m = match_patches(
-            images.spline[k],
-            points.xy[:, k],
-            [images.next_spline[k]],
-            [begin],
-            [eye],
-            view.matching,
-            row_step=view.rows.step,
-            of_texture=False,
-        )[0]
+        template = TemplatePoints(image=images.spline[k], xy=points.xy[:, k], row_step=view.rows.step, texture_centre=False)
+        m = match_patches(template, [SearchImage(image=images.next_spline[k], start=begin, shape=eye)], view.matching)[0]
         mark(status[:, k], ~m.ok, TrackStatus.NOT_MATCHED)
         matches.append(m)
     return matches
@@ -247,16 +239,11 @@ def match_spatially(
     """
     good = status == TrackStatus.MEASURED
     good &= good[:, [view.reference]]
-    spatial = match_patches(
-        images[view.reference],
-        at[view.reference],
-        [images[k] for k in view.others],
-        [np.where(good[:, [k]], at[k], np.nan) for k in view.others],
-        [points.shape[:, k] for k in view.others],
-        view.matching,
-        row_step=view.rows.step,
-        of_texture=False,
-    )
+    ref = view.reference
+    template = TemplatePoints(image=images[ref], xy=at[ref], row_step=view.rows.step, texture_centre=False)
+    starts = [np.where(good[:, [k]], at[k], np.nan) for k in view.others]
+    searches = [SearchImage(image=images[k], start=start, shape=points.shape[:, k]) for k, start in zip(view.others, starts)]
+    spatial = match_patches(template, searches, view.matching)
     for k, s in zip(view.others, spatial):
         mark(status[:, k], ~s.ok, TrackStatus.NOT_VERIFIED)
     return spatial

@@ -26,7 +26,15 @@ import numpy as np
 
 from ..geometry.small_matrices import invert_spd
 from ..images.sampling import SplineImage
-from ..matching.least_squares import Matches, MatchingSettings, PatchTemplates, match_prepared, prepare_templates
+from ..matching.least_squares import (
+    Matches,
+    MatchingSettings,
+    PatchTemplates,
+    SearchImage,
+    TemplatePoints,
+    match_prepared,
+    prepare_templates,
+)
 from ..matching.patches import patch_offsets
 from .tracked import rows_of
 
@@ -78,7 +86,7 @@ class Templates:
 
     def match(self, identity: np.ndarray, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
         """The templates of these points (each has one) matched in an image, from positions (N, 2) and shapes (N, 2, 2)."""
-        return match_prepared(self.patches, rows_of(self.tiles.identity, identity), image, start, shape)
+        return match_prepared(self.patches, rows_of(self.tiles.identity, identity), SearchImage(image=image, start=start, shape=shape))
 
 
 def no_templates(settings: MatchingSettings, row_step: int) -> Templates:
@@ -114,7 +122,8 @@ def atlas(tiles: Tiles) -> tuple[np.ndarray, np.ndarray]:
 def _prepared(tiles: Tiles, settings: MatchingSettings, row_step: int) -> PatchTemplates:
     grey, xy = atlas(tiles)
     none = not len(xy)
-    patches = prepare_templates(SplineImage(grey), np.zeros((1, 2)) if none else xy, settings, row_step)
+    points = TemplatePoints(image=SplineImage(grey), xy=np.zeros((1, 2)) if none else xy, row_step=row_step, texture_centre=False)
+    patches = prepare_templates(points, settings)
     return patches.select(np.zeros(0, np.int64)) if none else patches
 
 

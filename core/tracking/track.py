@@ -21,7 +21,7 @@ from ..foundation import store
 from ..foundation.progress import Monitor
 from ..images.enhance import EnhanceSettings
 from ..matching.least_squares import MatchingSettings
-from ..matching.region_growing import TripletField
+from ..matching.region_growing import MatchedField
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import FrameImages, MeasuredFrame, load_images
@@ -41,13 +41,13 @@ STEEPEST_SLOPE = 3.0  # change of depth per distance across, within one surface
 MOVED_CELLS = 0.8  # a cell whose texture lies further from its middle is at the outline
 
 
-def start_tracks(field: TripletField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
+def start_tracks(field: MatchedField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
     """The first tracked points: the measured surface, thinned to the tracking's spacing."""
     rows = _thinned(field, view.tracking.spacing_px)
     return _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], 0, view)
 
 
-def regenerate(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, view: TrackingView, next_identity: int) -> TrackedFrame:
+def regenerate(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, view: TrackingView, next_identity: int) -> TrackedFrame:
     """The tracked points of a frame and new ones from the frame's own surface, where it has no tracked point near."""
     rows = _thinned(field, view.tracking.spacing_px)
     if len(tracked.identity) and len(rows):
@@ -57,7 +57,7 @@ def regenerate(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, vi
     return joined(tracked, _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], next_identity, view))
 
 
-def on_surface(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
+def on_surface(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
     """The points that lie on the frame's own surface; the others end. A frame in which no surface was measured says nothing.
 
     The track says where on the surface a point is, the surface how deep: it was measured with all neighbours, and corrected for
@@ -86,7 +86,7 @@ def on_surface(tracked: TrackedFrame, field: TripletField, cloud: PointCloud, vi
     return _with_local_surface(placed, view).without(reason != TrackStatus.MEASURED, reason)
 
 
-def _well_inside(field: TripletField, cloud: PointCloud, rows: np.ndarray, view: TrackingView) -> np.ndarray:
+def _well_inside(field: MatchedField, cloud: PointCloud, rows: np.ndarray, view: TrackingView) -> np.ndarray:
     """Which of these rows of the field may become tracked points."""
     camera, xyz = view.cameras[view.reference], field.xyz_m[rows]
     back = camera.centre_m - xyz
@@ -96,7 +96,7 @@ def _well_inside(field: TripletField, cloud: PointCloud, rows: np.ndarray, view:
     return (coverage >= view.tracking.min_coverage) & (facing >= STEEPEST_COSINE) & (rays >= min(3, len(view.cameras)))
 
 
-def _coverage(field: TripletField, xy: np.ndarray, depth: np.ndarray, view: TrackingView) -> np.ndarray:
+def _coverage(field: MatchedField, xy: np.ndarray, depth: np.ndarray, view: TrackingView) -> np.ndarray:
     """Part (N,) of the patch about each point that the measured surface covers at the point's depth."""
     gh, gw = field.grid.shape
     step, camera = field.grid.step, view.cameras[view.reference]
@@ -113,7 +113,7 @@ def _coverage(field: TripletField, xy: np.ndarray, depth: np.ndarray, view: Trac
         return (np.abs(there - depth[:, None]) <= reach[:, None]).mean(axis=1)
 
 
-def _born(field: TripletField, cloud: PointCloud, rows: np.ndarray, first: int, view: TrackingView) -> TrackedFrame:
+def _born(field: MatchedField, cloud: PointCloud, rows: np.ndarray, first: int, view: TrackingView) -> TrackedFrame:
     identity = np.arange(first, first + len(rows))
     return _with_local_surface(
         born(cloud.frame, identity, field.xy[rows], field.shape[rows], cloud.xyz_m[rows], cloud.covariance_m2[rows]), view
@@ -128,7 +128,7 @@ def _with_local_surface(points: TrackedFrame, view: TrackingView) -> TrackedFram
     return replace(points, local_surface=here, key_local_surface=np.where(points.renewed[:, None], here, points.key_local_surface))
 
 
-def _thinned(field: TripletField, spacing_px: int) -> np.ndarray:
+def _thinned(field: MatchedField, spacing_px: int) -> np.ndarray:
     """Rows of the field on every n-th column and row of the grid."""
     n = max(1, round(spacing_px / field.grid.spacing_px))
     j, i = field.cell // field.grid.shape[1], field.cell % field.grid.shape[1]

@@ -16,10 +16,10 @@ from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import template_grid
-from tricap.core.matching.least_squares import MatchingSettings, match_patches
-from tricap.core.matching.occlusion_check import in_doubt
-from tricap.core.matching.region_growing import GrowingSettings, TripletField, grow
+from tricap.core.matching.grid import Views, template_grid
+from tricap.core.matching.least_squares import MatchingSettings, SearchImage, TemplatePoints, match_patches
+from tricap.core.matching.occlusion_check import fails_occlusion_check
+from tricap.core.matching.region_growing import GrowingSettings, MatchedField, grow_regions
 from tricap.core.matching.seeds import sweep_seeds
 from tricap.core.surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 
@@ -37,18 +37,16 @@ def measured(
     matching: MatchingSettings,
     growing: GrowingSettings,
     surface: SurfaceSettings,
-) -> tuple[PointCloud, TripletField]:
+) -> tuple[PointCloud, MatchedField]:
     """The cloud of one instant as a run measures it, and its field."""
-    images, monitor = [SplineImage(g) for g in grey], Monitor()
+    views = Views(images=[SplineImage(g) for g in grey], cameras=rig, reference=reference, rows=RowGrid())
     where = Foreground(depth_range_m=depth_range_m, method="everything")
-    grid = template_grid(images[reference].shape, RowGrid(), growing.spacing_px)
-    seeds = sweep_seeds(
-        images, rig, reference, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=depth_range_m, monitor=monitor
-    )
-    field = grow(images, rig, reference, grid, seeds, matching, growing, foreground=where, monitor=monitor)
-    field = constrain(field, images, rig, reference, matching, foreground=where, monitor=monitor)
+    grid = template_grid(views.template.shape, RowGrid(), growing.spacing_px)
+    seeds = sweep_seeds(views, grid, matching, spacing_px=growing.seed_spacing_px, depth_range_m=depth_range_m, monitor=Monitor())
+    field = grow_regions(views, grid, seeds, matching, growing, foreground=where, monitor=Monitor())
+    field = constrain(field, views, matching, foreground=where, monitor=Monitor())
     field = clean_field(field, rig[reference], reference, surface)
-    field = field.select(~in_doubt(field, images, rig, reference, matching))
+    field = field.select(~fails_occlusion_check(field, views, matching))
     return point_cloud(field, grey[reference], rig[reference], reference, 0, surface), field
 
 
@@ -89,8 +87,9 @@ def boards(most: int) -> Iterator[Row]:
             continue
         M = corners[1]
         L, R = (c if (c[-1] - c[0]) @ (M[-1] - M[0]) > 0 else c[::-1] for c in (corners[0], corners[2]))
-        images, shape = [SplineImage(g) for g in grey], [np.tile(np.eye(2), (len(M), 1, 1))] * 2
-        found = match_patches(images[1], M, [images[0], images[2]], [L, R], shape, MatchingSettings(patch_px=13))
+        images, shape = [SplineImage(g) for g in grey], np.tile(np.eye(2), (len(M), 1, 1))
+        searches = [SearchImage(image=images[k], start=start, shape=shape) for k, start in ((0, L), (2, R))]
+        found = match_patches(TemplatePoints(image=images[1], xy=M), searches, MatchingSettings(patch_px=13))
         ok = found[0].ok & found[1].ok
         if not ok.any():
             continue
@@ -166,7 +165,8 @@ def _found_again(grey: np.ndarray, xy: np.ndarray, later: np.ndarray) -> float:
     start, _, _ = cv2.calcOpticalFlowPyrLK(*images, xy.astype(np.float32), None, winSize=(31, 31), maxLevel=4)
     shape = np.tile(np.eye(2), (len(xy), 1, 1))
     settings = MatchingSettings(patch_px=21)
-    found = match_patches(SplineImage(grey), xy, [SplineImage(later)], [start.astype(np.float64)], [shape], settings)[0]
+    search = SearchImage(image=SplineImage(later), start=start.astype(np.float64), shape=shape)
+    found = match_patches(TemplatePoints(image=SplineImage(grey), xy=xy), [search], settings)[0]
     return float(found.ok.mean())
 
 
@@ -262,7 +262,8 @@ def _displacement_row(what: str, base: np.ndarray, later: np.ndarray, patch: int
     y, x = np.mgrid[30 : h - 30 : 7, 30 : w - 30 : 7]
     xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
     shape, settings = np.tile(np.eye(2), (len(xy), 1, 1)), MatchingSettings(patch_px=patch, min_correlation=0.5)
-    found = match_patches(SplineImage(base), xy, [SplineImage(later)], [xy], [shape], settings)[0]
+    search = SearchImage(image=SplineImage(later), start=xy, shape=shape)
+    found = match_patches(TemplatePoints(image=SplineImage(base), xy=xy), [search], settings)[0]
     error = (found.xy - xy - moved(xy))[found.ok]
     centre = xy + found.offset
     taken_over = (found.transfer_xy - centre - moved(centre))[found.ok]

@@ -22,9 +22,9 @@ from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import template_grid
+from tricap.core.matching.grid import Views, template_grid
 from tricap.core.matching.least_squares import MatchingSettings
-from tricap.core.matching.region_growing import GrowingSettings, TripletField, grow
+from tricap.core.matching.region_growing import GrowingSettings, MatchedField, grow_regions
 from tricap.core.matching.seeds import sweep_seeds
 from tricap.core.surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 
@@ -35,16 +35,16 @@ VARIANTS = [(c, n) for c in ("none", "epipolar", "object") for n in (False, True
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 
 
-def grown(rig: list, images: list[SplineImage], matching: MatchingSettings) -> tuple[TripletField, float]:
+def grown(views: Views, matching: MatchingSettings) -> tuple[MatchedField, float]:
     """The unconstrained field of the centre image, and its CPU seconds."""
     began, monitor = time.process_time(), Monitor()
-    grid = template_grid(images[1].shape, RowGrid(), 4)
-    seeds = sweep_seeds(images, rig, 1, grid, matching, spacing_px=24, depth_range_m=(1.1, 1.8), monitor=monitor)
-    field = grow(images, rig, 1, grid, seeds, matching, GrowingSettings(), foreground=EVERYWHERE, monitor=monitor)
+    grid = template_grid(views.template.shape, RowGrid(), 4)
+    seeds = sweep_seeds(views, grid, matching, spacing_px=24, depth_range_m=(1.1, 1.8), monitor=monitor)
+    field = grow_regions(views, grid, seeds, matching, GrowingSettings(), foreground=EVERYWHERE, monitor=monitor)
     return field, time.process_time() - began
 
 
-def judged(cloud: PointCloud, field: TripletField, surface: surfaces.Surface, rig: list) -> dict[str, float]:
+def judged(cloud: PointCloud, field: MatchedField, surface: surfaces.Surface, rig: list) -> dict[str, float]:
     """Coverage, gross share, RMS, bias and z of a cloud against the surface's equation."""
     error = surface.distance_m(cloud.xyz_m)
     normal = surface.normal(cloud.xyz_m)
@@ -66,12 +66,12 @@ def measure(scene: str, texture: str, seed: int) -> list[dict]:
     """One row for every variant."""
     surface, matching, rows = SCENES[scene], MatchingSettings(), []
     rig, grey = surfaces.render(surface, texture, seed=seed)
-    images = [SplineImage(g) for g in grey]
-    field, grow_s = grown(rig, images, matching)
+    views = Views(images=[SplineImage(g) for g in grey], cameras=rig, reference=1, rows=RowGrid())
+    field, grow_s = grown(views, matching)
     for constraint, neighbours in VARIANTS:
         began = time.process_time()
         settings = replace(matching, constraint=constraint, neighbours=neighbours)
-        found = constrain(field, images, rig, 1, settings, foreground=EVERYWHERE, monitor=Monitor())
+        found = constrain(field, views, settings, foreground=EVERYWHERE, monitor=Monitor())
         spent = time.process_time() - began
         if neighbours:
             found = clean_field(found, rig[1], 1, SurfaceSettings())

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,11 +22,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from tricap.core.foundation import threads as shared
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.least_squares import MatchingSettings, match_patches
+from tricap.core.matching.least_squares import MatchingSettings, SearchImage, TemplatePoints, match_patches
 from tricap.core.matching.patches import patch_offsets
 from tricap.core.results.folder import Results
 from tricap.core.run.pipeline import settings_of
-from tricap.core.surface.measure import measure_frames
+from tricap.core.surface.measure import MeasureSettings, measure_frames
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.take import open_take, read_take
 
@@ -102,7 +103,8 @@ def our_work(pair: Pair, patch_px: int, threads: int, points: int | None = None)
     def work() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shared.THREADS = threads
         cv2.setNumThreads(threads)
-        found = match_patches(F, pair.xy[rows], [G], [pair.start[rows]], [shape[rows]], settings)[0]
+        search = SearchImage(image=G, start=pair.start[rows], shape=shape[rows])
+        found = match_patches(TemplatePoints(image=F, xy=pair.xy[rows]), [search], settings)[0]
         shared.THREADS = 2
         cv2.setNumThreads(-1)
         return found.xy, found.ok, found.covariance
@@ -226,7 +228,7 @@ def triplet() -> dict[str, object]:
         footage = open_take(read_take(Path(folder, "take")))
         s = settings_of({}, {}, "bench")
         began, points, results = time.perf_counter(), 0, Results(Path(folder, "out"))
-        for measured in measure_frames(footage, s["matching"], s["growing"], s["surface"], results, Monitor()):
+        for measured in measure_frames(footage, replace(MeasureSettings.of(s), enhance=None), results, Monitor()):
             points += len(measured.cloud.xyz_m)
         return dict(tool="dense triplet of 768×576, end to end", points=points // 2, seconds_per_frame=(time.perf_counter() - began) / 2)
 

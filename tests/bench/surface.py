@@ -24,10 +24,11 @@ import numpy as np
 from _recordings import Row
 
 from tricap.core.images.sampling import SplineImage
+from tricap.core.matching.grid import Views
 from tricap.core.matching.least_squares import MatchingSettings
-from tricap.core.matching.object_space import match_surface
+from tricap.core.matching.object_space import SurfaceStarts, match_surface
 from tricap.core.matching.patches import monomials
-from tricap.core.matching.region_growing import GrowingSettings, TripletField
+from tricap.core.matching.region_growing import GrowingSettings, MatchedField
 from tricap.core.surface.cloud import SurfaceSettings
 
 BODIES = {"cylinder 40 mm": surfaces.cylinder(0.04), "sphere 60 mm": surfaces.sphere(0.06)}
@@ -77,13 +78,13 @@ def _clouds(surface: surfaces.Surface, patch: int, seed: int) -> Iterator[tuple[
             yield "quadric, free", _quadrics(field, rig, grey, matching)
 
 
-def _quadrics(field: TripletField, rig: list, grey: list[np.ndarray], settings: MatchingSettings) -> np.ndarray:
+def _quadrics(field: MatchedField, rig: list, grey: list[np.ndarray], settings: MatchingSettings) -> np.ndarray:
     """The points of a field measured again as pieces of surface whose curvatures nothing holds."""
     xy, base = field.xy[:, 1], rig[1]
     start = np.zeros((len(xy), 6))
     start[:, 0] = 1 / base.to_camera(field.xyz_m)[:, 2]
-    images = [SplineImage(g) for g in grey]
-    found = match_surface(images, rig, 1, field.grid.rows, xy, start, replace(settings, max_sigma_px=1.0), sigma_across_px=0.03)
+    views = Views(images=[SplineImage(g) for g in grey], cameras=rig, reference=1, rows=field.grid.rows)
+    found = match_surface(views, SurfaceStarts(xy=xy, theta=start), replace(settings, max_sigma_px=1.0), sigma_across_px=0.03)
     w = np.einsum("ni,ni->n", monomials(found.offset[:, 0], found.offset[:, 1], 2).astype(np.float64), found.theta)
     return base.points_at_depth(xy[found.ok] + found.offset[found.ok], 1 / w[found.ok])
 

@@ -15,7 +15,7 @@ from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.results.folder import Results
 from tricap.core.run import pipeline
-from tricap.core.surface.measure import MeasuredFrame, measure_frames
+from tricap.core.surface.measure import MeasuredFrame, MeasureSettings, measure_frames
 from tricap.core.take.take import open_take, read_take
 from tricap.core.tracking.lost_points import Guide
 from tricap.core.tracking.step import TrackedFrame
@@ -128,7 +128,7 @@ def measure(folder: Path, out: Path, overrides: Mapping[str, Any] | None = None,
     """The measured surface of a take, in the order of time; checkpoints lie in `out`."""
     footage = open_take(read_take(folder))
     s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
-    done = measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(out), monitor or Monitor(), s["enhance"])
+    done = measure_frames(footage, MeasureSettings.of(s), Results(out), monitor or Monitor())
     return sorted(done, key=lambda m: m.frame)
 
 

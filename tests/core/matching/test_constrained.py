@@ -13,17 +13,21 @@ from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import OUTLINE_ACROSS_PX, OUTLINE_ALONG_PX, RAY_SIGMA_PX, _model_covariance, _over_outline, constrain
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import NeighbourFit, template_grid
+from tricap.core.matching.grid import NeighbourFit, Views, template_grid
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
-from tricap.core.matching.multi_image import match_multi_image
-from tricap.core.matching.object_space import Epipolar, SurfacePrior, match_surface
-from tricap.core.matching.occlusion_check import believed, depth_doubt, in_doubt
+from tricap.core.matching.multi_image import MultiImageStarts, match_multi_image
+from tricap.core.matching.object_space import Epipolar, SurfacePrior, SurfaceStarts, match_surface
+from tricap.core.matching.occlusion_check import acceptable, depth_uncertainty, fails_occlusion_check
 from tricap.core.matching.patches import TemplatePatches, monomials, patch_offsets
-from tricap.core.matching.region_growing import GrowingSettings, TripletField, grow, rounds_of_larger_patches
+from tricap.core.matching.region_growing import GrowingSettings, MatchedField, grow_regions, rounds_of_larger_patches
 from tricap.core.matching.seeds import sweep_seeds
 
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 SETTINGS = MatchingSettings()
+
+
+def views(images: list[SplineImage], rig: Any) -> Views:
+    return Views(images=images, cameras=rig, reference=1, rows=RowGrid())
 
 
 class Scene:
@@ -31,7 +35,8 @@ class Scene:
 
     def __init__(self, surfaces: ModuleType, surface: Any, kind: str, seed: int = 0, noise: float = 2.0, spacing: int = 9) -> None:
         self.rig, self.grey = surfaces.render(surface, kind, seed=seed, noise=noise)
-        self.images, self.surface = [SplineImage(g) for g in self.grey], surface
+        self.surface = surface
+        self.images = [SplineImage(g) for g in self.grey]
         y, x = np.mgrid[40:200:spacing, 60:260:spacing].astype(float)
         xy = np.stack([x.ravel(), y.ravel()], axis=1)
         tips = xy[:, None] + [[0, 0], [9, 0], [-9, 0], [0, 9], [0, -9]]
@@ -51,11 +56,16 @@ class Scene:
         """Points of the centre view's pixels at inverse depth w."""
         return self.rig[1].points_at_depth(xy, 1 / w)
 
-    def grown(self) -> TripletField:
+    @property
+    def views(self) -> Views:
+        """The images with the rig as it is now."""
+        return views(self.images, self.rig)
+
+    def grown(self) -> MatchedField:
         """The unconstrained field."""
         grid = template_grid(self.images[1].shape, RowGrid(), 4)
-        seeds = sweep_seeds(self.images, self.rig, 1, grid, SETTINGS, spacing_px=24, depth_range_m=(1.1, 1.8), monitor=Monitor())
-        return grow(self.images, self.rig, 1, grid, seeds, SETTINGS, GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
+        seeds = sweep_seeds(self.views, grid, SETTINGS, spacing_px=24, depth_range_m=(1.1, 1.8), monitor=Monitor())
+        return grow_regions(self.views, grid, seeds, SETTINGS, GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +152,7 @@ def test_object_space_finds_the_plane_and_knows_its_error(surfaces: ModuleType, 
         scene = Scene(surfaces, surfaces.plane(), "strong", seed)
         start = scene.theta[:, :3] * (1 + 0.002 * np.random.default_rng(seed).standard_normal((len(scene.xy), 1)))  # about 0.3 px
         weight = None if window is None else np.tile(np.exp(-0.5 * (u**2 + v**2) / window**2), (len(start), 1))
-        found = match_surface(scene.images, scene.rig, 1, RowGrid(), scene.xy, start, settings, sigma_across_px=0.03, weight=weight)
+        found = match_surface(scene.views, SurfaceStarts(xy=scene.xy, theta=start, window=weight), settings, sigma_across_px=0.03)
         assert found.ok.mean() > 0.98
         o, ok = found.offset, found.ok
         m = monomials(o[:, 0], o[:, 1], 1).astype(float)
@@ -161,7 +171,7 @@ def test_beliefs_that_are_better_than_their_weight(plane: Scene) -> None:
     z = []
     for error in (None, 0.01 * sigma):
         prior = SurfacePrior(value=plane.theta, sigma=sigma, error=error)
-        found = match_surface(plane.images, plane.rig, 1, RowGrid(), plane.xy, plane.theta, SETTINGS, sigma_across_px=0.03, prior=prior)
+        found = match_surface(plane.views, SurfaceStarts(xy=plane.xy, theta=plane.theta, prior=prior), SETTINGS, sigma_across_px=0.03)
         wrong = found.theta[:, 0] - plane.theta[:, 0]
         z.append(np.sqrt(np.mean((wrong**2 / found.covariance[:, 0, 0])[found.ok])))
     assert z[0] < 0.9 < z[1] < 1.2
@@ -172,10 +182,8 @@ def test_collinearity_holds_the_rays_together(plane: Scene) -> None:
     scene, rows = plane, RowGrid()
     lines = [Epipolar(scene.rig[1], scene.rig[k], rows, scene.xy).centre(scene.theta[:, :3]) for k in (0, 2)]
     middle, shape = (np.stack([line[i] for line in lines], axis=1) for i in (0, 2))
-    X = scene.xyz(scene.xy, scene.theta[:, 0])
-    free, held = (
-        match_multi_image(scene.images, scene.rig, 1, rows, scene.xy, middle + 0.3, shape, X, SETTINGS, sigma_c_px=s) for s in (10.0, 0.001)
-    )
+    starts = MultiImageStarts(xy=scene.xy, centre=middle + 0.3, shape=shape, xyz_m=scene.xyz(scene.xy, scene.theta[:, 0]))
+    free, held = (match_multi_image(scene.views, starts, SETTINGS, sigma_c_px=s) for s in (10.0, 0.001))
     both = free.ok & held.ok
     assert both.mean() > 0.9
     assert np.abs(held.residual_px[both]).max() < 1e-3 < 0.02 < np.abs(free.residual_px[both]).mean() * 5
@@ -193,7 +201,7 @@ def test_curvature_removes_the_flattening(surfaces: ModuleType) -> None:
     for columns in (3, 6):
         start = scene.theta[:, :columns]
         prior = SurfacePrior(value=start, sigma=np.tile(sigma[:columns], (len(start), 1)))
-        found = match_surface(scene.images, scene.rig, 1, RowGrid(), scene.xy, start, settings, sigma_across_px=0.03, prior=prior)
+        found = match_surface(scene.views, SurfaceStarts(xy=scene.xy, theta=start, prior=prior), settings, sigma_across_px=0.03)
         m = monomials(found.offset[:, 0], found.offset[:, 1], 1 if columns == 3 else 2).astype(float)
         w = np.einsum("ni,ni->n", m, found.theta)
         biases.append(np.median(scene.surface.distance_m(scene.xyz(scene.xy + found.offset, w)[found.ok])))
@@ -207,9 +215,7 @@ def test_constraints_earn_their_place(surfaces: ModuleType, kind: str) -> None:
     field = scene.grown()
     rms = {}
     for constraint in ("none", "epipolar", "object"):
-        found = constrain(
-            field, scene.images, scene.rig, 1, replace(SETTINGS, constraint=constraint), foreground=EVERYWHERE, monitor=Monitor()
-        )
+        found = constrain(field, scene.views, replace(SETTINGS, constraint=constraint), foreground=EVERYWHERE, monitor=Monitor())
         error = scene.surface.distance_m(found.xyz_m)
         rms[constraint] = np.sqrt(np.mean(error[np.abs(error) < 0.005] ** 2))
         assert len(found.cell) > (0.75 if constraint == "epipolar" else 0.87) * len(field.cell)
@@ -229,7 +235,7 @@ def test_a_rig_that_is_half_a_pixel_off_still_helps(surfaces: ModuleType) -> Non
     field = scene.grown()
     for constraint in ("none", "object"):
         settings = replace(SETTINGS, constraint=constraint)
-        found = constrain(field, scene.images, scene.rig, 1, settings, foreground=EVERYWHERE, monitor=Monitor())
+        found = constrain(field, scene.views, settings, foreground=EVERYWHERE, monitor=Monitor())
         error = scene.surface.distance_m(found.xyz_m)
         assert len(found.cell) > 0.85 * len(field.cell)
         rms[constraint], residual[constraint] = np.sqrt(np.mean(error[np.abs(error) < 0.02] ** 2)), np.median(found.residual_px)
@@ -260,11 +266,11 @@ def test_points_on_which_two_ways_of_matching_disagree_are_rejected(surfaces: Mo
     """At an outline the unconstrained patch settles on a mixture of two surfaces; here such points are made."""
     scene = Scene(surfaces, surfaces.cylinder(0.06), "strong")
     field = scene.grown()
-    kept = constrain(field, scene.images, scene.rig, 1, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
+    kept = constrain(field, scene.views, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
     chosen = np.searchsorted(field.cell, kept.cell[::25])
     mixed = field.xyz_m.copy()
     mixed[chosen] += 0.015 * scene.rig[1].rays(field.xy[chosen, 1])
-    found = constrain(replace(field, xyz_m=mixed), scene.images, scene.rig, 1, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
+    found = constrain(replace(field, xyz_m=mixed), scene.views, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
     assert not np.isin(field.cell[chosen], found.cell).any()
     assert np.isin(np.delete(kept.cell, np.arange(0, len(kept.cell), 25)), found.cell).mean() > 0.97
 
@@ -292,41 +298,41 @@ def test_points_between_two_surfaces_are_left_out(surfaces: ModuleType) -> None:
     scene = Scene(surfaces, edge(surfaces), "strong")
     field = scene.grown()
 
-    found = constrain(field, scene.images, scene.rig, 1, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
-    kept = found.select(~in_doubt(found, scene.images, scene.rig, 1, SETTINGS))
+    found = constrain(field, scene.views, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
+    kept = found.select(~fails_occlusion_check(found, scene.views, SETTINGS))
     bad, left = (np.abs(scene.surface.distance_m(f.xyz_m)) > 0.01 for f in (found, kept))
     assert bad.sum() >= 10
     assert left.sum() <= 0.75 * bad.sum()
     assert (~left).sum() > 0.98 * (~bad).sum()
     unconstrained = replace(SETTINGS, constraint="none")
-    assert not in_doubt(found, scene.images, scene.rig, 1, unconstrained).any()
+    assert not fails_occlusion_check(found, scene.views, unconstrained).any()
 
 
-def test_doubt_about_depth(plane: Scene) -> None:
-    """Points off the surface are known by their middles; where most points are worse, more is believed."""
+def test_depth_uncertainty(plane: Scene) -> None:
+    """Points off the surface are found by their centres; where most points are worse, more is acceptable."""
     sigma = np.full(len(plane.xy), 0.001)
-    seen = np.ones((len(plane.xy), 2), dtype=bool)
 
-    def doubt(shift_px: float) -> np.ndarray:
+    def uncertainty(shift_px: float) -> np.ndarray:
         planes = plane.theta[:, :3] + np.array([shift_px / 210, 0.0, 0.0])  # f · base = 210 px m
-        return depth_doubt(plane.images, plane.rig, 1, RowGrid(), plane.xy, planes, sigma, SETTINGS, speed=210.0, seen=seen)
+        starts = SurfaceStarts(xy=plane.xy, theta=planes)
+        return depth_uncertainty(plane.views, starts, sigma, SETTINGS, px_per_inverse_metre=210.0)
 
-    right, wrong = doubt(0.0), doubt(2.0)
+    right, wrong = uncertainty(0.0), uncertainty(2.0)
     assert np.quantile(right, 0.95) < 0.008
     assert np.median(wrong) > 0.9 * 2.0 / 210 * 1.4**2
-    assert believed(right).mean() > 0.97
-    assert not believed(np.concatenate([right, wrong]))[len(right) :].mean() > 0.1
-    assert believed(np.full(5, 0.5)).all()
+    assert acceptable(right).mean() > 0.97
+    assert not acceptable(np.concatenate([right, wrong]))[len(right) :].mean() > 0.1
+    assert acceptable(np.full(5, 0.5)).all()
     flat = [SplineImage(np.full((240, 320), 90.0)) for _ in range(3)]
-    nothing = depth_doubt(flat, plane.rig, 1, RowGrid(), plane.xy, plane.theta[:, :3], sigma, SETTINGS, speed=210.0, seen=seen)
+    starts = SurfaceStarts(xy=plane.xy, theta=plane.theta[:, :3])
+    nothing = depth_uncertainty(views(flat, plane.rig), starts, sigma, SETTINGS, px_per_inverse_metre=210.0)
     assert nothing == pytest.approx(np.hypot(0.5 / 210 / plane.theta[:, 0] ** 2, 0.001))
 
 
-def test_doubt_about_nothing(plane: Scene) -> None:
-    none, nowhere = np.zeros(0), np.zeros((0, 2))
-    planes, seen = np.zeros((0, 3)), np.ones((0, 2), dtype=bool)
-    doubt = depth_doubt(plane.images, plane.rig, 1, RowGrid(), nowhere, planes, none, SETTINGS, speed=210.0, seen=seen)
-    assert believed(doubt).shape == (0,)
+def test_depth_uncertainty_of_no_points(plane: Scene) -> None:
+    starts = SurfaceStarts(xy=np.zeros((0, 2)), theta=np.zeros((0, 3)))
+    uncertainty = depth_uncertainty(plane.views, starts, np.zeros(0), SETTINGS, px_per_inverse_metre=210.0)
+    assert acceptable(uncertainty).shape == (0,)
 
 
 def test_larger_patches_only_where_pixels_are_small(plane: Scene) -> None:
@@ -339,11 +345,11 @@ def test_larger_patches_only_where_pixels_are_small(plane: Scene) -> None:
 def test_failures_are_statuses(plane: Scene) -> None:
     xy = np.array([[100.0, 100.0], [3.0, 100.0], [100.0, 100.0], [4.0, 4.0]])
     theta = np.array([[np.nan] * 3, [0.7, 0, 0], [5.0, 0, 0], [0.7, 0, 0]])
-    found = match_surface(plane.images, plane.rig, 1, RowGrid(), xy, theta, SETTINGS, sigma_across_px=0.03)
+    found = match_surface(plane.views, SurfaceStarts(xy=xy, theta=theta), SETTINGS, sigma_across_px=0.03)
     assert found.status.tolist()[0] == found.status.tolist()[1] == MatchStatus.OUT_OF_IMAGE
     assert not found.ok.any()
     flat = [SplineImage(np.full((240, 320), 90.0)) for _ in range(3)]
-    found = match_surface(flat, plane.rig, 1, RowGrid(), plane.xy, plane.theta[:, :3], SETTINGS, sigma_across_px=0.03)
+    found = match_surface(views(flat, plane.rig), SurfaceStarts(xy=plane.xy, theta=plane.theta[:, :3]), SETTINGS, sigma_across_px=0.03)
     assert (found.status == MatchStatus.NO_TEXTURE).all()
-    nothing = match_surface(plane.images, plane.rig, 1, RowGrid(), np.zeros((0, 2)), np.zeros((0, 3)), SETTINGS, sigma_across_px=0.03)
+    nothing = match_surface(plane.views, SurfaceStarts(xy=np.zeros((0, 2)), theta=np.zeros((0, 3))), SETTINGS, sigma_across_px=0.03)
     assert len(nothing.theta) == 0

@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,8 @@ from tricap.core.matching.least_squares import (
     Matches,
     MatchingSettings,
     MatchStatus,
+    SearchImage,
+    TemplatePoints,
     join_matches,
     match_patches,
     match_prepared,
@@ -49,7 +52,11 @@ def points(step: int = 15, margin: int = 20) -> np.ndarray:
 
 def find(a: np.ndarray, b: np.ndarray, xy: np.ndarray, settings: MatchingSettings = OPEN, start: np.ndarray | None = None) -> Matches:
     eye = np.tile(np.eye(2), (len(xy), 1, 1))
-    return match_patches(SplineImage(a), xy, [SplineImage(b)], [xy if start is None else start], [eye], settings)[0]
+    return matched(SplineImage(a), xy, SearchImage(image=SplineImage(b), start=xy if start is None else start, shape=eye), settings)
+
+
+def matched(template: SplineImage, xy: np.ndarray, search: SearchImage, settings: MatchingSettings, **of_template: Any) -> Matches:
+    return match_patches(TemplatePoints(image=template, xy=xy, **of_template), [search], settings)[0]
 
 
 def noisy_pair(blur_px: float, noise: float, shift: tuple[float, float], seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -167,10 +174,9 @@ def test_shapes_are_found(warp: str) -> None:
     grid = np.stack(np.meshgrid(np.arange(120.0), np.arange(120.0)), axis=-1)
     xy = np.stack(np.meshgrid(np.arange(52.0, 69, 4), np.arange(52.0, 69, 4)), axis=-1).reshape(-1, 2)
     true = c + (xy - 60) @ A.T
-    m = match_patches(
-        SplineImage(texture(grid - 60)), xy, [SplineImage(texture((grid - c) @ np.linalg.inv(A).T))],
-        [true + random.uniform(-0.5, 0.5, true.shape)], [np.tile(np.eye(2), (len(xy), 1, 1))], OPEN,
-    )[0]  # fmt: skip
+    warped, eye = SplineImage(texture((grid - c) @ np.linalg.inv(A).T)), np.tile(np.eye(2), (len(xy), 1, 1))
+    search = SearchImage(image=warped, start=true + random.uniform(-0.5, 0.5, true.shape), shape=eye)
+    m = matched(SplineImage(texture(grid - 60)), xy, search, OPEN)
     assert m.ok.all()
     assert np.abs(m.xy - true).max() < 0.01 and np.abs(m.shape - A).max() < 0.005  # measured 0.004 and 0.0015
     assert np.abs(m.transfer_xy - (c + (xy + m.offset - 60) @ A.T)).max() < 0.01
@@ -196,7 +202,7 @@ def test_a_field_is_matched_in_its_rows() -> None:
     a, b = noisy_pair(2.0, 1.0, (0.3, 0.8), 0)
     xy = points() * [1, 0.5]
     eye = np.tile(np.eye(2), (len(xy), 1, 1))
-    m = match_patches(SplineImage(a[::2]), xy, [SplineImage(b[::2])], [xy], [eye], OPEN, row_step=2)[0]
+    m = matched(SplineImage(a[::2]), xy, SearchImage(image=SplineImage(b[::2]), start=xy, shape=eye), OPEN, row_step=2)
     e = m.xy - xy - [0.3, 0.4]
     assert np.abs(e.mean(axis=0)).max() < 0.005
     z = e / np.sqrt(m.covariance[:, [0, 1], [0, 1]])
@@ -263,10 +269,10 @@ def test_cancelling_stops_within_a_chunk() -> None:
     monitor = Monitor()
     threading.Timer(0.1, monitor.cancel).start()
     began, eye = time.perf_counter(), np.tile(np.eye(2), (len(xy), 1, 1))
-    template, search = SplineImage(a), SplineImage(b)
+    template, search = TemplatePoints(image=SplineImage(a), xy=xy), SearchImage(image=SplineImage(b), start=xy, shape=eye)
     with pytest.raises(Cancelled):
         for _ in range(50):
-            match_patches(template, xy, [search], [xy], [eye], OPEN, monitor=monitor)
+            match_patches(template, [search], OPEN, monitor=monitor)
     assert time.perf_counter() - began < 1.1
 
 
@@ -279,7 +285,7 @@ def test_smoothing_helps_weak_texture_and_its_sigma_allows_for_it() -> None:
         xy, eye = points(), np.tile(np.eye(2), (len(points()), 1, 1))
         for sigma, found in errors.items():
             f, g = (a.smoothed(sigma, 1), b.smoothed(sigma, 1)) if sigma else (a, b)
-            m = match_patches(f, xy, [g], [xy], [eye], OPEN)[0]
+            m = matched(f, xy, SearchImage(image=g, start=xy, shape=eye), OPEN)
             e = (m.transfer_xy - xy - m.offset - (0.3, -0.2))[m.ok]
             found.extend(np.abs(e).ravel())
             if sigma:
@@ -292,7 +298,8 @@ def test_without_its_texture_a_patch_is_its_middle() -> None:
     xy = points()
     a, b = noisy_pair(1.5, 2.0, (0.4, -0.3), 0)
     eye = np.tile(np.eye(2), (len(xy), 1, 1))
-    whole, middle = (match_patches(SplineImage(a), xy, [SplineImage(b)], [xy], [eye], OPEN, of_texture=t)[0] for t in (True, False))
+    search = SearchImage(image=SplineImage(b), start=xy, shape=eye)
+    whole, middle = (matched(SplineImage(a), xy, search, OPEN, texture_centre=t) for t in (True, False))
     assert np.array_equal(whole.xy, middle.xy) and np.array_equal(whole.covariance, middle.covariance)
     assert np.abs(whole.offset).max() > 0.1 and not middle.offset.any() and not middle.spread.any()
     assert np.array_equal(middle.transfer_covariance, middle.covariance) and np.array_equal(middle.transfer_xy, middle.xy)
@@ -308,7 +315,7 @@ def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float,
     near, far = (find(a, b, xy, start=true + size * off) for size in (0.02, 0.35))
     image, at, eye = SplineImage(b), true, np.tile(np.eye(2), (len(xy), 1, 1))
     for _ in range(10):
-        end = match_patches(SplineImage(a), xy, [image], [at], [eye], OPEN)[0]
+        end = matched(SplineImage(a), xy, SearchImage(image=image, start=at, shape=eye), OPEN)
         at, eye = end.xy, end.shape
     sigma = np.sqrt(np.trace(end.covariance, axis1=1, axis2=2) / 2)
     assert near.iterations.mean() < most_iterations and near.iterations.mean() < far.iterations.mean()
@@ -326,12 +333,14 @@ def test_images_searched_together_or_alone_and_prepared_or_not_give_the_same() -
     starts = [xy + random.normal(0, 0.7, xy.shape) for _ in range(2)]
     starts[0][::9] = np.nan
     eye = np.tile(np.eye(2), (len(xy), 1, 1))
-    together = match_patches(a, xy, [b, again], starts, [eye, eye], OPEN, of_texture=False)
-    templates = prepare_templates(a, xy, OPEN, 1)
-    for k, (image, start) in enumerate(zip((b, again), starts)):
-        alone = match_patches(a, xy, [image], [start], [eye], OPEN, of_texture=False)[0]
+    points = TemplatePoints(image=a, xy=xy, texture_centre=False)
+    searches = [SearchImage(image=image, start=start, shape=eye) for image, start in zip((b, again), starts)]
+    together = match_patches(points, searches, OPEN)
+    templates = prepare_templates(points, OPEN)
+    for k, search in enumerate(searches):
+        alone = match_patches(points, [search], OPEN)[0]
         some = np.arange(3, 1400, 2)
-        prepared = match_prepared(templates, some, image, start[some], eye[some])
+        prepared = match_prepared(templates, some, SearchImage(image=search.image, start=search.start[some], shape=eye[some]))
         for other, rows in ((alone, slice(None)), (prepared, some)):
             assert np.array_equal(other.status, together[k].status[rows])
             good = other.ok

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.least_squares import Matches, MatchingSettings, match_patches
+from tricap.core.matching.least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
 
 LIMITLESS = MatchingSettings(max_sigma_px=2.0, min_correlation=0.0, max_sigma0=100.0)
 NOISE, H, W = 2.0, 240, 320
@@ -26,7 +26,11 @@ def matched(blur_px: float, contrast: float, limit_px: float, seed: int = 3) -> 
     true = there[j, i]
     start, shape = true + random.uniform(-1, 1, true.shape), np.tile(np.eye(2), (len(true), 1, 1))
     settings = replace(LIMITLESS, max_rim_sigma_px=limit_px)
-    found = match_patches(images[0], np.stack([i, j], axis=1).astype(float), [images[1]], [start], [shape], settings)[0]
+    found = match_patches(
+        TemplatePoints(image=images[0], xy=np.stack([i, j], axis=1).astype(float)),
+        [SearchImage(image=images[1], start=start, shape=shape)],
+        settings,
+    )[0]
     return found, found.xy - true
 
 

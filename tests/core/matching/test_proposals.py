@@ -1,11 +1,14 @@
 """The epipolar curve through distorted lenses, and the proposal of a clicked surface point in the other views."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tricap.core.geometry.camera import Camera
 from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
+from tricap.core.matching.grid import Views
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.matching.proposals import below_surface, epipolar_curve, propose, where_rays_meet
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
@@ -81,10 +84,11 @@ def cloth_points(truth: Truth, count: int) -> np.ndarray:
 @pytest.mark.parametrize("view", [0, 1])
 def test_a_clicked_point_of_the_cloth_is_proposed_where_it_is(arm: tuple[Footage, Truth, list[SplineImage]], view: int) -> None:
     footage, truth, images = arm
-    cameras, rows = footage.rig.cameras, footage.take.rows_at(0)
+    cameras = footage.rig.cameras
+    views = Views(images=images, cameras=cameras, reference=view, rows=footage.take.rows_at(0))
     errors, asked = [], 0
     for X in cloth_points(truth, 40):
-        found = propose(images, cameras, rows, view, cameras[view].project(X), MatchingSettings())
+        found = propose(views, cameras[view].project(X), MatchingSettings())
         assert found[view] is None
         for k in set(range(3)) - {view}:
             asked += 1
@@ -111,10 +115,11 @@ def test_where_the_rays_of_two_clicks_meet(arm: tuple[Footage, Truth, list[Splin
 def test_a_joint_is_proposed_below_the_surface_that_is_seen(arm: tuple[Footage, Truth, list[SplineImage]]) -> None:
     footage, truth, images = arm
     cameras = footage.rig.cameras
+    views = Views(images=images, cameras=cameras, reference=1, rows=footage.take.rows_at(0))
     for name, depth in (("RightArm", 0.05), ("RightForeArm", 0.042)):
         joint = truth.joints_m[name][0]
         xy = cameras[1].project(joint)
-        surface = propose(images, cameras, footage.take.rows_at(0), 1, xy, MatchingSettings())
+        surface = propose(views, xy, MatchingSettings())
         inside = below_surface(cameras, 1, xy, surface, depth)
         for k in (0, 2):
             before, after = (np.linalg.norm(p[k].xy_px - cameras[k].project(joint)) for p in (surface, inside))  # type: ignore[union-attr]
@@ -125,7 +130,9 @@ def test_a_joint_is_proposed_below_the_surface_that_is_seen(arm: tuple[Footage, 
 def test_nothing_is_proposed_without_texture(arm: tuple[Footage, Truth, list[SplineImage]]) -> None:
     footage, truth, images = arm
     flat = [SplineImage(np.full(image.shape, 80.0) + np.random.default_rng(i).normal(0, 1, image.shape)) for i, image in enumerate(images)]
+    views = Views(images=flat, cameras=footage.rig.cameras, reference=1, rows=RowGrid(2, 0))
     for X in cloth_points(truth, 5):
         xy = footage.rig.cameras[1].project(X)
-        assert propose(flat, footage.rig.cameras, RowGrid(2, 0), 1, xy, MatchingSettings()) == (None, None, None)
-    assert propose(images, footage.rig.cameras, footage.take.rows_at(0), 1, np.array([1.0, 1.0]), MatchingSettings()) == (None, None, None)
+        assert propose(views, xy, MatchingSettings()) == (None, None, None)
+    textured = replace(views, images=images, rows=footage.take.rows_at(0))
+    assert propose(textured, np.array([1.0, 1.0]), MatchingSettings()) == (None, None, None)

@@ -10,11 +10,11 @@ from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import fit_neighbours, neighbours_of, template_grid, unlike_neighbours
+from tricap.core.matching.grid import Views, fit_neighbours, neighbours_of, template_grid, unlike_neighbours
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.matching.region_growing import GrowingSettings
 from tricap.core.matching.seeds import Approximations, approximations_at_depth
-from tricap.core.matching.voronoi_scan import CASES, _Scan, limits_of, scan
+from tricap.core.matching.voronoi_scan import CASES, _Scan, limits_of, voronoi_scan
 
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 
@@ -23,19 +23,17 @@ EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 def scene(surfaces: ModuleType):
     surface = surfaces.plane(0.3)
     rig, grey = surfaces.render(surface, "strong")
-    images = [SplineImage(g) for g in grey]
-    grid = template_grid(images[1].shape, RowGrid(), 6)
+    views = Views(images=[SplineImage(g) for g in grey], cameras=rig, reference=1, rows=RowGrid())
+    grid = template_grid(views.template.shape, RowGrid(), 6)
     xy = np.array([[110.0, 90.0], [210.0, 130.0]])
     depth = surface.hit(rig[1].centre_m, rig[1].rays(xy))[0]
-    return surface, rig, images, grid, approximations_at_depth(rig, 1, RowGrid(), xy, depth)
+    return surface, rig, views, grid, approximations_at_depth(rig, 1, RowGrid(), xy, depth)
 
 
 def run(scene, seeds: Approximations | None = None, matching: MatchingSettings | None = None, **growing):
-    _, rig, images, grid, found = scene
-    return scan(
-        images,
-        rig,
-        1,
+    _, _, views, grid, found = scene
+    return voronoi_scan(
+        views,
         grid,
         seeds or found,
         matching or MatchingSettings(),
@@ -59,17 +57,17 @@ def test_two_seeds_cover_the_surface(scene) -> None:
 
 def test_search_images_are_independent(scene) -> None:
     """A search image without content costs its own matches, and so the triplets; the other's scan goes on."""
-    _, rig, images, grid, seeds = scene
-    blind = [images[0], images[1], SplineImage(np.full(images[2].shape, 80.0))]
-    field = scan(blind, rig, 1, grid, seeds, MatchingSettings(), GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
+    _, _, views, grid, seeds = scene
+    blind = replace(views, images=[*views.images[:2], SplineImage(np.full(views.images[2].shape, 80.0))])
+    field = voronoi_scan(blind, grid, seeds, MatchingSettings(), GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())
     assert len(field.cell) == 0
     assert field.tried > 0.5 * grid.shape[0] * grid.shape[1]
 
 
 def begun(scene, settings: MatchingSettings) -> _Scan:
-    _, _, images, grid, seeds = scene
+    _, _, views, grid, seeds = scene
     cells = grid.nearest(seeds.xy[:, 1])
-    one = _Scan(images[1], images[0], grid, cells, settings, Monitor())
+    one = _Scan(views.template, views.images[0], grid, cells, settings, Monitor())
     one.begin(seeds.xy[:, 0] + np.einsum("nij,nj->ni", seeds.shape[:, 0], grid.xy(cells) - seeds.xy[:, 1]), seeds.shape[:, 0])
     return one
 
@@ -112,11 +110,11 @@ def test_texture_cases_are_ordered(scene) -> None:
 def test_no_seed_gives_no_point_and_cancelling_works(scene) -> None:
     none = Approximations(xy=np.zeros((0, 3, 2)), shape=np.zeros((0, 3, 2, 2)), depth_m=np.zeros(0))
     assert len(run(scene, none).cell) == 0
-    _, rig, images, grid, seeds = scene
+    _, _, views, grid, seeds = scene
     monitor = Monitor()
     monitor.cancel()
     with pytest.raises(Cancelled):
-        scan(images, rig, 1, grid, seeds, replace(MatchingSettings()), GrowingSettings(), foreground=EVERYWHERE, monitor=monitor)
+        voronoi_scan(views, grid, seeds, replace(MatchingSettings()), GrowingSettings(), foreground=EVERYWHERE, monitor=monitor)
 
 
 def test_neighbours_fit_a_quadric_in_spite_of_outliers() -> None:

@@ -3,7 +3,7 @@
 import shutil
 import threading
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.matching.region_growing import TripletField
+from tricap.core.matching.region_growing import MatchedField
 from tricap.core.matching.seeds import Approximations
 from tricap.core.results.folder import Results
 from tricap.core.run import pipeline
@@ -31,7 +31,7 @@ def same(a: MeasuredFrame, b: MeasuredFrame) -> None:
     assert (a.frame, a.key, p.depth_range_m, p.method) == (b.frame, b.key, q.depth_range_m, q.method)
     assert p.planes.tobytes() == q.planes.tobytes()
     assert a.removed_px.tobytes() == b.removed_px.tobytes() and a.removed_why.tobytes() == b.removed_why.tobytes()
-    for one, other, cls in ((a.field, b.field, TripletField), (a.cloud, b.cloud, PointCloud)):
+    for one, other, cls in ((a.field, b.field, MatchedField), (a.cloud, b.cloud, PointCloud)):
         for f in fields(cls):
             x, y = getattr(one, f.name), getattr(other, f.name)
             assert x.tobytes() == y.tobytes() and x.dtype == y.dtype if isinstance(x, np.ndarray) else x == y, f.name
@@ -131,7 +131,7 @@ def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any
     (take / "take.toml").write_text(text + f'[seeds]\nframe = 0\n[seeds.joints]\n"elbow.R" = {{ {at} }}\n')
     footage = pipeline.only_frames(open_take(read_take(take)), (3, 4))
     s = pipeline.settings_of({}, {}, "take.toml")
-    (m,) = measure.measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(tmp_path / "out"), Monitor())
+    (m,) = measure.measure_frames(footage, replace(measure.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
     assert m.foreground.method == "clicks and nearest surface" and m.foreground.depth_range_m[1] < 4
     distance = bodies[3][1].distance_m(m.cloud.xyz_m)
     assert len(distance) > 200 and np.mean(np.abs(distance) < 0.02) > 0.9
@@ -185,7 +185,7 @@ def test_one_clicked_seed_is_enough(
     take = changed(plane_take, tmp_path / "take", f"[seeds]\nsurface = [{{ {at} }}]\n")
     footage = pipeline.only_frames(open_take(read_take(take)), (0, 1))
     s = pipeline.settings_of({}, {}, "take.toml")
-    (m,) = measure.measure_frames(footage, s["matching"], s["growing"], s["surface"], Results(tmp_path / "out"), Monitor())
+    (m,) = measure.measure_frames(footage, replace(measure.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
     assert len(m.cloud.xyz_m) > 500 and np.median(np.abs(plane.distance_m(m.cloud.xyz_m))) < 0.001
 
 
@@ -196,7 +196,8 @@ def test_seeds_follow_the_reference_and_the_settings(tmp_path: Path, scenes: Any
     footage = open_take(read_take(scenes.write_take(tmp_path / "take", rig, [[scenes.Body()]])))
     s = pipeline.settings_of({}, {"enhance": {"wallis": "on"}}, "take.toml")
     plain, enhanced = (
-        measure.first_seeds(footage, s["matching"], s["growing"], 0, Monitor(), enhance)[1] for enhance in (None, s["enhance"])
+        measure.first_seeds(footage, replace(measure.MeasureSettings.of(s), enhance=enhance), 0, Monitor())[1]
+        for enhance in (None, s["enhance"])
     )
     assert plain.xy[:, 1, 0].max() > 120 and len(enhanced.depth_m)
     both = [np.flatnonzero((plain.xy[:, 1] == at).all(axis=1)) for at in enhanced.xy[:, 1]]
