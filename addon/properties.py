@@ -56,7 +56,7 @@ def group_class(name: str, settings: type) -> type:
 
 
 def touched(group: bpy.types.PropertyGroup, settings: type) -> dict[str, Any]:
-    """The knobs that were set in Blender, as a plain table for `core.settings.from_table`."""
+    """The knobs that were set in Blender, as a plain table for `from_table`."""
     return {
         field.name: exact(getattr(group, field.name), field.default)
         for field in dataclasses.fields(settings)

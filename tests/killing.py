@@ -123,7 +123,7 @@ def _blender(tell: "Tell") -> Any:
     bpy, addon_utils = importlib.import_module("bpy"), importlib.import_module("addon_utils")
     addon_utils.extensions_refresh()
     assert addon_utils.enable(EXTENSION, default_set=True) is not None
-    tell(importlib.import_module(f"{EXTENSION}.core.progress").Monitor)
+    tell(importlib.import_module(f"{EXTENSION}.core.foundation.progress").Monitor)
     for group, table in SETTINGS.items():
         for name, value in table.items():
             setattr(getattr(bpy.context.scene.tricap, group), name, value)
