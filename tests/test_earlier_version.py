@@ -1,5 +1,5 @@
-"""Takes and results that Tricap 0.1.0 wrote are still read: version_0_1/ has a take.toml with every key and setting of that version, and the
-text files of a run."""
+"""Takes and results of Tricap 0.1.0 are still read: version_0_1/ has a take.toml with every key and setting of that version, and the text
+files of a run."""
 
 import dataclasses
 import json
