@@ -10,14 +10,14 @@ squares fit to limbs of three balls: a limb of 40 mm is off by 0.04 mm RMS (with
 most 0.33 mm). Blender adds the fields of all
 objects whose names differ only in the number; Blender calls these a family and polygonises it in the object without a number.
 
-core.body.families decides which balls form a family, so that hips and shoulders are as thick as fitted and arms do not fuse with
+core.body.metaball_groups decides which balls form a family, so that hips and shoulders are as thick as fitted and arms do not fuse with
 the flanks.
 """
 
 import bpy
 import numpy as np
 
-from ...core.body.metaball_groups import families
+from ...core.body.metaball_groups import metaball_groups
 from ...core.body.metaballs import THRESHOLD, Metaballs
 from ...core.body.shape import BodyShape
 from . import nodes
@@ -33,7 +33,7 @@ SKIN_COLOUR = (0.80, 0.52, 0.41)
 def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape) -> list[bpy.types.Object]:
     """For each family a metaball object per bone, child of that bone; a family is polygonised in its first object."""
     objects = []
-    found = families(shape)
+    found = metaball_groups(shape)
     for balls in found:
         bones = list(dict.fromkeys(balls.bone_index.tolist()))
         words = NAME if len(found) == 1 else f"{NAME} {shape.skeleton.bones[bones[0]].name}"

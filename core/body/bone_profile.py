@@ -1,7 +1,7 @@
-"""How thick a body is about each of its bones: where the summed field of the bone and its neighbours in the chain is at the threshold.
+"""The thickness of a body around each of its bones: where the summed field of the bone and its chain neighbours equals the threshold.
 
-The radii of single balls do not tell: a limb's follows from the sum, and stout bones that follow each other add to it as much as their own
-balls. Limbs that branch off (a shoulder beside the chest) are not counted.
+It does not follow from the radii of single balls: a limb's radius results from the sum, and adjacent stout bones add to it as much as the
+bone's own balls. Limbs that branch off (a shoulder at the chest) are not counted.
 """
 
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from .shape import BodyShape
 from .skeleton import Skeleton, bone_frames
 from .skin.parts import body_parts
 
-ALONG = 5  # places along a bone, from its first ball to its last
+ALONG = 5  # stations along a bone, from its first ball to its last
 SIDES = np.array([[1.0, 0, 0], [0, 0, 1.0], [-1.0, 0, 0], [0, 0, -1.0]])  # in the bone's axes: x, z, −x, −z
-HALVINGS = 14
-FARTHEST = 1.25  # seen radius / largest l across of balls that add up
-LEAST_M = 0.003  # where the balls do not reach around the axis
+HALVINGS = 14  # of the bisection: to 1/16384 of the reach
+FARTHEST = 1.25  # visible radius / largest l across of summed balls
+LEAST_M = 0.003  # where the balls do not surround the axis
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BoneProfile:
-    """Fractions along a bone (K,), and the radii there (K, 4) [m] towards x, z, −x and −z of its axes. Beyond the ends they go on."""
+    """Fractions along a bone (K,), and the radii there (K, 4) [m] towards x, z, −x and −z of its axes; constant beyond the ends."""
 
     stations: np.ndarray
     radii_m: np.ndarray
 
     def across(self, along: np.ndarray, across_m: np.ndarray) -> np.ndarray:
-        """Half axes (N, 2) of the quarter ellipse that holds a point at fractions (N,) and places across the bone (N, 2) in x and z."""
+        """Half axes (N, 2) of the quarter ellipse of a point at fractions (N,) along and positions (N, 2) in x and z across the bone."""
         axes = []
         for i in (0, 1):
             ahead, behind = (np.interp(along, self.stations, self.radii_m[:, i + k]) for k in (0, 2))
@@ -37,7 +37,7 @@ class BoneProfile:
 
 
 def chain_neighbours(shape: BodyShape) -> np.ndarray:
-    """Whether the balls of bone j count for the profile of bone i (B, B): they meet, and one leads on from the other."""
+    """(B, B) whether the balls of bone j count for the profile of bone i: adjacent bones of one chain."""
     together = np.zeros_like(shape.skeleton.neighbours)
     for part in body_parts(shape):
         together[np.ix_(part.bones, part.bones)] = True
@@ -60,13 +60,13 @@ def bone_profiles(skeleton: Skeleton, lengths_m: np.ndarray, balls: Metaballs, c
         u = np.einsum("mij,nj->nmi", M, np.tile(SIDES @ R[b].T, (ALONG, 1)))
         aside = np.linalg.norm(balls.centres_m(lengths_m)[used][:, [0, 2]], axis=1)
         reach = float((FARTHEST * balls.radii_m[used][:, [0, 2]].max(axis=1) + aside).max())
-        radii = _where_seen(o, u, balls.weight[used], reach)
+        radii = _visible_radii(o, u, balls.weight[used], reach)
         found[b] = BoneProfile(stations=stations, radii_m=np.maximum(radii, LEAST_M).reshape(ALONG, len(SIDES)))
     return found
 
 
-def _where_seen(o: np.ndarray, u: np.ndarray, weight: np.ndarray, reach_m: float) -> np.ndarray:
-    """The radii (N,) at which rays o + ρ u (N, m, 3), in units of each ball's l, leave the surface; 0 where they begin outside."""
+def _visible_radii(o: np.ndarray, u: np.ndarray, weight: np.ndarray, reach_m: float) -> np.ndarray:
+    """The ρ (N,) at which rays o + ρ u (N, m, 3), in units of each ball's l, leave the surface; 0 where they begin outside."""
     a, b, c = (np.einsum("nmi,nmi->nm", p, q) for p, q in ((u, u), (o, u), (o, o)))
     low, high = np.zeros(len(o)), np.full(len(o), reach_m)
     for _ in range(HALVINGS):

@@ -1,16 +1,16 @@
-"""The complete model: metaballs in an anatomical arrangement, made from a body of the simplified kind (D'Apuzzo et al. 1999, §3.1, §4).
+"""The complete model: metaballs in an anatomical arrangement, made from the simplified body (D'Apuzzo et al. 1999, §3.1, §4).
 
-Every bone gets a core along its axis, and beside it balls for the groups of muscles and fat that shape it (`anatomy`), placed and sized by
-the bone's own profile. Then all cross radii are adjusted together until the surface is the simplified body's:
+Every bone gets a core along its axis, and around it balls for the groups of muscle and fat that shape it (`anatomy`), placed and sized by
+the bone's profile. Then all cross radii are adjusted together until the surface is the simplified body's:
 
     √(−½ ln F_complete(X)) = √(−½ ln F_simplified(X)) at points X of the surface and a little outside it,   ln l = its start ± 50 %    (1)
 
-So the refined fit begins with the same body, and departs from it only where the measurement says so. A bone that no table knows (in a
-model of one's own) gets rings of four balls. The whole body has 150 balls.
+So the refined fit begins with the same body and departs from it only where the data require it. A bone without a table (in a user's own
+model) gets rings of four balls. The whole body has 150 balls.
 
-Which groups of muscles and fat shape each bone's surface, as balls beside the bone: the tables of the complete model.
+The groups of muscle and fat that shape each bone's surface, as balls around the bone: the tables of the complete model.
 
-Places and sizes are shares of the half width there, from the middle of the section: `aside` along the bone's x axis (for bones of the
+Positions and sizes are fractions of the half width there, from the middle of the section: `aside` along the bone's x axis (for bones of the
 right side; mirrored on the left), `ahead` along its z axis, `width` of the ball's own visible radius. `along` and `length` (its l along the
 bone) are fractions of the bone. The arrangement is that of surface anatomy (after the plates of Gray, 1918); the sizes are starting values
 for a fit.
@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .bone_profile import BoneProfile, bone_profiles, chain_neighbours
-from .metaballs import VISIBLE, Metaballs, field
+from .metaballs import STATIONS, VISIBLE, Metaballs, field
 from .shape import BodyShape, FieldSamples, root_of, with_radii_for
 from .skeleton import bone_frames
 
@@ -153,10 +153,13 @@ def arrangement(bone: str) -> tuple[Ball, ...]:
     return TABLES.get(bone.removesuffix(".R").removesuffix(".L"), RINGS)
 
 
-ALONG, AROUND = 9, 12  # points of the simplified surface, per bone
-OUTSIDE, OUTSIDE_WEIGHT = 1.25, 0.2  # points outside: so many radii from the axis; what they count there
-LEAST_F = 1e-4
-FREE = 0.2  # of ln l in (1): muscles keep their part of the surface
+ALONG = 9  # points of the simplified surface along a bone …
+AROUND = 12  # … and around it
+OUTSIDE = 1.25  # distance from the axis of the points outside, in radii
+OUTSIDE_WEIGHT = 0.2  # of the points outside
+LEAST_F = 1e-4  # of the field at the points, for its logarithm
+FREE = 0.2  # sigma of ln l in (1): muscles keep their part of the surface
+SEGMENT = 2 / 3  # span of the three balls of a limb, from 1/6 to 5/6 of the bone
 ROUND = 0.9  # on stout bones, where the tables' balls would be flat: l along the bone over l across it, at least
 
 
@@ -177,7 +180,7 @@ def complete_shape(shape: BodyShape) -> BodyShape:
 
 
 def _placed(shape: BodyShape, profiles: dict[int, BoneProfile]) -> Metaballs:
-    """The balls where the profile puts them; their shares are of the profile's radii at their places."""
+    """The balls placed by the profile; their sizes are fractions of its radii there."""
     bone_index, centre, radii = [], [], []
     for b, profile in profiles.items():
         name, length = shape.skeleton.bones[b].name, float(shape.lengths_m[b])
@@ -186,7 +189,7 @@ def _placed(shape: BodyShape, profiles: dict[int, BoneProfile]) -> Metaballs:
             along = _on_bone(profile, ball)
             ahead, behind = profile.across(np.full(2, along), np.array([[1.0, 1.0], [-1.0, -1.0]]))
             half = (ahead + behind) / 2
-            at = (ahead - behind) / 2 + np.array([side * ball.aside, ball.ahead]) * half  # a calf lies beside its bone
+            at = (ahead - behind) / 2 + np.array([side * ball.aside, ball.ahead]) * half  # a calf lies off its bone
             bone_index.append(b)
             centre.append([at[0] / length, along, at[1] / length])
             cross = ball.width / VISIBLE * half
@@ -195,13 +198,13 @@ def _placed(shape: BodyShape, profiles: dict[int, BoneProfile]) -> Metaballs:
 
 
 def _span(profile: BoneProfile) -> float:
-    """How much of the bone its balls cover, over what three balls cover of a limb."""
-    return float(profile.stations[-1] - profile.stations[0]) / (2 / 3)
+    """The span of a bone's balls by that of a limb's three balls."""
+    return float(profile.stations[-1] - profile.stations[0]) / SEGMENT
 
 
 def _on_bone(profile: BoneProfile, ball: Ball) -> float:
-    """The ball's place on this bone: its table is that of a limb with balls from 1/6 to 5/6."""
-    return float(profile.stations[0] + (ball.along - 1 / 6) * _span(profile))
+    """The ball's fraction along this bone; its table is that of a limb with balls from 1/6 to 5/6."""
+    return float(profile.stations[0] + (ball.along - STATIONS[0]) * _span(profile))
 
 
 def _about(profile: BoneProfile, R: np.ndarray, head: np.ndarray, length: float) -> np.ndarray:

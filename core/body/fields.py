@@ -3,12 +3,12 @@
     exponential  e^(−2d)                                          D'Apuzzo et al. 1999, Eq. 8: the only one that is fitted
     Blinn        e^(−a d), a = 4 ln 2                             Blinn 1982, ACM ToG 1(3); half of its weight at half of l
     Wyvill       1 − (22/9) d + (17/9) d² − (4/9) d³,  d < 1      Wyvill, McPheeters & Wyvill 1986, The Visual Computer 2
-    quadric      1 − 3 d,  r < l/3;   (3/2)(1 − √d)²,  r < l      Nishimura et al. 1985, the “metaballs”
+    quadric      1 − 3 d,  r < l/3;   (3/2)(1 − √d)²,  r < l      Nishimura et al. 1985, “metaballs”
     Blender      (1 − d)³,  d < 1                                 Blender's mball_tessellate.cc
     Shen         1 − d,  d < 1                                    Shen & Thalmann 1995; its slope does not end in 0
 
-w_t = T = ½ is the threshold of the surface, r_t the radius at which an isolated ball of weight w is seen, f(r_t²) = T/w, and r_a the radius
-of influence, beyond which f = 0: l. The first two never end; for them r_a = l is a name only.
+w_t = T = ½ is the threshold of the surface, r_t the visible radius of an isolated ball of weight w, f(r_t²) = T/w, and r_a the radius of
+influence, beyond which f = 0: l. The first two have no finite radius of influence; for them r_a = l is nominal.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ THRESHOLD = 0.5
 VISIBLE = float(np.sqrt(0.5 * np.log(1 / THRESHOLD)))  # r_t / l of the exponential
 BLINN = 4 * float(np.log(2))
 WYVILL = (22 / 9, 17 / 9, 4 / 9)
-LITTLE = 0.0015  # of T: what is less does not show
+LITTLE = 0.0015  # of T: a field below it is invisible
 
 Curve = Callable[[np.ndarray], np.ndarray]
 
@@ -56,23 +56,23 @@ class Potential:
 
     @property
     def reach(self) -> float:
-        """The radius, in units of l, beyond which nothing of the field shows."""
+        """The radius, in units of l, beyond which the field is invisible."""
         return self.radius_of(LITTLE * THRESHOLD) if self.endless else self.stretch
 
     def threshold_radius(self, weight: float = 1.0) -> float:
-        """r_t in units of l of an isolated ball of this weight; 0 where it is too weak to be seen."""
+        """r_t in units of l of an isolated ball of this weight; 0 if it is too weak to be visible."""
         return self.radius_of(THRESHOLD / weight) if weight > THRESHOLD else 0.0
 
     def radius_of(self, value: float) -> float:
-        """The radius, in units of l, at which f has a value between 0 and 1. Bisection: every potential falls all the way."""
+        """The radius, in units of l, at which f has a value between 0 and 1, by bisection: every potential decreases monotonically."""
         low, high = 0.0, 4.0 * self.stretch
         for _ in range(60):
             middle = (low + high) / 2
             low, high = (middle, high) if float(self.value(np.array(middle**2))) > value else (low, middle)
         return (low + high) / 2
 
-    def as_seen(self) -> "Potential":
-        """The same potential, stretched until an isolated ball looks as large as one with the exponential of the same l."""
+    def of_visible_size(self) -> "Potential":
+        """The same potential, stretched so that an isolated ball has the visible radius of one with the exponential of the same l."""
         return replace(self, stretch=self.stretch * VISIBLE / self.threshold_radius())
 
 
@@ -109,11 +109,11 @@ POTENTIALS = {
 
 
 def potential_named(name: str) -> Potential:
-    """The potential of that name, as large as the exponential (`as_seen`), for the surface of a body that was fitted.
+    """The potential of that name, with the visible size of the exponential (`of_visible_size`), for the surface of a fitted body.
 
     Raises:
         InputError: there is none of that name.
     """
     if name not in POTENTIALS:
         raise InputError(f"There is no field “{name}”.{nearest_name(name, list(POTENTIALS))}")
-    return POTENTIALS[name] if name == EXPONENTIAL.name else POTENTIALS[name].as_seen()
+    return POTENTIALS[name] if name == EXPONENTIAL.name else POTENTIALS[name].of_visible_size()

@@ -1,8 +1,8 @@
 """Body models are data files (models/*.toml): bones, DOFs with limits, default lengths and radii. A user can write another one.
 
 A file with `mirror_of` is the mirror image (x → −x) of another: names change side, limits about y and z change sign. In a `symmetric`
-file the bones of the right side stand for both. A file with `part_of` is another model `without` some bones and what hangs on them.
-The other is one of ours by its name, or a .toml file beside this one.
+file the bones of the right side define both. A file with `part_of` is another model `without` some bones and their descendants.
+The other is a built-in one by its name, or a .toml file in the same folder.
 """
 
 import tomllib
@@ -22,21 +22,21 @@ from .skeleton import Bone, Dof, Skeleton
 
 MODELS = Path(__file__).with_name("models")
 MIRROR = np.array([-1.0, 1.0, 1.0])
-LOCKED = radians(0.1)  # sigma of what is not free to turn
+LOCKED = radians(0.1)  # sigma of the prior of a locked DOF
 OTHER_SIDE = {".R": ".L", ".L": ".R"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BodyModel:
-    """A kind of body before any measurement: skeleton with nominal lengths, default radii, which part of a bone shows its own surface."""
+    """A body before any measurement: skeleton with nominal lengths, default radii, and where each bone has a surface of its own."""
 
     name: str
     skeleton: Skeleton
-    visible_radii_m: np.ndarray  # (B, 3, 2) seen cross radii at the stations in x and z; NaN for bones without balls
+    visible_radii_m: np.ndarray  # (B, 3, 2) visible cross radii at the stations in x and z; NaN for bones without balls
     surface: np.ndarray  # (B, 2) fractions of the bone between which a measured surface is the bone's own
     stations: np.ndarray  # (B, 3) fractions of the bone where its balls are
-    aside: np.ndarray  # (B, 3, 2) how far they lie off the bone in its x and z, as fractions of its length
-    length_sigma: np.ndarray  # (B,) relative: how far the joints' places, as people click them, leave a bone's length open
+    aside: np.ndarray  # (B, 3, 2) their offsets from the bone in its x and z, as fractions of its length
+    length_sigma: np.ndarray  # (B,) relative sigma of a bone's length that clicks on its joints leave
 
     def __post_init__(self) -> None:
         b = len(self.skeleton.bones)
@@ -68,7 +68,7 @@ def read_model(name: str | Path) -> BodyModel:
 
 
 def model_files(name: str | Path) -> list[Path]:
-    """The file of a model, and those that it is a mirror image or a part of.
+    """The file of a model, and the files of the models that it is a mirror image or a part of.
 
     Raises:
         InputError: as `read_model`.
@@ -77,13 +77,13 @@ def model_files(name: str | Path) -> list[Path]:
 
 
 def _sources(name: str | Path) -> list[tuple[Path, dict[str, Any]]]:
-    """A model's file and table, then those that it is made from; a file that another names lies beside it."""
+    """A model's file and table, then those that it is made from; a file named by another is in the same folder."""
     found: list[tuple[Path, dict[str, Any]]] = []
     wanted: Any = name
     while wanted is not None:
         path = _path(wanted, found[-1][0].parent if found else Path())
         if any(path.resolve() == other.resolve() for other, _ in found):
-            raise InputError(f"The body model {found[0][0]} is made from itself, by way of “{wanted}”; mend `mirror_of` or `part_of`.")
+            raise InputError(f"The body model {found[0][0]} is made from itself, by way of “{wanted}”; correct `mirror_of` or `part_of`.")
         found.append((path, _table(path)))
         table = found[-1][1]
         wanted = table.get("mirror_of", table.get("part_of"))
@@ -108,7 +108,7 @@ def _table(path: Path) -> dict[str, Any]:
 
 
 def joint_depths_m(model: BodyModel) -> dict[str, float]:
-    """How deep [m] each joint lies below the skin, seen from the front: the mean radius of the bones that meet there."""
+    """Depth [m] of each joint below the skin in a view from the front: the mean radius of the bones that meet there."""
     found: dict[str, list[float]] = {}
     for bone, radii in zip(model.skeleton.bones, model.visible_radii_m):
         for joint, radius in ((bone.head_joint, radii[0, 1]), (bone.tail_joint, radii[2, 1])):
@@ -117,7 +117,7 @@ def joint_depths_m(model: BodyModel) -> dict[str, float]:
 
 
 def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
-    """A model without some bones and all that hangs on them.
+    """A model without some bones and their descendants.
 
     Raises:
         InputError: the model has no such bone, or nothing is left.
@@ -143,7 +143,7 @@ def without(model: BodyModel, bones: Sequence[str], name: str) -> BodyModel:
 
 
 def with_limits(model: BodyModel, limits: Mapping[str, tuple[float, float]], locked: Sequence[str]) -> BodyModel:
-    """A model with other limits [rad], by the names of its DOFs; those that are `locked` keep their rest value (0, or the nearest limit).
+    """A model with other limits [rad], by the names of its DOFs; `locked` DOFs have their rest value (0, or the nearest limit).
 
     Raises:
         InputError: the model has no such degree of freedom, or it is the base's.
@@ -236,7 +236,7 @@ def base_dofs(joint: str) -> tuple[Dof, Dof, Dof]:
 
 def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
     if table.get("format") != "tricap-model" or table.get("version") != 1:
-        raise InputError(f'{path} is no body model of this version of Tricap; begin it with format = "tricap-model" and version = 1.')
+        raise InputError(f'{path} is not a body model of this version of Tricap; begin it with format = "tricap-model" and version = 1.')
     try:
         stature = float(table["stature_m"])
         rows = list(table["bones"])
@@ -262,7 +262,7 @@ def _model(table: Mapping[str, Any], path: Path) -> BodyModel:
             length_sigma=np.array(open_lengths),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"The body model {path} lacks something or holds a wrong value: {error}.") from error
+        raise InputError(f"The body model {path} lacks an entry or has a wrong value: {error}.") from error
 
 
 def _bone(t: Mapping[str, Any], stature: float) -> Bone:

@@ -19,7 +19,7 @@ import numpy as np
 from ..foundation import store
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
-from .metaballs import VISIBLE, Metaballs, field_and_derivatives, three_balls
+from .metaballs import ACROSS, VISIBLE, Metaballs, field_and_derivatives, three_balls
 from .model_file import BodyModel, base_dofs, dof_from_table
 from .skeleton import Bone, Skeleton, bone_frames
 
@@ -163,10 +163,10 @@ def default_shape(model: BodyModel) -> BodyShape:
 
 
 def one_ball_shape(shape: BodyShape) -> BodyShape:
-    """The same body with one ellipsoid a bone, from joint to joint: what bodies were made of before metaballs, for comparison."""
+    """The same body with one ellipsoid a bone, from joint to joint, as body models before metaballs; for comparison."""
     balls = shape.metaballs
     bones = np.unique(balls.bone_index)
-    cross = np.array([balls.radii_m[balls.bone_index == b][:, [0, 2]].mean(axis=0) for b in bones]) / (1.534 * VISIBLE)
+    cross = np.array([balls.radii_m[balls.bone_index == b][:, [0, 2]].mean(axis=0) for b in bones]) / (ACROSS * VISIBLE)
     radii = np.stack([cross[:, 0], shape.lengths_m[bones] / (2 * VISIBLE), cross[:, 1]], axis=1)
     single = Metaballs(bone_index=bones, centre=np.tile([0.0, 0.5, 0.0], (len(bones), 1)), radii_m=radii, weight=np.ones(len(bones)))
     return replace(shape, metaballs=single, radius_sigma_m=np.full((len(bones), 3), np.nan))
@@ -221,19 +221,19 @@ def read_body(path: Path) -> BodyShape:
     """Read body.toml.
 
     Raises:
-        InputError: the file is missing, is no body.toml of this version, or lacks something.
+        InputError: the file is missing, is not a body.toml of this version, or lacks an entry.
     """
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        said = getattr(error, "strerror", None) or error
-        raise InputError(f"Cannot read the body {path}: {said}; run the fit again.") from error
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"Cannot read the body {path}: {reason}; run the fit again.") from error
     if table.get("format") != "tricap-body" or table.get("version") != 1:
-        raise InputError(f"{path} is no body of this version of Tricap; run the fit again.")
+        raise InputError(f"{path} is not a body.toml of this version of Tricap; run the fit again.")
     try:
         return _shape(table)
     except (KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
-        raise InputError(f"The body {path} lacks something or holds a wrong value ({error}); run the fit again.") from error
+        raise InputError(f"The body {path} lacks an entry or has a wrong value ({error}); run the fit again.") from error
 
 
 def _shape(table: dict[str, Any]) -> BodyShape:

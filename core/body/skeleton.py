@@ -29,7 +29,7 @@ ROTATION_MODES = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 class Dof:
     """One degree of freedom: an angle [rad] about a bone's local `axis`, or a coordinate [m] of the base along the world's `axis`.
 
-    `prior_mean`, `prior_sigma`: what is believed before any measurement, in the same unit; an infinite sigma believes nothing.
+    `prior_mean`, `prior_sigma`: the prior before any measurement, in the same unit; an infinite sigma is no prior.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Bone:
 
 
 class Layout:
-    """Where each parameter stands in a vector: `layout["elbow.R flexion"]` is its index, `layout.group("base")` the indices of a group."""
+    """The index of each parameter in a vector: `layout["elbow.R flexion"]` is its index, `layout.group("base")` the indices of a group."""
 
     def __init__(self, names: Sequence[str], groups: Mapping[str, Sequence[int]]) -> None:
         self.names = tuple(names)
@@ -134,8 +134,8 @@ class Skeleton:
         return Layout(self.dof_names, groups)
 
     @cached_property
-    def held(self) -> np.ndarray:
-        """The DOFs that keep one value, because their limits are equal."""
+    def locked(self) -> np.ndarray:
+        """The DOFs whose limits are equal, so that they have one value only."""
         return np.flatnonzero([dof.limits[0] == dof.limits[1] for dof in self.dofs])
 
     @cached_property
@@ -195,7 +195,7 @@ class Skeleton:
     def neighbours(self) -> np.ndarray:
         """(B, B) symmetric: a bone itself, its parent and its children; their fields add where they meet (consistent mode).
 
-        A bone without DOFs is a rigid part of its parent: what hangs on it is the parent's child.
+        A bone without DOFs is a rigid part of its parent: its children count as the parent's.
         """
         rigid = list(range(len(self.bones)))
         for b, p in enumerate(self.parents):
@@ -214,7 +214,7 @@ class Skeleton:
 
     @cached_property
     def joint_bones(self) -> tuple[tuple[int, bool], ...]:
-        """For each joint a bone that ends at it, and whether with its tail (else with its head)."""
+        """For each joint a bone that begins or ends there, and whether with its tail (else with its head)."""
         where: dict[str, tuple[int, bool]] = {}
         for b, bone in enumerate(self.bones):
             where.setdefault(bone.head_joint, (b, False))
@@ -223,7 +223,7 @@ class Skeleton:
 
     @cached_property
     def ancestors(self) -> np.ndarray:
-        """(B, B) whether the second bone is the first, or what it hangs on."""
+        """(B, B) whether the second bone is the first, or one of its ancestors."""
         table = np.eye(len(self.bones), dtype=bool)
         for b, p in enumerate(self.parents):
             if p >= 0:

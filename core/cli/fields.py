@@ -32,7 +32,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """
     if args.out.suffix.lower() != ".svg":
         raise InputError(f"--out {args.out} is not an .svg file; choose a name that ends in .svg.")
-    same_size = {name: p.as_seen() for name, p in POTENTIALS.items()}
+    same_size = {name: p.of_visible_size() for name, p in POTENTIALS.items()}
     graphs = [_graph("Fields of one radius l", POTENTIALS), _graph("The same, with the surface of the exponential", same_size)]
     second = graphs[1].replace("<svg ", f'<svg y="{2 * HEIGHT}" ', 1)
     head = f'<svg viewBox="0 0 {WIDTH} {4 * HEIGHT}" width="{WIDTH}" height="{4 * HEIGHT}" xmlns="http://www.w3.org/2000/svg">'

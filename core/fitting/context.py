@@ -166,7 +166,7 @@ class Conditions:
     ) -> Problem:
         """An adjustment in which the shape parameters of the set `free` may change, and the motion unless it is held."""
         shape = self.parameters.layout.group(free) if free else NO_SHAPE
-        held = np.arange(len(self.model.skeleton.dofs)) if hold_motion else self.model.skeleton.held
+        held = np.arange(len(self.model.skeleton.dofs)) if hold_motion else self.model.skeleton.locked
         return Problem(
             parameters=self.parameters,
             observe=observe,

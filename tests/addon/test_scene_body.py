@@ -7,7 +7,7 @@ import pytest
 
 from tricap.core.body import metaballs as core_metaballs
 from tricap.core.body.complete import complete_shape
-from tricap.core.body.metaball_groups import families
+from tricap.core.body.metaball_groups import metaball_groups
 from tricap.core.body.model_file import model_names, read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
@@ -156,7 +156,7 @@ def test_at_the_joints_of_a_whole_body_the_metaballs_are_the_families_surface(em
     R, head = bone_frames(shape.skeleton, shape.lengths_m, motion[0])
     empty.context.scene.frame_set(0)
     seen = [part for part in flesh if "." not in part.name.replace(".R", "").replace(".L", "")]
-    found = families(shape)
+    found = metaball_groups(shape)
     assert len(seen) == len(found)
     for family, balls in zip(seen, found):
         points = world_vertices(empty, family)

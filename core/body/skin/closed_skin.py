@@ -1,25 +1,25 @@
-"""The skin of a body as one closed mesh, as a modeller would have built it: rings of quads along the limbs, sewn into the trunk's.
+"""The skin of a body as one closed mesh, built like a modeller's: rings of quads along the limbs, sewn into the trunk's.
 
-    skin of the parts ── sewn together (welding) ──▶ vertices about the seams evened out, on the surface of the whole
+    skin of the parts ── sewn together (welding) ──▶ vertices near the seams relaxed on the surface of the whole body
 
-Between Newton's steps that take it onto the surface (whole_surface) a vertex near a seam goes half way to the middle of its neighbours.
-The bones' shares are those of the parts, smoothed about the seams, or the skin would tear where one part ends. Where the surface of
-the whole folds near a seam (thighs that touch, an arm close to the flank), the mesh leaves it and goes smoothly over the fold. Where a quad
-near a seam is turned over after all, what is about it is evened out until none is; edges along seams are rounded (seams). Where contours
-across the trunk miss what lies level, under a chin, vertices are evened out along the surface.
+Relaxation: between Newton's steps onto the surface (whole_surface) a vertex near a seam moves half way to the mean of its neighbours.
+The bones' weights are those of the parts, smoothed near the seams, or the skin would tear where a part ends. Where the surface of the
+whole body folds near a seam (thighs that touch, an arm close to the flank), the mesh leaves it and bridges the fold smoothly. If a quad
+near a seam is flipped in spite of this, its surroundings are relaxed until none is; edges along seams are rounded (1). Where contours
+across the trunk miss horizontal surfaces, under a chin, vertices are relaxed along the surface.
 
-Seams of a skin in one piece without an edge: where limbs leave a trunk the normal turns no more suddenly than beside.
+Seams without an edge: where limbs leave the trunk, the normal turns no more abruptly than nearby.
 
-The jump at an edge between two parts is by how much the normal turns over it, less the mean of its turns over the two edges beside (those
-opposite to it in both quads): what is left of the turn when the surface is only round there. Where thighs touch, the surface has a crease,
-100° and more within a millimetre. About an edge that jumps the mesh becomes a thin plate, tied to where it was,
+The jump at an edge between two parts is the turn of the normal over it, less the mean of the turns over the two adjacent edges (those
+opposite to it in both quads): zero where the surface is merely curved. Where thighs touch, the surface has a crease, 100° and more within
+a millimetre. Near an edge with a jump the mesh becomes a thin plate, tied to its earlier position x⁰,
 
-    Σ |x_i − Σ_j x_j/e_ij / Σ_j 1/e_ij|² + w⁻⁴ Σ |x_i − its place|² → min                                  (1)
+    Σ |x_i − Σ_j x_j/e_ij / Σ_j 1/e_ij|² + w⁻⁴ Σ |x_i − x⁰_i|² → min                                        (1)
 
 with e_ij the lengths of the edges to its neighbours (Desbrun, Meyer, Schröder & Barr 1999, SIGGRAPH; Botsch & Kobbelt 2004, ACM ToG 23(3)):
-bends of less than w quads go. That is done anew, from wider about, until none jumps; of rounds that do not end so the best is taken in
-which no quad folds. Places that left the surface before (folds) are not tied. Neighbours that count alike would do away with the crease by
-spreading its narrow quads: a gap of 2 mm would be bridged by 20.
+it removes bends shorter than w quads. This is repeated over growing neighbourhoods until no edge jumps; if some remain, the best round
+without folded quads is used. Vertices that left the surface before (folds) are not tied. Equal weights of the neighbours would remove the
+crease by spreading its narrow quads: a gap of 2 mm would be bridged by 20.
 """
 
 from dataclasses import dataclass
@@ -37,17 +37,17 @@ from .parts import body_parts
 from .welding import cut, face_uv, net_faces, welded
 from .whole_surface import WholeSurface
 
-LARGEST_JUMP = np.radians(4.8)
+LARGEST_JUMP = np.radians(4.8)  # [rad]
 WIDTH = 1.5  # w of (1) in quads
-RINGS = 5  # so many quads about an edge that jumps are the plate …
-WIDER_AFTER = 3  # … and one more after so many rounds
+RINGS = 5  # quads of the plate about an edge with a jump …
+WIDER_AFTER = 3  # … and rounds after which there is one more
 ROUNDS = 18
-SHORTEST_M = 1e-4  # of the edges in (1)
-FOLD = 0.4  # cosine: a face that stands so steeply on what is about its corners is in a fold
+SHORTEST_M = 1e-4  # least edge length in (1)
+FOLD = 0.4  # cosine between a face's normal and the mean normal at a corner, below which the face is in a fold
 
 
 def mean_of_neighbours(faces: np.ndarray, count: int) -> sparse.csr_matrix:
-    """(V, V): of values at `count` vertices, the mean of those that an edge joins to each."""
+    """(V, V): the mean of the values at the neighbours of each of `count` vertices."""
     ends = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     both = np.concatenate([ends, ends[:, ::-1]])
     joined = sparse.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), (count, count))
@@ -56,7 +56,7 @@ def mean_of_neighbours(faces: np.ndarray, count: int) -> sparse.csr_matrix:
 
 
 def within(near: sparse.csr_matrix, chosen: np.ndarray, rings: int) -> np.ndarray:
-    """Which vertices are at most so many edges from the chosen ones."""
+    """The vertices at most `rings` edges from the chosen ones."""
     found = chosen.astype(np.float64)
     for _ in range(rings):
         found = np.maximum(found, near @ found > 0)
@@ -78,7 +78,7 @@ def seam_jumps(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np.
 
 
 def in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which faces (F,) stand steeply on the mean of the faces about one of their corners."""
+    """The faces (F,) that are steep to the mean of the faces around one of their corners."""
     corner = vertices[faces]
     normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -87,8 +87,8 @@ def in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.asarray((np.einsum("fk,fck->fc", normal, mean[faces]) < FOLD).any(axis=1))
 
 
-def turned_over(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which quads (F,) look, at one of their corners, away from what is about that corner: flipped ones, and those folded in themselves."""
+def flipped(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The quads (F,) that, at one of their corners, face away from the surface around it: flipped ones, and those folded in themselves."""
     corner = vertices[faces]
     normal = np.cross(np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
@@ -101,10 +101,10 @@ def faired(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, tied: np.n
     """Vertices (V, 3), moved about edges between parts (V,) that jump by more than `LARGEST_JUMP`; `tied` (V,) 0 to 1.  (1)"""
     found = best = np.array(vertices)
     least, near, rough = np.inf, mean_of_neighbours(faces, len(found)), np.zeros(len(found), dtype=bool)
-    troubled = _troubled(found, faces)
+    at_first = _defects(found, faces)
     for step in range(ROUNDS):
         jumps = seam_jumps(found, faces, part)
-        if jumps.max() < least and (_troubled(found, faces) <= troubled).all():
+        if jumps.max() < least and (_defects(found, faces) <= at_first).all():
             best, least = found.copy(), jumps.max()
         if least <= LARGEST_JUMP:
             break
@@ -116,18 +116,18 @@ def faired(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, tied: np.n
 
 
 def _reached_from(near: sparse.csr_matrix, among: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Those `among` the vertices that hang together, by edges between them, with `chosen` (V,) ones."""
+    """Those `among` the vertices that edges between them connect to `chosen` (V,) ones."""
     _, piece = csgraph.connected_components(near[among][:, among], directed=False)
     return np.asarray(among[np.isin(piece, piece[chosen[among]])])
 
 
-def _troubled(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(2,) how many quads are turned over, and how many in a fold."""
-    return np.array([turned_over(vertices, faces).sum(), in_a_fold(vertices, faces).sum()])
+def _defects(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(2,) the number of flipped quads, and of quads in a fold."""
+    return np.array([flipped(vertices, faces).sum(), in_a_fold(vertices, faces).sum()])
 
 
 def _plate(vertices: np.ndarray, faces: np.ndarray, rows: np.ndarray, moved: np.ndarray, ties: np.ndarray) -> np.ndarray:
-    """(M, 3): where (1) over the vertices `rows` has those `moved` (M,), with `ties` (M,) to their places; all others stay."""
+    """Positions (M, 3) of the vertices `moved` (M,) that minimise (1) over the vertices `rows`, with the weights `ties` (M,)."""
     ends = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     ends = ends[np.isin(ends[:, 0], rows)]  # both ways round: every edge has two quads
     count = len(vertices)
@@ -150,23 +150,23 @@ def _beyond(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _most_frequent(values: np.ndarray) -> np.ndarray:
-    """Of each row (F, 4) the value that is in it most often, the least of several."""
+    """The most frequent value of each row (F, 4), the smallest of several."""
     ordered = np.sort(values, axis=1)
     times = (ordered[:, :, None] == ordered[:, None, :]).sum(axis=2)
     return np.asarray(np.take_along_axis(ordered, times.argmax(axis=1)[:, None], axis=1)[:, 0])
 
 
 DETAIL = 2  # of a scene: at 32 rays the quads are 0.15 to 0.25 mm RMS from the surface, with 1 they are 0.7, being flat
-SEAM_RINGS = 4  # so many quads on either side of a seam are evened out
-SPARSE_M = 0.005  # … and about quads whose middle is so far from the surface
-EVENING_STEPS = 40
+SEAM_RINGS = 4  # quads on either side of a seam that are relaxed
+SPARSE_M = 0.005  # quads whose middle is farther from the surface are relaxed, too
+RELAXING_STEPS = 40
 UNTANGLING_STEPS = 30  # the first of them, which move vertices also across the surface
 CUT_STEPS = 2  # Newton's, from the middle of an edge or quad: a millimetre
 UNFOLDING_STEPS = 40
-LOOSE_RINGS = 4  # over so many quads the mesh comes back to the surface
-MENDING_STEPS = 200  # at most
-MENDING_RING = 20  # … and a ring more is evened out after so many
-SMOOTHED_M = 0.03  # shares are smoothed over about this distance
+LOOSE_RINGS = 4  # quads over which the mesh returns to the surface
+UNFLIPPING_STEPS = 200  # at most
+UNFLIPPING_RING = 20  # steps after which another ring is relaxed
+SMOOTHED_M = 0.03  # distance over which weights are smoothed, about
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -176,8 +176,8 @@ class OneSkin:
     vertices_m: np.ndarray  # (V, 3) world
     faces: np.ndarray  # (F, 4)
     uv: np.ndarray  # (F, 4, 2) of the faces' corners in 0…1: around the bones and along them, an island a part
-    weights: np.ndarray  # (V, B) share of each bone of the skeleton in a vertex; rows sum to 1
-    part: np.ndarray  # (V,) which of `body_parts` a vertex is a place of
+    weights: np.ndarray  # (V, B) of each bone of the skeleton in a vertex; rows sum to 1
+    part: np.ndarray  # (V,) index in `body_parts` of the part to which a vertex belongs
     bone_names: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -190,10 +190,10 @@ class OneSkin:
 
 
 def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSkin:
-    """The skin of the rest posture in one piece; with `detail` above 1 every edge in so many pieces, on the surface.
+    """The skin of the rest pose in one piece; with `detail` above 1 every edge is cut into so many pieces, on the surface.
 
-    A body of one chain is its closed chain, by B-spline patches where `settings` or `detail` want them; a whole body's vertices are on the
-    surface itself in any fineness, but for folds near its seams. A whole body has 10,000 quads and takes 1.5 s.
+    A body of one chain has the closed mesh of that chain, refined by B-spline patches where `settings` or `detail` ask for them; a whole
+    body's vertices are on the surface itself at any detail, except in folds near its seams. A whole body has 10,000 quads and takes 1.5 s.
 
     Raises:
         InputError: there are no metaballs, or the number of rays is odd.
@@ -209,15 +209,15 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     near = mean_of_neighbours(faces, len(whole.vertices_m))
     free = within(near, whole.sewn, SEAM_RINGS)
     uneven = np.union1d(free, within(near, _sparse(whole.vertices_m, faces, whole.part, surface), SEAM_RINGS))
-    vertices, loose = _unfolded(_evened(whole.vertices_m, near, uneven, free, whole.part, surface), faces, near, free)
+    vertices, loose = _unfolded(_relaxed(whole.vertices_m, near, uneven, free, whole.part, surface), faces, near, free)
     weights = _smoothed(whole.weights, vertices, faces, near, free)
     part, pieces, kept = whole.part, detail * settings.detail, 1 - loose
     seam = np.isin(np.arange(len(vertices)), free).astype(np.float64)
     if pieces > 1:
         vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, seam, loose]), part, faces, uv, pieces)
         weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1]
-        vertices = vertices + kept[:, None] * (surface.reached(vertices, part, CUT_STEPS) - vertices)
-    vertices = faired(_mended(vertices, faces, seam > 0), faces, part, kept)
+        vertices = vertices + kept[:, None] * (surface.projected(vertices, part, CUT_STEPS) - vertices)
+    vertices = faired(_unflipped(vertices, faces, seam > 0), faces, part, kept)
     return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
 
 
@@ -235,9 +235,9 @@ def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneS
 
 
 def _sparse(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, surface: WholeSurface) -> np.ndarray:
-    """Which vertices (V,) of the trunk are corners of quads that cut short what is between them, as under the chin above a short neck.
+    """The vertices (V,) of the trunk at corners of quads too coarse for the surface, as under the chin above a short neck.
 
-    Of limbs none: evened out, a thumb has fewer quads.
+    None of limbs: relaxed, a thumb has fewer quads.
     """
     trunk = faces[(part[faces] == 0).all(axis=1)]
     found = np.zeros(len(vertices), dtype=bool)
@@ -245,24 +245,24 @@ def _sparse(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, surface: 
     return found
 
 
-def _evened(
+def _relaxed(
     vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, sewn: np.ndarray, part: np.ndarray, surface: WholeSurface
 ) -> np.ndarray:
-    """Vertices (V, 3), the free ones evened out on the surface; those about a seam first in all directions."""
+    """Vertices (V, 3), the free ones relaxed on the surface; those near a seam first in all directions."""
     found, part = vertices.copy(), part[free]
     along, towards = np.flatnonzero(~np.isin(free, sewn)), np.arange(len(free))
-    for i in range(EVENING_STEPS if len(free) else 0):
+    for i in range(RELAXING_STEPS if len(free) else 0):
         step = 0.5 * (near[free] @ found - found[free])
         rows = along if i < UNTANGLING_STEPS else towards
         normals = surface.normals(found[free[rows]], part[rows])
         step[rows] -= np.einsum("nk,nk->n", step[rows], normals)[:, None] * normals
-        found[free] = surface.reached(found[free] + step, part, steps=1)
-    found[free] = surface.reached(found[free], part)
+        found[free] = surface.projected(found[free] + step, part, steps=1)
+    found[free] = surface.projected(found[free], part)
     return found
 
 
 def _unfolded(vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) of which the free ones leave the surface where it folds, and how far (V,), 0 to 1, each belongs to such a place."""
+    """Vertices (V, 3) of which the free ones leave the surface where it folds, and the degree (V,), 0 to 1, to which each has left it."""
     found, may = vertices.copy(), np.isin(np.arange(len(vertices)), free)
     loose = np.zeros(len(vertices))
     for _ in range(UNFOLDING_STEPS):
@@ -278,15 +278,15 @@ def _unfolded(vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, 
     return found, loose
 
 
-def _mended(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3): those that `may` (V,), about quads that are turned over, go half way to their neighbours' middle until none is."""
+def _unflipped(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3): those that `may` move (V,), near flipped quads, move half way to their neighbours' mean until none is flipped."""
     found, near = np.array(vertices), None
-    for step in range(MENDING_STEPS):
-        bad = turned_over(found, faces) & may[faces].all(axis=1)
+    for step in range(UNFLIPPING_STEPS):
+        bad = flipped(found, faces) & may[faces].all(axis=1)
         if not bad.any():
             break
         near = mean_of_neighbours(faces, len(found)) if near is None else near
-        moved = within(near, np.isin(np.arange(len(found)), faces[bad]), 1 + step // MENDING_RING)
+        moved = within(near, np.isin(np.arange(len(found)), faces[bad]), 1 + step // UNFLIPPING_RING)
         moved = moved[may[moved]]
         found[moved] = 0.5 * (found[moved] + near[moved] @ found)
     return found

@@ -1,22 +1,22 @@
 """The skin of a body: contours across the bones, each point cast from the axis to the implicit surface (Thalmann, Shen & Chauvineau
-1996; D'Apuzzo et al. 1999). The deformation needs no weights: the metaballs move with the bones and the surface is found anew.
+1996; D'Apuzzo et al. 1999). The deformation needs no weights: the metaballs move with the bones, and the surface is computed in each pose.
 
-    shape, posture ── chains of bones (skin_parts) ── rays of their contours (skin_rays) ── outermost roots (skin_roots)
-      ──▶ Skin, with B-spline patches between the contours (skin_patches)
+    shape, pose ── chains of bones (parts) ── rays of their contours (rays) ── outermost roots (roots)
+      ──▶ Skin, with B-spline patches between the contours (mesh)
 
 A chain is one closed mesh over all its joints, so elbow, knee, waist and neck have no seam. Chains that grow out of others (arms and legs
 out of the trunk) overlap with them on one common surface.
 
-Which bones move a vertex of the skin: shares that let a joint bend as far as joints bend, without the skin passing through itself.
+Weights of the bones in the vertices of the skin, with which joints bend over their whole range without self-intersection of the skin.
 
-An armature that keeps volumes turns a vertex near a joint, bent by β, by w β about the joint. On the inner side of the bend a vertex at
-the distance d along its bone and h off the axis stands at the angle 90° + φ from the joint, φ = atan(d/h), and must not be carried past the
-plane that halves the bend: φ + w β ≥ β/2, rising with d. So, for all β < 2 atan(D/h),
+An armature that preserves volume turns a vertex near a joint, bent by β, by w β about the joint. On the inner side of the bend a vertex at
+the distance d along its bone and h off the axis is at the angle 90° + φ from the joint, φ = atan(d/h), and must not be carried past the
+bisecting plane of the bend: φ + w β ≥ β/2, increasing with d. So, for all β < 2 atan(D/h),
 
     w = ½ (1 − atan(d/q)/atan(D/q)) ,   q = max(h, q_0) ,   D = 5 q                                         (1)
 
-which allows 157° of a cylinder. Joints that bend to one side only, as elbows and knees, have a wide zone there and a narrow one on the
-outer side, so that the point of the elbow stays with its bones; how far a joint is such a hinge is read from its limits.
+which allows 157° for a cylinder. Joints that bend to one side only, such as elbows and knees, have a wide zone there and a narrow one on
+the outer side, so that the point of the elbow moves with its bones; the joint's limits define to what degree it is such a hinge.
 """
 
 from collections.abc import Sequence
@@ -34,12 +34,12 @@ from .roots import limb_normals, limb_root, part_root
 ZONE = 5.0  # D/q of (1): atan 5 = 79°, with room for limbs that are no cylinders
 LEAST_Q = 0.5  # q_0, in limb radii
 ROUNDED = 0.4  # the maximum of (1) is rounded over this many limb radii
-MOST_BONES = 4  # at a vertex, as game engines and glTF take them
-LARGEST_ZONE = 0.95  # of the bone's length: with less, a knee as stout as most lets only 130° of (1)
+MOST_BONES = 4  # per vertex, the limit of game engines and glTF
+LARGEST_ZONE = 0.95  # of the bone's length: with less, a knee of usual thickness bends only by 130°
 
 
 def chain_weights(shape: BodyShape, segments: Sequence[Segment], rays: Rays, local_m: np.ndarray) -> np.ndarray:
-    """The share (V, B) of every bone in the vertices of one chain, given in their bones' axes (V, 3); rows sum to 1.  (1)"""
+    """The weights (V, B) of all bones in the vertices of one chain, given in their bones' axes (V, 3); rows sum to 1.  (1)"""
     weights = np.zeros((len(local_m), len(shape.skeleton.bones)))
     for here, segment in enumerate(segments):
         own = np.flatnonzero(rays.bone == segment.bone)
@@ -55,12 +55,12 @@ def chain_weights(shape: BodyShape, segments: Sequence[Segment], rays: Rays, loc
 
 
 def strongest(weights: np.ndarray) -> np.ndarray:
-    """Of the shares (V, B) in every vertex the `MOST_BONES` largest, less the next, which sum to 1: no bone leaves or comes at once."""
+    """The `MOST_BONES` largest weights (V, B) of every vertex, less the next largest, normalised: no bone's weight jumps to 0 or from 0."""
     order = np.argsort(-weights, axis=1, kind="stable")[:, : MOST_BONES + 1]
     largest = np.take_along_axis(weights, order, axis=1)
     less = largest[:, MOST_BONES:] if largest.shape[1] > MOST_BONES else np.zeros((len(weights), 1))
     found = np.zeros(weights.shape)
-    np.put_along_axis(found, order[:, :MOST_BONES], largest[:, :MOST_BONES] - (1 - 1e-9) * less, axis=1)  # five alike do not leave nothing
+    np.put_along_axis(found, order[:, :MOST_BONES], largest[:, :MOST_BONES] - (1 - 1e-9) * less, axis=1)  # not all zero if five are equal
     return np.asarray(found / found.sum(axis=1, keepdims=True))
 
 
@@ -73,7 +73,7 @@ def _share(distance: np.ndarray, inwards: np.ndarray, radius: float, length: flo
 
 
 def _inner_side(shape: BodyShape, parent: int, child: int, bone: int) -> np.ndarray:
-    """Where the joint of parent and child bends its bones to, in the axes of `bone`, one of both; as long as it is a hinge, 0 to 1."""
+    """`hinge` of the joint of parent and child, in the axes of `bone`, one of both."""
     bones = shape.skeleton.bones
     inner = hinge(bones[child])
     if bone == child:
@@ -83,7 +83,7 @@ def _inner_side(shape: BodyShape, parent: int, child: int, bone: int) -> np.ndar
 
 
 def hinge(bone: Bone) -> np.ndarray:
-    """(3,) in the bone's axes: the side that its joint bends it to, 1 long if to that side only, 0 if to all sides alike."""
+    """(3,) in the bone's axes: the side to which its joint bends; of length 1 if to that side only, 0 if to all sides equally."""
     middle, reach = np.zeros(3), 0.0
     for dof in bone.dofs:
         if dof.axis == "y":
@@ -102,10 +102,10 @@ __all__ = ["Skin", "SkinSettings", "body_skin", "limb_skin"]
 
 
 def limb_skin(shape: BodyShape, motion: np.ndarray, settings: SkinSettings | None = None) -> Skin:
-    """The skin of a limb in one posture. `motion` (D,) rad and metres, in the order of the skeleton's DOFs.
+    """The skin of a limb in one pose. `motion` (D,) rad and metres, in the order of the skeleton's DOFs.
 
-    A vertex lies on F = T, with the field of its bone and of the bones that meet it. Two exceptions: where two segments are pressed
-    together the vertex stops at the plane between them, and where the metaballs do not reach around the axis it stays 1 mm from it.
+    A vertex lies on F = T, with the field of its bone and of the adjacent bones. Two exceptions: where two segments are pressed together
+    the vertex stops at the plane between them, and where the metaballs do not surround the axis it is 1 mm from it.
     About 10 ms for two bones at the default settings.
 
     Raises:
@@ -117,11 +117,11 @@ def limb_skin(shape: BodyShape, motion: np.ndarray, settings: SkinSettings | Non
 
 
 def body_skin(shape: BodyShape, motion: np.ndarray, settings: SkinSettings | None = None) -> Skin:
-    """The skin of any body in one posture: one closed mesh per chain of bones, of the same topology in every posture.
+    """The skin of any body in one pose: one closed mesh per chain of bones, of the same topology in every pose.
 
     `motion` (D,) rad and metres, in the order of the skeleton's DOFs. Vertices lie as in `limb_skin`, or, where a chain meets the one it
-    grows out of, on the joint surface of both or inside the other (skin_roots). A body of one chain has the skin of `limb_skin`.
-    With `detail` above 1, B-spline patches through these vertices are cut finer (skin_patches). A whole body: 0.2 s.
+    grows out of, on the joint surface of both or inside the other (roots). A body of one chain has the skin of `limb_skin`.
+    With `detail` above 1, B-spline patches through these vertices are cut finer (mesh). A whole body: 0.2 s.
 
     Raises:
         InputError: there are no metaballs, or the number of rays is odd.

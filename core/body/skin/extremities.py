@@ -1,9 +1,9 @@
-"""Head, hands and feet as people have them, for the skin: the fit's three balls a bone end where the bone does.
+"""Anatomical heads, hands and feet for the skin: the fit's three balls of a bone end where the bone does.
 
 The head's bone begins at the atlas, the hand's ends at the knuckles and the foot's at the ball of the foot, so a body of three balls a bone
-has no jaw, no fingers, no heel and no toes, and what is measured of them makes its balls swell. Postures are fitted with them all the same.
-Here the three balls of such a bone give way to ellipsoids at their places in anatomy, as large as anthropometry has them for the bone's
-length, turned and stretched to the surface that was fitted, where that is a head's, a hand's or a foot's (not at the jaw, nor the sole):
+has no jaw, no fingers, no heel and no toes, and points measured there enlarge its balls. Poses are fitted with this model all the same.
+Here the three balls of such a bone are replaced by ellipsoids in their anatomical positions, with anthropometric sizes for the bone's
+length, rotated and scaled to the fitted surface, where that is a head's, a hand's or a foot's (not at the jaw, nor the sole):
 
     √(−½ ln F(X)) = √(½ ln 2) at points X of the fitted surface ± 4 mm ,   ln s_x, ln s_z = 0 ± 0.12 ,   ln s_y = 0 ± 0.03 ,
     pitch = 0 ± 6°                                                                                        (1)
@@ -23,18 +23,23 @@ from ..metaballs import VISIBLE, Metaballs
 from ..shape import BodyShape
 from .mesh import SkinSettings
 
-SIZE, LENGTH, PITCH = 0.12, 0.03, np.radians(6.0)  # sigmas of ln s across and along the bone, and of the pitch, in (1)
-UNKNOWN = 1e-3  # of both where the fitted surface tells no thickness
-NEAR_M = 0.004  # and of the distance from the fitted surface
-FARTHEST = 30.0  # of an equation
-LEAST_F = 1e-9
+SIZE = 0.12  # sigma of ln s across the bone in (1)
+LENGTH = 0.03  # sigma of ln s along the bone
+PITCH = np.radians(6.0)  # sigma of the pitch
+UNKNOWN = 1e-3  # sigma of ln s_z and of the pitch where the fitted surface does not determine a thickness
+NEAR_M = 0.004  # sigma of the distance from the fitted surface
+FARTHEST = 30.0  # bound of a residual, in sigmas
+LEAST_F = 1e-9  # bounds of F, so that its logarithm …
+MOST_F = 0.99
+LEAST_ROOT_SQUARED = 1e-3  # … and the derivative of the root stay finite
+BOUND = 3.0  # of the parameters, in sigmas
 NECK = "neck"
-SIMPLE = 3  # balls of a bone that were fitted without anatomy
+SIMPLE = 3  # balls of a bone fitted without anatomy
 
 
 @dataclass(frozen=True, slots=True)
 class Ellipsoid:
-    """Place and half axes as seen, in bone lengths and the axes of a right bone: across (x), along (y), across (z)."""
+    """Centre and visible half axes, in bone lengths and the axes of a right bone: across (x), along (y), across (z)."""
 
     name: str
     x: float
@@ -46,11 +51,11 @@ class Ellipsoid:
 
 
 @dataclass(frozen=True, slots=True)
-class End:
-    """The ellipsoids of a bone, and where what was fitted is theirs, too: stations (of five along the bone) and sides (x, z, −x, −z).
+class Extremity:
+    """The ellipsoids of a bone, and where the fitted surface is theirs, too: stations (of five along the bone) and sides (x, z, −x, −z).
 
-    `tip`: how far beyond its head the bone's flesh ends. A fit that sees toes takes the bone there; such a bone is no measure of size.
-    `drop`: how far below its head the bone ends where y and z of the ellipsoids' places are level and down, not the bone's.
+    `tip`: distance of the flesh's end from the bone's head. A fit with visible toes may extend the bone to there, so that its length is no
+    measure of size. `drop`: how far below its head the bone ends if y and z of the ellipsoids are level and down, not the bone's axes.
     """
 
     stations: tuple[int, ...]
@@ -61,8 +66,8 @@ class End:
 
 
 # Head: z forwards. Hand: x to the thumb, z to the palm. Foot: x to the other foot, y level ahead, z down.
-TABLES: dict[str, End] = {
-    "head": End(
+TABLES: dict[str, Extremity] = {
+    "head": Extremity(
         (1, 2, 3, 4),
         (0, 1, 2, 3),
         (
@@ -74,7 +79,7 @@ TABLES: dict[str, End] = {
             Ellipsoid("nose", 0, 0.15, 0.59, 0.075, 0.13, 0.11),
         ),
     ),
-    "hand": End(
+    "hand": Extremity(
         (1, 2, 3),
         (0, 2),
         (
@@ -89,7 +94,7 @@ TABLES: dict[str, End] = {
             Ellipsoid("fingers 3", -0.01, 1.66, 0.05, 0.26, 0.15, 0.08),
         ),
     ),
-    "foot": End(
+    "foot": Extremity(
         (1, 2, 3),
         (0, 2, 3),
         (
@@ -114,10 +119,10 @@ TABLES: dict[str, End] = {
 
 
 def person_shape(shape: BodyShape) -> BodyShape:
-    """The body with the head, hands and feet of a person; what else was fitted stays. 0.1 s for a whole body.
+    """The body with anatomical head, hands and feet; all other balls stay as fitted. 0.1 s for a whole body.
 
-    Bones of other names, and those that were refined to more than three balls, keep theirs. A neck that was fitted to the jaw, too, gets
-    the width that it has below.
+    Bones of other names, and those refined to more than three balls, keep their balls. The upper end of the neck, which the fit widens
+    towards the jaw, gets the width of the lower end.
     """
     counts = np.bincount(shape.metaballs.bone_index, minlength=len(shape.skeleton.bones))
     ends = {
@@ -143,7 +148,7 @@ def person_shape(shape: BodyShape) -> BodyShape:
 
 @lru_cache(maxsize=4)
 def shape_for_skin(shape: BodyShape, settings: SkinSettings) -> BodyShape:
-    """What a skin with these settings is the skin of."""
+    """The body of which a skin with these settings is made."""
     return person_shape(shape) if settings.anatomy else shape
 
 
@@ -157,7 +162,7 @@ def _slender_neck(shape: BodyShape) -> Metaballs:
     return replace(balls, radii_m=radii)
 
 
-def _fitted(shape: BodyShape, b: int, end: End, profile: BoneProfile) -> np.ndarray:
+def _fitted(shape: BodyShape, b: int, end: Extremity, profile: BoneProfile) -> np.ndarray:
     """(4,) ln s_x, ln s_y, ln s_z and the pitch of (1)."""
     radii = profile.radii_m[list(end.stations)][:, list(end.sides)]
     across = radii[..., None] * SIDES[list(end.sides)]
@@ -169,14 +174,14 @@ def _fitted(shape: BodyShape, b: int, end: End, profile: BoneProfile) -> np.ndar
         balls = _placed(shape, b, end, x)
         q = (points[:, None] - balls.centres_m(shape.lengths_m)) / balls.radii_m
         F = np.exp(-2 * np.einsum("nmi,nmi->nm", q, q)).sum(axis=1)
-        off = np.sqrt(np.maximum(-0.5 * np.log(np.clip(F, LEAST_F, 0.99)), 1e-3)) / VISIBLE - 1
+        off = np.sqrt(np.maximum(-0.5 * np.log(np.clip(F, LEAST_F, MOST_F)), LEAST_ROOT_SQUARED)) / VISIBLE - 1
         return np.asarray(np.concatenate([np.clip(off * radii.ravel() / NEAR_M, -FARTHEST, FARTHEST), x / sigma]))
 
-    return np.asarray(least_squares(residuals, np.zeros(4), loss="soft_l1", bounds=(-3 * sigma, 3 * sigma)).x)
+    return np.asarray(least_squares(residuals, np.zeros(4), loss="soft_l1", bounds=(-BOUND * sigma, BOUND * sigma)).x)
 
 
-def _unit_m(shape: BodyShape, b: int, end: End) -> float:
-    """What the table's numbers are multiples of: the bone's length, or of a bone that may be too long, what its parent lets expect."""
+def _unit_m(shape: BodyShape, b: int, end: Extremity) -> float:
+    """The unit of the table's numbers: the bone's length, or, if the bone may be too long, the length expected from its parent's."""
     length, parent = float(shape.lengths_m[b]), int(shape.skeleton.parents[b])
     if end.tip is None or parent < 0:
         return length
@@ -185,8 +190,8 @@ def _unit_m(shape: BodyShape, b: int, end: End) -> float:
     return max(min(length, of_parent), length / end.tip)
 
 
-def _placed(shape: BodyShape, b: int, end: End, x: np.ndarray) -> Metaballs:
-    """Balls that would look like the table's ellipsoids if each were alone, for parameters (4,) of (1)."""
+def _placed(shape: BodyShape, b: int, end: Extremity, x: np.ndarray) -> Metaballs:
+    """Balls with the visible size of the table's ellipsoids if each were alone, for parameters (4,) of (1)."""
     side = -1.0 if shape.skeleton.bones[b].name.endswith(".L") else 1.0  # a left bone's x axis is the right one's mirror image
     unit, n = _unit_m(shape, b, end), len(end.balls)
     at = np.array([[side * e.x, e.y, e.z] for e in end.balls]) * np.exp(x[:3])

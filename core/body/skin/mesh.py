@@ -1,4 +1,4 @@
-"""The mesh of a skin: closed, of quadrilaterals, of the same topology in every posture.
+"""The mesh of a skin: closed, of quadrilaterals, of the same topology in every pose.
 
 Cubic B-spline patches over the contours of a skin (Thalmann, Shen & Chauvineau 1996), and their polygons in any fineness.
 
@@ -27,32 +27,34 @@ INTERPOLATING, APPROXIMATING = "interpolating", "approximating"
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SkinSettings:
-    """How finely the skin is sampled."""
+    """The sampling of the skin."""
 
     contours: int = knob(14, "Contours along each bone.", low=4, high=200)
     rays: int = knob(32, "Points on each contour (an even number).", low=8, high=400)
     cap_contours: int = knob(5, "Contours that close each end of the limb.", low=2, high=100)
-    detail: int = knob(1, "Pieces of each mesh between contours and points, by B-spline patches; 1: the points alone.", low=1, high=16)
+    detail: int = knob(
+        1, "Subdivisions of each edge between contours and points, by B-spline patches; 1: the points alone.", low=1, high=16
+    )
     patches: str = knob(
         INTERPOLATING,
         "B-spline patches go through the points, or approximate them and shrink a little.",
         choices=(INTERPOLATING, APPROXIMATING),
     )
     anatomy: bool = knob(
-        True, "Heads, hands and feet as people have them, with jaw, fingers, heel and toes, not the three balls that were fitted."
+        True, "Anatomical heads, hands and feet, with jaw, fingers, heel and toes, instead of the three fitted balls of a bone."
     )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Skin:
-    """A closed mesh, outside counter-clockwise, of the same topology in every posture."""
+    """A closed mesh, outside counter-clockwise, of the same topology in every pose."""
 
     vertices_m: np.ndarray  # (V, 3) world: the pole at the base, contour after contour, the pole at the end
     faces: np.ndarray  # (F, 4)
-    weights: np.ndarray  # (V, B) share of each bone of the skeleton in a vertex; rows sum to 1
+    weights: np.ndarray  # (V, B) of each bone of the skeleton in a vertex; rows sum to 1
     bone_names: tuple[str, ...]
     normals: np.ndarray  # (V, 3) outward, of the implicit surface
-    part_sizes: tuple[int, ...]  # vertices of each part, in order; every part is closed by itself
+    part_sizes: tuple[int, ...]  # vertices of each part, in order; every part is closed
     rays: int  # points on each contour
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
-"""The parts of a body for its skin: chains of bones, from joint to joint, and where one grows out of another.
+"""The parts of a body for its skin: chains of bones, from joint to joint, and the bone from which each chain branches off.
 
-A chain follows, at each joint, the child that leads on most nearly straight (pelvis, spine, chest, neck, head; upper arm, forearm, hand);
-the other children begin chains of their own, which grow out of the bone they hang on. Bones without metaballs are passed over.
+At each joint a chain continues with the child whose direction is nearest to its own (pelvis, spine, chest, neck, head; upper arm, forearm,
+hand); the other children begin chains that branch off their parent bone. Bones without metaballs are skipped.
 """
 
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ import numpy as np
 
 from ..shape import BodyShape
 
-JUNCTION_SHARE = 1 / 3  # the leading part of a chain, of its length, that blends with the part it grows out of
+JUNCTION_SHARE = 1 / 3  # first fraction of a chain's length, that blends with its parent part
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Part:
-    """One chain of bones with metaballs, in the order in which they follow each other."""
+    """One chain of consecutive bones with metaballs."""
 
     bones: tuple[int, ...]
-    junction: tuple[int, ...]  # its first bones: as far as it may blend with its parent part
-    parent: int | None  # the part it grows out of
-    attachment: int | None  # … and the bone of it
+    junction: tuple[int, ...]  # its first bones, which may blend with the parent part
+    parent: int | None  # the part from which it branches off
+    attachment: int | None  # … and the bone of that part
 
 
 def body_parts(shape: BodyShape) -> tuple[Part, ...]:

@@ -1,4 +1,4 @@
-"""The rays on which the vertices of a skin are looked for: contours across the bones of one chain, caps at its ends.
+"""The rays on which the vertices of a skin are found: contours across the bones of one chain, caps at its ends.
 
 The rays of a contour start at a point of the bone's axis, in the direction
 
@@ -10,10 +10,10 @@ parent p and child c, cut by its bisecting plane,
     k_tail of p = (y_c − y_p cos β)/(1 + cos β) ,   k_head of c = (−y_p + y_c cos β)/(1 + cos β) ,  |k| = tan(β/2)   (2)
 
 so the contour at the joint lies in the bisecting plane, and the planes of the contours near it form a pencil through one line, at the
-distance D/tan(β/2) from the axis on the inner side. Rays end there, so contours never cross. Both bones give the joint the same
-contour, because e(φ) is carried over the joint by the smallest rotation; a twist of the child is spread over its length.
+distance D/tan(β/2) from the axis on the inner side. Rays end there, so contours never cross. Both bones have the same contour at the joint,
+because e(φ) is carried over the joint by the smallest rotation; a twist of the child is spread over its length.
 
-Where flesh goes on beyond the last bone (fingers, toes) so do its contours, about a line that bends from the bone's middle to their tips.
+Where flesh continues beyond the last bone (fingers, toes), so do its contours, about a line that bends from the bone's middle to the tips.
 """
 
 from collections.abc import Sequence
@@ -26,25 +26,25 @@ from ..metaballs import VISIBLE
 from ..shape import BodyShape
 from .mesh import SkinSettings
 
-REACH = 1.25  # farthest seen radius / largest l across: the sum of many balls stays below T beyond it
+REACH = 1.25  # farthest visible radius / largest l across: the sum of many balls stays below T beyond it
 CAP_START = 0.85  # the cap's rays start this many limb radii inside the joint
 DEEPEST_CAP = 0.45  # … but no deeper than this fraction of a stout bone
-RADIUS_OF_L = 0.65  # seen radius of a limb of three balls / l
+RADIUS_OF_L = 0.65  # visible radius of a limb of three balls / l
 TILT_NEEDED = 1.3  # reach of the tilted contours, in limb radii times tan(β/2); > 1, or contours would cross
 TILT_LEAST = 0.30  # … and at least this fraction of the bone
-BENT_FROM = 0.5  # from here on along the last bone the contours' middles go over to that of the tips
+BENT_FROM = 0.5  # fraction of the last bone from which on the contours' middles bend towards the tips
 SHARPEST_COS = -0.96  # bends beyond 164° are cut as if 164°
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Rays:
-    """The rays on which V vertices are looked for, in mesh order."""
+    """The rays on which V vertices are found, in mesh order."""
 
     origin: np.ndarray  # (V, 3)
     direction: np.ndarray  # (V, 3) ρ is the distance across the bone
     reach: np.ndarray  # (V,) largest ρ
     bone: np.ndarray  # (V,)
-    station: np.ndarray  # (V,) how far from its bone's head the contour of a vertex meets the bone [m]
+    station: np.ndarray  # (V,) [m] from the bone's head to where the vertex' contour meets the bone
 
     def rows(self, which: np.ndarray) -> "Rays":
         """The rays `which` (N,) alone."""
@@ -53,7 +53,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Segment:
-    """One bone in one posture, as the contours see it."""
+    """One bone in one pose, with what its contours need."""
 
     bone: int
     head: np.ndarray
@@ -62,7 +62,7 @@ class Segment:
     length: float
     radius: float  # of the limb, roughly
     reach: float
-    delta: float  # angle from e1 to the parent's e1 carried over the joint: the twist, as seen by the skin
+    delta: float  # angle from e1 to the parent's e1 carried over the joint: the twist of the skin
     k_head: np.ndarray
     k_tail: np.ndarray
     first: bool
@@ -71,13 +71,13 @@ class Segment:
     aside: np.ndarray  # (3,) from the bone's line to the middle of their tips
 
     def tilt_reach(self, k: np.ndarray) -> float:
-        """D of (1): how far from the joint contours are tilted."""
+        """D of (1): distance from the joint up to which contours are tilted."""
         share = 0.8 if self.first or self.last else 0.5
         return min(share * self.length, TILT_LEAST * self.length + TILT_NEEDED * self.radius * float(np.linalg.norm(k)))
 
 
 def segments_of(shape: BodyShape, chain: Sequence[int], R: np.ndarray, head: np.ndarray) -> list[Segment]:
-    """The bones of `chain`, each beginning where the one before ends, in the posture of frames R (B, 3, 3) and heads (B, 3)."""
+    """The consecutive bones of `chain` in the pose with frames R (B, 3, 3) and heads (B, 3)."""
     balls = shape.metaballs
     reach = float(_reach(shape, chain))
     rest = np.stack([bone.R_rest for bone in shape.skeleton.bones])
@@ -115,7 +115,7 @@ def segments_of(shape: BodyShape, chain: Sequence[int], R: np.ndarray, head: np.
 
 
 def _tips(shape: BodyShape, b: int) -> tuple[float, np.ndarray]:
-    """How far along a bone, over its length, a cap of what ends farthest from its head begins; and (3,) aside, in the bone's axes."""
+    """Where the cap of a bone's last ball begins, as a fraction of the bone's length, and the ball's offset (3,) in the bone's axes."""
     balls, own = shape.metaballs, np.flatnonzero(shape.metaballs.bone_index == b)
     centre, half = balls.centres_m(shape.lengths_m)[own], VISIBLE * balls.radii_m[own]
     tip = int(np.argmax(centre[:, 1] + half[:, 1]))
@@ -124,7 +124,7 @@ def _tips(shape: BodyShape, b: int) -> tuple[float, np.ndarray]:
 
 
 def _reach(shape: BodyShape, chain: Sequence[int]) -> float:
-    """How far from the axis a chain's surface can lie."""
+    """The largest possible distance of a chain's surface from the axis."""
     balls, own = shape.metaballs, np.isin(shape.metaballs.bone_index, chain)
     aside = np.linalg.norm(balls.centres_m(shape.lengths_m)[own][:, [0, 2]], axis=1)
     return float((aside + REACH * balls.radii_m[own][:, [0, 2]].max(axis=1)).max())
@@ -163,7 +163,7 @@ def cast(segments: list[Segment], settings: SkinSettings) -> Rays:
 
 
 def _cap_angles(segment: Segment, settings: SkinSettings) -> np.ndarray:
-    """How far the rays of a cap's contours rise from the contour's plane; a stout bone's cap is wide and gets more of them."""
+    """Angles of the rays of a cap's contours over the contour's plane; a stout bone's cap is wide and has more contours."""
     count = settings.cap_contours * max(1, round(2 * segment.radius / segment.length))
     return np.arange(1, count + 1) * (np.pi / 2 / (count + 1))
 

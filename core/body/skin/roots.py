@@ -1,32 +1,32 @@
-"""Where the rays of a skin meet the implicit surface: a march inwards, then a secant on ln F.
+"""The intersections of a skin's rays with the implicit surface: a march inwards, then a secant on ln F.
 
 A limb of one chain has the field of its bones, F_b = own + parent's + children's balls, and the surface F_b = T. Where two parts
-of a body meet, the sum would bulge and the larger of the two would leave a crease; their fields are blended (`blend`),
+of a body meet, the sum would bulge, and the maximum would leave a crease; their fields are blended (3, 4),
 
     G = max blend(M, M_other) ,   M = Σ_b u_b F_b   over a part's bones                                    (1)
 
-with the bones of the other part next to b in M_other. F_b and the next bone's field differ by the balls beyond both, which at a short neck
-are a tenth of the field: so along a chain u passes from bone to bone about their joint X_j,
+with the bones of the other part adjacent to b in M_other. F_b and the next bone's field differ by the balls beyond both, a tenth of the
+field at a short neck. So along a chain the weight u passes from bone to bone about their joint X_j,
 
     u_1 = 1 − S_1 ,   u_2 = S_1 (1 − S_2) , … ,   S_j = smooth((1 + s/h)/2) ,   s = (X − X_j)·(y_j + y_j+1)/(1 + cos β)          (1b)
 
 with h half of the shorter bone, s = 0 on the plane that halves the bend β and the distance from the joint on both axes,
-or there would be a step around the neck. Both parts are cast to the same G = T, so what overlaps coincides and no seam is seen. A part ends
-inside its neighbour:
+or there would be a step around the neck. Both parts are cast to the same G = T, so overlapping surfaces coincide without a visible seam.
+A part ends inside its neighbour:
 
     first exit of the ray, beyond the outermost F_b = T, from  min( G/T , F_own/(τ T) ) ≥ 1 ,   τ = 0.4    (2)
 
 with F_own the field of its own balls, so its mesh leaves the common surface only where the neighbour's is the body's surface.
 
-Where two parts of a body meet, one surface: balls that both count are counted once, and what is each one's own is blended.
+One surface where two parts of a body meet: balls common to both are counted once, and the balls of either alone are blended.
 
-    C = Σ min(α, β) f ,   A = Σ α f − C ,   B = Σ β f − C                                                    (1)
-    G = C + (A^n + B^n)^(1/n) ,   n = 4                                                                     (2)
+    C = Σ min(α, β) f ,   A = Σ α f − C ,   B = Σ β f − C                                                    (3)
+    G = C + (A^n + B^n)^(1/n) ,   n = 4                                                                     (4)
 
-f are the fields of the balls at a place, α and β how much the two parts count each. The field of a part's bone holds the balls of the bones
-that it meets, as in the fit, so next to a joint both fields are the same sum: a blend of the whole fields (Ricci 1973, Comput. J. 16) made
-chest and pelvis 8 to 13 mm thicker than they were fitted. (2) is Ricci's for what only one of them has: the fitted surface where the
-other is far, 2^(1/n) of the larger where both are equal.
+f are the fields of the balls at a point, α and β their weights in the two parts. The field of a part's bone includes the balls of adjacent
+bones, as in the fit, so near a joint both fields are the same sum: a blend of the whole fields (Ricci 1973, Comput. J. 16) made chest and
+pelvis 8 to 13 mm thicker than fitted. (4) is Ricci's blend of the balls that are not common: the fitted surface where the other part is
+far, 2^(1/n) times the larger where both are equal.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,12 +39,12 @@ from ..shape import BodyShape
 from .parts import Part
 from .rays import SHARPEST_COS, Rays, smooth
 
-BLEND_POWER = 4.0  # n of (2): a fillet of 4 mm on a radius of 60 mm
+BLEND_POWER = 4.0  # n of (4): a fillet of 4 mm on a radius of 60 mm
 NOTHING = 1e-300
 
 
 def blended(terms: np.ndarray, first: np.ndarray, second: np.ndarray, fade: np.ndarray | float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """G (N,) of (2) from fields of balls (N, m) and how much each of two parts counts them (N, m), with B times `fade` (N,).
+    """G (N,) of (4) from fields of balls (N, m) and their weights in either part (N, m), with B times `fade` (N,).
 
     Also the balls' factors (N, m) in G and in its derivatives: G = Σ factor f, dG = Σ factor df.
     """
@@ -53,7 +53,7 @@ def blended(terms: np.ndarray, first: np.ndarray, second: np.ndarray, fade: np.n
 
 
 def joined(terms: np.ndarray, both: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(2) from the factors (N, m) of C, A and B."""
+    """(4) from the factors (N, m) of C, A and B."""
     A, B = np.maximum(_sum(terms, a), NOTHING), np.maximum(_sum(terms, b), NOTHING)
     larger = np.maximum(A, B)
     S = larger * ((A / larger) ** BLEND_POWER + (B / larger) ** BLEND_POWER) ** (1 / BLEND_POWER)
@@ -65,7 +65,7 @@ def _sum(terms: np.ndarray, factors: np.ndarray) -> np.ndarray:
     return np.asarray(np.einsum("nm,nm->n", terms, factors))
 
 
-OWN_SHARE = 0.4  # τ of (2): below ½, or two that reach T together would both stay below it
+OWN_SHARE = 0.4  # τ of (2): below ½, or two parts that reach T together would both stay below it
 PASSING = 0.5  # h of (1b) over the shorter bone
 FADE_FROM = 0.5  # fraction of a junction's last bone from which on other parts fade
 STEP = 0.05  # march, in units of the reach
@@ -88,7 +88,7 @@ def limb_root(shape: BodyShape, R: np.ndarray, head: np.ndarray, rays: Rays) -> 
 
 
 def limb_normals(shape: BodyShape, R: np.ndarray, head: np.ndarray, rays: Rays, vertices_m: np.ndarray) -> np.ndarray:
-    """Outward unit normals (V, 3) of the field that `limb_root` looked at, −∇F/|∇F|."""
+    """Outward unit normals (V, 3) of the field of `limb_root`, −∇F/|∇F|."""
     active = np.stack([active_balls(shape.metaballs, shape.skeleton.neighbours, b) for b in range(len(shape.skeleton.bones))])[rays.bone]
     return _unit(-field_and_derivatives(shape.metaballs, shape.lengths_m, R, head, vertices_m, active)[1])
 
@@ -135,7 +135,7 @@ def _secant(f: LogField, a: np.ndarray, b: np.ndarray, fa: np.ndarray, fb: np.nd
 
 
 def _connected_root(near: "_JoinedField", reach: np.ndarray) -> np.ndarray:
-    """ρ (N,) of (2): beyond the own surface as far as the joint one goes without a gap, or an arm beside the flank would be webbed."""
+    """ρ (N,) of (2): beyond the own surface up to the first gap in the joint one, or an arm close to the flank would be webbed."""
     if not near.others:
         return outermost_root(near.log_ratio, reach)
     inner = outermost_root(near.log_own, reach)
@@ -150,9 +150,9 @@ def _connected_root(near: "_JoinedField", reach: np.ndarray) -> np.ndarray:
     low = np.where(outer > inner, np.maximum(outer - step, inner), inner)
     f_low, f_outer = near.log_ratio(low, every), near.log_ratio(outer, every)
     rho = np.where(f_outer >= 0, outer, _secant(near.log_ratio, low, outer, f_low, f_outer))
-    dives = np.flatnonzero(begins < 0)  # the neighbour's flesh alone is there: the part ends deeper inside
-    if len(dives):
-        rho[dives] = outermost_root(lambda r, which: near.log_ratio(r, dives[which]), inner[dives])
+    covered = np.flatnonzero(begins < 0)  # only the neighbour's flesh: the part ends deeper inside
+    if len(covered):
+        rho[covered] = outermost_root(lambda r, which: near.log_ratio(r, covered[which]), inner[covered])
     return rho
 
 
@@ -162,7 +162,7 @@ class _JoinedField:
 
     origin: np.ndarray  # (N, 3)
     direction: np.ndarray  # (N, 3)
-    fade: np.ndarray  # (N,) how much other parts count
+    fade: np.ndarray  # (N,) weight of other parts
     weight: np.ndarray  # (m,) of the balls in use
     frame: np.ndarray  # (m, 3, 3) columns: a ball's axes in the world over its l
     shift: np.ndarray  # (m, 3) its centre in them
@@ -207,14 +207,14 @@ class _JoinedField:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Chain:
-    """K bones, each beginning where the one before ends, and where one's field passes to the next's: (1b)."""
+    """K consecutive bones, and the transition of the field from each to the next: (1b)."""
 
     across: np.ndarray  # (K − 1, 3) 1/m
     joints: np.ndarray  # (K − 1,) s/h = X·across − joints
 
     @staticmethod
     def of(bones: Sequence[int], lengths_m: np.ndarray, R: np.ndarray, head: np.ndarray) -> "Chain":
-        """The chain of some bones of a part in a posture."""
+        """The chain of some bones of a part in a pose."""
         chain = list(bones)
         y, h = R[chain, :, 1], PASSING * np.minimum(lengths_m[chain][:-1], lengths_m[chain][1:])
         bend = 1 + np.maximum(np.einsum("ki,ki->k", y[:-1], y[1:]), SHARPEST_COS)
@@ -277,7 +277,7 @@ def _adjacent(parts: tuple[Part, ...], index: int, bone: int) -> list[tuple[int,
 
 
 def _near(part: Part, attachment: int | None, bone: int) -> bool:
-    """Whether `bone` is the bone of its part that another part hangs on, or next to it."""
+    """Whether `bone` is the bone of its part to which another part is attached, or adjacent to it."""
     return attachment in part.bones and abs(part.bones.index(bone) - part.bones.index(attachment)) <= 1
 
 

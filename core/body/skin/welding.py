@@ -1,14 +1,14 @@
-"""One net of quads out of the closed parts of a skin: limbs are sewn into the trunk, ring to ring.
+"""One net of quads from the closed parts of a skin: limbs are sewn into the trunk, ring to ring.
 
-    an arm   a block of a × b quads of the trunk is taken out, with 2 (a + b) = N the points of a limb's ring; its border becomes the
-             arm's first ring, and rings between it and the first ring that is the arm's alone bridge the gap            (1)
+    an arm   a block of a × b quads of the trunk is removed, with 2 (a + b) = N the points of a limb's ring; its border becomes the arm's
+             first ring, and rings between it and the first ring outside the trunk bridge the gap                        (1)
     legs     two limbs at the trunk's first bone: the trunk ends in a ring of N; a line of N/2 − 1 points under the crotch
              halves it, so that each leg's first ring is half of that ring and the line                                  (2)
 
-That is how modellers join limbs: quads alone, and of other than four neighbours only the corners of the blocks, the ends of the crotch's
-line and the poles. Which vertices are whose is told by the parts' fields in the posture of the parts' skin.
+Modellers join limbs like this: only quads, and only the corners of the blocks, the ends of the crotch's line and the poles have other than
+four neighbours. The parts' fields in the pose of the parts' skin decide to which part a vertex belongs.
 
-Quads of nets of rings, their texture coordinates, and quads cut finer.
+Quads of nets of rings, their texture coordinates, and their subdivision.
 """
 
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ from .mesh import Skin
 from .parts import Part
 from .whole_surface import WholeSurface
 
-ALONE = 0.5  # a ring is the limb's alone where the field of the others is below this share of the limb's
+OUTSIDE = 0.5  # a ring is outside the parent part where the parent's field is below this fraction of the limb's
 LEAST_SIDE = 2  # quads along a side of a block
-SETTLING_STEPS = 20  # of 5 mm at most
+PROJECTION_STEPS = 20  # Newton's, of 5 mm at most
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Net:
-    """The rings of one part, by numbers of vertices of the whole: the first `shared` rings came from sewing."""
+    """The rings of one part, by indices of the vertices of the whole net."""
 
     rings: np.ndarray  # (C, N)
-    poles: tuple[int | None, int | None]  # before the first ring and beyond the last; None: open
+    poles: tuple[int | None, int | None]  # before the first ring and after the last; None: open
     kept: np.ndarray  # (C − 1, N) bool: whether the quad from ring i to i + 1 and from column j to j + 1 exists
 
 
@@ -40,32 +40,32 @@ class Welded:
     vertices_m: np.ndarray  # (V, 3)
     weights: np.ndarray  # (V, B)
     nets: tuple[Net, ...]  # one a part
-    part: np.ndarray  # (V,) whose place a vertex is; those of a limb's first ring are the trunk's
-    sewn: np.ndarray  # (V,) bool: vertices that were made, and those of the rings that they join
+    part: np.ndarray  # (V,) the part to which a vertex belongs; those of a limb's first ring belong to the trunk
+    sewn: np.ndarray  # (V,) bool: new vertices, and those of the rings that they join
 
 
 class _Sewing:
-    """The growing lists of vertices; parts' own vertices keep their numbers."""
+    """The growing lists of vertices; the parts' own vertices keep their indices."""
 
     def __init__(self, skin: Skin) -> None:
         self.places, self.weights = [skin.vertices_m], [skin.weights]
         self.count = len(skin.vertices_m)
 
     def added(self, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """The numbers of new vertices (n, 3) with shares (n, B)."""
+        """The indices of new vertices (n, 3) with weights (n, B)."""
         self.places.append(places)
         self.weights.append(weights)
         self.count += len(places)
         return np.arange(self.count - len(places), self.count)
 
-    def settle(self, surface: WholeSurface, numbers: np.ndarray, part: int) -> None:
-        """Take vertices that were added onto the surface, as places of a part."""
+    def project(self, surface: WholeSurface, numbers: np.ndarray, part: int) -> None:
+        """Move new vertices onto the surface, as points of a part."""
         places = np.concatenate(self.places)
-        places[numbers] = surface.reached(places[numbers], np.full(len(numbers), part), SETTLING_STEPS)
+        places[numbers] = surface.projected(places[numbers], np.full(len(numbers), part), PROJECTION_STEPS)
         self.places = [places]
 
     def at(self, numbers: np.ndarray) -> np.ndarray:
-        """Places (…, 3)."""
+        """Positions (…, 3)."""
         return np.asarray(np.concatenate(self.places)[numbers])
 
     def shares(self, numbers: np.ndarray) -> np.ndarray:
@@ -76,23 +76,23 @@ class _Sewing:
 def welded(skin: Skin, parts: tuple[Part, ...], surface: WholeSurface) -> Welded:
     """The parts of `skin` (`body_skin`, detail 1) sewn together; new vertices are on the surface, but unevenly spaced."""
     sewing, nets = _Sewing(skin), _own_nets(skin)
-    of_others = surface.of_others(skin.vertices_m).T
+    parent_ratio = surface.parent_ratio(skin.vertices_m).T
     joined: list[np.ndarray] = []
     for trunk, part in enumerate(parts):
         limbs = [i for i, other in enumerate(parts) if other.parent == trunk]
         forked = [i for i in limbs if parts[i].attachment == part.bones[0]]
         loops: dict[int, np.ndarray] = {}
         if len(forked) == 2:
-            inside = of_others[forked].min(axis=0)[nets[trunk].rings] < 1
+            inside = parent_ratio[forked].min(axis=0)[nets[trunk].rings] < 1
             nets[trunk], halves, line = _forked(sewing, nets[trunk], nets[forked[0]], inside)
-            sewing.settle(surface, line, trunk)
+            sewing.project(surface, line, trunk)
             loops |= dict(zip(forked, halves))
         for i in limbs:
             if i not in loops:
-                nets[trunk], loops[i] = _block_out(sewing, nets[trunk], nets[i], of_others[i, nets[trunk].rings] < 1)
+                nets[trunk], loops[i] = _block_out(sewing, nets[trunk], nets[i], parent_ratio[i, nets[trunk].rings] < 1)
         for i, loop in loops.items():
-            nets[i], ring = _sewn_on(sewing, nets[i], loop, of_others[i])
-            sewing.settle(surface, ring[len(loop) : -len(loop)], i)
+            nets[i], ring = _sewn_on(sewing, nets[i], loop, parent_ratio[i])
+            sewing.project(surface, ring[len(loop) : -len(loop)], i)
             joined.append(ring)
     return _compact(sewing, parts, nets, np.concatenate([np.zeros(0, dtype=np.int64), *joined]), len(skin.vertices_m))
 
@@ -106,19 +106,19 @@ def _own_nets(skin: Skin) -> list[Net]:
     return nets
 
 
-def _first_alone(net: Net, of_others: np.ndarray) -> int:
-    """The first ring from which on all are the limb's alone; at least one ring is left beyond it."""
-    mixed = (of_others[net.rings] > ALONE).any(axis=1)
+def _first_outside(net: Net, parent_ratio: np.ndarray) -> int:
+    """The first ring from which on all are outside the parent part; at least one ring is left after it."""
+    mixed = (parent_ratio[net.rings] > OUTSIDE).any(axis=1)
     return min(int(np.flatnonzero(mixed)[-1]) + 1 if mixed.any() else 0, len(net.rings) - 2)
 
 
 def _column(sewing: _Sewing, ring: np.ndarray, place: np.ndarray) -> float:
-    """In which column (a fraction) of a ring a place beside it lies."""
+    """The column (fractional) of a ring in whose direction a point lies."""
     points = sewing.at(ring)
     centre = points.mean(axis=0)
     axis = np.cross(points - centre, np.roll(points, -1, axis=0) - centre).sum(axis=0)  # whatever its points' own tilt
-    seen = np.stack([points[0], points[len(ring) // 4], place]) - centre
-    first, quarter, towards = seen - np.outer(seen @ axis / (axis @ axis), axis)
+    spokes = np.stack([points[0], points[len(ring) // 4], place]) - centre
+    first, quarter, towards = spokes - np.outer(spokes @ axis / (axis @ axis), axis)
     a, b = np.linalg.lstsq(np.stack([first, quarter], axis=1), towards, rcond=None)[0]
     angle = np.arctan2(b, a)
     return float(angle / (2 * np.pi) * len(ring))
@@ -127,7 +127,7 @@ def _column(sewing: _Sewing, ring: np.ndarray, place: np.ndarray) -> float:
 def _forked(sewing: _Sewing, net: Net, limb: Net, inside: np.ndarray) -> tuple[Net, list[np.ndarray], np.ndarray]:
     """(2): the trunk above its fork, the first ring of both limbs, `limb` first, and the crotch's line.
 
-    `inside` (C, N): trunk's points in one of them.
+    `inside` (C, N): the trunk's points inside one of the limbs.
     """
     rays = net.rings.shape[1]
     mixed = inside.any(axis=1) & (np.arange(len(net.rings)) < len(net.rings) // 2)
@@ -142,7 +142,7 @@ def _forked(sewing: _Sewing, net: Net, limb: Net, inside: np.ndarray) -> tuple[N
 
 
 def _crotch(sewing: _Sewing, net: Net, level: int, ends: tuple[int, int]) -> np.ndarray:
-    """N/2 − 1 new vertices on the trunk's surface from column to column over the pole, evenly."""
+    """N/2 − 1 new vertices on the trunk's surface from column to column over the pole, evenly spaced."""
     down, up = net.rings[level::-1, ends[0]], net.rings[: level + 1, ends[1]]
     path = np.concatenate([down, [net.poles[0]], up]).astype(np.int64)
     places = sewing.at(path)
@@ -157,7 +157,7 @@ def _crotch(sewing: _Sewing, net: Net, level: int, ends: tuple[int, int]) -> np.
 
 
 def _block_out(sewing: _Sewing, net: Net, limb: Net, inside: np.ndarray) -> tuple[Net, np.ndarray]:
-    """(1): the trunk without a block where the limb grows out, and the block's border. `inside` (C, N): trunk's points in the limb."""
+    """(1): the trunk without the block where the limb leaves it, and the block's border. `inside` (C, N): trunk's points in the limb."""
     n_rings, rays = net.rings.shape
     rows = np.flatnonzero(inside.any(axis=1))
     outward = sewing.at(limb.rings[len(limb.rings) // 2]).mean(axis=0)
@@ -180,10 +180,10 @@ def _block_out(sewing: _Sewing, net: Net, limb: Net, inside: np.ndarray) -> tupl
     return Net(rings=net.rings, poles=net.poles, kept=kept), np.concatenate(border)
 
 
-def _sewn_on(sewing: _Sewing, net: Net, loop: np.ndarray, of_others: np.ndarray) -> tuple[Net, np.ndarray]:
-    """The limb from its new first ring `loop` on, and the vertices of the rings that were joined and made."""
+def _sewn_on(sewing: _Sewing, net: Net, loop: np.ndarray, parent_ratio: np.ndarray) -> tuple[Net, np.ndarray]:
+    """The limb from its new first ring `loop` on, and the vertices of the joined and the new rings."""
     rays = len(loop)
-    first = _first_alone(net, of_others)
+    first = _first_outside(net, parent_ratio)
     ring = sewing.at(net.rings[first])
     shift = int(np.argmin([((sewing.at(np.roll(loop, s)) - ring) ** 2).sum() for s in range(rays)]))
     loop = np.roll(loop, shift)
@@ -199,7 +199,7 @@ def _sewn_on(sewing: _Sewing, net: Net, loop: np.ndarray, of_others: np.ndarray)
 
 
 def _compact(sewing: _Sewing, parts: tuple[Part, ...], nets: list[Net], sewn: np.ndarray, before: int) -> Welded:
-    """Vertices that no quad uses any more are left out, and the rest numbered anew."""
+    """The nets without the vertices that no quad uses any more."""
     used = np.zeros(sewing.count, dtype=bool)
     for net in nets:
         i, j = np.nonzero(net.kept)
@@ -236,7 +236,7 @@ def _of(number: np.ndarray, pole: int | None) -> int | None:
     return None if pole is None else int(number[pole])
 
 
-MARGIN = 0.01  # between the islands and around them
+MARGIN = 0.01  # between the islands and around them, in texture coordinates
 
 
 def net_faces(net: Net) -> np.ndarray:
@@ -253,7 +253,7 @@ def _fan(ring: np.ndarray, pole: int | None) -> np.ndarray:
 
 
 def face_uv(whole: Welded) -> np.ndarray:
-    """Texture coordinates (F, 4, 2) in the order of the nets' faces: an island a part, side by side, all to one scale.
+    """Texture coordinates (F, 4, 2) in the order of the nets' faces: one island per part, side by side, all at one scale.
 
     u runs around the bones, v along them; an island is as wide as its part's mean girth and as high as the part is long.
     """

@@ -1,14 +1,14 @@
-"""The fitted surface of a whole body as a field of places, near the seams of its parts: what skin_roots finds along rays.
+"""The fitted surface of a whole body as a field of points, near the seams of its parts: the surface that roots finds along rays.
 
     G = M_trunk + (Σ E_limb^m)^(1/m) = T ,   E_limb = blend(M_trunk, M_limb) − M_trunk ,   m = 12          (1)
 
-M_part = Σ_b u_b F_b over the part's bones b. F_b is the sum of the balls of bone b and of the bones that it meets, as in the fit; u_b is 1
-at the bone's middle and passes to the next bone's about the joint (1b in skin_roots); what a limb adds to the trunk is by `blend`. A place
-on the trunk sees all its limbs, a place on a limb the trunk alone, or two thighs that touch would be one; and far out, from the middle of
-the last bone that may meet the trunk to its end, it sees the trunk less and less. M_trunk is at most 1/τ times what its own balls give
-(τ = 0.4, skin_roots; bent, not cut off, at that), and what it then lacks is the limb's: two thighs that nearly touch are no trunk.
+M_part = Σ_b u_b F_b over the part's bones b. F_b is the sum of the balls of bone b and of the adjacent bones, as in the fit; u_b is 1 at
+the bone's middle and passes to the next bone's about the joint (1b in roots); a limb is added by `roots.blended`. At a point of
+the trunk all its limbs count, at a point of a limb the trunk alone, or two thighs that touch would fuse; from the middle of the limb's
+last junction bone to its end the trunk's weight fades to zero. M_trunk is limited to 1/τ times the field of its own balls (τ = 0.4,
+roots; smoothly), and the remainder belongs to the limb: two thighs that nearly touch are no trunk.
 
-The implicit surface of a whole body on a grid: what a mesh of it, or any other check, is made from.
+The field of a whole body on a grid, from which the implicit surface can be meshed or checked.
 """
 
 from collections.abc import Sequence
@@ -27,15 +27,16 @@ from .rays import smooth
 from .roots import OWN_SHARE, Chain, joined
 
 TOGETHER = 12.0  # m of (1)
-BENDING = 8.0  # how suddenly the trunk gives way where it has too little of its own
+BENDING = 8.0  # exponent of the smooth limit of M_trunk
 NEWTON_STEPS = 4
-LONGEST_STEP_M = 0.005
-CHUNK = 4000
-NOTHING = 1e-20
+LONGEST_STEP_M = 0.005  # of Newton's
+CHUNK = 4000  # points at a time, for memory
+NOTHING = 1e-20  # a field that is zero
+FADE_FROM = 0.5  # fraction of a limb's last junction bone from which on the trunk fades
 
 
 class WholeSurface:
-    """The surface (1) of a body in one posture. `part`: (N,) the part that each of the points (N, 3) is a place of."""
+    """The surface (1) of a body in one pose. `part`: (N,) the part to which each of the points (N, 3) belongs."""
 
     def __init__(self, shape: BodyShape, motion: np.ndarray) -> None:
         self._shape, self._parts = shape, body_parts(shape)
@@ -44,11 +45,11 @@ class WholeSurface:
         self._own = np.stack([np.isin(balls.bone_index, part.bones) for part in self._parts], axis=1).astype(np.float64)
         self._of_bone = {b: active_balls(balls, neighbours, b).astype(np.float64) for part in self._parts for b in part.bones}
 
-    def of_others(self, points: np.ndarray) -> np.ndarray:
-        """At points (N, 3), for each part (N, P): the field there of what it grows out of, without its own balls, over that of its own."""
-        return np.concatenate([self._of_others(points[i : i + CHUNK]) for i in range(0, len(points), CHUNK)])
+    def parent_ratio(self, points: np.ndarray) -> np.ndarray:
+        """At points (N, 3), for each part (N, P): the field of its parent part, without the part's own balls, over the field of its own."""
+        return np.concatenate([self._parent_ratio(points[i : i + CHUNK]) for i in range(0, len(points), CHUNK)])
 
-    def _of_others(self, points: np.ndarray) -> np.ndarray:
+    def _parent_ratio(self, points: np.ndarray) -> np.ndarray:
         terms = self._terms(points)[1]
         found = np.zeros((len(points), len(self._parts)))
         for p, part in enumerate(self._parts):
@@ -60,8 +61,8 @@ class WholeSurface:
                 found[:, p] = without / np.maximum(terms @ self._own[:, p], NOTHING)
         return found
 
-    def reached(self, points: np.ndarray, part: np.ndarray, steps: int = NEWTON_STEPS) -> np.ndarray:
-        """Points near the surface, moved onto it."""
+    def projected(self, points: np.ndarray, part: np.ndarray, steps: int = NEWTON_STEPS) -> np.ndarray:
+        """Points near the surface, moved onto it by Newton's method."""
         found = np.array(points, dtype=np.float64)
         for first in range(0, len(found), CHUNK):
             rows = slice(first, first + CHUNK)
@@ -73,7 +74,7 @@ class WholeSurface:
         return found
 
     def distance_m(self, points: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """How far (N,) points near the surface are off it, outwards positive, to first order."""
+        """Distance (N,) of points near the surface from it, outwards positive, to first order."""
         G, gradient = self._joined(points, part)
         return np.asarray((THRESHOLD - G) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12))
 
@@ -91,31 +92,31 @@ class WholeSurface:
         return q, self._shape.metaballs.weight * np.exp(-2 * d)
 
     def _joined(self, points: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """G (N,) and ∇G (N, 3), the slopes of the weights left out.  (1)"""
+        """G (N,) and ∇G (N, 3), without the gradients of the weights u.  (1)"""
         q, terms = self._terms(points)
         G, of_ball = np.empty(len(points)), np.empty(terms.shape)
         for p in np.unique(part):
             rows = np.flatnonzero(part == p)
-            G[rows], factors = self._seen_from(int(p), points[rows], terms[rows])
+            G[rows], factors = self._field_of_part(int(p), points[rows], terms[rows])
             of_ball[rows] = terms[rows] * factors
         balls = self._shape.metaballs
         return G, -4 * np.einsum("nm,nmi,mji->nj", of_ball, q / balls.radii_m, self._R[balls.bone_index], optimize=True)
 
-    def _seen_from(self, p: int, points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """G (N,) at places of part p, and the balls' factors in it and in its gradient (N, m).  (1)"""
+    def _field_of_part(self, p: int, points: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """G (N,) at points of part p, and the balls' factors in it and in its gradient (N, m).  (1)"""
         parts, parent = self._parts, self._parts[p].parent
         trunk = p if parent is None or any(other.parent == p for other in parts) else parent
         limbs = [part.bones if i == p else part.junction for i, part in enumerate(parts) if part.parent == trunk and p in (i, trunk)]
         if trunk == p and parent is not None:
             limbs.append(parts[parent].bones)
-        G, factors = self._together(trunk, limbs, points, terms)
+        G, factors = self._with_limbs(trunk, limbs, points, terms)
         if trunk == p:
             return G, factors
         own_factors, fade = self._factors(parts[p].bones, points), self._fade(p, points)
         own = np.einsum("nm,nm->n", terms, own_factors)
         return own + fade * (G - own), own_factors + fade[:, None] * (factors - own_factors)
 
-    def _together(
+    def _with_limbs(
         self, trunk: int, limbs: Sequence[tuple[int, ...]], points: np.ndarray, terms: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """(1) for a trunk and the bones of its limbs."""
@@ -139,7 +140,7 @@ class WholeSurface:
         return G + E, factors + np.einsum("ln,lnm->nm", (excess / np.maximum(E, NOTHING)) ** (TOGETHER - 1), of_excess)
 
     def _bounded(self, trunk: int, terms: np.ndarray, counted: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By what share (N,) of M (N,) it is within 1/τ of what the trunk's own balls give, and its derivatives to them (N, m)."""
+        """The factor (N,) that limits M (N,) to 1/τ times the field of the trunk's own balls, and its derivatives to them (N, m)."""
         if self._parts[trunk].parent is not None:
             return np.ones(len(M)), np.zeros(terms.shape)
         own_balls = self._own[:, trunk]
@@ -149,7 +150,7 @@ class WholeSurface:
         return s, (s * lack / (1 + lack))[:, None] * (own_balls / own[:, None] - counted / M[:, None])
 
     def _factors(self, bones: Sequence[int], points: np.ndarray) -> np.ndarray:
-        """How much each ball counts (N, M) in the field of bones of one part."""
+        """The weight of each ball (N, M) in the field of bones of one part."""
         balls = np.stack([self._of_bone[b] for b in bones])
         return Chain.of(bones, self._shape.lengths_m, self._R, self._head).shares(points) @ balls
 
@@ -160,7 +161,7 @@ class WholeSurface:
         part = self._parts[p]
         if part.parent is None or part.junction[-1] == part.bones[-1]:
             return np.ones(len(points))
-        return np.asarray(1 - smooth((self._station(part.junction[-1], points) - 0.5) / 0.5))
+        return np.asarray(1 - smooth((self._station(part.junction[-1], points) - FADE_FROM) / (1 - FADE_FROM)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -179,10 +180,10 @@ class FieldGrid:
 def field_grid(
     shape: BodyShape, motion: np.ndarray, spacing_m: float = 0.005, monitor: Monitor | None = None, potential: Potential = EXPONENTIAL
 ) -> FieldGrid:
-    """The field of a body in one posture, `motion` (D,) rad and metres, around everything that it reaches.
+    """The field of a body in one pose, `motion` (D,) rad and metres, over its whole extent.
 
-    The balls of a part (`skin_parts`: an arm, a leg, the trunk) add, and of the parts' fields the largest counts: the surface is the
-    union of the parts', as the metaball skin in Blender is. A whole body at 5 mm: 16 million points, 1.5 s.
+    The balls of a part (`parts`: an arm, a leg, the trunk) are summed, and the field is the maximum of the parts': the surface is the
+    union of theirs, as the metaball skin in Blender. A whole body at 5 mm: 16 million points, 1.5 s.
 
     Raises:
         Cancelled: the monitor was cancelled.
@@ -206,8 +207,8 @@ def field_grid(
             axes = [low[i] + spacing_m * np.arange(first[i], last[i]) - centre[m, i] for i in range(3)]
             # q = Rᵀ (x − c) / l is a sum of one term for each axis of the grid.
             q = [turn[m, i] / balls.radii_m[m] * axes[i][:, None] for i in range(3)]
-            there = q[0][:, None, None] + q[1][None, :, None] + q[2][None, None, :]
+            grid_q = q[0][:, None, None] + q[1][None, :, None] + q[2][None, None, :]
             box = tuple(slice(a, b) for a, b in zip(first, last))
-            field[box] += (balls.weight[m] * potential.value(np.einsum("ijkc,ijkc->ijk", there, there))).astype(np.float32)
+            field[box] += (balls.weight[m] * potential.value(np.einsum("ijkc,ijkc->ijk", grid_q, grid_q))).astype(np.float32)
         np.maximum(values, field, out=values)
     return FieldGrid(values=values, origin_m=low, spacing_m=spacing_m)

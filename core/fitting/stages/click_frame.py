@@ -114,7 +114,7 @@ def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
     skeleton = fit.model.skeleton
     spread = np.full(len(motion), AROUND_RAD)
     spread[skeleton.layout.group("base")] = AROUND_M
-    spread[skeleton.held] = 0.0
+    spread[skeleton.locked] = 0.0
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
     moved = motion + spread * (2 * qmc.Halton(len(motion), scramble=False).random(OTHERS_AROUND + 1)[1:] - 1)  # its first is a corner
     within = np.where(spread > 0, np.clip(moved, np.minimum(low, motion), np.maximum(high, motion)), motion)

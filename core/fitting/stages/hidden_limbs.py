@@ -123,7 +123,7 @@ def _postures(fit: Conditions, motion: np.ndarray, limb: np.ndarray, count: int,
     skeleton, free = fit.model.skeleton, free_bones(fit.parameters)
     above = int(skeleton.parents[limb[0]])
     twist = (skeleton.dof_bone == above) & free[above] & np.array([dof.axis == "y" for dof in skeleton.dofs])
-    columns = np.flatnonzero((np.isin(skeleton.dof_bone, limb) | twist) & ~np.isin(np.arange(len(motion)), skeleton.held))
+    columns = np.flatnonzero((np.isin(skeleton.dof_bone, limb) | twist) & ~np.isin(np.arange(len(motion)), skeleton.locked))
     low, high = (np.array([skeleton.dofs[c].limits[i] for c in columns]) for i in (0, 1))
     low, high = np.maximum(low, motion[columns] - spread), np.minimum(high, motion[columns] + spread)
     tried = np.tile(motion, (count, 1))

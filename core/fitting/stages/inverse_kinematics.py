@@ -38,7 +38,7 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
         observe=lambda t, state: [*clicks.observations, *priors],
         of_shape=[lengths],
         free_shape=parameters.layout.group("lengths"),
-        held=parameters.skeleton.held,
+        held=parameters.skeleton.locked,
     )
     return solve(problem, start[None], vector, steps=STEPS)
 

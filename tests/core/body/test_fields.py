@@ -43,7 +43,7 @@ def test_a_field_is_1_inside_falls_and_ends_at_its_radius_of_influence(name: str
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seen", [False, True])
 def test_slopes_equal_differences(name: str, seen: bool) -> None:
-    p, h = POTENTIALS[name].as_seen() if seen else POTENTIALS[name], 1e-7
+    p, h = POTENTIALS[name].of_visible_size() if seen else POTENTIALS[name], 1e-7
     d = np.random.default_rng(0).uniform(0.001, 1.9, 400)
     d = d[(np.abs(d / p.stretch**2 - 1) > 1e-5) & (np.abs(d / p.stretch**2 - 1 / 9) > 1e-5)]  # Shen's slope jumps at its end
     assert np.abs((p.value(d + h) - p.value(d - h)) / (2 * h) - p.slope(d)).max() < 1e-6

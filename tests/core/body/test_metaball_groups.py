@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.body.metaball_groups import families
+from tricap.core.body.metaball_groups import metaball_groups
 from tricap.core.body.metaballs import THRESHOLD, Metaballs, field
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
@@ -23,10 +23,10 @@ def shape() -> BodyShape:
 
 @pytest.fixture(scope="module")
 def found(shape: BodyShape) -> list[Metaballs]:
-    return families(shape)
+    return metaball_groups(shape)
 
 
-def test_the_largest_family_has_the_skins_surface(shape: BodyShape, found: list[Metaballs]) -> None:
+def test_the_largest_group_has_the_skins_surface(shape: BodyShape, found: list[Metaballs]) -> None:
     """In a step, which the weights have not seen: 0.32 mm RMS, 0.24 about the hips, 0.66 about the shoulders; they were 1.4."""
     motion = np.zeros(len(shape.skeleton.dof_names))
     for name, degrees in {"shoulder.R flexion": 40, "shoulder.L flexion": -30, "hip.R flexion": 30, "hip.L flexion": -15}.items():
@@ -61,7 +61,7 @@ def test_arms_beside_the_flank_do_not_melt_into_it(shape: BodyShape, found: list
         assert len(low & {"thigh.R", "thigh.L"}) <= 1
 
 
-def test_a_limb_alone_is_one_family() -> None:
+def test_a_limb_alone_is_one_group() -> None:
     shape = default_shape(read_model("arm.R"))
-    (only,) = families(shape)
+    (only,) = metaball_groups(shape)
     assert np.array_equal(only.bone_index, shape.metaballs.bone_index) and np.array_equal(only.weight, shape.metaballs.weight)

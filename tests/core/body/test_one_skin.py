@@ -10,7 +10,7 @@ import pytest
 from tricap.core.body import model_file
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
-from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, one_skin, seam_jumps, turned_over
+from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, flipped, one_skin, seam_jumps
 from tricap.core.body.skin.contour_skin import MOST_BONES, body_skin, hinge, strongest
 from tricap.core.body.skin.extremities import person_shape
 from tricap.core.body.skin.mesh import SkinSettings
@@ -118,7 +118,7 @@ def test_hands_are_as_near_to_the_surface_as_the_rest() -> None:
     """Contours go on to the fingers' tips; when those were left to the end's cap, hands were 0.8 mm off, and 20 quads turned over there."""
     shape = person_shape(default_shape(read_model("upper_body")))
     skin = one_skin(shape, SkinSettings(), DETAIL)
-    assert rms_of_quads(shape, skin) < 0.2e-3 and not turned_over(skin.vertices_m, skin.faces).any()  # measured 0.164 mm; it was 0.244
+    assert rms_of_quads(shape, skin) < 0.2e-3 and not flipped(skin.vertices_m, skin.faces).any()  # measured 0.164 mm; it was 0.244
     hands = np.isin(skin.weights.argmax(axis=1), [i for i, name in enumerate(skin.bone_names) if name.startswith("hand")])
     assert rms_of_quads(shape, skin, hands) < 0.4e-3
 
@@ -142,11 +142,11 @@ def test_quads_that_are_turned_over_are_mended() -> None:
     """Thighs a third thicker cross each other where the legs begin; a quad whose point is drawn over its opposite side is told."""
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]])
     faces = np.array([[0, 1, 2, 3], [1, 4, 5, 2]])
-    assert not turned_over(square, faces).any()
+    assert not flipped(square, faces).any()
     square[4] = 0.5, 0.6, 0.0
-    assert turned_over(square, faces)[1]
+    assert flipped(square, faces)[1]
     skin = one_skin(with_thighs(1.3), SkinSettings())
-    assert not turned_over(skin.vertices_m, skin.faces).any()
+    assert not flipped(skin.vertices_m, skin.faces).any()
 
 
 def rms_of_quads(shape: BodyShape, skin: OneSkin, of: np.ndarray | None = None) -> float:

@@ -106,5 +106,5 @@ def test_calves_lie_behind_and_outside_of_their_bones() -> None:
 def test_a_model_whose_balls_lie_aside_of_nothing_is_refused(tmp_path: Path) -> None:
     text = model_files("leg.R")[0].read_text()
     (tmp_path / "mine.toml").write_text(text.replace("[-0.015, 0.022]]", "]"))
-    with pytest.raises(InputError, match="lacks something or holds a wrong value"):
+    with pytest.raises(InputError, match="lacks an entry or has a wrong value"):
         read_model(tmp_path / "mine.toml")
