@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ..core.foundation import settings as knobs
-from ..core.run import pipeline
+from ..core.run import take_run
 from . import take_properties
 from .session import get_session
 
@@ -81,7 +81,7 @@ def check_settings(tables: Mapping[str, Mapping[str, Any]], where: str) -> None:
     Raises:
         InputError: an unknown name, or a value that cannot be.
     """
-    pipeline.settings_of(tables, {}, where)
+    take_run.settings_of(tables, {}, where)
 
 
 def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]]) -> None:
@@ -98,7 +98,7 @@ def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]
 
 def stages() -> Mapping[str, type]:
     """Settings class of every stage, by the name it has in take.toml."""
-    return pipeline.SETTINGS
+    return take_run.SETTINGS
 
 
 def exact(value: Any, default: Any = 0.0) -> Any:

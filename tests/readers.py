@@ -32,8 +32,8 @@ from tricap.core.results.folder import Results
 from tricap.core.run import record as frame_table
 from tricap.core.run.inspection import patch_boxes, read_removed, read_tracks
 from tricap.core.run.inspection import read_points as read_shown
-from tricap.core.run.pipeline import Run
 from tricap.core.run.stages import valid_stages
+from tricap.core.run.take_run import Run
 from tricap.core.synthetic.arm import arm_rig
 from tricap.core.take.bar_file import read_bar, write_bar
 from tricap.core.take.take import read_take

@@ -25,7 +25,7 @@ CLOUD_HALF, CLOUD_99, TRACKS_99, BODY = 0.001, 0.02, 0.02, 0.02
 SHAPE, SKIN_M = 0.02, 1e-4  # sigmas of a length or radius, and the skin
 ONE_ALONE = 0.01  # of the points of a frame, that only one run has: those at a limit
 DRIVER = "import pathlib, sys, killing as k; *a, d = map(pathlib.Path, sys.argv[2:]); k.prepare_profile(d); k.DRIVERS[sys.argv[1]](*a, id)"
-COMMAND = "import sys; from tricap.core import commands; sys.exit(commands.main(sys.argv[1:]))"
+COMMAND = "import sys; from tricap.core.cli import main as commands; sys.exit(commands.main(sys.argv[1:]))"
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def take(killing: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(take: Path, out: Path, python: str = sys.executable, threads: int = 1) -> Path:
     """A run in a process of its own with so many threads: ours, OpenCV's and, if the command left it at that, the linear algebra's."""
-    code = f"import cv2; from tricap.core import threads; threads.THREADS = {threads}; cv2.setNumThreads({threads}); {COMMAND}"
+    code = f"import cv2; from tricap.core.foundation import threads; threads.THREADS = {threads}; cv2.setNumThreads({threads}); {COMMAND}"
     some = {name: str(threads) for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
     done = subprocess.run([python, "-c", code, "run", str(take), "--out", str(out), "--quiet"], env=os.environ | some,
                           capture_output=True, text=True, check=False)  # fmt: skip

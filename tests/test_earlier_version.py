@@ -17,7 +17,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.motion.sources import read_motion_source
 from tricap.core.results.run_json import read_run
-from tricap.core.run import pipeline
+from tricap.core.run import take_run
 from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
 
@@ -26,7 +26,7 @@ from .core.conftest import Body, three_cameras, write_take
 VERSION_0_1 = Path(__file__).parent / "version_0_1"
 RENAMED = [
     (group, field, earlier)
-    for group, settings in pipeline.SETTINGS.items()
+    for group, settings in take_run.SETTINGS.items()
     for field in dataclasses.fields(settings)
     for earlier in field.metadata["was"]
 ]
@@ -80,10 +80,10 @@ def test_every_key_of_the_take_is_read(take: Path) -> None:
     assert main(["check", str(take), "--quiet"]) in (0, 1)
 
 
-@pytest.mark.parametrize("group", [group for group in read_table(VERSION_0_1)["settings"] if group in pipeline.SETTINGS])
+@pytest.mark.parametrize("group", [group for group in read_table(VERSION_0_1)["settings"] if group in take_run.SETTINGS])
 def test_every_setting_of_the_take_has_its_value(group: str) -> None:
     tables = read_table(VERSION_0_1)["settings"]
-    settings = pipeline.settings_of(tables, {}, "take.toml")
+    settings = take_run.settings_of(tables, {}, "take.toml")
     for name, value in tables[group].items():
         now, knob = current_name(group, name)
         assert getattr(settings[now], knob) == value, name
@@ -92,7 +92,7 @@ def test_every_setting_of_the_take_has_its_value(group: str) -> None:
 def test_a_setting_that_no_version_had_is_refused() -> None:
     tables = read_table(VERSION_0_1)["settings"] | {"matching": {"patch_inches": 13}}
     with pytest.raises(InputError, match="no setting “patch_inches”"):
-        pipeline.settings_of(tables, {}, "take.toml")
+        take_run.settings_of(tables, {}, "take.toml")
 
 
 @pytest.mark.parametrize(("group", "field", "earlier"), RENAMED, ids=[f"{g}.{f.name}" for g, f, _ in RENAMED])
@@ -100,13 +100,13 @@ def test_a_renamed_setting_may_be_set_under_its_earlier_name(group: str, field: 
     earlier_group, _, earlier_name = earlier.rpartition(".")
     table = {earlier_group or group: {earlier_name: other_value(field)}}
     for tables in ((table, {}), ({}, table)):
-        assert getattr(pipeline.settings_of(*tables, "take.toml")[group], field.name) == other_value(field)
+        assert getattr(take_run.settings_of(*tables, "take.toml")[group], field.name) == other_value(field)
 
 
 def test_the_results_are_read(out: Path, capfd: pytest.CaptureFixture[str]) -> None:
     run = read_run(out / "run.json")
     assert set(run["stages"]) == {"measure", "track", "fit", "report"}
-    pipeline.settings_of(run["settings"], {}, "run.json")
+    take_run.settings_of(run["settings"], {}, "run.json")
     contents = read_contents(out, Monitor())
     assert contents.motion is not None and contents.shape is not None and contents.prepared.skin is not None
     assert contents.motion.frames.tolist() == list(range(6)) and contents.footage is not None

@@ -8,7 +8,7 @@ import bpy
 
 from ...core.body.model_file import BodyModel, joint_depths_m, read_model
 from ...core.foundation.errors import InputError
-from ...core.run import pipeline
+from ...core.run import take_run
 from ...core.take.take import JOINTS, Seeds, open_take
 from .. import project, properties, seeds, status
 from ..overlay import canvas
@@ -293,7 +293,7 @@ def make_finder(scene: bpy.types.Scene) -> tuple[Finder | None, str]:
     try:
         take = project.take(scene)
         footage = open_take(replace(take, seeds=Seeds(), keyframes=(), corrections=(), frames=None))
-        settings = pipeline.settings_of(take.settings, properties.overrides(scene), "take.toml")["matching"]
+        settings = take_run.settings_of(take.settings, properties.overrides(scene), "take.toml")["matching"]
     except InputError as error:
         return None, f"No epipolar lines and proposals: {error}"
     return Finder(footage, settings), ""

@@ -7,7 +7,7 @@ import bpy
 
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
-from ...core.run import pipeline
+from ...core.run import take_run
 from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
 from .. import folders, project
 from ..jobs import JobOperator
@@ -28,7 +28,7 @@ class LoadSample(JobOperator, bpy.types.Operator):
     bl_label = "Load Sample and Run"
     bl_options = {"UNDO"}
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, pipeline.Run, Contents | None]]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, take_run.Run, Contents | None]]:
         """Where the recording and its results go: beside the .blend, or among the extension's own files while there is none."""
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
         take = base / NAME
@@ -37,7 +37,7 @@ class LoadSample(JobOperator, bpy.types.Operator):
         folders.check_writable(base)
         return lambda monitor: make_and_measure(take, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[Path, pipeline.Run, Contents | None]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: tuple[Path, take_run.Run, Contents | None]) -> set[str]:
         """The sample becomes the scene's project; build the scene."""
         take, run, contents = result
         project.open_take(context.scene, take)
@@ -48,7 +48,7 @@ class LoadSample(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def make_and_measure(take: Path, monitor: Monitor) -> tuple[Path, pipeline.Run, Contents | None]:
+def make_and_measure(take: Path, monitor: Monitor) -> tuple[Path, take_run.Run, Contents | None]:
     """The computation, free of bpy. A sample that is there already, with whatever was changed in it, is measured as it is."""
     if not is_arm_take(take):
         make_arm_take(take, SAMPLE, monitor)

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ...core.foundation.progress import Monitor
-from ...core.run import pipeline
+from ...core.run import pipeline, take_run
 from .. import project
 from ..scene.contents import Contents, read_contents
 from .build_scene import RELATIVE, put_into_scene
@@ -40,13 +40,13 @@ class Run(StageOperator, bpy.types.Operator):
         description="Put the results into this scene afterwards",
     )
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[pipeline.Run, Contents | None]]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[take_run.Run, Contents | None]]:
         """Folders and settings as they are now."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)
         build = self.build
         return lambda monitor: measure(take, out, overrides, build, monitor)
 
-    def finish(self, context: bpy.types.Context, result: tuple[pipeline.Run, Contents | None]) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: tuple[take_run.Run, Contents | None]) -> set[str]:
         """Build the scene and report the run."""
         run, contents = result
         if contents is not None:
@@ -57,9 +57,9 @@ class Run(StageOperator, bpy.types.Operator):
 
 def measure(
     take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor
-) -> tuple[pipeline.Run, Contents | None]:
+) -> tuple[take_run.Run, Contents | None]:
     """The computation, free of bpy: all that is not done yet, and its results read back for the scene."""
-    with pipeline.open_run(take, out, overrides) as run:
+    with take_run.open_run(take, out, overrides) as run:
         if not pipeline.is_complete(run):
             pipeline.all_stages(run, monitor)
     return run, read_contents(out, monitor) if build else None

@@ -8,7 +8,7 @@ import bpy
 
 from ...core.fitting.inputs.take_inputs import check_body
 from ...core.foundation.progress import Monitor
-from ...core.run import pipeline
+from ...core.run import pipeline, take_run
 from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE
@@ -34,18 +34,18 @@ class StageOperator(JobOperator):
         """Measuring comes first wherever it is not done."""
         return STEP_WORDS.get(stage.split()[0] if stage else "", cls.step)
 
-    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], pipeline.Run]:
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], take_run.Run]:
         """Folders and settings as they are now; the project's take.toml is written."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)  # type: ignore[attr-defined]
         return lambda monitor: run_stages(take, out, overrides, self.stages, monitor)
 
-    def finish(self, context: bpy.types.Context, result: pipeline.Run) -> set[str]:
+    def finish(self, context: bpy.types.Context, result: take_run.Run) -> set[str]:
         """Report the run."""
         report_run(self, context, result)
         return {"FINISHED"}
 
 
-def report_run(operator: Any, context: bpy.types.Context, run: pipeline.Run) -> None:
+def report_run(operator: Any, context: bpy.types.Context, run: take_run.Run) -> None:
     """Show a run's warnings and its summary, and keep the summary for the panel."""
     context.scene.tricap.last = str(run)
     for sentence in run.record["warnings"]:
@@ -53,9 +53,9 @@ def report_run(operator: Any, context: bpy.types.Context, run: pipeline.Run) -> 
     operator.report({"INFO"}, str(run))
 
 
-def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> pipeline.Run:
+def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> take_run.Run:
     """The computation, free of bpy. What is checkpointed is not computed again."""
-    with pipeline.open_run(take, out, overrides) as run:
+    with take_run.open_run(take, out, overrides) as run:
         if "fit" in names:
             check_body(run.footage, run.settings["fitting"])
         for name in names:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...core.cli.contour import Start, write_contours
 from ...core.foundation.progress import Monitor
-from ...core.run import pipeline
+from ...core.run import take_run
 from .. import project, status
 from ..jobs import JobOperator
 from . import canvas, draw, layers, results
@@ -109,9 +109,9 @@ class FollowContours(JobOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def track_outline(take: Path, out: Path, overrides: pipeline.Overrides, view: str, monitor: Monitor, start: Start) -> list[str]:
+def track_outline(take: Path, out: Path, overrides: take_run.Overrides, view: str, monitor: Monitor, start: Start) -> list[str]:
     """The computation, without bpy: a sentence for each view."""
-    with pipeline.open_run(take, out, overrides, ignore_contours=True) as run:
+    with take_run.open_run(take, out, overrides, ignore_contours=True) as run:
         names = [view] if view else [v.name for v in run.footage.take.views]
         return write_contours(run, names, monitor, start)
 

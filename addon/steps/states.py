@@ -17,8 +17,8 @@ from ...core.foundation.errors import InputError
 from ...core.geometry.rig import read_rig
 from ...core.images.sequence import ImageSequence, open_sequence
 from ...core.results.run_json import read_run
-from ...core.run.pipeline import settings_of
 from ...core.run.stages import stage_keys
+from ...core.run.take_run import settings_of
 from ...core.take.clicked_points import clicked_depth
 from ...core.take.take import Footage, Take, footage_frames, open_take
 from .. import folders, project

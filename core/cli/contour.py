@@ -16,7 +16,7 @@ from ..foundation.progress import Monitor
 from ..foundation.settings import nearest_name
 from ..geometry.rig import read_rig
 from ..images.sequence import read_image
-from ..run import pipeline
+from ..run import pipeline, take_run
 from ..run.inspection import body_outline
 from ..surface.cloud import PointCloud
 from ..surface.measure import NothingMeasured
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     _check_views(take, args.view)
     if start.polygon is not None and not read_rig(take.rig_path)[args.view[0]].sees(start.polygon).any():
         raise InputError(f"The polygon {args.polygon} lies outside the image of view {args.view[0]}; write its pixels in the first frame.")
-    with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), ignore_contours=True) as job:
+    with take_run.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames), ignore_contours=True) as job:
         return write_contours(job, args.view, monitor, start)
 
 
@@ -103,7 +103,7 @@ def _check_views(take: Take, views: list[str]) -> list[str]:
     return names
 
 
-def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
+def write_contours(job: take_run.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
     """Track the contour in the views of these names: contours/NAME.csv of each.
 
     Measures and tracks first where that is needed: a background shows the outline in every frame, and what cannot be measured, or is not
@@ -127,7 +127,7 @@ def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start:
     return [_write_contour(job, name, names.index(name), monitor, start) for name in views]
 
 
-def _track_if_possible(job: pipeline.Run, monitor: Monitor, own_start: bool) -> None:
+def _track_if_possible(job: take_run.Run, monitor: Monitor, own_start: bool) -> None:
     """Measure and track; that there is nothing to measure is no fault where the contour has another start."""
     try:
         pipeline.track(job, monitor)
@@ -137,7 +137,7 @@ def _track_if_possible(job: pipeline.Run, monitor: Monitor, own_start: bool) -> 
         job.warn(f"{error} The outline was followed in the images.")
 
 
-def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
+def _write_contour(job: take_run.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
     path, seen = job.results.path("contours", f"{name}.csv"), list[float]()
     with store.written(path) as file:
         file.write(HEAD.encode())
@@ -152,7 +152,7 @@ def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, st
 class KeptContours:
     """Checkpoints of the contours of a view, one a frame, with a key of all that the first and the following depend on."""
 
-    def __init__(self, job: pipeline.Run, view: int, start: Start) -> None:
+    def __init__(self, job: take_run.Run, view: int, start: Start) -> None:
         self._results, self._stage = job.results, _checkpoints(view)
         begun = [b"" if a is None else np.ascontiguousarray(a).tobytes() for a in (start.polygon, start.background)]
         body = sorted(job.results.path("skin").glob("*.ply")) if start.body else []
@@ -175,7 +175,7 @@ def _checkpoints(view: int) -> str:
 
 
 def track_contour(
-    job: pipeline.Run, view: int, monitor: Monitor, start: Start, kept: KeptContours | None = None
+    job: take_run.Run, view: int, monitor: Monitor, start: Start, kept: KeptContours | None = None
 ) -> Iterator[tuple[int, Contour]]:
     """(frame, contour) of one view; each predicted by the projected trajectories inside the last one that had any, or else by points that
     are followed in the images.
@@ -201,7 +201,7 @@ def track_contour(
 class _Follower:
     """The contour from frame to frame: `base` is the last that had something to go by, in frame index `last` of number `frame`."""
 
-    def __init__(self, job: pipeline.Run, view: int, start: Start) -> None:
+    def __init__(self, job: take_run.Run, view: int, start: Start) -> None:
         self._job, self._view, self._start = job, view, start
         self._camera, self._tracks, self._settings = job.footage.rig.cameras[view], job.trajectories, job.settings["contour"]
         self._base: Contour | None = None

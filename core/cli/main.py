@@ -22,7 +22,7 @@ from ..foundation.progress import Cancelled, Monitor
 from ..foundation.threads import one_thread_in_linear_algebra
 from ..images.interlace import BOTH, INTERLACE
 from ..results.folder import check_separate_folder
-from ..run import pipeline
+from ..run import pipeline, take_run
 from ..take.bar_file import read_bar, write_bar
 from ..take.take import open_take, read_take
 from ..take.writing import footage_entry, make_take, new_table, take_of_table
@@ -107,7 +107,7 @@ def _stage_command(commands: Any, name: str, about: str, action: Callable[..., l
 
 def _stages(*names: str) -> Callable[[argparse.Namespace, Monitor], list[str]]:
     def action(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-        with pipeline.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
+        with take_run.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
             for name in names:
                 getattr(pipeline, name)(job, monitor)
             return _summary(job, args.json)
@@ -121,13 +121,13 @@ def _track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     given = args.take, args.out, overrides(args.set), frame_range(args.frames)
-    with pipeline.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
+    with take_run.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
         pipeline.all_stages(job, monitor)
         scene = _build_scene(job, args, monitor)
         return _summary(job, args.json) + ([] if args.json else scene)
 
 
-def _build_scene(job: pipeline.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
+def _build_scene(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Build body.blend with the add-on's command `scene`, where Blender is available."""
     blend = job.results.path("body.blend")
     if "scene" not in _names_of(given.parser):
@@ -142,7 +142,7 @@ def _build_scene(job: pipeline.Run, given: argparse.Namespace, monitor: Monitor)
     return []
 
 
-def _summary(job: pipeline.Run, as_json: bool) -> list[str]:
+def _summary(job: take_run.Run, as_json: bool) -> list[str]:
     if as_json:
         return [json.dumps(job.results.read_run(), indent=1, ensure_ascii=False)]
     return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in job.record["warnings"])]
@@ -152,7 +152,7 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from ..surface.measure import MeasureSettings, first_seeds
 
     footage = open_take(read_take(args.take))
-    settings = pipeline.settings_of(footage.take.settings, overrides(args.set), str(args.take))
+    settings = take_run.settings_of(footage.take.settings, overrides(args.set), str(args.take))
     frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
     where, seeds = first_seeds(footage, MeasureSettings.of(settings), frame, monitor)
     near, far = where.depth_range_m

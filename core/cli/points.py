@@ -10,7 +10,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..results.folder import Results, check_separate_folder
-from ..run import pipeline
+from ..run import take_run
 from ..take.take import Footage, open_take, read_take
 from ..tracking.key_points import KeyPoints, track_key_points
 from ..tracking.point_tables import ChosenPoints, read_points, write_key_points
@@ -32,10 +32,10 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         InputError: the arguments, the points or the footage need mending.
     """
     take = read_take(args.take)
-    settings = pipeline.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
+    settings = take_run.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
     footage, frames = open_take(take), frame_range(args.frames)
     check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
-    footage = footage if frames is None else pipeline.only_frames(footage, frames)
+    footage = footage if frames is None else take_run.only_frames(footage, frames)
     first = footage.frames.start if args.points_frame is None else args.points_frame
     if first not in footage.frames:
         raise InputError(f"--points-frame {first} is not among the frames {footage.frames.start} to {footage.frames.stop - 1}.")

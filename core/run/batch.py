@@ -25,7 +25,7 @@ from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..results.folder import check_separate_folder
-from . import pipeline
+from . import pipeline, take_run
 
 FORMAT, VERSION = "tricap-batch", 1
 TOPIC = "tricap"  # of the workers' progress reports
@@ -69,7 +69,7 @@ class Engine:
 
 
 def run_batch(
-    takes: Sequence[Path], folder: Path, engine: Engine, overrides: pipeline.Overrides, monitor: Monitor, *, restart: bool = False
+    takes: Sequence[Path], folder: Path, engine: Engine, overrides: take_run.Overrides, monitor: Monitor, *, restart: bool = False
 ) -> list[Outcome]:
     """Run all takes. FOLDER/NAME gets the results of the take NAME, FOLDER/batch.json the outcome of each.
 
@@ -111,11 +111,11 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     return [folder / name for name in names]
 
 
-def run_take(take: str, out: str, overrides: pipeline.Overrides, restart: bool) -> dict[str, Any]:
+def run_take(take: str, out: str, overrides: take_run.Overrides, restart: bool) -> dict[str, Any]:
     """The task of a worker: run one take like `tricap run`. Returns an Outcome as a table; the task fails only if the worker dies."""
     began = time.perf_counter()
     try:
-        with pipeline.open_run(Path(take), Path(out), overrides, restart=restart) as job:
+        with take_run.open_run(Path(take), Path(out), overrides, restart=restart) as job:
             pipeline.all_stages(job, Monitor(_reporter(take)))
             _scene(job)
         status, said = Status.DONE, _summary_of(job)
@@ -128,14 +128,14 @@ def run_take(take: str, out: str, overrides: pipeline.Overrides, restart: bool) 
     return asdict(Outcome(take=take, out=out, status=status, said=said, seconds=round(time.perf_counter() - began, 1)))
 
 
-def _summary_of(job: pipeline.Run) -> str:
+def _summary_of(job: take_run.Run) -> str:
     """The run in one line, with its first warning and the number of further ones."""
     warnings = job.record["warnings"]
     more = f" ({len(warnings) - 1} more in the report)" if len(warnings) > 1 else ""
     return f"{job}. Warning: {warnings[0]}{more}" if warnings else str(job)
 
 
-def _scene(job: pipeline.Run) -> None:
+def _scene(job: take_run.Run) -> None:
     """Build body.blend in a process of its own, because Blender needs the main thread; nothing without Blender."""
     if importlib.util.find_spec("bpy") is None:
         return

@@ -16,6 +16,7 @@ from ..body.motion import FITTED, BodyFit
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
+from ..matching.foreground import Foreground
 from ..surface.frames import FrameNote
 from ..take.take import Footage
 from ..tracking.settings import TrackStatus
@@ -43,6 +44,18 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def surface_figures(notes: Sequence[FrameNote], foreground: Foreground | None) -> dict[str, Any]:
+    """Figures of the measured frames: number, points, residuals, sigma, and how the person was told from the room."""
+    return {
+        "frames": len(notes),
+        "points_per_frame": float(np.mean([n.points for n in notes])),
+        "residual_px": median([n.residual_px for n in notes]),
+        "sigma_mm": 1e3 * median([n.sigma_m for n in notes]),
+        "foreground": foreground.method if foreground else "",
+        "background_planes": len(foreground.planes) if foreground else 0,
+    }
+
+
 def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[str, Any], list[str]]:
     """Figures of the kept trajectories: number, length, sigma, counts of the reasons for removals; and warnings."""
     seen, started = kept.seen, sum(reasons.values())
@@ -65,6 +78,34 @@ def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[
         "reasons": why,
     }
     return figures, warnings
+
+
+def fit_figures(body: BodyFit, silhouettes: Mapping[str, Any], tracked_again: Mapping[str, Any]) -> dict[str, Any]:
+    """Figures of the fitted body; those of outlines, silhouettes and the second tracking only where there are any."""
+    figures = {
+        "frames": frame_states(body),
+        "iterations": body.iterations,
+        "converged": body.converged,
+        "sigma0": median(body.motion.sigma0),
+        "joint_sigma_mm": 1e3 * median(body.motion.joint_sigma_m),
+    }
+    if len(body.outline_m):
+        figures["outline_mm"] = 1e3 * median(body.outline_m)
+    return figures | ({"silhouettes": silhouettes} if silhouettes else {}) | ({"tracked_again": tracked_again} if tracked_again else {})
+
+
+def frame_states(body: BodyFit) -> dict[str, int]:
+    """How many frames are in each state."""
+    return {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
+
+
+def fit_warnings(body: BodyFit) -> list[str]:
+    """What is doubtful about the fit as a whole: frames that rest on prediction, an adjustment that did not converge."""
+    predicted = ", ".join(f"{n} {word}" for word, n in frame_states(body).items() if word != FITTED)
+    warnings = [f"Frames in which the body rests partly on prediction: {predicted}."] if predicted else []
+    if not body.converged:
+        warnings.append(f"The fit has not converged after {body.iterations} steps: look at the pictures, and raise fitting.sequence_steps.")
+    return warnings
 
 
 def median(values: Sequence[float] | np.ndarray) -> float:

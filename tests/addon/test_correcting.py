@@ -118,13 +118,13 @@ def test_undo_save_and_open(blender: ModuleType, scene: Any, tmp_path: Path) -> 
 
 
 def test_a_correction_makes_the_later_steps_stale(blender: ModuleType, scene: Any, take: Path) -> None:
-    from tricap.core.run import pipeline
+    from tricap.core.run import take_run
     from tricap.core.run.stages import stage_keys
     from tricap.core.take.take import open_take
 
     def keys() -> dict[str, str]:
         module("project").write(scene)
-        return stage_keys(open_take(read_take(take)), pipeline.settings_of({}, {}, ""), take / "results")
+        return stage_keys(open_take(read_take(take)), take_run.settings_of({}, {}, ""), take / "results")
 
     before = keys()
     blender.ops.tricap.remove_trajectory(view="C", x=40, y=61)

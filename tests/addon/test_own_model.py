@@ -7,7 +7,7 @@ import pytest
 
 from tricap.core.body.model_file import MODELS
 from tricap.core.body.shape import read_body
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.writing import read_table, write_table
 
@@ -35,13 +35,13 @@ def test_a_run_with_a_model_of_ones_own_ends_in_a_scene(
     build_scene(tmp_path / "out", tmp_path / "body.blend")
     assert set(empty.data.objects["Body"].pose.bones.keys()) >= {"upper_arm.R", "forearm.R"}
     again = pipeline.run(take, tmp_path / "out", {"growing": {"spacing_px": 6}}, frames=(0, 3))
-    assert again.account["stages"]["fit"]["key"] == job.account["stages"]["fit"]["key"]
+    assert again.record["stages"]["fit"]["key"] == job.record["stages"]["fit"]["key"]
 
 
 def test_another_file_of_the_model_makes_the_fit_stale(take: Path, tmp_path: Path) -> None:
-    with pipeline.open_run(take, tmp_path / "out", frames=(0, 3)) as job:
+    with take_run.open_run(take, tmp_path / "out", frames=(0, 3)) as job:
         before = dict(job.keys)
     theirs = take / "theirs.toml"
     theirs.write_text(theirs.read_text(encoding="utf-8").replace("stature_m = 1.75", "stature_m = 1.60"), encoding="utf-8")
-    with pipeline.open_run(take, tmp_path / "out", frames=(0, 3)) as job:
+    with take_run.open_run(take, tmp_path / "out", frames=(0, 3)) as job:
         assert job.keys["fit"] != before["fit"] and job.keys["track"] == before["track"]

@@ -24,7 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from tricap.core.foundation.progress import Monitor
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.synthetic import arm
 from tricap.core.synthetic.film import digitize, expose, paint
 from tricap.core.take.take import Take, open_take
@@ -108,9 +108,9 @@ def run_clip(folder: Path, frames: int, until: str) -> list[dict[str, Any]]:
         views = enumerate(arm.VIEWS)
         return open_take(take, tuple(Swinging(k, frames, pictures[k], take.folder / name / "0000.png") for k, name in views))
 
-    pipeline.open_take = opened
+    take_run.open_take = opened
     watch = Watch(folder / "memory.csv")
-    with pipeline.open_run(take, folder / f"out{frames}", SETTINGS) as job:
+    with take_run.open_run(take, folder / f"out{frames}", SETTINGS) as job:
         for name in list(STAGES)[: list(STAGES).index(until) + 1]:
             began = time.process_time()
             STAGES[name](job, Monitor(watch))

@@ -25,7 +25,7 @@ from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.least_squares import MatchingSettings, SearchImage, TemplatePoints, match_patches
 from tricap.core.matching.patches import patch_offsets
 from tricap.core.results.folder import Results
-from tricap.core.run.pipeline import settings_of
+from tricap.core.run.take_run import settings_of
 from tricap.core.surface.measure import MeasureSettings, measure_frames
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.take import open_take, read_take

@@ -48,7 +48,7 @@ else:
 """
 CHILD = f"""
 import pathlib, resource, sys
-from tricap.core import commands
+from tricap.core.cli import main as commands
 code = commands.main(sys.argv[1:])
 {PEAK}
 sys.exit(code)

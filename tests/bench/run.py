@@ -21,7 +21,7 @@ from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
 CHILD = """
 import json, pathlib, sys, time
-from tricap.core import commands
+from tricap.core.cli import main as commands
 began = time.process_time()
 code = commands.main(sys.argv[1:])
 spent = time.process_time() - began

@@ -14,7 +14,7 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.results.folder import Results
-from tricap.core.run import pipeline
+from tricap.core.run import take_run
 from tricap.core.surface.measure import MeasuredFrame, MeasureSettings, measure_frames
 from tricap.core.take.take import open_take, read_take
 from tricap.core.tracking.lost_points import Guide
@@ -127,7 +127,7 @@ def write_take_toml(folder: Path, views: Sequence[str], *, more: str = "", inter
 def measure(folder: Path, out: Path, overrides: Mapping[str, Any] | None = None, monitor: Monitor | None = None) -> list[MeasuredFrame]:
     """The measured surface of a take, in the order of time; checkpoints lie in `out`."""
     footage = open_take(read_take(folder))
-    s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
+    s = take_run.settings_of(footage.take.settings, overrides or {}, "take.toml")
     done = measure_frames(footage, MeasureSettings.of(s), Results(out), monitor or Monitor())
     return sorted(done, key=lambda m: m.frame)
 
@@ -138,7 +138,7 @@ def track(
 ) -> list[TrackedFrame]:  # fmt: skip
     """The tracked points of a take that was measured."""
     footage = open_take(read_take(folder))
-    s = pipeline.settings_of(footage.take.settings, overrides or {}, "take.toml")
+    s = take_run.settings_of(footage.take.settings, overrides or {}, "take.toml")
     limit_px = float(np.median([m.field.limit_px for m in measured]))
     rules = TrackingRules(matching=s["matching"], tracking=s["tracking"], enhance=s["enhance"], limit_px=limit_px)
     return list(track_frames(footage, measured, rules, Results(out), monitor or Monitor(), guide))

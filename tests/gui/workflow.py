@@ -12,7 +12,7 @@ import bpy
 import display
 import drive
 from bl_ext.user_default.tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
-from bl_ext.user_default.tricap.core.take import read_take
+from bl_ext.user_default.tricap.core.take.take import read_take
 from mathutils import Vector
 
 CLICK_ERROR_PX = 5.0

@@ -10,7 +10,7 @@ from tricap.core.checking.timing import synchronised
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.retime import Recent, retimed
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.surface.measure import measured_rows
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.score import score_run
@@ -82,7 +82,7 @@ def test_a_view_half_a_frame_late_costs_nothing_once_corrected(tmp_path: Path) -
         if not take.exists():
             make_arm_take(take, ArmTakeSettings(width_px=320, frames=9, interlaced="none", late_frames=late))
         settings = {"growing": {"spacing_px": 6}, "timing": {"correct": correct}}
-        with pipeline.open_run(take, tmp_path / name, settings, frames=(3, 6)) as run:
+        with take_run.open_run(take, tmp_path / name, settings, frames=(3, 6)) as run:
             pipeline.track(run, Monitor())
         score = score_run(take, tmp_path / name, Monitor())
         error[name] = score.clouds.median_mm

@@ -23,7 +23,7 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.take.take import open_take, read_take
 
 from ..images.test_sequence import with_a_pause
@@ -299,7 +299,7 @@ def test_measuring_it_all_the_same_names_the_cause(make: Callable[[Path], None],
     shutil.copytree(arm_recording(), tmp_path / "take")
     make(tmp_path / "take")
     try:
-        with pipeline.open_run(tmp_path / "take", tmp_path / "out", {"growing": {"spacing_px": 8}}, frames=(0, 3)) as run:
+        with take_run.open_run(tmp_path / "take", tmp_path / "out", {"growing": {"spacing_px": 8}}, frames=(0, 3)) as run:
             pipeline.measure(run, Monitor())
             assert any(MEASURED[make] in sentence for sentence in run.record["warnings"]), run.record["warnings"]
     except InputError as error:
@@ -325,7 +325,7 @@ def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp
     take = Path(shutil.copytree(arm_recording(), tmp_path / "take"))
     said = {}
     for name in ("sound", "lost"):
-        with pipeline.open_run(take, tmp_path / name, {"growing": {"spacing_px": 8}}) as run:
+        with take_run.open_run(take, tmp_path / name, {"growing": {"spacing_px": 8}}) as run:
             pipeline.measure(run, Monitor())
         said[name] = [s for s in run.record["warnings"] if "a view may have lost" in s]
         shots = pictures(take, "R")

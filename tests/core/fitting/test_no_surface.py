@@ -17,7 +17,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.raster import rasterize
 from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.formats.trc import write_trc
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.run.record import read_frame_table
 from tricap.core.take.take import open_take, read_take
 from tricap.core.tracking.contour import contour_of_mask, outward_normals
@@ -89,7 +89,7 @@ def test_outlines_alone_and_nothing_is_measured_where_it_is_not_wanted(tmp_path:
 def test_what_lies_outside_an_outline_is_empty(tmp_path: Path) -> None:
     footage = open_take(read_take(_with_keypoints(tmp_path / "take")))
     _outlines(tmp_path / "out")
-    job = pipeline.Results(tmp_path / "out")
+    job = take_run.Results(tmp_path / "out")
     polygons = outline_polygons(footage, job)
     assert set(polygons) == {"L", "C", "R"} and set(polygons["C"]) == {0, 1, 2}
     empty = next(e for e in outside_outlines(footage, polygons) if e.view == "C")

@@ -13,7 +13,7 @@ import pytest
 from tricap.core.cli import contour, points
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.settings import from_table, knob, nearest_name, to_table
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,9 +74,9 @@ def test_what_is_refused(table: dict, said: str) -> None:
     assert "\n" not in str(error.value) and len(str(error.value)) < 250
 
 
-@pytest.mark.parametrize("group", sorted(pipeline.SETTINGS))
+@pytest.mark.parametrize("group", sorted(take_run.SETTINGS))
 def test_every_knob_says_what_it_is_and_lies_within_its_limits(group: str) -> None:
-    cls = pipeline.SETTINGS[group]
+    cls = take_run.SETTINGS[group]
     for field in dataclasses.fields(cls):
         about = field.metadata["about"]
         assert about.endswith(".") and about[0].isupper(), field.name
@@ -87,10 +87,10 @@ def test_every_knob_says_what_it_is_and_lies_within_its_limits(group: str) -> No
 
 
 def test_the_commands_settings_overrule_the_takes() -> None:
-    made = pipeline.settings_of({"matching": {"patch_px": 15, "max_shift_px": 2.0}}, {"matching": {"patch_px": 17}}, "take.toml")
+    made = take_run.settings_of({"matching": {"patch_px": 15, "max_shift_px": 2.0}}, {"matching": {"patch_px": 17}}, "take.toml")
     assert (made["matching"].patch_px, made["matching"].max_shift_px) == (17, 2.0)
     with pytest.raises(InputError, match="Did you mean “matching”"):
-        pipeline.settings_of({}, {"matchin": {"patch_px": 17}}, "take.toml")
+        take_run.settings_of({}, {"matchin": {"patch_px": 17}}, "take.toml")
 
 
 def test_the_nearest_name() -> None:
@@ -102,9 +102,9 @@ def test_a_knob_that_moved_to_another_group() -> None:
     """`tracking.markers` of earlier versions is `key_points.markers`."""
     old, new = {"tracking": {"markers": True, "box_px": 9}}, {"key_points": {"markers": True}}
     for tables in ((old, {}), ({}, old), ({}, new)):
-        assert pipeline.settings_of(*tables, "take.toml")["key_points"].markers
+        assert take_run.settings_of(*tables, "take.toml")["key_points"].markers
     with pytest.raises(InputError, match=r"\[key_points\] sets “markers” twice, also under its earlier name"):
-        pipeline.settings_of({}, {"tracking": {"markers": True}, "key_points": {"markers": False}}, "take.toml")
+        take_run.settings_of({}, {"tracking": {"markers": True}, "key_points": {"markers": False}}, "take.toml")
 
 
 Reads = set[tuple[str, str]]  # an expression, and an attribute of it that is read
@@ -144,13 +144,13 @@ def unread_knobs(group: str, cls: type, reads: Reads) -> list[str]:
 READ_BY = {"contour": contour, "key_points": points}  # the others by the run
 
 
-@pytest.mark.parametrize("group", sorted(pipeline.SETTINGS))
+@pytest.mark.parametrize("group", sorted(take_run.SETTINGS))
 def test_every_knob_is_read_by_what_it_belongs_to(group: str) -> None:
-    assert not unread_knobs(group, pipeline.SETTINGS[group], reads_of(READ_BY.get(group, pipeline)))
+    assert not unread_knobs(group, take_run.SETTINGS[group], reads_of(READ_BY.get(group, pipeline)))
 
 
 def test_a_knob_that_nothing_reads_is_reported() -> None:
     """One that is only defined, set, or read from something else; and one that the run does not read, though a command does."""
     source = "def f(settings, sample, link):\n    settings.sigma = link.text = 1\n    return settings.patch_px, sample.way, link.correct"
     assert unread_knobs("sample", Sample, reads_in(source)) == ["sigma", "free", "correct", "text"]
-    assert unread_knobs("key_points", pipeline.SETTINGS["key_points"], reads_of(pipeline)) == ["markers"]
+    assert unread_knobs("key_points", take_run.SETTINGS["key_points"], reads_of(pipeline)) == ["markers"]

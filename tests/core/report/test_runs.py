@@ -45,7 +45,7 @@ def test_a_body_that_nobody_wants_is_no_warning(plane_take: Path, tmp_path: Path
     take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"
     write_table(take, read_table(take) | {"body": {"model": "none"}})
     job = pipeline.run(take, out, frames=(0, 2))
-    assert job.account["warnings"] == [] and "“" not in job.account["stages"]["fit"]["not_done"]
+    assert job.record["warnings"] == [] and "“" not in job.record["stages"]["fit"]["not_done"]
     assert not (out / "body.toml").exists()
 
 

@@ -18,7 +18,7 @@ from tricap.core.cli import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.lock import NAME
 from tricap.core.foundation.progress import Cancelled, Monitor
-from tricap.core.run import batch, pipeline
+from tricap.core.run import batch, pipeline, take_run
 from tricap.core.run.batch import Engine, Outcome, Status, out_folders, run_batch, run_take, summary
 
 COARSE = {"growing": {"spacing_px": 8}}
@@ -80,7 +80,7 @@ def test_a_scheduler_by_its_address(takes: list[Path], tmp_path: Path, monkeypat
     """Workers as threads of this process, so that they see what is patched here: a run that is short, and a bug."""
     from distributed import LocalCluster
 
-    def stages(job: pipeline.Run, monitor: Monitor) -> None:
+    def stages(job: take_run.Run, monitor: Monitor) -> None:
         monitor.step("surface", 1, 2)
         if job.footage.take.folder.name == "throw":
             raise ZeroDivisionError("ours")
@@ -115,7 +115,7 @@ def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(("workers", "cores", "threads"), [(1, 2, "2"), (2, 2, "1"), (2, 8, "2"), (16, 8, "1")])
 def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, threads: str) -> None:
     environment = os.environ | batch.thread_limits(workers, cores)
-    code = "from tricap.core import threads; print(threads.THREADS)"
+    code = "from tricap.core.foundation import threads; print(threads.THREADS)"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [threads]
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tricap.core.foundation import store
-from tricap.core.run import pipeline
+from tricap.core.run import take_run
 from tricap.core.run.stages import STAGE_INPUTS, STAGES, WITHOUT_STAGE, stage_keys, stage_of, valid_stages
 from tricap.core.take.take import Take, open_take
 from tricap.core.take.writing import read_table, take_of_table
@@ -28,7 +28,7 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def keys(folder: Path, overrides: dict[str, Any] | None = None, **changes: Any) -> dict[str, str]:
     table = read_table(folder) | {"seeds": {"frame": 1, "joints": JOINTS}, "body": {"model": "arm.R"}} | changes
     take = take_of_table(folder, table)
-    return stage_keys(open_take(take), pipeline.settings_of(take.settings, overrides or {}, "the test"), folder / "out")
+    return stage_keys(open_take(take), take_run.settings_of(take.settings, overrides or {}, "the test"), folder / "out")
 
 
 def stale(folder: Path, overrides: dict[str, Any] | None = None, **changes: Any) -> list[str]:
@@ -68,11 +68,11 @@ def test_a_change_concerns_its_stage_and_those_after_it(take: Path, first: str, 
 
 def other_than_default(group: str) -> dict[str, Any]:
     """One knob of the group, changed."""
-    for name, knob in pipeline.SETTINGS[group].__dataclass_fields__.items():
+    for name, knob in take_run.SETTINGS[group].__dataclass_fields__.items():
         high = knob.metadata["high"]
         if not isinstance(knob.default, (str, bool)) and high is not None and high > knob.default:
             return {name: high}
-    for name, knob in pipeline.SETTINGS[group].__dataclass_fields__.items():
+    for name, knob in take_run.SETTINGS[group].__dataclass_fields__.items():
         if isinstance(knob.default, bool):
             return {name: not knob.default}
     raise AssertionError(group)
@@ -134,7 +134,7 @@ def test_keypoints_concern_the_fit(take: Path, tmp_path: Path) -> None:
 
 def test_every_group_of_knobs_concerns_one_stage() -> None:
     groups = [name for concern in STAGE_INPUTS.values() for name in concern.settings]
-    assert sorted([*groups, *WITHOUT_STAGE]) == sorted(pipeline.SETTINGS) and stage_of("tracking") == "track"
+    assert sorted([*groups, *WITHOUT_STAGE]) == sorted(take_run.SETTINGS) and stage_of("tracking") == "track"
 
 
 @pytest.mark.parametrize("group", WITHOUT_STAGE)

@@ -18,7 +18,7 @@ from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.matching.region_growing import MatchedField
 from tricap.core.matching.seeds import Approximations
 from tricap.core.results.folder import Results
-from tricap.core.run import pipeline
+from tricap.core.run import take_run
 from tricap.core.surface import measure
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.surface.measure import MeasuredFrame
@@ -129,8 +129,8 @@ def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any
     at = ", ".join("{} = [{:.1f}, {:.1f}]".format(c.name, *c.project(np.array([-0.1, 0.0, 2.0]))) for c in rig.cameras)
     text = (take / "take.toml").read_text().replace("fps = 25.0", "fps = 2.0")
     (take / "take.toml").write_text(text + f'[seeds]\nframe = 0\n[seeds.joints]\n"elbow.R" = {{ {at} }}\n')
-    footage = pipeline.only_frames(open_take(read_take(take)), (3, 4))
-    s = pipeline.settings_of({}, {}, "take.toml")
+    footage = take_run.only_frames(open_take(read_take(take)), (3, 4))
+    s = take_run.settings_of({}, {}, "take.toml")
     (m,) = measure.measure_frames(footage, replace(measure.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
     assert m.foreground.method == "clicks and nearest surface" and m.foreground.depth_range_m[1] < 4
     distance = bodies[3][1].distance_m(m.cloud.xyz_m)
@@ -183,8 +183,8 @@ def test_one_clicked_seed_is_enough(
     wrong = {"L": off_px[0], "C": 0, "R": off_px[1]}
     at = ", ".join("{} = [{:.2f}, {:.2f}]".format(v, *(rig[v].project(X) + (wrong[v], 0))) for v in views)
     take = changed(plane_take, tmp_path / "take", f"[seeds]\nsurface = [{{ {at} }}]\n")
-    footage = pipeline.only_frames(open_take(read_take(take)), (0, 1))
-    s = pipeline.settings_of({}, {}, "take.toml")
+    footage = take_run.only_frames(open_take(read_take(take)), (0, 1))
+    s = take_run.settings_of({}, {}, "take.toml")
     (m,) = measure.measure_frames(footage, replace(measure.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
     assert len(m.cloud.xyz_m) > 500 and np.median(np.abs(plane.distance_m(m.cloud.xyz_m))) < 0.001
 
@@ -194,7 +194,7 @@ def test_seeds_follow_the_reference_and_the_settings(tmp_path: Path, scenes: Any
     small, large = scenes.three_cameras(width=120, height=90), scenes.three_cameras()
     rig = Rig(cameras=(small["L"], large["C"], large["R"]))
     footage = open_take(read_take(scenes.write_take(tmp_path / "take", rig, [[scenes.Body()]])))
-    s = pipeline.settings_of({}, {"enhance": {"wallis": "on"}}, "take.toml")
+    s = take_run.settings_of({}, {"enhance": {"wallis": "on"}}, "take.toml")
     plain, enhanced = (
         measure.first_seeds(footage, replace(measure.MeasureSettings.of(s), enhance=enhance), 0, Monitor())[1]
         for enhance in (None, s["enhance"])

@@ -14,7 +14,7 @@ from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.matching.region_growing import chi2_limit
 from tricap.core.motion.formats.ply import read_ply
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 
 COARSE = {"growing": {"spacing_px": 6}}
 
@@ -84,7 +84,7 @@ def test_pairs_reach_the_file(plane_take: Path, tmp_path: Path, scenes: Any, pla
     take, counts = painted(plane_take, tmp_path / "take", "R", slice(0, 100)), []
     for pairs in (False, True):
         settings = {"growing": COARSE["growing"] | {"pairs": pairs}}
-        with pipeline.open_run(take, tmp_path / f"{pairs}", settings, (0, 1)) as run:
+        with take_run.open_run(take, tmp_path / f"{pairs}", settings, (0, 1)) as run:
             pipeline.measure(run, Monitor())
         ply = read_ply(tmp_path / f"{pairs}" / "clouds" / "0000.ply")
         rays, near = ply.vertex["rays"], np.abs(plane.distance_m(ply.xyz_m))

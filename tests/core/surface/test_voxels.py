@@ -7,7 +7,7 @@ import pytest
 
 from tricap.core.foundation.progress import Monitor
 from tricap.core.motion.formats.ply import read_ply
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.surface import measure
 from tricap.core.surface.cloud import PointCloud, voxel_filtered
 
@@ -52,7 +52,7 @@ def test_only_the_file_is_thinned(plane_take: Path, tmp_path: Path, monkeypatch:
     sizes = []
     for edge_mm in (0.0, 30.0):
         settings = {"growing": {"spacing_px": 6}, "surface": {"voxel_mm": edge_mm}}
-        with pipeline.open_run(plane_take, tmp_path / "out", settings, (0, 1)) as run:
+        with take_run.open_run(plane_take, tmp_path / "out", settings, (0, 1)) as run:
             pipeline.measure(run, Monitor())
             sizes.append((len(read_ply(tmp_path / "out" / "clouds" / "0000.ply").xyz_m), len(run.clouds[0].xyz_m)))
         monkeypatch.setattr(measure, "_measure", None)

@@ -11,7 +11,7 @@ import pytest
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.results.folder import Results
-from tricap.core.run import pipeline
+from tricap.core.run import pipeline, take_run
 from tricap.core.run.stages import stage_keys
 from tricap.core.take.take import open_take, read_take
 
@@ -82,7 +82,7 @@ def test_nothing_beside_the_person(take: Path, tmp_path: Path, scenes: Any, bodi
 
 def test_run_json_says_what_told_the_person(take: Path, tmp_path: Path) -> None:
     changed = with_source(take, tmp_path / "take", {"C": 'mask = "MC/0.png"'})
-    with pipeline.open_run(changed, tmp_path / "out", COARSE, (0, 1)) as run:
+    with take_run.open_run(changed, tmp_path / "out", COARSE, (0, 1)) as run:
         pipeline.measure(run, Monitor())
     assert Results(tmp_path / "out").read_run()["stages"]["measure"]["foreground"] == "nearest surface, mask of C"
 
@@ -90,7 +90,7 @@ def test_run_json_says_what_told_the_person(take: Path, tmp_path: Path) -> None:
 def test_another_mask_is_another_input(take: Path, tmp_path: Path, scenes: Any) -> None:
     """A mask that is painted anew makes the stage stale, and its frame and those after are measured again."""
     changed = with_source(take, tmp_path / "take", {"C": 'masks = "MC/*.png"'})
-    settings = pipeline.settings_of({}, COARSE, "")
+    settings = take_run.settings_of({}, COARSE, "")
     before, key = scenes.measure(changed, tmp_path / "out", COARSE), stage_keys(open_take(read_take(changed)), settings, tmp_path / "out")
     mask = cv2.imread(str(changed / "MC" / "1.png"), 0)
     mask[:, 100:] = 0

@@ -1,0 +1,184 @@
+"""A run under way: the opened take, its settings, the locked folder of its results, and the record that becomes run.json."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ..body.model_file import read_model
+from ..body.motion import BodyFit
+from ..body.skin.contour_skin import SkinSettings
+from ..fitting.inputs.no_surface import empty_clouds
+from ..fitting.settings import FitSettings
+from ..foundation.errors import InputError
+from ..foundation.progress import Cancelled
+from ..foundation.settings import current_tables, from_table
+from ..images.enhance import EnhanceSettings
+from ..images.retime import TimingSettings
+from ..matching.least_squares import MatchingSettings
+from ..matching.region_growing import GrowingSettings
+from ..report.pages import check_pictured
+from ..report.silhouettes import Silhouettes
+from ..results.folder import Results, check_separate_folder
+from ..surface.cloud import PointCloud, SurfaceSettings
+from ..surface.frames import MeasuredFrames
+from ..take.clicked_points import clicked_depth
+from ..take.take import Footage, open_take, read_take
+from ..tracking.contour import ContourSettings
+from ..tracking.corrections import corrected_cloud
+from ..tracking.settings import KeyPointSettings, TrackingSettings
+from ..tracking.trajectories import Trajectories
+from .record import frame_table, new_record, write_frame_table
+from .stages import STAGE_FILES, STAGE_INPUTS, stage_keys, valid_stages
+
+SETTINGS: dict[str, type] = {
+    "timing": TimingSettings,
+    "enhance": EnhanceSettings,
+    "matching": MatchingSettings,
+    "growing": GrowingSettings,
+    "surface": SurfaceSettings,
+    "tracking": TrackingSettings,
+    "key_points": KeyPointSettings,
+    "contour": ContourSettings,
+    "fitting": FitSettings,
+    "skin": SkinSettings,
+}
+Overrides = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(kw_only=True)
+class Run:
+    """A run under way: an opened take, its settings, and the folder for its results. `record` becomes run.json."""
+
+    footage: Footage
+    settings: dict[str, Any]
+    results: Results
+    keys: Mapping[str, str] = field(default_factory=dict)  # of the stages: see stages.py
+    record: dict[str, Any] = field(default_factory=dict)
+    measured: MeasuredFrames = field(init=False)
+    trajectories: Trajectories | None = None
+    body: BodyFit | None = None
+    surfaceless: bool = False  # nothing could be measured, or nothing is to be
+    silhouettes: Silhouettes = field(default_factory=Silhouettes)
+    pictured: Sequence[int] = ()  # the frames of the report's pictures; none: the first, a middle and the last
+
+    def __post_init__(self) -> None:
+        self.measured = MeasuredFrames(footage=self.footage, results=self.results)
+
+    @property
+    def clouds(self) -> Sequence[PointCloud]:
+        """The clouds in the order of time, as the user corrected them; without points where nothing was measured."""
+        return self.measured.clouds(self.corrected) if self.measured else empty_clouds(self.footage)
+
+    def corrected(self, cloud: PointCloud) -> PointCloud:
+        """A cloud without what the user took out."""
+        return corrected_cloud(cloud, self.footage.take.corrections, self.footage.rig)
+
+    def warn(self, *sentences: str) -> None:
+        """Note what the user should know."""
+        self.record["warnings"].extend(s for s in dict.fromkeys(sentences) if s not in self.record["warnings"])
+
+    def finish_stage(self, stage: str, began: float, **figures: Any) -> None:
+        """Note what a stage took and found, and write run.json."""
+        key = self.keys.get(stage, self.keys.get("fit", ""))
+        self.record["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
+        write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.notes, self.trajectories, self.body))
+        self.results.write_run(self.record)
+
+    @contextmanager
+    def resumable(self, *partial: str, stopped: Callable[[], str]) -> Iterator[None]:
+        """A cancelled stage says what its checkpoints keep (`stopped`), and leaves no `partial` results."""
+        try:
+            yield
+        except Cancelled as stop:
+            self.results.remove(*partial)
+            raise Cancelled(stopped()) from stop
+
+    def do_without_surface(self, why: str) -> None:
+        """Note that there are no clouds and no trajectories."""
+        self.surfaceless = True
+        self.results.remove("clouds", "trajectories.npz", "trajectories_raw.npz")
+        for stage in ("measure", "track"):
+            self.finish_stage(stage, time.perf_counter(), not_done=why)
+
+    def __str__(self) -> str:
+        """One line for a panel."""
+        stages = self.record["stages"]
+        parts = [f"{len(self.footage.frames)} frames"]
+        if "points_per_frame" in stages.get("measure", {}):
+            parts.append(f"{stages['measure']['points_per_frame']:.0f} points a frame (sigma {stages['measure']['sigma_mm']:.2f} mm)")
+        if "trajectories" in stages.get("track", {}):
+            parts.append(f"{stages['track']['trajectories']} trajectories")
+        if "fit" in stages and "not_done" not in stages["fit"]:
+            parts.append("body fitted")
+        return ", ".join(parts)
+
+
+def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> dict[str, Any]:
+    """All settings of a run: the defaults, then take.toml's, then the command's or the panel's.
+
+    Raises:
+        InputError: an unknown table or name, or a value that cannot be.
+    """
+    groups: dict[str, dict[str, Any]] = {name: {} for name in SETTINGS}
+    for source, place in ((take_settings, f" in {where}"), (overrides, "")):
+        for name, table in current_tables(source, SETTINGS, place).items():
+            groups[name].update(table)
+    return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
+
+
+@contextmanager
+def open_run(
+    take_folder: Path,
+    out: Path,
+    overrides: Overrides | None = None,
+    frames: tuple[int, int] | None = None,
+    *,
+    restart: bool = False,
+    ignore_contours: bool = False,
+    pictures: Sequence[int] = (),
+) -> Iterator[Run]:
+    """Open a take and the folder for its results, into which no other run can write meanwhile. What can be checked beforehand is checked.
+
+    What an earlier run of other input left in OUT is removed (with `ignore_contours` not for new contours alone); `restart` removes it all.
+    `pictures`: the frames of the report's, by default a few.
+
+    Raises:
+        InputError: the take, the rig, the settings or the folder need mending, or another run is at work in the folder.
+    """
+    take = read_take(take_folder)
+    settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
+    footage = open_take(take)
+    if frames is not None:
+        footage = only_frames(footage, frames)
+    for name, at in take.seeds.joints.items():
+        clicked_depth(footage, name, at)
+    if take.body_model is not None:
+        read_model(take.body_model)
+    check_separate_folder(out, take.folder, (s.files()[0] for s in footage.sequences))
+    check_pictured(footage.frames, pictures)
+    keys = stage_keys(footage, settings, Path(out))
+    with Results(out).opened() as results:
+        if restart:
+            results.remove("clouds", *STAGE_FILES, "cache")  # the cache last: it marks the folder as ours
+        before = {} if restart else results.read_run()
+        record = new_record(footage, settings)
+        record["stages"] = kept = valid_stages(before, keys, ignore_contours=ignore_contours)
+        if before:  # what was made otherwise must not stand beside the new
+            results.remove(*(name for stage, c in STAGE_INPUTS.items() if stage not in kept for name in c.files))
+        yield Run(footage=footage, settings=settings, results=results, keys=keys, record=record, pictured=pictures)
+
+
+def only_frames(footage: Footage, frames: tuple[int, int]) -> Footage:
+    """The footage with only these frames, half-open.
+
+    Raises:
+        InputError: the take has not all of them.
+    """
+    if frames[0] not in footage.frames or frames[1] - 1 not in footage.frames or frames[0] >= frames[1]:
+        raise InputError(
+            f"Frames {frames[0]}:{frames[1]} are not among the take's frames {footage.frames.start}:{footage.frames.stop}; choose others."
+        )
+    return replace(footage, frames=range(*frames))
