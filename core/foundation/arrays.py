@@ -45,7 +45,7 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-class Lazy(Sequence[B], Generic[A, B]):
+class LazySequence(Sequence[B], Generic[A, B]):
     """The items of another sequence as what `made` makes of each."""
 
     def __init__(self, items: Sequence[A], made: Callable[[A], B]) -> None:
@@ -57,8 +57,8 @@ class Lazy(Sequence[B], Generic[A, B]):
     @overload
     def __getitem__(self, index: int) -> B: ...
     @overload
-    def __getitem__(self, index: slice) -> "Lazy[A, B]": ...
-    def __getitem__(self, index: int | slice) -> "B | Lazy[A, B]":
+    def __getitem__(self, index: slice) -> "LazySequence[A, B]": ...
+    def __getitem__(self, index: int | slice) -> "B | LazySequence[A, B]":
         if isinstance(index, slice):
-            return Lazy(self._items[index], self._made)
+            return LazySequence(self._items[index], self._made)
         return self._made(self._items[index])

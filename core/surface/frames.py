@@ -10,7 +10,7 @@ from typing import overload
 
 import numpy as np
 
-from ..foundation.arrays import Lazy
+from ..foundation.arrays import LazySequence
 from ..foundation.errors import InputError
 from ..results.folder import Results
 from ..take.take import Footage
@@ -70,4 +70,4 @@ class MeasuredFrames(Sequence[MeasuredFrame]):
 
     def clouds(self, corrected: Callable[[PointCloud], PointCloud]) -> Sequence[PointCloud]:
         """The frames' clouds, each read and corrected when it is asked for."""
-        return Lazy(self, lambda measured: corrected(measured.cloud))
+        return LazySequence(self, lambda measured: corrected(measured.cloud))

@@ -27,7 +27,7 @@ from ...body.complete import complete_shape
 from ...body.model_file import read_model, with_limits
 from ...body.motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
 from ...body.shape import default_shape, one_ball_shape, scaled_shape
-from ...foundation.arrays import Lazy
+from ...foundation.arrays import LazySequence
 from ...foundation.progress import Monitor
 from ..context import NO_SHAPE, Conditions
 from ..inputs.background import EmptyViews
@@ -74,7 +74,7 @@ def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: 
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
     fit = replace(conditions(given, settings), monitor=monitor)
-    points: Sequence[CloudPoints] = Lazy(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
+    points: Sequence[CloudPoints] = LazySequence(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
     if len(points) <= AT_ONCE:
         points = _read(points, monitor)
     first = fit_click_frame(fit, points[fit.click], monitor)
