@@ -55,8 +55,8 @@ def coloured_points(run: "RunResults", view: str, frame: int, red_mm: float) -> 
     sigma = 1e3 * points.sigma_m
     most = red_mm if red_mm > 0 else max(float(np.quantile(sigma, RED_QUANTILE)), 1e-6)
     xy = points.xy_px[:, list(run.cameras).index(view)]
-    seen = np.isfinite(xy).all(axis=1)
-    return ColouredPoints(xy_px=xy[seen], colours=heat_colours(sigma[seen] / most), red_mm=most)
+    visible = np.isfinite(xy).all(axis=1)
+    return ColouredPoints(xy_px=xy[visible], colours=heat_colours(sigma[visible] / most), red_mm=most)
 
 
 def removed_points(run: "RunResults", view: str, frame: int, by: str = ALL) -> tuple[np.ndarray, list[tuple[str, int]]]:
@@ -65,9 +65,9 @@ def removed_points(run: "RunResults", view: str, frame: int, by: str = ALL) -> t
     mine = np.isin(why, np.arange(1, len(FILTERS) + 1)) if by == ALL else why == int(by)
     if not mine.any():
         return np.zeros((0, 2)), []
-    seen = xy[mine, list(run.cameras).index(view)]
+    visible = xy[mine, list(run.cameras).index(view)]
     counts = [(words, int((why[mine] == n).sum())) for n, words in enumerate(FILTERS, 1)]
-    return seen[np.isfinite(seen).all(axis=1)], [(words, count) for words, count in counts if count]
+    return visible[np.isfinite(visible).all(axis=1)], [(words, count) for words, count in counts if count]
 
 
 def tails(run: "RunResults", view: str, frame: int, length: int, which: str, by: str = ALL) -> tuple[np.ndarray, np.ndarray]:

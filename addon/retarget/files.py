@@ -121,11 +121,11 @@ def the_armature(name: str, what: str) -> bpy.types.Object:
     if name:
         found = next((o for o in armatures if o.name == name), None)
         if found is None:
-            known = ", ".join(o.name for o in armatures) or "none"
-            raise InputError(f"{what} has no armature “{name}”; it has: {known}.")
+            names = ", ".join(o.name for o in armatures) or "none"
+            raise InputError(f"{what} has no armature “{name}”; it has: {names}.")
         return found
     if not armatures:
         raise InputError(f"{what} has no armature; choose a file with a rig.")
     if len(armatures) > 1:
-        raise InputError(f"{what} has {len(armatures)} armatures ({', '.join(o.name for o in armatures)}); name one with --armature.")
+        raise InputError(f"{what} has {len(armatures)} armatures ({', '.join(o.name for o in armatures)}); choose one with --armature.")
     return armatures[0]

@@ -93,13 +93,13 @@ def orthonormal(M: np.ndarray) -> np.ndarray:
 
 
 def humanoid_roles(armature_object: bpy.types.Object) -> dict[str, str]:
-    """What a VRM file says its bones are, as kept by our own import or by the add-on for VRM files; and what bones of ours are."""
-    known = armature_object.data.get(ROLES_KEY)
-    if known is not None:
-        return {str(role): str(name) for role, name in known.items() if name in armature_object.data.bones}
+    """The bone of each part, as stored by Tricap's import or its own armatures, or by the VRM add-on."""
+    stored = armature_object.data.get(ROLES_KEY)
+    if stored is not None:
+        return {str(role): str(name) for role, name in stored.items() if name in armature_object.data.bones}
     extension = getattr(armature_object.data, "vrm_addon_extension", None)
     found: dict[str, str] = {}
-    for table in (_vrm1(extension), _vrm0(extension)):  # the one that is not the file's is empty
+    for table in (_vrm1(extension), _vrm0(extension)):  # the table of the other version is empty
         found |= {role: name for role, name in table.items() if name in armature_object.data.bones and role not in found}
     return found
 

@@ -168,13 +168,13 @@ def save_blend(path: Path) -> None:
 def _relative_caches(path: Path) -> Iterator[None]:
     """While the file is saved, mesh caches in its folder have relative paths, so that both can be moved together."""
     modifiers = [m for o in bpy.data.objects for m in o.modifiers if m.type == "MESH_CACHE"]
-    kept = [(m, m.filepath) for m in modifiers if not m.filepath.startswith("//") and Path(m.filepath).parent == path.parent]
-    for modifier, file in kept:
+    absolute = [(m, m.filepath) for m in modifiers if not m.filepath.startswith("//") and Path(m.filepath).parent == path.parent]
+    for modifier, file in absolute:
         modifier.filepath = "//" + Path(file).name
     try:
         yield
     finally:
-        for modifier, file in kept:
+        for modifier, file in absolute:
             modifier.filepath = file
 
 

@@ -84,7 +84,7 @@ def undistorted(grey: np.ndarray, camera: Camera) -> np.ndarray:
 def _only_body(scene: bpy.types.Scene) -> Iterator[None]:
     """Render with Workbench on a transparent background, without cloud and trails; restores the scene afterwards."""
     render, shading = scene.render, scene.display.shading
-    kept = render.engine, render.film_transparent, shading.light, shading.color_type, shading.show_cavity
+    earlier = render.engine, render.film_transparent, shading.light, shading.color_type, shading.show_cavity
     hidden = [o for o in scene.objects if o.type in SHOWN and not o.hide_render and o.name.split(".")[0] in HIDDEN]
     for thing in hidden:
         thing.hide_render = True
@@ -93,7 +93,7 @@ def _only_body(scene: bpy.types.Scene) -> Iterator[None]:
     try:
         yield
     finally:
-        render.engine, render.film_transparent, shading.light, shading.color_type, shading.show_cavity = kept
+        render.engine, render.film_transparent, shading.light, shading.color_type, shading.show_cavity = earlier
         for thing in hidden:
             thing.hide_render = False
 
@@ -108,7 +108,7 @@ def _turning_camera(scene: bpy.types.Scene) -> Iterator:
     data.sensor_height = 36.0
     distance = 1.15 * radius / math.sin(math.atan(0.5 * data.sensor_height / data.lens))
     render = scene.render
-    kept = scene.camera, render.resolution_x, render.resolution_y, render.pixel_aspect_x, render.pixel_aspect_y
+    earlier = scene.camera, render.resolution_x, render.resolution_y, render.pixel_aspect_x, render.pixel_aspect_y
     scene.camera = camera
     render.resolution_x, render.resolution_y = TURN_SIZE_PX
     render.pixel_aspect_x = render.pixel_aspect_y = 1.0
@@ -120,7 +120,7 @@ def _turning_camera(scene: bpy.types.Scene) -> Iterator:
     try:
         yield turn
     finally:
-        scene.camera, render.resolution_x, render.resolution_y, render.pixel_aspect_x, render.pixel_aspect_y = kept
+        scene.camera, render.resolution_x, render.resolution_y, render.pixel_aspect_x, render.pixel_aspect_y = earlier
         bpy.data.cameras.remove(data)
 
 
@@ -144,13 +144,13 @@ def _extent(scene: bpy.types.Scene) -> tuple[Vector, float]:
 def _rendered(scene: bpy.types.Scene) -> np.ndarray:
     """A render of the scene (h, w, 4), BGR and alpha, 0…255."""
     with tempfile.TemporaryDirectory() as folder:
-        kept = scene.render.filepath, scene.render.image_settings.file_format, scene.render.image_settings.color_mode
+        earlier = scene.render.filepath, scene.render.image_settings.file_format, scene.render.image_settings.color_mode
         scene.render.filepath = str(Path(folder) / "picture.png")
         scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
         try:
             bpy.ops.render.render(write_still=True)
         finally:
-            scene.render.filepath, scene.render.image_settings.file_format, scene.render.image_settings.color_mode = kept
+            scene.render.filepath, scene.render.image_settings.file_format, scene.render.image_settings.color_mode = earlier
         return np.asarray(cv2.imread(str(Path(folder) / "picture.png"), cv2.IMREAD_UNCHANGED)).astype(np.float64)
 
 

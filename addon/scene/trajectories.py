@@ -1,4 +1,4 @@
-"""The trajectories of all tracked points as ONE mesh of edges; geometry nodes show the trail behind the current frame.
+"""The trajectories of all tracked points as ONE mesh of edges; geometry nodes show the trail up to the current frame.
 
 A point that is visible in two successive frames gives an edge. Named attributes on the points: frame, track and segment (int, see
 prepare.py), sigma [m] and speed [m/s] (float), velocity [m/s] (vector).

@@ -77,21 +77,21 @@ def check_not_read(flag: str, out: Path, *read: Path | None) -> None:
 
 
 def check_simplify(degrees: float) -> None:
-    """Whether keys can be left out within so many degrees.
+    """Check the tolerance of --simplify.
 
     Raises:
-        InputError: they cannot.
+        InputError: it is out of range.
     """
     if not 0 <= degrees <= 180:
-        raise InputError(f"--simplify {degrees:g} is no tolerance; write degrees, such as 0.5.")
+        raise InputError(f"--simplify {degrees:g} is out of range; write 0 to 180 degrees, such as 0.5.")
 
 
 @contextmanager
 def standard_output_kept_clean(args: argparse.Namespace) -> Iterator[None]:
-    """Blender and its exporters write notes to standard output, also below Python; they go to standard error, so that ours can be read by
-    machines, and nowhere with --quiet."""
+    """Redirect what Blender and its exporters print, also below Python, from standard output to standard error, so that scripts can read our
+    output; with --quiet, discard it."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    stdout = os.dup(1)
     away = os.open(os.devnull, os.O_WRONLY) if getattr(args, "quiet", False) else os.dup(2)
     os.dup2(away, 1)
     os.close(away)
@@ -99,5 +99,5 @@ def standard_output_kept_clean(args: argparse.Namespace) -> Iterator[None]:
         yield
     finally:
         sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(stdout, 1)
+        os.close(stdout)

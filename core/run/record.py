@@ -1,6 +1,6 @@
 """The content of run.json: the take, settings and inputs of a run, the command that repeats it, and figures of its results.
 
-frames.csv: how good every frame is, in one row, for the panel's graph and for whoever looks for the bad ones.
+frames.csv: the quality of every frame in one row, for the panel's graph and for finding doubtful frames.
 """
 
 import csv
@@ -117,28 +117,28 @@ def median(values: Sequence[float] | np.ndarray) -> float:
 
 COLUMNS = ("points", "sigma_mm", "residual_px", "tracks", "track_sigma_mm", "fit_sigma0", "joint_sigma_mm")
 FEWER_IS_WORSE = ("points", "tracks")
-WORDS = {
+REASONS = {
     "points": "few points",
     "sigma_mm": "points uncertain",
-    "residual_px": "rays miss",
+    "residual_px": "large residuals",
     "tracks": "few tracks",
     "track_sigma_mm": "tracks uncertain",
-    "fit_sigma0": "body beside the points",
+    "fit_sigma0": "body off the points",
     "joint_sigma_mm": "joints uncertain",
 }
-BAD = 1.5  # times worse than in half of the frames
+DOUBTFUL = 1.5  # times worse than the median frame
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FrameTable:
-    """T frames. NaN where a stage did not run or had nothing in a frame; medians over the frame's points."""
+    """The quality of T frames: medians over a frame's points, NaN where a stage did not run or has nothing in a frame."""
 
     frames: np.ndarray  # (T,)
     values: dict[str, np.ndarray]  # (T,) by COLUMNS
     fit: tuple[str, ...]  # (T,) "" where no body was fitted, else a status of the fit
 
     def badness(self) -> tuple[np.ndarray, tuple[str, ...]]:
-        """How many times worse than in half of the frames each frame is (T,), in what is worst about it, and what that is in words."""
+        """How many times worse than the median frame each frame is (T,), in its worst value; and the reasons, "" unless doubtful."""
         ratio = np.ones((len(COLUMNS), len(self.frames)))
         for i, name in enumerate(COLUMNS):
             value = self.values[name]
@@ -148,16 +148,16 @@ class FrameTable:
                 worse = middle / np.maximum(value, 0.01 * middle) if name in FEWER_IS_WORSE else value / middle
                 ratio[i] = np.where(np.isfinite(value), worse, 1.0)
         worst = ratio.argmax(axis=0) if len(self.frames) else np.zeros(0, dtype=int)
-        much = ratio.max(axis=0)
-        words = [WORDS[COLUMNS[k]] if r >= BAD else "" for k, r in zip(worst, much)]
+        badness = ratio.max(axis=0)
+        reasons = [REASONS[COLUMNS[k]] if r >= DOUBTFUL else "" for k, r in zip(worst, badness)]
         for t, state in enumerate(self.fit):
             if state not in ("", FITTED):
-                much[t], words[t] = max(much[t], 2 * BAD), f"fit {state}"
-        return much, tuple(words)
+                badness[t], reasons[t] = max(badness[t], 2 * DOUBTFUL), f"fit {state}"
+        return badness, tuple(reasons)
 
 
 def frame_table(notes: Sequence[FrameNote], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
-    """The table of a run, as far as it is; points count as measured, before corrections. Without measured frames, those of the body."""
+    """The table of a run, as far as it has come. Points are counted before corrections. Without measured frames, those of the body."""
     frames = np.array([n.frame for n in notes] if notes or body is None else body.motion.frames, dtype=np.int64)
     values = {name: np.full(len(frames), np.nan) for name in COLUMNS}
     for i, note in enumerate(notes):
@@ -178,7 +178,7 @@ def frame_table(notes: Sequence[FrameNote], trajectories: Trajectories | None, b
 
 
 def write_frame_table(path: Path, table: FrameTable) -> None:
-    """Write frames.csv; an empty cell is what is not known."""
+    """Write frames.csv; NaN gives an empty cell."""
     lines = [",".join(("frame", *COLUMNS, "fit"))]
     for t, frame in enumerate(table.frames):
         cells = [f"{v:.4g}" if np.isfinite(v) else "" for v in (table.values[name][t] for name in COLUMNS)]

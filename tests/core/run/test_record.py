@@ -35,7 +35,7 @@ def test_what_stands_in_it() -> None:
 
 def test_bad_frames_and_why() -> None:
     much, why = table().badness()
-    assert why == ("", "rays miss", "few points", "", "") and much.argmax() == 2 and much[0] < 1.2
+    assert why == ("", "large residuals", "few points", "", "") and much.argmax() == 2 and much[0] < 1.2
     fitted = FrameTable(frames=np.arange(2), values={name: np.ones(2) for name in COLUMNS}, fit=("fitted", "bridged"))
     assert fitted.badness()[1] == ("", "fit bridged")
     nothing = FrameTable(frames=np.zeros(0, dtype=int), values={name: np.zeros(0) for name in COLUMNS}, fit=())
