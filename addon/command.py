@@ -28,9 +28,11 @@ def add_commands(subparsers: Any) -> None:
     parser: argparse.ArgumentParser = subparsers.add_parser("scene", help=about, description=about)
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run")
     parser.add_argument("--blend", metavar="FILE.blend", type=Path, required=True, help="the file to write")
-    parser.add_argument("--preview", metavar="FILE.png", type=Path, help="also a picture: the body shaded, and over the footage")
-    parser.add_argument("--turntable", metavar="FILE.mp4", type=Path, help="also a movie of a turn around the body")
-    parser.add_argument("--frame", metavar="N", type=int, help="the frame of preview, turntable, implicit surface (default: middle)")
+    parser.add_argument("--preview", metavar="FILE.png", type=Path, help="also write a picture: the body shaded, and over the footage")
+    parser.add_argument("--turntable", metavar="FILE.mp4", type=Path, help="also write a turntable movie of the body")
+    parser.add_argument(
+        "--frame", metavar="N", type=int, help="the frame of preview, turntable and implicit surface (default: the middle one)"
+    )
     parser.add_argument(
         "--detail",
         metavar="N",
@@ -39,13 +41,13 @@ def add_commands(subparsers: Any) -> None:
         choices=range(1, 9),
         help=f"level of detail of the skin, 1 to 8 (default {DETAIL})",
     )
-    parser.add_argument("--exact-skin", action="store_true", help="also the run's skin of every frame, as FILE.pc2 beside the .blend")
-    parser.add_argument("--implicit", action="store_true", help="also the implicit surface itself in the middle frame, for checking")
+    parser.add_argument("--exact-skin", action="store_true", help="also the run's skin of every frame, as FILE.pc2 next to the .blend")
+    parser.add_argument("--implicit", action="store_true", help="also the implicit surface itself in one frame, for checking")
     parser.add_argument(
         "--field",
         choices=tuple(POTENTIALS),
         default=EXPONENTIAL.name,
-        help="the field of that surface's balls, see `tricap fields` (default: the fitted one)",
+        help="the field function of that surface, see `tricap fields` (default: the fitted one)",
     )
     parser.add_argument("--rest-pose", choices=("A", "T"), default="A", help="of the armature (default A)")
     parser.add_argument(
@@ -53,9 +55,9 @@ def add_commands(subparsers: Any) -> None:
         metavar="DEG",
         type=float,
         default=0.0,
-        help="play a second action with few keys, within this many degrees; the measured one is kept",
+        help="play a second action with fewer keys, within this many degrees; the measured one stays in the file",
     )
-    parser.add_argument("--colour", choices=("intensity", "sigma", "speed"), default="intensity", help="what colours the cloud")
+    parser.add_argument("--colour", choices=("intensity", "sigma", "speed"), default="intensity", help="the colour of the cloud")
     parser.add_argument("--arrows", action="store_true", help="velocities as arrows")
     parser.set_defaults(run=scene)
 
@@ -64,7 +66,7 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Build the scene of args.out in an empty file and save it as args.blend; the lines to show.
 
     Raises:
-        InputError: there is no Blender in this Python, or the input needs mending.
+        InputError: there is no Blender in this Python, or the input is invalid.
         Cancelled: the monitor was cancelled; no file was written.
     """
     if importlib.util.find_spec("bpy") is None:
@@ -104,16 +106,16 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Whether the arguments can be, before anything is read.
+    """Check the arguments before anything is read.
 
     Raises:
-        InputError: one of them cannot.
+        InputError: one of them is invalid.
     """
     check_simplify(args.simplify)
     named = (("--blend", args.blend, ".blend"), ("--preview", args.preview, ".png"), ("--turntable", args.turntable, ".mp4"))
     for flag, path, ending in named:
         if path is not None and path.suffix.lower() != ending:
-            raise InputError(f"{flag} {path} is no {ending}; let its name end so.")
+            raise InputError(f"{flag} {path} is not a {ending} file; choose a name that ends in {ending}.")
 
 
 def register() -> None:

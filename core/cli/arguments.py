@@ -88,7 +88,7 @@ def check_simplify(degrees: float) -> None:
 
 @contextmanager
 def standard_output_kept_clean(args: argparse.Namespace) -> Iterator[None]:
-    """Redirect what Blender and its exporters print, also below Python, from standard output to standard error, so that scripts can read our
+    """Redirect what Blender and its exporters print, also below Python, to standard error, so that scripts can read our standard
     output; with --quiet, discard it."""
     sys.stdout.flush()
     stdout = os.dup(1)
