@@ -213,7 +213,8 @@ def test_the_command(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("more", "said"), [
-    (["--frame", "99", "--preview", "a.png"], "--frame 99 is not among the frames 2 to 7"), (["--simplify", "-1"], "--simplify -1 is out of range"),
+    (["--frame", "99", "--preview", "a.png"], "--frame 99 is not among the frames 2 to 7"),
+    (["--simplify", "-1"], "--simplify -1 is out of range"),
     (["--simplify", "nan"], "is out of range"), (["--preview", "a.jpg"], "--preview a.jpg is not a .png file"),
     (["--turntable", "a"], "is not a .mp4 file"),
 ])  # fmt: skip
