@@ -1,10 +1,9 @@
-"""The person, not the wall: in which depths to measure, and which planes of the room to leave out.
+"""Where the person is: the range of depths to measure, and the planes of the background to leave out.
 
-The depth range comes from what the user clicked in that frame; without clicks, or where they are of another frame, from the nearest
-surface that carries many seeds, of those that moved if these are enough; later from the frame before. Where the user gave masks or images
-of the empty background, only what lies inside these silhouettes is measured. Floor and walls are planes of seeds
-that do not change over time and have nothing behind them; they are found once per take, and points on them are not measured. Which of
-these was used is said in `method`.
+The depth range comes from the clicks in that frame; without clicks, or where they are in another frame, from the nearest surface with many
+seeds, of those that moved if these are enough; later from the frame before. Where the take has masks or images of the empty background,
+only points inside these silhouettes are measured. Floor and walls are planes of seeds that do not change over time and have nothing behind
+them; they are found once per take, and points on them are not measured. `method` records which of these was used.
 """
 
 from collections.abc import Sequence
@@ -16,15 +15,28 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..images.interlace import RowGrid
 
-REACH_M = 0.55  # a body's extent in depth beyond clicked joints
-SPEED_M_S = 2.0  # of someone who walks, in depth
-MARGIN_M = 0.30  # what a person may move in depth between frames, and a limb beyond the cloud of the frame before
-CLUSTER_WIDTH, CLUSTER_SHARE = 0.12, 0.3  # of log depth; of the seeds in the richest cluster
-PLANE_TOLERANCE_M, PLANE_SHARE, PLANE_MIN, BEHIND_SHARE = 0.015, 0.3, 20, 0.03
-PLANE_TRIALS, MAX_PLANES = 400, 3
-STATIC_NOISE = 2.0
-PLANE_SIGMAS = 3.0
-PLANE_EXTENT_M = 1.2  # longer than the flat front of a person who stands still
+REACH_M = 0.55  # m, a body's extent in depth beyond clicked joints
+NEAREST_M = 0.05  # m, smallest depth of all
+SPEED_M_S = 2.0  # m/s in depth, of a walking person
+MARGIN_M = 0.30  # m that a person may move in depth between frames, and by which a limb may exceed the cloud of the frame before
+CLOUD_PERCENT = (1, 99)  # percentiles of a cloud's depths that are taken as its limits
+MIN_CLOUD = 20  # points of a cloud; fewer do not change the depths
+CLUSTER_WIDTH = 0.12  # of log depth
+CLUSTER_SHARE = 0.3  # of the seeds in the richest cluster
+PLANE_TOLERANCE_M = 0.015  # m
+PLANE_SIGMAS = 3.0  # of a point's own sigma across a plane, up to the tolerance once more
+PLANE_SHARE = 0.3  # of the static seeds that are left, which a plane must contain
+PLANE_MIN = 20  # seeds of a plane
+PLANE_EXTENT_M = 1.2  # m; longer than the flat front of a person who stands still
+EXTENT_PERCENT = (5, 95)  # percentiles along the longest axis that are taken as a plane's extent
+BEHIND_SHARE = 0.03  # of all seeds, which may lie behind a plane
+BEHIND_TOLERANCES = 4  # PLANE_TOLERANCE_M behind the plane, from which a seed lies behind it
+REMOVED_TOLERANCES = 2  # PLANE_TOLERANCE_M before the plane, up to which seeds belong to it and do not support another one
+PLANE_TRIALS = 400  # triples of seeds
+MAX_PLANES = 3
+RANDOM_SEED = 1999
+STATIC_NOISE = 2.0  # times the images' usual difference, up to which a place is unchanged
+STATIC_WINDOW = (9, 9)  # px over which differences are averaged
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -36,7 +48,7 @@ class Silhouette:
     mask: np.ndarray
 
     def misses(self, xyz_m: np.ndarray) -> np.ndarray:
-        """(N,) points (N, 3) that this view would show beside the person; those out of its sight may be there."""
+        """(N,) points (N, 3) whose projection lies outside the person; points outside the image do not count."""
         xy = self.rows.from_frame(self.camera.project(xyz_m))
         h, w = self.mask.shape
         with np.errstate(invalid="ignore"):
@@ -55,30 +67,30 @@ class Foreground:
     silhouettes: tuple[Silhouette, ...] = ()  # of this frame
 
     def excludes(self, xyz_m: np.ndarray, covariance_m2: np.ndarray) -> np.ndarray:
-        """(N,) points (N, 3) that lie on one of the planes as far as their covariances (N, 3, 3) can tell, or behind it, or beside a
+        """(N,) points (N, 3) on one of the planes, within tolerances from their covariances (N, 3, 3), or behind it, or outside a
         silhouette."""
-        beside = np.zeros(len(xyz_m), dtype=bool)
+        outside = np.zeros(len(xyz_m), dtype=bool)
         for silhouette in self.silhouettes:
-            beside |= silhouette.misses(xyz_m)
+            outside |= silhouette.misses(xyz_m)
         if not len(self.planes):
-            return beside
+            return outside
         n = self.planes[:, :3]
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(np.einsum("pi,nij,pj->np", n, covariance_m2, n))
             tolerance = PLANE_TOLERANCE_M + np.minimum(PLANE_SIGMAS * sigma, PLANE_TOLERANCE_M)
-            return np.asarray(beside | (xyz_m @ n.T - self.planes[:, 3] < tolerance).any(axis=1))
+            return np.asarray(outside | (xyz_m @ n.T - self.planes[:, 3] < tolerance).any(axis=1))
 
 
 def around_clicks(depth_m: np.ndarray) -> Foreground:
     """The depths of a body some of whose joints or surface points were clicked."""
-    return Foreground(depth_range_m=(max(0.05, float(depth_m.min()) - REACH_M), float(depth_m.max()) + REACH_M), method="clicks")
+    return Foreground(depth_range_m=(max(NEAREST_M, float(depth_m.min()) - REACH_M), float(depth_m.max()) + REACH_M), method="clicks")
 
 
 def since_clicks(depth_m: np.ndarray, seconds: float, person_m: np.ndarray) -> Foreground:
-    """The depths `seconds` before or after joints were clicked: of what is nearest among the seeds' depths `person_m` (N,) that a body
-    can have reached since; where there is none, all that it can have reached."""
+    """The depths `seconds` before or after the frame of the clicks: those of the nearest cluster of the seeds' depths `person_m` (N,)
+    that a body can reach in this time; without such seeds, all that it can reach."""
     near, far = around_clicks(depth_m).depth_range_m
-    near, far = max(0.05, near - SPEED_M_S * seconds), far + SPEED_M_S * seconds
+    near, far = max(NEAREST_M, near - SPEED_M_S * seconds), far + SPEED_M_S * seconds
     reached = person_m[(person_m >= near) & (person_m <= far)]
     if not len(reached):
         return Foreground(depth_range_m=(near, far), method="clicks")
@@ -89,7 +101,7 @@ def since_clicks(depth_m: np.ndarray, seconds: float, person_m: np.ndarray) -> F
 
 
 def nearest_surface(depth_m: np.ndarray) -> Foreground:
-    """The nearest cluster of seeds' depths that holds at least CLUSTER_SHARE of the richest cluster's seeds."""
+    """The nearest cluster of seeds' depths with at least CLUSTER_SHARE of the richest cluster's seeds."""
     position = np.log(np.sort(depth_m))
     density = (np.abs(position[:, None] - position[None, :]) < CLUSTER_WIDTH).sum(axis=1)
     nearest = position[np.argmax(density >= CLUSTER_SHARE * density.max())]
@@ -100,46 +112,46 @@ def nearest_surface(depth_m: np.ndarray) -> Foreground:
 
 
 def after(cloud_depth_m: np.ndarray, before: Foreground) -> Foreground:
-    """The depths in the next frame, from the cloud of this one; a frame without points changes nothing."""
-    if len(cloud_depth_m) < 20:
+    """The depths in the next frame, from the cloud of this one; a frame with few points changes nothing."""
+    if len(cloud_depth_m) < MIN_CLOUD:
         return before
-    low, high = np.percentile(cloud_depth_m, [1, 99])
+    low, high = np.percentile(cloud_depth_m, CLOUD_PERCENT)
     width = max(before.depth_range_m[1] - before.depth_range_m[0], 2 * MARGIN_M)
-    near = max(0.05, float(low) - MARGIN_M)
+    near = max(NEAREST_M, float(low) - MARGIN_M)
     return Foreground(depth_range_m=(near, min(float(high) + MARGIN_M, near + width)), method="frame before", planes=before.planes)
 
 
 def background_planes(static_xyz_m: np.ndarray, all_xyz_m: np.ndarray, cameras_m: Sequence[np.ndarray]) -> np.ndarray:
     """Planes (P, 4) of floor and walls among seeds (N, 3) that do not change over time.
 
-    A plane must hold PLANE_SHARE of the static seeds that are left, be longer than a body's flat parts, and have almost none of all seeds
-    behind it. The trials are seeded.
+    A plane must contain PLANE_SHARE of the static seeds that are left, be longer than a body's flat parts, and have hardly any of all
+    seeds behind it. The trials are seeded.
     """
     planes: list[np.ndarray] = []
     rest = static_xyz_m
-    random = np.random.default_rng(1999)
+    random = np.random.default_rng(RANDOM_SEED)
     eye = np.mean(np.stack(list(cameras_m)), axis=0)
     while len(rest) >= PLANE_MIN and len(planes) < MAX_PLANES:
         plane = _best_plane(rest, eye, random)
         distance = rest @ plane[:3] - plane[3]
         inlier = np.abs(distance) < PLANE_TOLERANCE_M
-        behind = float(np.mean(all_xyz_m @ plane[:3] - plane[3] < -4 * PLANE_TOLERANCE_M))
+        behind = float(np.mean(all_xyz_m @ plane[:3] - plane[3] < -BEHIND_TOLERANCES * PLANE_TOLERANCE_M))
         if inlier.sum() < max(PLANE_MIN, PLANE_SHARE * len(rest)) or behind > BEHIND_SHARE or _extent(rest[inlier]) < PLANE_EXTENT_M:
             break
         planes.append(plane)
-        all_xyz_m = all_xyz_m[all_xyz_m @ plane[:3] - plane[3] > -4 * PLANE_TOLERANCE_M]
-        rest = rest[distance > 2 * PLANE_TOLERANCE_M]
+        all_xyz_m = all_xyz_m[all_xyz_m @ plane[:3] - plane[3] > -BEHIND_TOLERANCES * PLANE_TOLERANCE_M]
+        rest = rest[distance > REMOVED_TOLERANCES * PLANE_TOLERANCE_M]
     return np.array(planes).reshape(-1, 4)
 
 
 def _extent(points: np.ndarray) -> float:
     """Length of a group of points along its longest axis, without its outermost twentieths."""
     along = (points - points.mean(axis=0)) @ np.linalg.svd(points - points.mean(axis=0))[2][0]
-    return float(np.diff(np.percentile(along, [5, 95]))[0])
+    return float(np.diff(np.percentile(along, EXTENT_PERCENT))[0])
 
 
 def _best_plane(points: np.ndarray, eye: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """The plane through three points that holds most points, refitted to them."""
+    """The plane through three points that contains most points, refitted to them."""
     triples = points[random.integers(0, len(points), (PLANE_TRIALS, 3))]
     normal = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normal, axis=1)
@@ -157,10 +169,10 @@ def _best_plane(points: np.ndarray, eye: np.ndarray, random: np.random.Generator
 def unchanged(grey: np.ndarray, later: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """(N,) points (N, 2) of the reference image whose surroundings have the same grey values in a frame far away in time.
 
-    The images may differ in brightness as a whole; what counts is the difference beside the images' usual difference, which is noise.
+    The images may differ in brightness as a whole; differences are compared with the images' median difference, which is noise.
     """
     difference = np.abs((grey - np.median(grey)) - (later - np.median(later)))
     noise = max(1.0, float(np.median(difference)))
-    blurred = cv2.blur(difference, (9, 9))
+    blurred = cv2.blur(difference, STATIC_WINDOW)
     pixel = np.rint(xy).astype(int)
     return blurred[pixel[:, 1], pixel[:, 0]] < STATIC_NOISE * noise

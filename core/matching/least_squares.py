@@ -12,25 +12,21 @@ J = [fx, fx u, fx v, fy, fy u, fy v] of the template's gradients, r0 and r1 are 
     σ0² = |f̃|² (1 − ρ²) / (n − 8) ,   ρ = g̃·f̂ / |g̃| ,   K_c = σ0² A H⁻¹[d] Aᵀ             (4)
     o = Σ u |∇f|² / Σ |∇f|² ,   x_o = c + A o ,   K_o = σ0² A E H⁻¹ Eᵀ Aᵀ , E = [1 o] ⊗ I   (5)
 
-Noise of the template's gradients is in H but does not pull, so a step leaves a part λ of the way to go, with σ the point's sigma, and
-no less than a tenth, for the texture's curvature. Where that foresees too little to matter, the next iteration is spared:
+Noise of the template's gradients is in H but does not pull the patch, so that a step leaves a part λ of the distance, with σ the point's
+sigma, and no less than a tenth because of the texture's curvature. Where this predicts a negligible rest, the next iteration is spared:
 
     λ = 130/144 σn² n H⁻¹[d] ≈ 0.45 n σ² ,   σ² = 2 σn² H⁻¹[d] of two images of noise σn                           (6)
 
-What was matched is the texture, so the point that is transferred with least bias is the gradients' centre of gravity o of the patch
-(Förstner 1984), not its middle: at the outline of a body it lies on the body, where the middle may lie on the background.
+What is matched is the texture, so that the point which is transferred with least bias is the centre of gravity o of the patch's gradients
+(Förstner 1984), not its centre: at the outline of a body it lies on the body, where the patch's centre may lie on the background.
 
-H belongs to the template alone, so it is built once; all patches of a piece, in all search images, are arrays, and what has converged
-leaves them.
+Where the texture does not determine a patch's shape, smaller parameter sets are used (Gruen 1985 excludes parameters that cannot be
+determined). An error of a shape parameter moves the rim of the patch by half its width times that error. Where the noise of both images
+alone moves it by more than a limit, the shears are left out (6 unknowns: shift, two scales, radiometry), then the scales, too (4: shift,
+radiometry); the shape then stays that of the start.
+
+H belongs to the template alone and is built once; all patches of a piece, in all search images, are arrays, which converged patches leave.
 Coordinates are pixels of the images given (a field's rows count as rows).
-
-The inverse-compositional update of affine warps, for many patches at once (equation (3) of `least_squares`).
-
-Smaller parameter sets where the texture cannot tell a patch's shape (SCIENCE §4; Gruen 1985: parameters excluded as not determinable).
-
-An error of a shape parameter moves the rim of the patch by half its width times that error. Where the noise of both images alone moves it
-by more than a limit, the shears go first (6 unknowns: shift, two scales, radiometry), then the scales too (4: shift, radiometry); the shape
-then stays that of the start. The parameters are those of `least_squares` (3): d1, B11, B12, d2, B21, B22.
 """
 
 from collections.abc import Sequence
@@ -47,69 +43,34 @@ from ..geometry.small_matrices import invert_spd, largest, sandwich
 from ..images.sampling import SplineImage, correlated_noise
 from .patches import compare, patch_offsets, template_pixels
 
-MAX_STEP_PX = 2.0
-
-
-def compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres (N, 2) and shapes (N, 2, 2) after steps Δp (N, 6), and how far the centres moved (N,) [px]; a longer step is shortened."""
-    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
-    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
-    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
-    det = a * e - b * d
-    inverse = 1 / np.where(np.abs(det) < 0.1, np.nan, det)
-    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
-    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
-    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
-    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
-    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
-    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
-    if bad.any():
-        A_new[bad], move[bad] = A[bad], 0.0
-    return c - move, A_new, moved
-
-
-PARAMETERS = 8
-SETS = ((6, (1, 2, 4, 5), (0, 1, 3, 5)), (4, (1, 5), (0, 3)))  # unknowns, the shape parameters that must be sure, those that stay
-
-
-def reduced_sets(H: np.ndarray, inverse: np.ndarray, noise: float, half_px: float, limit_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Inverses (N, 6, 6) of normal matrices H (N, 6, 6) with zeros for what is left out, and the numbers of unknowns (N,).
-
-    `inverse` is that of all parameters, `noise` that of an image in grey values, `half_px` half the patch's width; a limit of 0 leaves
-    all as it is.
-    """
-    count = np.full(len(H), PARAMETERS, dtype=np.int8)
-    if not limit_px:
-        return inverse, count
-    inverse = inverse.copy()
-    for unknowns, needed, kept in SETS:
-        variance = np.max([inverse[:, i, i] for i in needed], axis=0)
-        rows = np.flatnonzero(np.sqrt(2 * np.maximum(variance, 0.0)) * noise * half_px > limit_px)
-        block = np.ix_(rows, np.array(kept), np.array(kept))
-        part = H[block]
-        scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-9))
-        both = scale[:, :, None] * scale[:, None, :]
-        inverse[rows], count[rows] = 0.0, unknowns
-        inverse[block] = invert_spd(part * both + 1e-6 * np.eye(len(kept))) * both
-    return inverse, count
-
-
-LARGEST, SHARED_FROM = 4096, 513  # patches of a piece; from so many on threads share them
-STILL_WORTH = 0.75  # of the patches at work: with fewer that move, those that have ended are taken out
-CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma changes nothing that can be seen
-REMAINS_SIGMAS, REMAINS_PX = 0.1, 0.005  # what may remain after the last step where (6) foresees it
-GRADIENT_NOISE, CURVATURE = 0.45, 0.1  # of (6)
-LINEAR_PX, MIN_CONDITION = 0.25, 1e-6  # (6) holds while no part of the patch moves by more
+LARGEST = 4096  # patches of a piece
+SHARED_FROM = 513  # patches from which on threads share them
+PARAMETERS = 8  # unknowns: six of the shape and position, two of the radiometry
+SETS = ((6, (1, 2, 4, 5), (0, 1, 3, 5)), (4, (1, 5), (0, 3)))  # unknowns; parameters of (3) that must be certain before; those that stay
+SETS_CONDITION = 1e-6  # added to the scaled diagonal of a smaller set's normal matrix
+MIN_CONDITION = 1e-6  # added to the scaled diagonal of the whole one
+MAX_STEP_PX = 2.0  # px, longer steps are shortened
+MIN_DETERMINANT = 0.1  # of I + B; a smaller one has no usable inverse
+COMPACT_BELOW = 0.75  # of the patches at work: if fewer still move, the others are taken out of the arrays
+CONVERGED_SIGMAS = 0.25  # a step below this part of the point's own sigma is the last
+REST_SIGMAS = 0.1  # of the point's sigma, rest after the last step that is accepted where (6) predicts it
+REST_PX = 0.005  # px, the same, where it is more
+GRADIENT_NOISE = 0.45  # of (6)
+CURVATURE_RATE = 0.1  # smallest λ of (6)
+LINEAR_PX = 0.25  # px by which any part of the patch may move for (6) to apply
+SIGMA0_CONTRAST = 50  # grey values: contrast to which the patches are scaled for the reported sigma0
+INSIDE_SHARE = 0.5  # of half the patch: a match must lie this far inside the search image
+TEXTURED_RMS = 0.5  # grey values, smallest RMS contrast of a patch
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # a 3×3 matrix from its upper part
 PER_PATCH = ("inside", "contrast", "f", "fx", "fy", "q", "inverse", "parameters", "offset", "spread", "noise_factor", "textured")  # arrays
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MatchingSettings:
-    """Least squares matching and its quality limits (SCIENCE §4: the five indicators of D'Apuzzo et al. 2000)."""
+    """Least squares matching and its quality limits (the five indicators of D'Apuzzo et al. 2000, §2.2)."""
 
     patch_px: int = knob(13, "Side of the square patch that is compared.", unit="px", low=5, high=51)
-    max_iterations: int = knob(20, "Iterations before a patch is given up.", low=2, high=100)
+    max_iterations: int = knob(20, "Iterations after which a patch has failed.", low=2, high=100)
     converged_px: float = knob(
         0.01, "A patch has converged when it moves by less than this, or by a small part of its sigma.", unit="px", low=1e-4, high=0.5
     )
@@ -119,20 +80,20 @@ class MatchingSettings:
     max_sigma0: float = knob(35.0, "Largest sigma0, in grey values of a patch whose contrast is set to 50.", low=1.0, high=100.0)
     constraint: str = knob(
         "object",
-        "Geometry in the matching: none, collinearity observations (epipolar), or one piece of surface seen by all views (object).",
+        "Geometric constraint: none, collinearity observations (epipolar), or one piece of surface common to all views (object).",
         choices=("none", "epipolar", "object"),
     )
     neighbours: bool = knob(
-        True, "What neighbouring points say of the surface enters constrained matching as observations, not as its start alone."
+        True, "The surface through the neighbouring points enters constrained matching as observations, not only as its start."
     )
     max_rim_sigma_px: float = knob(
-        0.0, "Weak texture is matched without its shape where noise would move the patch's rim by more; 0: never.", unit="px", low=0, high=2
+        0.0, "Where noise would move the rim of a patch by more, its shape is not estimated; 0: always estimated.", unit="px", low=0, high=2
     )
     max_shear: float = knob(0.75, "Largest change of the patch's shape from its start.", low=0.1, high=3.0)
 
 
 class MatchStatus(IntEnum):
-    """Why a match is good or not; a point that failed keeps its row."""
+    """Whether a match is good, or the limit that it exceeds; a point that failed keeps its row."""
 
     OK = 0
     OUT_OF_IMAGE = 1
@@ -150,16 +111,16 @@ class MatchStatus(IntEnum):
 class Matches:
     """N patches found (or not) in one search image. Pixels of that image."""
 
-    xy: np.ndarray  # (N, 2) position of the patch's middle
+    xy: np.ndarray  # (N, 2) position of the patch's centre
     shape: np.ndarray  # (N, 2, 2) the affine shape A
     covariance: np.ndarray  # (N, 2, 2) of xy [px²]
-    offset: np.ndarray  # (N, 2) o of (5), from the patch's middle, in the template
+    offset: np.ndarray  # (N, 2) o of (5), from the patch's centre, in the template
     spread: np.ndarray  # (N, 2) variance of the gradients' energy about o [px²]
     transfer_covariance: np.ndarray  # (N, 2, 2) of transfer_xy [px²]
     sigma0: np.ndarray  # (N,) grey values of a patch whose contrast is 50
     correlation: np.ndarray  # (N,)
     iterations: np.ndarray  # (N,)
-    parameters: np.ndarray  # (N,) 8 unknowns, or 6 or 4 where the texture cannot tell the shape
+    parameters: np.ndarray  # (N,) 8 unknowns, or 6 or 4 where the texture does not determine the shape
     status: np.ndarray  # (N,) MatchStatus
 
     @property
@@ -236,7 +197,7 @@ def _pieces(n: int) -> list[slice]:
 
 
 def join_matches(parts: Sequence[Matches]) -> Matches:
-    """One after the other, rows kept in order."""
+    """The matches of all parts, one after the other."""
     names = Matches.__dataclass_fields__
     return Matches(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
@@ -264,7 +225,7 @@ class PatchTemplates:
             self.offset, self.spread = energy[:, :2], energy[:, 2:] - energy[:, :2] ** 2  # (5)
         patch = (-1, 2 * self.half[1] + 1, 2 * self.half[0] + 1)
         self.noise_factor = correlated_noise(p.fx.reshape(patch), p.fy.reshape(patch), image.smoothing)
-        self.textured = self.contrast > 0.5 * np.sqrt(self.n_pixels)
+        self.textured = self.contrast > TEXTURED_RMS * np.sqrt(self.n_pixels)
 
     def select(self, rows: np.ndarray | slice) -> "PatchTemplates":
         """Only these rows (a mask, indices or a slice)."""
@@ -275,7 +236,7 @@ class PatchTemplates:
 
     @staticmethod
     def joined(parts: "Sequence[PatchTemplates]") -> "PatchTemplates":
-        """One after the other; all of one size of patch."""
+        """The templates of all parts, one after the other; all of one patch size."""
         whole = copy(parts[0])
         for name in PER_PATCH:
             setattr(whole, name, np.concatenate([getattr(part, name) for part in parts]))
@@ -312,7 +273,7 @@ class PatchTemplates:
         for iteration in range(1, most + 1):
             if not alive.any():
                 break
-            if np.count_nonzero(alive) < STILL_WORTH * len(alive):
+            if np.count_nonzero(alive) < COMPACT_BELOW * len(alive):
                 place, at, warp, alive = place[alive], at[alive], warp[alive], alive[alive]
                 work = _AtWork(self, images, place)
             step, rho, gain = work.step(at, warp)
@@ -337,10 +298,10 @@ class PatchTemplates:
         return status
 
     def _converged(self, step: np.ndarray, moved: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which patches' last step was small; and for which it foresees by (6) that the next would be."""
-        rate = np.maximum(CURVATURE, GRADIENT_NOISE * self.n_pixels * sigma**2)
+        """Which patches' last step was small; and for which it predicts by (6) that the next would be."""
+        rate = np.maximum(CURVATURE_RATE, GRADIENT_NOISE * self.n_pixels * sigma**2)
         linear = moved + self.half[0] * largest(step[:, [1, 2, 4, 5]]) <= LINEAR_PX
-        spared = linear & (moved < np.maximum(REMAINS_PX, REMAINS_SIGMAS * sigma) / rate)
+        spared = linear & (moved < np.maximum(REST_PX, REST_SIGMAS * sigma) / rate)
         return moved < np.maximum(self._settings.converged_px, CONVERGED_SIGMAS * sigma), spared
 
     def _transferred(self) -> np.ndarray | None:
@@ -360,11 +321,11 @@ class PatchTemplates:
         K = K_o = variance[:, None, None] * sandwich(A, self.inverse[:, ::3, ::3])
         if transferred is not None:
             K_o = variance[:, None, None] * sandwich(A, transferred)
-        sigma0 = 50 * np.sqrt(lost * self.n_pixels / dof)
+        sigma0 = SIGMA0_CONTRAST * np.sqrt(lost * self.n_pixels / dof)
         sigma = np.sqrt(np.maximum(np.maximum(K[:, 0, 0], K[:, 1, 1]), 0))
         for bad, why in (
             (largest(c - search.start) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
-            (~search.image.inside(c, np.array(self.half) * 0.5), MatchStatus.OUT_OF_IMAGE),
+            (~search.image.inside(c, np.array(self.half) * INSIDE_SHARE), MatchStatus.OUT_OF_IMAGE),
             (largest((A - search.shape).reshape(-1, 4)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
             (correlation < s.min_correlation, MatchStatus.LOW_CORRELATION),
             (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE),
@@ -402,7 +363,7 @@ class _Settled:
 
 
 class _AtWork:
-    """Those patches of a piece that move: the rows `place` (m,) of all patches in all images, image after image."""
+    """The patches of a piece that still move: the rows `place` (m,) of all patches in all images, image after image."""
 
     def __init__(self, templates: PatchTemplates, images: Sequence[SplineImage], place: np.ndarray) -> None:
         t, N = templates, len(templates.inside)
@@ -418,7 +379,7 @@ class _AtWork:
         )
 
     def step(self, c: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Δp of (2) (m, 6), the correlation ρ (m,) before it, and what it adds to ρ² where it is small enough to be linear."""
+        """Δp of (2) (m, 6), the correlation ρ (m,) before it, and the step's gain in ρ² where it is small enough to be linear."""
         found = [compare(image, c[rows], A[rows], self._half, patches) for image, rows, patches in self._views]
         power, along, pulled = found[0] if len(found) == 1 else (np.concatenate(parts) for parts in zip(*found))
         gain = self._contrast * along / power  # r1
@@ -431,3 +392,43 @@ class _AtWork:
         """Standard deviation of the position in the template [px] at correlation rho.  (4)"""
         variance = self._contrast.astype(np.float64) ** 2 * np.clip(1 - rho**2, 0, 1) / self._dof
         return np.asarray(np.sqrt(variance * np.maximum(self._inverse[:, 0, 0], self._inverse[:, 3, 3])))
+
+
+def compose(c: np.ndarray, A: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (N, 2) and shapes (N, 2, 2) after steps Δp (N, 6), and how far the centres moved (N,) [px].  (3)"""
+    s = np.ascontiguousarray(step.T)  # rows over the patches: numpy's products of single 2×2 matrices take several times as long
+    s *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.sqrt(s[0] ** 2 + s[3] ** 2), 1e-9))
+    a, b, d, e = s[1] + 1, s[2], s[4], s[5] + 1
+    det = a * e - b * d
+    inverse = 1 / np.where(np.abs(det) < MIN_DETERMINANT, np.nan, det)
+    a, b, d, e = e * inverse, -b * inverse, -d * inverse, a * inverse
+    p, q, r, t = np.ascontiguousarray(A.reshape(-1, 4).T)
+    turned = np.stack([p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e])
+    move = np.stack([turned[0] * s[0] + turned[1] * s[3], turned[2] * s[0] + turned[3] * s[3]])
+    moved = np.sqrt(move[0] ** 2 + move[1] ** 2)
+    A_new, move, bad = turned.T.reshape(-1, 2, 2), move.T, ~np.isfinite(moved)
+    if bad.any():
+        A_new[bad], move[bad] = A[bad], 0.0
+    return c - move, A_new, moved
+
+
+def reduced_sets(H: np.ndarray, inverse: np.ndarray, noise: float, half_px: float, limit_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Inverses (N, 6, 6) of normal matrices H (N, 6, 6) with zeros for what is left out, and the numbers of unknowns (N,).
+
+    `inverse` is that of all parameters, `noise` that of an image in grey values, `half_px` half the patch's width; a limit of 0 keeps
+    all parameters.
+    """
+    count = np.full(len(H), PARAMETERS, dtype=np.int8)
+    if not limit_px:
+        return inverse, count
+    inverse = inverse.copy()
+    for unknowns, needed, stay in SETS:
+        variance = np.max([inverse[:, i, i] for i in needed], axis=0)
+        rows = np.flatnonzero(np.sqrt(2 * np.maximum(variance, 0.0)) * noise * half_px > limit_px)
+        block = np.ix_(rows, np.array(stay), np.array(stay))
+        part = H[block]
+        scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-9))
+        both = scale[:, :, None] * scale[:, None, :]
+        inverse[rows], count[rows] = 0.0, unknowns
+        inverse[block] = invert_spd(part * both + SETS_CONDITION * np.eye(len(stay))) * both
+    return inverse, count

@@ -1,4 +1,4 @@
-"""Multi-image matching with collinearity observations (Gruen & Baltsavias 1988; Gruen 1985; SCIENCE §5).
+"""Multi-image matching with collinearity observations (Gruen & Baltsavias 1988; Gruen 1985).
 
 All search images k = 1 … S of a point are matched in one adjustment with its position X in space: 6 S geometric unknowns and the 2 S
 radiometric ones, which are eliminated, and 3 of X: 8 S + 3.
@@ -21,7 +21,7 @@ import numpy as np
 from ..foundation.progress import Monitor
 from ..foundation.threads import equal_pieces, in_threads
 from .grid import Views
-from .least_squares import MatchingSettings, MatchStatus
+from .least_squares import INSIDE_SHARE, SIGMA0_CONTRAST, MatchingSettings, MatchStatus
 from .object_space import MIN_NOISE, MOST_CONVERGED_PX, SHARED_FROM, inverse_normals, solve_normals, without_noise
 from .patches import TemplatePatches
 
@@ -44,8 +44,8 @@ class MultiImageMatches:
     xyz_m: np.ndarray  # (N, 3)
     covariance_m2: np.ndarray  # (N, 3, 3)
     residual_px: np.ndarray  # (N, S + 1, 2) image point − projection, the template first, full-frame pixels; 0 in views without part
-    visible: np.ndarray  # (N, S) which views took part
-    correlation: np.ndarray  # (N, S), 1 in views that did not
+    visible: np.ndarray  # (N, S) which search views took part
+    correlation: np.ndarray  # (N, S), 1 in views without part
     offset: np.ndarray  # (N, 2) o
     spread: np.ndarray  # (N, 2) variance of the texture's energy about o
     iterations: np.ndarray  # (N,)
@@ -180,7 +180,7 @@ class _Adjustment:
         p, taking_part, c, A = self._patches, self._visible[rows], now.c, now.A
         rhs, rho, all_inside = np.zeros((len(rows), self._S, 6)), np.zeros((len(rows), self._S)), np.ones(len(rows), dtype=bool)
         for k, image in enumerate(self._images[1:]):
-            inside = image.inside(c[:, k], np.array(p.half) * 0.5)
+            inside = image.inside(c[:, k], np.array(p.half) * INSIDE_SHARE)
             c32, A32 = np.where(inside[:, None], c[:, k], 0.0).astype(np.float32), A[:, k].astype(np.float32)
             x, y = (c32[:, i, None] + A32[:, i, :1] * p.u + A32[:, i, 1:] * p.v for i in range(2))
             rho[:, k], (gx, gy) = p.compare(image.sample(x, y), rows)
@@ -243,7 +243,7 @@ class _Adjustment:
                 share = (1.0 if j == k else 0.5) * np.sqrt(P[:, k] * P[:, j])
                 middle[:, at, 6 * j : 6 * j + 6] += share[:, None, None] * self._H
         half = inverse_normals(texture)
-        return half @ middle @ half
+        return half @ middle @ half  # as `object_space` (5)
 
     def _judge(self, unknowns: _Unknowns, P: np.ndarray, rho: np.ndarray, iterations: np.ndarray, status: np.ndarray) -> MultiImageMatches:
         """The result with its covariance, and the first limit that each point exceeds as its status."""
@@ -257,7 +257,7 @@ class _Adjustment:
         variance = np.nan_to_num(Kx[:, :, [0, 1], [0, 1]], nan=1e6) * self._visible[..., None]
         sigma = np.sqrt(np.maximum(variance, 0)).max(axis=(1, 2))
         pixels = np.maximum(patches.pixels, 9.0)
-        sigma0 = 50 * np.sqrt(np.clip(1 - rho.min(axis=1) ** 2, 0, 1) * pixels / (pixels - 8))
+        sigma0 = SIGMA0_CONTRAST * np.sqrt(np.clip(1 - rho.min(axis=1) ** 2, 0, 1) * pixels / (pixels - 8))
         for bad, why in (
             (np.abs(c - self._c).max(axis=(1, 2)) > s.max_shift_px, MatchStatus.SHIFT_TOO_LARGE),
             (np.abs(A - self._A).max(axis=(1, 2, 3)) > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),

@@ -1,30 +1,30 @@
-"""Least squares matching in object space: one piece of surface, seen by all search images at once (SCIENCE §5; Krupnik & Schenk 1997).
+"""Least squares matching in object space: one piece of surface is fitted to all search images at once (Krupnik & Schenk 1997).
 
-The unknowns are not those of patches in images but of the surface on the reference view's rays q(u, v): its inverse depth, with slopes and
-curvatures, so that every search image k sees the same piece through its own camera,
+The unknowns are not those of patches in images but of the surface on the reference view's rays: its inverse depth w, with slopes and
+curvatures. Every search view k shows the same piece through its own camera X_k = R_k X + t_k:
 
-    w(u, v) = θ · m(u, v) ,   m = 1, u, v [, ½ u², u v, ½ v²]                                            (1)
-    h_k = M_k q + w t_k ,   M_k = R_k R_0ᵀ ,   t_k = R_k C_0 + t_k ,   x_k(u, v) = π_k(h_k) + δ_k n_k      (2)
-    f(u, v) + e = r0_k + r1_k g_k(x_k(u, v))                                                              (3)
+    w(u, v) = θ · m(u, v) ,   m = 1, u, v [, ½ u², u v, ½ v²]                                                (1)
+    h_k(u, v) = R_k R_0ᵀ q(u, v) + w b_k ,   b_k = R_k C_0 + t_k ,   x_k(u, v) = π_k(h_k) + δ_k n_k            (2)
+    f(u, v) + e = r0_k + r1_k g_k(x_k(u, v))                                                                  (3)
 
-Planes are linear in inverse depth, so 1, u, v are an exact plane and move the search patches by its homography. δ_k shifts a patch
-across its epipolar line (n_k ⟂ ∂x_k/∂w) under the pseudo-observation δ_k = 0 ± σ_c: what the rig does not know. r0, r1 are eliminated.
-With the direction s_k = A_k⁻¹ ∂x_k/∂w in the template (A_k = ∂x_k/∂(u, v)) and n'_k = A_k⁻¹ n_k the design matrix is that of the template
-(see `template_patches`), with P_k = 1/σ_k² from the residuals of each image:
+R_0 and C_0 are the rotation and the projection centre of the reference view, q the direction of its ray at unit depth, and b_k that centre
+in the frame of camera k; π_k projects with lens distortion, which is taken as linear over a patch. Planes are linear in inverse depth, so
+that 1, u, v are an exact plane and move the search patches by its homography. δ_k shifts a patch across its epipolar line
+(n_k ⟂ e_k = ∂x_k/∂w) under the pseudo-observation δ_k = 0 ± σ_c, which allows for errors of the calibration. r0, r1 are eliminated. In the
+template these directions are s_k = A_k⁻¹ e_k and n'_k = A_k⁻¹ n_k, with A_k = ∂x_k/∂(u, v), and the design matrix is that of the template's
+gradients (see `patches`). With P_k = 1/σ_k² from the residuals of each image, 0 in views without part in a point,
 
-    N = Σ_k P_k J_kᵀ M J_k + P_prior ,   N dθ = Σ_k P_k J_kᵀ M (f − r0 − r1 g_k) + P_prior (θ_prior − θ)    (4)
+    N = Σ_k P_k J_kᵀ M J_k + P_prior ,   N dθ = Σ_k P_k J_kᵀ M (f − r0 − r1 g_k) + P_prior (θ_prior − θ)        (4)
 
-A view that does not see a point has P_k = 0 there.
+Here θ contains the δ_k, and P_prior their weights 1/σ_c².
 
-Covariance: the template's noise is common to all search images (σ_f² = σ²/2), and the noise of the gradients makes N too large
-(SCIENCE §4), so with N' free of the gradients' noise
+Covariance: the template's noise is common to all search images (σ_f² = ½ min σ_k²), and the noise of the gradients makes N too large (on
+simulated skin N⁻¹ gives 0.11 px, and the scatter is 0.24 px). With N' free of the gradients' noise
 
-    K = N'⁻¹ [ Σ_k ½ P_k J_kᵀ J_k + σ_f² (Σ_k P_k J_k)ᵀ (Σ_k P_k J_k) + P_prior ] N'⁻¹                       (5)
+    K = N'⁻¹ [ Σ_k ½ P_k J_kᵀ J_k + σ_f² (Σ_k P_k J_k)ᵀ (Σ_k P_k J_k) + P_prior ] N'⁻¹                           (5)
 
-in whose middle J_kᵀ J_k is weighted by W², not W, where the patch is seen through a window, and P_prior is P_prior² times the squares of
-the prior's errors where these are known.
-
-Where a search view sees what lies on the reference view's rays: equation (2) of `object_space`.
+In its middle, J_kᵀ J_k is weighted by W², not W, where a patch has a window, and P_prior is replaced by P_prior² times the squared errors
+of the prior where these are given.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,16 @@ from ..geometry.camera import Camera
 from ..geometry.small_matrices import invert_spd
 from ..images.interlace import RowGrid
 from .grid import Views
-from .least_squares import MatchingSettings, MatchStatus
+from .least_squares import INSIDE_SHARE, SIGMA0_CONTRAST, MatchingSettings, MatchStatus
 from .patches import TemplatePatches, monomials, pieces
+
+LARGEST = 2048  # points of a piece
+SHARED_FROM = 513  # points from which on threads share them
+MIN_NOISE = 0.4  # grey values, of a difference of two images: no image is better than its quantisation
+CONVERGED_SIGMAS = 0.2  # a step below this part of N's sigma is the last; noise of the gradients makes that sigma small on weak texture
+MOST_CONVERGED_PX = 0.01  # px, upper limit of the knob `converged_px` here: constrained matches are more precise
+MAX_STEP_PX = 1.5  # px in the fastest search view, longer steps are shortened
+MIN_REMAINING = 0.1  # part of the gradients' energy that is always taken as texture
 
 
 def px_per_inverse_metre(views: Views) -> float:
@@ -48,7 +56,7 @@ def px_per_inverse_metre(views: Views) -> float:
 
 
 class Epipolar:
-    """N rays of the reference view and their images in one search view: (2), with lens distortion linear over a patch."""
+    """The geometry (2) between N points of the reference view and one search view."""
 
     def __init__(self, base: Camera, camera: Camera, rows: RowGrid, xy: np.ndarray) -> None:
         self._camera, self._rows = camera, rows
@@ -58,30 +66,30 @@ class Epipolar:
         Q = np.stack([tip[:, 0] - tip[:, 1], (tip[:, 2] - tip[:, 3]) * rows.step], axis=2)  # ∂q/∂(u, v) (N, 3, 2)
         rotation = camera.R_cam_world @ base.R_cam_world.T
         self._h0, self._H = q @ rotation.T, rotation @ Q
-        self.shift = camera.R_cam_world @ base.centre_m + camera.t_cam_world_m  # t_k (3,)
+        self._b = camera.R_cam_world @ base.centre_m + camera.t_cam_world_m  # b_k (3,)
 
     def centre(self, theta: np.ndarray, rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Image (m, 2) of the patch's middle, ∂x/∂w (m, 2), A (m, 2, 2) and the distortion's slope L (m, 2, 2). Rows' pixels."""
-        h = self._h0[rows] + theta[:, :1] * self.shift
+        """At the patch's centre, in rows' pixels: x_k without δ (m, 2), e_k (m, 2), A_k (m, 2, 2) and L = ∂x_k/∂(h_1/h_3, h_2/h_3)."""
+        h = self._h0[rows] + theta[:, :1] * self._b  # (2)
         X = (h - self._camera.t_cam_world_m) @ self._camera.R_cam_world
         frame, J = self._camera.project_with_jacobian(X)
         J = (J @ self._camera.R_cam_world.T) / np.array([1.0, self._rows.step])[:, None]  # ∂x/∂h
-        A = J @ (self._H[rows] + self.shift[:, None] * theta[:, None, 1:3])
-        return self._rows.from_frame(frame), J @ self.shift, A, J[:, :, :2] * h[:, 2, None, None]
+        A = J @ (self._H[rows] + self._b[:, None] * theta[:, None, 1:3])
+        return self._rows.from_frame(frame), J @ self._b, A, J[:, :, :2] * h[:, 2, None, None]
 
     def warp(
         self, theta: np.ndarray, monomials: np.ndarray, rows: np.ndarray | slice, at: np.ndarray, slope: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows (m, n) float32 of x(u, v), with middle `at` (m, 2) and distortion's slope `slope` (m, 2, 2).  (2)
+        """Columns and rows (m, n) float32 of x_k(u, v), of patches with centres `at` (m, 2) and L `slope` (m, 2, 2).
 
         h_k is linear in the monomials, and so is L h_k: one product with the pixels, and a division by the third row.
         """
-        h = theta[:, None, :] * self.shift[:, None]  # (m, 3, P)
+        h = theta[:, None, :] * self._b[:, None]  # (2) by monomials (m, 3, P)
         h[:, :, 0] += self._h0[rows]
-        middle = h[:, :2, 0] / h[:, 2:, 0]
+        centre = h[:, :2, 0] / h[:, 2:, 0]
         h[:, :, 1:3] += self._H[rows]
         h[:, :2] = slope @ h[:, :2]
-        c = (at - np.einsum("nij,nj->ni", slope, middle)).astype(np.float32)
+        c = (at - np.einsum("nij,nj->ni", slope, centre)).astype(np.float32)
         x, y, z = np.matmul(h.transpose(1, 0, 2).astype(np.float32), monomials.T)
         x /= z
         x += c[:, :1]
@@ -90,19 +98,11 @@ class Epipolar:
         return x, y
 
 
-LARGEST, SHARED_FROM = 2048, 513  # points of a piece; from so many on threads share them
-MIN_NOISE = 0.4  # grey values, of a difference of two images: no image is better than its quantisation
-CONVERGED_SIGMAS = 0.2  # of the sigma that N says, which noise of the gradients makes too small where texture is weak
-MOST_CONVERGED_PX = 0.01  # px, upper limit of the knob `converged_px` here: constrained matches are more precise
-MAX_STEP_PX = 1.5  # px, longer steps are shortened
-MIN_REMAINING = 0.1  # of the gradients' energy is always texture
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SurfacePrior:
-    """Pseudo-observations θ = value ± sigma of N points, in the unknowns of (1); an infinite sigma says nothing.
+    """Pseudo-observations θ = value ± sigma of N points, in the unknowns of (1); an infinite sigma has no weight.
 
-    `error` is how wrong the values are thought to be, where that is known better than the sigma with which they take part.
+    `error` is the standard deviation of the values, where it is better known than by the sigma that sets their weight.
     """
 
     value: np.ndarray  # (N, P)
@@ -116,16 +116,16 @@ class SurfacePrior:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SurfacePatch:
-    """N pieces of surface: θ of (1) about the patch's middle, in units of 1/m and rows' pixels, and how well they are seen."""
+    """N pieces of surface: θ of (1) about the patch's centre, in units of 1/m and rows' pixels, and the quality of the match."""
 
     theta: np.ndarray  # (N, P)
     covariance: np.ndarray  # (N, P, P)
     across_px: np.ndarray  # (N, S) δ of the S search views, rows' pixels
     across_sigma_px: np.ndarray  # (N, S)
-    visible: np.ndarray  # (N, S) which views took part
-    correlation: np.ndarray  # (N, S), 1 in views that did not
+    visible: np.ndarray  # (N, S) which search views took part
+    correlation: np.ndarray  # (N, S), 1 in views without part
     sigma_px: np.ndarray  # (N,) of the inverse depth at the texture's centre, as the largest shift in a search view
-    offset: np.ndarray  # (N, 2) the texture's centre of gravity, from the patch's middle
+    offset: np.ndarray  # (N, 2) the texture's centre of gravity, from the patch's centre
     spread: np.ndarray  # (N, 2) variance of the texture's energy about it
     iterations: np.ndarray  # (N,)
     status: np.ndarray  # (N,) MatchStatus
@@ -138,7 +138,7 @@ class SurfacePatch:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SurfaceStarts:
-    """N pieces of surface to be matched about points of the reference view, and what is known of them before."""
+    """N pieces of surface to be matched about points of the reference view, and what is known of them beforehand."""
 
     xy: np.ndarray  # (N, 2) rows' pixels of the reference view
     theta: np.ndarray  # (N, 3) or (N, 6) approximate θ of (1); the width chooses planes or quadrics
@@ -178,20 +178,20 @@ def match_surface(
 
 @dataclass(eq=False, kw_only=True, slots=True)
 class _Linear:
-    """What the adjustment of m points is made of, at one place. S search views."""
+    """The adjustment of m points, linearised at one θ. S search views."""
 
     along: np.ndarray  # (m, S, 2) s_k
-    side: np.ndarray  # (m, S, 2) n'_k
+    across: np.ndarray  # (m, S, 2) n'_k
     weight: np.ndarray  # (m, S) P_k
     correlation: np.ndarray  # (m, S)
-    speed: np.ndarray  # (m,) largest |∂x_k/∂w|
+    speed: np.ndarray  # (m,) largest |e_k|
     inside: np.ndarray  # (m,) the images of all search views that take part
 
     @classmethod
     def empty(cls, m: int, S: int) -> "_Linear":
         z = np.zeros
         return cls(
-            along=z((m, S, 2)), side=z((m, S, 2)), weight=z((m, S)), correlation=z((m, S)), speed=z(m), inside=np.ones(m, dtype=bool)
+            along=z((m, S, 2)), across=z((m, S, 2)), weight=z((m, S)), correlation=z((m, S)), speed=z(m), inside=np.ones(m, dtype=bool)
         )
 
     def put(self, rows: np.ndarray, other: "_Linear") -> None:
@@ -228,9 +228,9 @@ class _Adjustment:
                 break
             rows = slice(None) if len(active) == n else active  # all: no copies
             linear, rhs = self._linearise(theta[active], across[active], rows)
-            pseudo, wish = self._pseudo(theta[active], across[active], rows)
+            pseudo, difference = self._pseudo(theta[active], across[active], rows)
             N = self._normal(linear, self._patches, rows) + pseudo[:, :, None] * np.eye(P + S)
-            step = solve_normals(N, rhs + pseudo * wish)
+            step = solve_normals(N, rhs + pseudo * difference)  # (4)
             length = np.abs(step[:, 0]) * linear.speed
             shrink = np.minimum(1.0, MAX_STEP_PX / np.maximum(length, 1e-12))[:, None]
             theta[active] += step[:, :P] * shrink
@@ -258,13 +258,13 @@ class _Adjustment:
                 c, e, A, L = (np.where(visible.reshape(-1, *[1] * (a.ndim - 1)), a, 1.0) for a in (c, e, A, L))
             normal = normal_to(e)
             c = c + across[:, k, None] * normal
-            inside = image.inside(c, np.array(patches.half) * 0.5)
+            inside = image.inside(c, np.array(patches.half) * INSIDE_SHARE)
             rho, (gx, gy) = self._compare(k, theta, np.where(inside[:, None], c, 0.0), L, rows)
             s, t = _apply_inverse(A, e), _apply_inverse(A, normal)
             weight = visible / np.maximum(patches.residual_variance(rho, P + 2, rows), MIN_NOISE**2)
             rhs[:, :P] -= weight[:, None] * (s[:, :1] * gx + s[:, 1:] * gy)
             rhs[:, P + k] -= weight * (t[:, 0] * gx[:, 0] + t[:, 1] * gy[:, 0])
-            state.along[:, k], state.side[:, k], state.weight[:, k], state.correlation[:, k] = s, t, weight, np.where(visible, rho, 1.0)
+            state.along[:, k], state.across[:, k], state.weight[:, k], state.correlation[:, k] = s, t, weight, np.where(visible, rho, 1.0)
             np.maximum(state.speed, visible * np.linalg.norm(e, axis=1), out=state.speed)
             state.inside &= inside | ~visible
         return state, rhs
@@ -272,7 +272,7 @@ class _Adjustment:
     def _compare(
         self, k: int, theta: np.ndarray, at: np.ndarray, slope: np.ndarray, rows: np.ndarray | slice
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Correlation (m,) and the products with the design matrix, of the patches where search view k sees the surface θ (m, P)."""
+        """Correlation (m,) and the products with the design matrix, of the patches of search view k for the surface θ (m, P)."""
         patches, visible, parts = self._patches, self._visible[rows, k], []
         for piece in pieces(len(theta), len(patches.monomials)):
             own = piece if isinstance(rows, slice) else rows[piece]
@@ -287,7 +287,7 @@ class _Adjustment:
         """Σ P_k J_kᵀ M J_k (m, P + S, P + S)."""
         P, N = self._P, np.zeros((len(a.speed), self._P + self._S, self._P + self._S))
         for k in range(self._S):
-            s, t, weight = a.along[:, k], a.side[:, k], a.weight[:, k]
+            s, t, weight = a.along[:, k], a.across[:, k], a.weight[:, k]
             N[:, :P, :P] += weight[:, None, None] * patches.normal(s, s, rows)
             self._cross(N, k, weight[:, None] * patches.normal_to_shift(s, t, rows))
             N[:, P + k, P + k] = weight * patches.normal_of_shift(t, t, rows)
@@ -303,32 +303,32 @@ class _Adjustment:
         total = np.einsum("nk,nki->ni", a.weight, a.along)
         common[:, :P, :P] = squared.normal(total, total)
         for k in range(self._S):
-            s, t = a.along[:, k] * self._visible[:, [k]], a.side[:, k] * self._visible[:, [k]]
+            s, t = a.along[:, k] * self._visible[:, [k]], a.across[:, k] * self._visible[:, [k]]
             noise[:, :P, :P] += np.einsum("ni,ni->n", s, s)[:, None, None] * patches.noise_moment
             self._cross(noise, k, np.einsum("ni,ni->n", s, t)[:, None] * patches.noise_moment[:, 0])
             noise[:, P + k, P + k] = np.einsum("ni,ni->n", t, t) * patches.noise_moment[:, 0, 0]
             self._cross(common, k, squared.normal_to_shift(total, a.weight[:, k, None] * t))
             for j in range(self._S):
-                common[:, P + k, P + j] = squared.normal_of_shift(a.weight[:, k, None] * t, a.weight[:, j, None] * a.side[:, j])
+                common[:, P + k, P + j] = squared.normal_of_shift(a.weight[:, k, None] * t, a.weight[:, j, None] * a.across[:, j])
         middle = 0.5 * self._normal(a, squared) + 0.5 * common / np.maximum(a.weight.max(axis=1), 1e-12)[:, None, None]
         diagonal = np.arange(P + self._S)
         texture = without_noise(self._normal(a, patches), 0.5 * patches.gradient_noise[:, None, None] * noise)
         texture[:, diagonal, diagonal] += pseudo
-        middle[:, diagonal, diagonal] += pseudo * self._overrated(pseudo)
+        middle[:, diagonal, diagonal] += pseudo * self._error_ratio(pseudo)
         half = inverse_normals(texture)
-        return half @ middle @ half
+        return half @ middle @ half  # (5)
 
     def _pseudo(self, theta: np.ndarray, across: np.ndarray, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
-        """Weights (m, P + S) of the pseudo-observations and what they wish to be added."""
-        weight, wish = np.zeros((2, len(theta), self._P + self._S))
-        weight[:, self._P :], wish[:, self._P :] = self._across_weight, -across
+        """Weights (m, P + S) of the pseudo-observations, and their values less the present unknowns."""
+        weight, difference = np.zeros((2, len(theta), self._P + self._S))
+        weight[:, self._P :], difference[:, self._P :] = self._across_weight, -across
         if self._prior is not None:
             weight[:, : self._P] = 1 / self._prior.sigma[rows] ** 2
-            wish[:, : self._P] = np.where(weight[:, : self._P] > 0, self._prior.value[rows] - theta, 0.0)
-        return weight, wish
+            difference[:, : self._P] = np.where(weight[:, : self._P] > 0, self._prior.value[rows] - theta, 0.0)
+        return weight, difference
 
-    def _overrated(self, pseudo: np.ndarray) -> np.ndarray:
-        """(n, P + S) variance of the pseudo-observations' errors in units of what their weights say."""
+    def _error_ratio(self, pseudo: np.ndarray) -> np.ndarray:
+        """(n, P + S) variance of the pseudo-observations' errors in units of their weights' inverses."""
         ratio = np.ones_like(pseudo)
         if self._prior is not None and self._prior.error is not None:
             taking_part = pseudo[:, : self._P] > 0
@@ -350,7 +350,7 @@ class _Adjustment:
             (np.abs(theta[:, 1:3] - start[:, 1:3]).max(axis=1) * speed > s.max_shear, MatchStatus.SHAPE_TOO_LARGE),
             (correlation.min(axis=1) < s.min_correlation, MatchStatus.LOW_CORRELATION),
             (sigma > s.max_sigma_px, MatchStatus.SIGMA_TOO_LARGE),
-            (50 * np.sqrt(lost * pixels / (pixels - P - 2)) > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE),
+            (SIGMA0_CONTRAST * np.sqrt(lost * pixels / (pixels - P - 2)) > s.max_sigma0, MatchStatus.SIGMA0_TOO_LARGE),
         ):
             status[(status == MatchStatus.OK) & bad] = why
         side = np.sqrt(np.maximum(K[:, range(P, P + self._S), range(P, P + self._S)], 0.0))
@@ -375,7 +375,7 @@ def normal_to(direction: np.ndarray) -> np.ndarray:
 
 
 def without_noise(N: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """N without the gradients' noise, of which each unknown keeps at least MIN_REMAINING of its own."""
+    """N without the gradients' noise, but not more than 1 − MIN_REMAINING of any unknown's own."""
     d = np.einsum("nii->ni", N)
     share = np.einsum("nii->ni", noise) / np.maximum(d, 1e-300)
     scale = np.minimum(1.0, (1 - MIN_REMAINING) / np.maximum(share.max(axis=1), 1e-12))

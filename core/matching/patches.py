@@ -1,13 +1,11 @@
-"""The pixels of many patches: looked up, and summed up to the few products that least squares matching needs of them.
+"""The pixels of many patches: sampling, gradients, and the few products that least squares matching needs of them.
 
-Threads wait for each other between the calls of numpy, and the fewer rows a call has, the more of its time is such waiting. Everything of a
-pixel is therefore done here, in pieces that stay in the cache, and everything of a patch (`least_squares`) on many more patches at once.
+Threads wait for each other between the calls of numpy, and the fewer rows a call has, the larger is the share of waiting. All work on
+pixels is therefore done here, in pieces that stay in the cache, and all work on patches (`least_squares`) on many more patches at once.
 
-The template's side of constrained matching: patches, gradients, and their products with the monomials of the patch coordinates.
-
-In all constrained forms a parameter θ_i with the monomial m_i(u, v) moves a patch in a search image along a direction, which is the
-direction s in the template. The design matrix is then made of the template's gradients alone (the inverse-compositional idea of Baker &
-Matthews 2004):
+Constrained matching (`object_space`, `multi_image`) needs the template side only. In all its forms a parameter θ_i with the monomial
+m_i(u, v) moves a patch in a search image along a direction, which is the direction s in the template. The design matrix then consists of
+the template's gradients alone (the inverse-compositional idea of Baker & Matthews 2004):
 
     J[:, i] = (fx s_x + fy s_y) m_i ,   m = 1, u, v, ½ u², u v, ½ v²                                            (1)
     Jᵀ W M J = s_x² Mxx + s_x s_y (Mxy + Mxyᵀ) + s_y² Myy ,   M = I − 1 1ᵀ W / ΣW − f̂ f̂ᵀ W                      (2)
@@ -15,7 +13,7 @@ Matthews 2004):
 with W the pixels' weights, f̂ the patch free of its mean and of unit length, and M the elimination of offset and gain. Mxx, Mxy and Myy
 belong to the template, so that normal matrices of any number of search images, in any iteration, cost a few small products.
 
-Weights that fade out towards the rim (a window) are not those of the noise, which is alike in all pixels. The right side of the normal
+Weights that decrease towards the rim (a window) are not those of the noise, which is the same in all pixels. The right side of the normal
 equations then has the covariance σ² (M J)ᵀ W² M J, which is less than σ² Jᵀ W M J: see `squared`.
 """
 
@@ -29,7 +27,9 @@ import numpy as np
 from ..images.sampling import SplineImage, correlated_noise, difference
 
 PIECE = 1 << 17  # pixels of a piece
-NOISE_ENERGY = 4.0  # of a gradient [grey values² / px²]: less is noise, not texture
+NOISE_ENERGY = 4.0  # grey values² / px², energy of a gradient that is taken as noise, not texture
+GRADIENT_NOISE = 130 / 144  # variance of the fourth-order central difference, for white noise of variance 1; 1 / 2σ² after smoothing
+MIN_CONTRAST = 0.5  # grey values, smallest RMS contrast of a patch
 UPPER = np.triu_indices(3)  # of the products of 1, u, v
 
 
@@ -57,7 +57,7 @@ class TemplatePixels:
     f: np.ndarray  # (N, n) f̂
     fx: np.ndarray  # (N, n)
     fy: np.ndarray  # (N, n)
-    contrast: np.ndarray  # (N,) the length that was taken out
+    contrast: np.ndarray  # (N,) the length before
     q: np.ndarray  # (N, 6) Jᵀ f̂
     mean: np.ndarray  # (N, 6) Jᵀ 1
     second: np.ndarray  # (3, N, 6) sums of fx fx, fx fy, fy fy times 1, u, v, u², u v, v²
@@ -65,11 +65,11 @@ class TemplatePixels:
 
 
 def template_pixels(image: SplineImage, xy: np.ndarray, shape: np.ndarray | None, half: tuple[int, int]) -> TemplatePixels:
-    """The patches about `xy` (N, 2) with shapes (N, 2, 2), by default upright; those about whole pixels need no look-up."""
+    """The patches about `xy` (N, 2) with shapes (N, 2, 2), by default upright; those about whole pixels need no interpolation."""
     if shape is None and min(image.shape) > 2 * max(half) and np.array_equal(xy, np.rint(xy)):
         f, fx, fy = image.around(xy.astype(np.int64), half)
     else:
-        f, fx, fy = _looked_up(image, xy, np.broadcast_to(np.eye(2), (len(xy), 2, 2)) if shape is None else shape, half)
+        f, fx, fy = _interpolated(image, xy, np.broadcast_to(np.eye(2), (len(xy), 2, 2)) if shape is None else shape, half)
     N, n = f.shape
     contrast, q, mean = np.empty(N, np.float32), np.empty((N, 6), np.float32), np.empty((N, 6), np.float32)
     second, energy = np.empty((3, N, 6), np.float32), np.empty((N, 4), np.float32)
@@ -94,7 +94,7 @@ def template_pixels(image: SplineImage, xy: np.ndarray, shape: np.ndarray | None
 def compare(
     image: SplineImage, c: np.ndarray, A: np.ndarray, half: tuple[int, int], templates: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Products of the patches about c (m, 2) with shapes A (m, 2, 2) of a search image with the `templates` f̂, fx, fy (m, n) beside them.
+    """Products of the patches about c (m, 2) with shapes A (m, 2, 2) of a search image with their `templates` f̂, fx, fy (m, n).
 
     With g̃ free of its mean: g̃·g̃ (m,), at least 1e-6; g̃·f̂ (m,); and Jᵀ g̃ (m, 6).
     """
@@ -112,13 +112,13 @@ def compare(
 
 
 def pieces(rows: int, pixels: int) -> Iterator[slice]:
-    """Pieces of so many patches with so many pixels each."""
+    """Slices of `rows` patches of `pixels` pixels each that stay in the cache."""
     step = max(1, PIECE // pixels)
     return (slice(i, min(i + step, rows)) for i in range(0, rows, step))
 
 
 def _normalise(g: np.ndarray, length: np.ndarray) -> None:
-    """Take means and lengths out of the rows of g (m, n), in place."""
+    """Subtract the means of the rows of g (m, n) and divide by their lengths, in place."""
     g -= (g @ _mean(g.shape[1]))[:, None]
     np.sqrt(np.einsum("ij,ij->i", g, g), out=length)
     g *= (1 / np.maximum(length, np.float32(1e-6)))[:, None]
@@ -143,8 +143,10 @@ def _mean(n: int) -> np.ndarray:
     return np.full(n, 1 / n, dtype=np.float32)
 
 
-def _looked_up(image: SplineImage, xy: np.ndarray, shape: np.ndarray, half: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Patches and their gradients by fourth-order central differences, in one look-up with a border of two."""
+def _interpolated(
+    image: SplineImage, xy: np.ndarray, shape: np.ndarray, half: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Patches and their gradients by fourth-order central differences, interpolated at once with a border of two."""
     w, h = half
     outs = f, fx, fy = [np.empty((len(xy), (2 * h + 1) * (2 * w + 1)), np.float32) for _ in range(3)]
     basis = patch_basis(w + 2, h + 2)
@@ -153,10 +155,6 @@ def _looked_up(image: SplineImage, xy: np.ndarray, shape: np.ndarray, half: tupl
         for out, a in zip(outs, (P, difference(P, 1), difference(P, 2 * w + 5))):
             out[rows].reshape(len(P), 2 * h + 1, 2 * w + 1)[...] = a.reshape(P.shape)[:, 2:-2, 2:-2]
     return f, fx, fy
-
-
-GRADIENT_NOISE = 130 / 144  # variance of the fourth-order central difference, for white noise of variance 1; 1 / 2σ² after smoothing
-MIN_CONTRAST = 0.5  # grey values
 
 
 class TemplatePatches:
@@ -197,7 +195,7 @@ class TemplatePatches:
         self.q = np.stack(self.project(self.f), axis=1)  # (N, 2, P)  Jᵀ W f̂ for s = (1, 0) and (0, 1)
         n = np.sqrt(np.maximum(self.pixels, 1e-6))[:, None, None]
         mean = np.stack([self._sums(self._wfx), self._sums(self._wfy)], axis=1) / n
-        C = np.stack([mean, self.q], axis=2)  # (N, 2, 2, P) of Jᵀ W with the two vectors of unit length that M takes out
+        C = np.stack([mean, self.q], axis=2)  # (N, 2, 2, P) of Jᵀ W with the two vectors of unit length that M eliminates
         pairs = ((self._wfx * fx, 0, 0), (self._wfx * fy, 0, 1), (self._wfy * fy, 1, 1))
         self.noise_moment = self._products(self._weight)  # of gradients that are noise of variance 1
         self._moment = np.stack([self._products(g) - C[:, i].transpose(0, 2, 1) @ C[:, j] for g, i, j in pairs], axis=1)  # (N, 3, P, P)
@@ -206,7 +204,7 @@ class TemplatePatches:
             self._squared, self.parameter_pixels = self._squared_moments(C)
 
     def _squared_moments(self, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(M J)ᵀ W² M J (N, 3, P, P), and Σ w² / Σ w (N,): of the weights' sum, what an unknown takes from the residuals."""
+        """(M J)ᵀ W² M J (N, 3, P, P), and Σ w² / Σ w (N,): the part of the weights' sum by which an unknown reduces the residuals."""
         x, y, w, wf = self._wfx, self._wfy, self._weight, self.weighted_f
         n = np.sqrt(np.maximum(self.pixels, 1e-6))
         share, cross = np.einsum("ij,ij->i", w, w) / n**2, np.einsum("ij,ij->i", w, wf) / n
@@ -230,7 +228,7 @@ class TemplatePatches:
         return (values @ (self.monomials[:, i] * self.monomials[:, j])).astype(np.float64)[:, place]
 
     def squared(self) -> "TemplatePatches":
-        """The same, but its normal matrices are (M J)ᵀ W² M J: what noise that is alike in all pixels does to the right side."""
+        """The same with normal matrices (M J)ᵀ W² M J: the right side's covariance for noise that is the same in all pixels."""
         same = copy(self)
         same._moment = self._squared
         return same
@@ -252,13 +250,13 @@ class TemplatePatches:
         )
 
     def normal_to_shift(self, s: np.ndarray, t: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """The column of `normal` (m, P) for a mere shift along t."""
+        """The column of `normal` (m, P) for a shift alone, along t."""
         M = self._moment[rows]
         xx, xy, yx, yy = M[:, 0, :, 0], M[:, 1, :, 0], M[:, 1, 0, :], M[:, 2, :, 0]
         return s[:, :1] * (t[:, :1] * xx + t[:, 1:] * xy) + s[:, 1:] * (t[:, :1] * yx + t[:, 1:] * yy)
 
     def normal_of_shift(self, s: np.ndarray, t: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """The element of `normal` (m,) for mere shifts along s and t."""
+        """The element of `normal` (m,) for shifts alone, along s and t."""
         M = self._moment[rows, :, 0, 0]
         return s[:, 0] * t[:, 0] * M[:, 0] + (s[:, 0] * t[:, 1] + s[:, 1] * t[:, 0]) * M[:, 1] + s[:, 1] * t[:, 1] * M[:, 2]
 
@@ -273,7 +271,7 @@ class TemplatePatches:
         return along / np.sqrt(power), (gain * (px - q[:, 0] * along[:, None]), gain * (py - q[:, 1] * along[:, None]))
 
     def residual_variance(self, rho: np.ndarray, parameters: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Variance [grey values²] of a pixel after the adjustment, at correlation rho (m,), as white noise that would do as much."""
+        """Variance [grey values²] of a pixel after the adjustment, at correlation rho (m,), as white noise of the same effect."""
         lost = self.noise_factor[rows] * self.contrast[rows] ** 2 * np.clip(1 - rho**2, 0, 1)
         return lost / np.maximum(self.pixels[rows] - parameters * self.parameter_pixels[rows], 1.0)
 
@@ -285,7 +283,7 @@ def monomials(u: np.ndarray, v: np.ndarray, degree: int) -> np.ndarray:
 
 
 def _sample(image: SplineImage, xy: np.ndarray, half: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Patches (N, n) and their gradients by fourth-order central differences, all in one look-up with a border of two."""
+    """Patches (N, n) and their gradients by fourth-order central differences, all interpolated at once with a border of two."""
     w, h = half
     v, u = np.mgrid[-h - 2 : h + 3, -w - 2 : w + 3].astype(np.float32)
     x32 = xy.astype(np.float32)

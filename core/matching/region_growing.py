@@ -1,8 +1,8 @@
-"""Dense matching: from seeds to a field of triplets, whole fronts of points at a time.
+"""Region growing: dense matching from seeds, whole fronts of points at a time.
 
-As published (D'Apuzzo et al. 2000, §2.2) the centre image is the template, a point's start is its matched neighbour shifted with the
-neighbour's shape, and what fails is tried again from other neighbours. Here the neighbours of all points that were just accepted form one
-array, and a point is accepted only when enough views find it, its rays meet, and its depth continues that of its neighbour:
+As published (D'Apuzzo et al. 2000, §2.2) the reference image is the template, a point's start is its matched neighbour shifted with the
+neighbour's shape, and failed points are tried again from other neighbours. Here the neighbours of all points that were just accepted form
+one array, and a point is accepted only if enough views match it, its rays meet, and its depth continues that of its neighbour:
 
     start_k(p + δ) = x_k(p) + A_k(p) δ                                                    (1)
 """
@@ -48,43 +48,44 @@ class GrowingSettings:
 
     method: str = knob(
         "fronts",
-        "How the surface is covered: whole fronts of points at a time, or the published scan over the seeds' regions.",
+        "How the surface is covered: by region growing (fronts), or by the published scan of the seeds' Voronoi regions.",
         choices=("fronts", "published"),
     )
     texture: str = knob(
         "clothing",
-        "Quality limits of the published scan: those of a level of texture, or the ones set for matching (own).",
+        "Quality limits of the published scan: those for a level of texture, or those of the matching settings (own).",
         choices=("strong", "clothing", "skin", "own"),
     )
     spacing_px: int = knob(4, "Distance between measured points in the reference image.", unit="px", low=1, high=32)
-    seed_spacing_px: int = knob(24, "Distance between the points at which seeds are looked for.", unit="px", low=4, high=128)
-    attempts: int = knob(3, "How often a point is tried from different neighbours.", low=1, high=8)
+    seed_spacing_px: int = knob(24, "Distance between the points at which automatic seeds are searched for.", unit="px", low=4, high=128)
+    attempts: int = knob(3, "How often a point is tried, each time from another neighbour.", low=1, high=8)
     bigger_patches: int = knob(
         5,
-        "Rounds in which what failed is tried again with a patch 4 px larger, from the second on smoothed; fewer where pixels are large.",
+        "Rounds in which failed points are tried again with patches 4 px larger, from the second on in smoothed images; "
+        "fewer where a pixel covers much of the body.",
         low=0,
         high=5,
     )
     max_residual_px: float = knob(
         0.7,
-        "Largest distance by which rays may miss; if half of the seeds miss by more, three times their median.",
+        "Largest RMS distance by which rays may miss each other; three times the seeds' median where that is more.",
         unit="px",
         low=0.05,
         high=10.0,
     )
-    max_ray_sigma0: float = knob(  # χ² removes 2 % more points, hardly any of them wrong
+    max_ray_sigma0: float = knob(  # the χ² test removes 2 % more points, of which hardly any are wrong
         3.0,
-        "Largest distance by which rays may miss, in units of its own sigma; 0: the χ² test at 99.9 % for their number.",
+        "Largest distance by which rays may miss each other, in units of its sigma; 0: a χ² test at 99.9 % for their number.",
         low=0.0,
         high=100.0,
     )
-    pairs: bool = knob(False, "Keep points that only two views see; the cloud says how many rays each point has.")
-    max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across.", low=0.5, high=20.0)
+    pairs: bool = knob(False, "Accept points matched in two views only; the cloud records the number of rays of each point.")
+    max_slope: float = knob(3.0, "Steepest surface, as change of depth per distance across the line of sight.", low=0.5, high=20.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class MatchedField:
-    """The points that were matched: one row per accepted cell of the grid. Rows' pixels, metres; NaN in views that do not see it."""
+    """The points that were matched, one row per accepted cell of the grid. Rows' pixels, metres; NaN in views without a match."""
 
     grid: TemplateGrid
     cell: np.ndarray  # (N,) flat cell numbers, ascending
@@ -94,16 +95,16 @@ class MatchedField:
     correlation: np.ndarray  # (N,) the smallest over the views
     xyz_m: np.ndarray  # (N, 3)
     covariance_m2: np.ndarray  # (N, 3, 3)
-    residual_px: np.ndarray  # (N,) rms distance of the image points to the meeting point's projections
+    residual_px: np.ndarray  # (N,) RMS distance between the image points and the projections of the intersection
     sigma0: np.ndarray  # (N,) of the intersection
     spread: np.ndarray  # (N, 2) variance of the texture's energy in the patch of the reference view
-    smoothed: np.ndarray  # (N,) found in the smoothed images only
+    smoothed: np.ndarray  # (N,) matched in the smoothed images only
     tried: int  # how many cells were tried
     limit_px: float  # the residual that was allowed
 
     @property
     def complete(self) -> np.ndarray:
-        """(N,) which points all views see."""
+        """(N,) which points are matched in all views."""
         return np.isfinite(self.xy).all(axis=(1, 2))
 
     def select(self, rows: np.ndarray) -> "MatchedField":

@@ -1,14 +1,13 @@
-"""Seeds: the first triplets, found without a click by sweeping along the rays of the reference view (Collins 1996).
+"""Seeds: the first matched points, found automatically by sweeping along the rays of the reference view (Collins 1996).
 
 On a coarse grid of textured points of the reference image, each ray is sampled in inverse depth, so finely that the search images move by
-about a pixel; the patch, warped as a plane facing the reference camera would be, is compared in all other views:
+about a pixel. The patch, warped as a plane facing the reference camera, is correlated with all search views:
 
-    score(w) = Σ_k ρ_k(w) / K ,   w = 1 / depth ,   best w taken if it is high, alone, and found in all K views         (1)
+    score(w) = Σ_k ρ_k(w) / K ,   w = 1 / depth ,   best w taken if its score is high, unique, and from all K views     (1)
 
-With more views than two beside the reference, a point that not all of them see is scored over one view less, the best ones at every depth,
-and so on down to two (with `pairs`, to one).
-
-Least squares matching then refines the winners. Of a clicked surface seed only the depths near the click are swept.
+With more than two search views, a point that is not visible in all of them is scored over one view less, the best ones at every depth, and
+so on down to two (with `pairs`, to one). Least squares matching then refines the result. For a clicked surface seed only the depths near
+the click are swept.
 """
 
 from collections.abc import Sequence
@@ -26,20 +25,29 @@ from .grid import TemplateGrid, Views
 from .least_squares import MatchingSettings
 from .patches import patch_offsets
 
-NEAREST_BASES, FARTHEST_BASES = 0.8, 40.0  # depth range to look in, in lengths of the longest base, when nothing else is known
-SWEEP_STEP_PX = 1.0
-MIN_SCORE, MIN_LEAD = 0.80, 0.04
-MIN_CONTRAST, CONTRAST_OVER_NOISE = 0.5, 1.4
-PATCH_STRIDE = 2
-SWEEP_SMOOTHING_PX = 1.0  # a patch is compared at every other pixel: what is finer is noise to it
+NEAREST_BASES = 0.8  # nearest depth of the sweep, in lengths of the longest base, where nothing else limits it
+FARTHEST_BASES = 40.0  # farthest depth
+SWEEP_STEP_PX = 1.0  # px of the fastest search image from sample to sample
+MIN_SCORE = 0.80  # of (1)
+MIN_LEAD = 0.04  # of the best score over the second-best peak
+PEAK_SAMPLES = 9  # a peak has the best score of so many samples about it
+PEAK_DISTANCE = 8  # samples from the best one within which there is no other peak
+MIN_CONTRAST = 0.5  # grey values, smallest standard deviation of a patch
+CONTRAST_OVER_NOISE = 1.4  # and smallest ratio of it to the image's noise
+PATCH_STRIDE = 2  # px between the pixels that are compared
+DENSE_PATCH_PX = 9  # side of the largest patch of which all pixels are compared
+SWEEP_SMOOTHING_PX = 1.0  # px, sigma of the Gaussian: finer details would be noise to every other pixel
+MIN_SAMPLES = 8  # of a ray
 MAX_SAMPLES = 1200
-LOOK_UP = 30_000_000
-CLICK_SIGMAS, CLICK_SHARE = 3.0, 0.5  # of depth, swept about a click; and not more than this part of it
+LOOK_UP = 30_000_000  # grey values interpolated per block
+CORRELATED = 16_384  # patches correlated at once
+CLICK_SIGMAS = 3.0  # sigmas of depth that are swept about a click,
+CLICK_SHARE = 0.5  # but not more than this part of the depth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Approximations:
-    """Starts of M points: where they lie in every view and how a patch of the reference view is warped there. Rows' pixels."""
+    """Starts of M points: their positions in every view, and the shapes of a reference patch there. Rows' pixels."""
 
     xy: np.ndarray  # (M, K, 2)
     shape: np.ndarray  # (M, K, 2, 2)
@@ -145,7 +153,7 @@ def _inverse_depths(views: Views, near: float, far: float) -> np.ndarray:
     """Inverse depths from far to near, so that the fastest search image moves by about SWEEP_STEP_PX."""
     centres = np.stack([c.centre_m for c in views.cameras])
     speed = np.linalg.norm(centres - centres[views.reference], axis=1).max() * views.base.focal_px
-    count = int(np.clip(speed * (1 / near - 1 / far) / SWEEP_STEP_PX, 8, MAX_SAMPLES))
+    count = int(np.clip(speed * (1 / near - 1 / far) / SWEEP_STEP_PX, MIN_SAMPLES, MAX_SAMPLES))
     return np.linspace(1 / far, 1 / near, count)
 
 
@@ -153,7 +161,7 @@ def _sweep_correlations(views: Views, settings: MatchingSettings, xy: np.ndarray
     """Correlations (S, m, D) of the patches in the S search views, NaN where a view does not contain them."""
     m, D = len(xy), len(inverse)
     u, v, half = patch_offsets(settings.patch_px, views.rows.step)
-    sampled = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > 9 else np.ones(len(u), dtype=bool)
+    sampled = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > DENSE_PATCH_PX else np.ones(len(u), dtype=bool)
     u, v = u[sampled], v[sampled]
     f = _normalised(views.template.sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
     corners = _corners(views.base, views.rows, xy, 1 / inverse[None])
@@ -168,7 +176,7 @@ def _sweep_correlations(views: Views, settings: MatchingSettings, xy: np.ndarray
 
 
 def _best_depths(rho: np.ndarray, inverse: np.ndarray, fewest: int) -> tuple[np.ndarray, np.ndarray]:
-    """The depths (m,) at which most of the views (S, m, D) agree, but not fewer than `fewest`, and whether they are clear."""
+    """The depths (m,) at which most of the views (S, m, D) agree, but not fewer than `fewest`, and whether these are unambiguous."""
     ordered = -np.sort(-np.where(np.isnan(rho), -np.inf, rho), axis=0)  # the best view first
     depth, good = np.zeros(rho.shape[1]), np.zeros(rho.shape[1], dtype=bool)
     for views in range(len(rho), min(fewest, len(rho)) - 1, -1):
@@ -182,8 +190,8 @@ def _correlations(
     image: SplineImage, c: np.ndarray, A: np.ndarray, f: np.ndarray, owner: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
     rho = np.empty(len(c))
-    for i in range(0, len(c), 16_384):
-        s = slice(i, i + 16_384)
+    for i in range(0, len(c), CORRELATED):
+        s = slice(i, i + CORRELATED)
         c32, A32 = c[s].astype(np.float32), A[s].astype(np.float32)
         g = _normalised(
             image.sample(c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v)
@@ -198,10 +206,12 @@ def _normalised(patch: np.ndarray) -> np.ndarray:
 
 
 def _peaks(score: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the best sample of each row, refined by a parabola, and whether it is high and leads the second-best peak."""
+    """Depth of the best sample of each row, refined by a parabola, and whether its score is high enough and leads the second-best peak."""
     rows, best = np.arange(len(score)), score.argmax(axis=1)
     top = score[rows, best]
-    peaks = (score == maximum_filter1d(score, size=9, axis=1)) & (np.abs(np.arange(score.shape[1]) - best[:, None]) > 8)
+    peaks = (score == maximum_filter1d(score, size=PEAK_SAMPLES, axis=1)) & (
+        np.abs(np.arange(score.shape[1]) - best[:, None]) > PEAK_DISTANCE
+    )
     second = np.where(peaks, score, -1.0).max(axis=1)
     i = np.clip(best, 1, score.shape[1] - 2)
     a, b, c = score[rows, i - 1], score[rows, i], score[rows, i + 1]

@@ -1,16 +1,16 @@
-"""Dense matching as published (D'Apuzzo et al. 2000, §2.2; SCIENCE §6): shifts over the Voronoi regions of the seeds.
+"""Dense matching as published (D'Apuzzo et al. 2000, §2.2): shifts over the Voronoi regions of the seeds.
 
-The centre image is the template; every search image is matched on its own, without geometry. From each seed the match is shifted
-horizontally to the boundary of the seed's region, then vertically from the points so found, and so on until the region is covered:
+The reference image is the template; every search image is matched independently, without geometry. From each seed the match is shifted
+horizontally to the boundary of the seed's region, then vertically from the points so matched, and so on until the region is covered:
 
     start(p + δ) = x(p) + A(p) δ                                                                             (1)
 
-A match counts if five indicators are within the limits of its texture case: sigma0, the standard deviations of the shifts in x and y, and
-the displacements from the start in x and y. What fails is matched again with half the shift, then with bigger patches; holes are closed
+A match is accepted if five indicators are within the limits of its texture case: sigma0, the standard deviations of the shifts in x and y,
+and the displacements from the start in x and y. A failed match is repeated with half the shift, then with bigger patches; holes are closed
 from all directions around; points whose affine parameters differ from their neighbours' are removed, and matched again from the others.
-At the end the search images' results are merged to triplets, and these intersected.
+At the end the search images' results are merged and intersected.
 
-All regions advance together: the heads of all scans are one array, a step of all of them is one call of the matcher.
+All regions advance together: the heads of all scans are one array, and a step of all of them is one call of the matcher.
 """
 
 from collections.abc import Sequence
@@ -30,13 +30,19 @@ from .seeds import Approximations
 
 HORIZONTAL, VERTICAL = np.array([(-1, 0), (1, 0)]), np.array([(0, -1), (0, 1)])
 AROUND = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
-BIGGER_PX = (4, 8)
-FILTER_SIGMAS, FILTER_LEAST, FILTER_PASSES = 3.0, np.array([0.02, 0.02, 0.02, 0.02, 0.3, 0.3]), 2
+BIGGER_PX = (4, 8)  # px by which patches are larger in the retries
+FILTER_SIGMAS = 3.0  # robust deviations from the neighbours' median at which a point is removed
+FILTER_LEAST = np.array([0.02, 0.02, 0.02, 0.02, 0.3, 0.3])  # least deviation of the four shape parameters, and of the two shifts [px]
+FILTER_PASSES = 2
+HOLES_CLOSED = 0.002  # closing holes ends when a pass adds less than this part of the matched cells
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TextureCase:
-    """Limits of the five indicators for a level of texture (SCIENCE §4), and of two more."""
+    """Limits of the five indicators (and of the correlation) for a level of texture.
+
+    D'Apuzzo et al. 2000 leave the values to the user; these are ours.
+    """
 
     max_sigma0: float  # grey values of a patch whose contrast is 50
     max_sigma_px: float  # of the shifts in x and y
@@ -52,7 +58,7 @@ CASES = {
 
 
 def limits_of(texture: str, matching: MatchingSettings) -> MatchingSettings:
-    """The matching settings with the limits of a texture case; "own" keeps those that were set."""
+    """The matching settings with the limits of a texture case; "own" leaves them unchanged."""
     if texture == "own":
         return matching
     case = CASES[texture]
@@ -96,7 +102,7 @@ def voronoi_scan(
 
 
 class _Scan:
-    """The scan of one search image: what is known of every cell of the grid."""
+    """The scan of one search image: the state of every cell of the grid."""
 
     def __init__(
         self, template: SplineImage, image: SplineImage, grid: TemplateGrid, seeds: np.ndarray, settings: MatchingSettings, monitor: Monitor
@@ -107,7 +113,7 @@ class _Scan:
         every = np.arange(n)
         self._region = cKDTree(grid.xy(seeds) * (1, grid.rows.step)).query(grid.xy(every) * (1, grid.rows.step))[1] if len(seeds) else every
         self.found, self.tried = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-        self.middle, self.xy, self.offset, self.spread = (np.zeros((n, 2)) for _ in range(4))
+        self.centre, self.xy, self.offset, self.spread = (np.zeros((n, 2)) for _ in range(4))
         self.shape, self.covariance = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
         self.correlation = np.zeros(n)
 
@@ -116,7 +122,7 @@ class _Scan:
         self._try(self._seeds, start, shape)
 
     def cover(self) -> None:
-        """Shift horizontally, then vertically, from what was found last, until the regions are covered."""
+        """Shift horizontally, then vertically, from all matched cells, until the regions are covered."""
         fresh, directions = np.flatnonzero(self.found), HORIZONTAL
         idle = 0
         while idle < 2:
@@ -128,19 +134,19 @@ class _Scan:
             idle = 0 if new.any() else idle + 1
 
     def close_holes(self) -> None:
-        """Match what is left from all directions around, across the regions' boundaries; the best result counts."""
+        """Match the open cells from all directions around, across the regions' boundaries; the best result is taken."""
         while True:
             before = self.found.copy()
             cells, parents = self._pairs(np.flatnonzero(self.found), AROUND, within=False)
             open_ = ~self.found[cells]
             self._best(cells[open_], parents[open_])
-            if (self.found & ~before).sum() < max(1, 0.002 * before.sum()):
+            if (self.found & ~before).sum() < max(1, HOLES_CLOSED * before.sum()):
                 return
 
     def filter_and_repeat(self) -> None:
         """Remove points whose affine parameters differ from their neighbours', and match them again from those."""
         cell = np.flatnonzero(self.found)
-        moved = self.middle[cell] - self._grid.xy(cell)
+        moved = self.centre[cell] - self._grid.xy(cell)
         parameters = np.concatenate([self.shape[cell].reshape(-1, 4), self._local_shift(cell, moved)], axis=1)
         removed = cell[unlike_neighbours(self._grid, cell, parameters, sigmas=FILTER_SIGMAS, least=FILTER_LEAST)]
         self.found[removed] = False
@@ -149,7 +155,7 @@ class _Scan:
         self._best(cells[again], parents[again])
 
     def _local_shift(self, cell: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        """Parallax (N, 2) against what the mean of the neighbours' own predictions (1) says."""
+        """Parallax (N, 2) less the mean of the predictions (1) from the neighbours."""
         neighbour = neighbours_of(self._grid, cell, cell, radius=1, itself=False)
         valid = (neighbour >= 0)[..., None]
         at = self._grid.xy(cell)
@@ -159,7 +165,7 @@ class _Scan:
         return np.where(valid.any(axis=1), moved - mean, 0.0)
 
     def _run(self, heads: np.ndarray, directions: np.ndarray) -> None:
-        """Advance all heads in these directions, cell by cell, until each meets its region's boundary, a known cell or a failure."""
+        """Advance all heads in these directions, cell by cell, until each reaches its region's boundary, a tried cell, or fails."""
         for direction in directions:
             at = heads
             while len(at):
@@ -169,7 +175,7 @@ class _Scan:
                 at = self._from_parents(cells[open_], parents[open_])
 
     def _pairs(self, parents: np.ndarray, directions: np.ndarray, *, within: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The neighbours of cells in some directions, and whose they are; `within` their region only."""
+        """The neighbours of cells in some directions, and the cell that each belongs to; `within` their region only."""
         gh, gw = self._grid.shape
         i, j = (parents % gw)[:, None] + directions[:, 0], (parents // gw)[:, None] + directions[:, 1]
         usable = ((i >= 0) & (i < gw) & (j >= 0) & (j < gh)).ravel()
@@ -180,7 +186,7 @@ class _Scan:
         return cells, owners
 
     def _from_parents(self, cells: np.ndarray, parents: np.ndarray) -> np.ndarray:
-        """Match cells from their neighbours (one each), with the retries as published. The cells that were found."""
+        """Match cells from their neighbours (one each), with the retries as published; returns the matched cells."""
         cells, first = np.unique(cells, return_index=True)
         parents = parents[first]
         good = self._try(cells, *self._start(cells, parents))
@@ -196,10 +202,10 @@ class _Scan:
 
     def _start(self, cells: np.ndarray, parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         step = self._grid.xy(cells) - self._grid.xy(parents)
-        return self.middle[parents] + np.einsum("nij,nj->ni", self.shape[parents], step), self.shape[parents]  # (1)
+        return self.centre[parents] + np.einsum("nij,nj->ni", self.shape[parents], step), self.shape[parents]  # (1)
 
     def _half_way(self, cells: np.ndarray, parents: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Starts of cells by way of a match half-way to them: the smaller shift."""
+        """Starts of cells from a match half-way to them: the smaller shift."""
         if not len(cells):
             return None
         start, shape = self._start(cells, parents)
@@ -213,17 +219,17 @@ class _Scan:
         return match_patches(template, [SearchImage(image=self._image, start=start, shape=shape)], settings)[0]
 
     def _try(self, cells: np.ndarray, start: np.ndarray, shape: np.ndarray, *, patch_px: int | None = None) -> np.ndarray:
-        """Match cells from these starts; note what was found. Which (n,) were."""
+        """Match cells from these starts and store the good matches; returns which (n,) are good."""
         if not len(cells):
             return np.zeros(0, dtype=bool)
         settings = self._settings if patch_px is None else replace(self._settings, patch_px=patch_px)
         m = self._match(self._grid.xy(cells), start, shape, settings)
         self.tried[cells] = True
-        self._note(cells[m.ok], m, m.ok)
+        self._store(cells[m.ok], m, m.ok)
         return m.ok
 
     def _best(self, cells: np.ndarray, parents: np.ndarray) -> None:
-        """Match every pair of a cell and a neighbour; of each cell the result with the smallest variance is noted."""
+        """Match every pair of a cell and a neighbour; of each cell the result with the smallest variance is stored."""
         self._monitor.step("surface", float(self.found.sum()), len(self.found))
         if not len(cells):
             return
@@ -232,11 +238,11 @@ class _Scan:
         unique, first = np.unique(cells[order], return_index=True)
         rows = order[first]
         good = m.ok[rows]
-        self._note(unique[good], m, rows[good])
+        self._store(unique[good], m, rows[good])
 
-    def _note(self, cells: np.ndarray, m: Matches, rows: np.ndarray) -> None:
+    def _store(self, cells: np.ndarray, m: Matches, rows: np.ndarray) -> None:
         self.found[cells] = True
-        self.middle[cells], self.xy[cells], self.shape[cells] = m.xy[rows], m.transfer_xy[rows], m.shape[rows]
+        self.centre[cells], self.xy[cells], self.shape[cells] = m.xy[rows], m.transfer_xy[rows], m.shape[rows]
         self.covariance[cells], self.correlation[cells] = m.transfer_covariance[rows], m.correlation[rows]
         self.offset[cells], self.spread[cells] = m.offset[rows], m.spread[rows]
 

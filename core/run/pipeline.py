@@ -30,7 +30,7 @@ from ..report.pages import Report, write_report
 from ..report.silhouettes import by_view, silhouettes_of
 from ..results.folder import FitCheckpoints
 from ..surface.cloud import as_written, write_cloud
-from ..surface.frames import FrameNote, MeasuredFrames, note_of
+from ..surface.frames import FrameSummary, MeasuredFrames, summary_of
 from ..surface.measure import MeasureSettings, NothingMeasured, measure_frames
 from ..tracking.corrections import corrected_tracks, missed_clicks
 from ..tracking.long_tracks import trajectories_of
@@ -51,19 +51,21 @@ def measure(run: Run, monitor: Monitor) -> None:
         InputError: the footage cannot be read, or nothing can be measured.
         Cancelled: the frames measured so far are kept.
     """
-    began, notes, frames = time.perf_counter(), list[FrameNote](), run.footage.frames
+    began, summaries, frames = time.perf_counter(), list[FrameSummary](), run.footage.frames
     run.results.remove_other_clouds(frames)
     if run.settings["timing"].correct and not run.footage.delay_images:
         run.footage, run.record["offsets"] = synchronised(run.footage, monitor)
     try:
-        with run.resumable(stopped=lambda: f"Stopped: the surface of {len(notes)} of {len(frames)} frames is kept; run it again to go on."):
-            foreground = _measure_frames(run, notes, monitor)
+        with run.resumable(
+            stopped=lambda: f"Stopped: the surface of {len(summaries)} of {len(frames)} frames is kept; run it again to go on."
+        ):
+            foreground = _measure_frames(run, summaries, monitor)
     except NothingMeasured as error:
         return _no_surface(run, error, monitor)
-    notes.sort(key=lambda note: note.frame)
-    run.measured = MeasuredFrames(footage=run.footage, results=run.results, notes=tuple(notes))
-    run.warn(*doubts(run.footage, [n.frame for n in notes], [n.points for n in notes], [n.residual_px for n in notes], monitor))
-    run.finish_stage("measure", began, **surface_figures(notes, foreground))
+    summaries.sort(key=lambda summary: summary.frame)
+    run.measured = MeasuredFrames(footage=run.footage, results=run.results, summaries=tuple(summaries))
+    run.warn(*doubts(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor))
+    run.finish_stage("measure", began, **surface_figures(summaries, foreground))
 
 
 def track(run: Run, monitor: Monitor) -> None:
@@ -99,7 +101,7 @@ def fit(run: Run, monitor: Monitor) -> None:
         with run.resumable(*BODY_FILES, stopped=lambda: "Stopped during the fit: surface and tracks are kept; run it again to go on."):
             given, body, tracked_again = _fit_body(run, monitor)
     except InputError as error:
-        raise with_cause(error, run.footage, run.measured.notes[0].frame) if run.measured else error from error
+        raise with_cause(error, run.footage, run.measured.summaries[0].frame) if run.measured else error from error
     run.warn(*fit_warnings(body), *check_fit(given, body, run.settings["fitting"].click_sigma_px))
     run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again))
 
@@ -159,12 +161,12 @@ def is_complete(run: Run) -> bool:
 # ---- the steps of the stages ---------------------------------------------------------------------------------------------
 
 
-def _measure_frames(run: Run, notes: list[FrameNote], monitor: Monitor) -> Foreground | None:
-    """Write the clouds, note each frame in `notes`; gives the first frame's foreground."""
+def _measure_frames(run: Run, summaries: list[FrameSummary], monitor: Monitor) -> Foreground | None:
+    """Write the clouds, summarise each frame in `summaries`; gives the first frame's foreground."""
     s, foreground = run.settings, None
     for m in measure_frames(run.footage, MeasureSettings.of(s), run.results, monitor):
         write_cloud(run.results.cloud_path(m.frame), as_written(run.corrected(m.cloud), s["surface"]))
-        notes.append(note_of(m))
+        summaries.append(summary_of(m))
         foreground = foreground or m.foreground
     return foreground
 

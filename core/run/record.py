@@ -17,7 +17,7 @@ from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
 from ..matching.foreground import Foreground
-from ..surface.frames import FrameNote
+from ..surface.frames import FrameSummary
 from ..take.take import Footage
 from ..tracking.settings import TrackStatus
 from ..tracking.trajectories import Trajectories
@@ -44,13 +44,13 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def surface_figures(notes: Sequence[FrameNote], foreground: Foreground | None) -> dict[str, Any]:
+def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | None) -> dict[str, Any]:
     """Figures of the measured frames: number, points, residuals, sigma, and how the person was told from the room."""
     return {
-        "frames": len(notes),
-        "points_per_frame": float(np.mean([n.points for n in notes])),
-        "residual_px": median([n.residual_px for n in notes]),
-        "sigma_mm": 1e3 * median([n.sigma_m for n in notes]),
+        "frames": len(summaries),
+        "points_per_frame": float(np.mean([f.points for f in summaries])),
+        "residual_px": median([f.residual_px for f in summaries]),
+        "sigma_mm": 1e3 * median([f.sigma_m for f in summaries]),
         "foreground": foreground.method if foreground else "",
         "background_planes": len(foreground.planes) if foreground else 0,
     }
@@ -156,12 +156,12 @@ class FrameTable:
         return badness, tuple(reasons)
 
 
-def frame_table(notes: Sequence[FrameNote], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
+def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | None, body: BodyFit | None) -> FrameTable:
     """The table of a run, as far as it has come. Points are counted before corrections. Without measured frames, those of the body."""
-    frames = np.array([n.frame for n in notes] if notes or body is None else body.motion.frames, dtype=np.int64)
+    frames = np.array([f.frame for f in summaries] if summaries or body is None else body.motion.frames, dtype=np.int64)
     values = {name: np.full(len(frames), np.nan) for name in COLUMNS}
-    for i, note in enumerate(notes):
-        values["points"][i], values["sigma_mm"][i], values["residual_px"][i] = note.points, 1e3 * note.sigma_m, note.residual_px
+    for i, summary in enumerate(summaries):
+        values["points"][i], values["sigma_mm"][i], values["residual_px"][i] = summary.points, 1e3 * summary.sigma_m, summary.residual_px
     if trajectories is not None:
         for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
             at = np.searchsorted(frames, trajectories.frames[t])

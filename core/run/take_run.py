@@ -84,7 +84,7 @@ class Run:
         """Note what a stage took and found, and write run.json."""
         key = self.keys.get(stage, self.keys.get("fit", ""))
         self.record["stages"][stage] = {"seconds": round(time.perf_counter() - began, 2), "key": key, **figures}
-        write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.notes, self.trajectories, self.body))
+        write_frame_table(self.results.path("frames.csv"), frame_table(self.measured.summaries, self.trajectories, self.body))
         self.results.write_run(self.record)
 
     @contextmanager

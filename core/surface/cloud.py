@@ -1,15 +1,14 @@
-"""From triplets to a clean cloud: filters, the correction for curvature, normals and covariances.
+"""From a matched field to a clean cloud: filters, the correction for curvature, normals, covariances, and thinning.
 
-Filters (D'Apuzzo et al. 2000, §2.3): a point must agree with its neighbours and must not stand alone. The sigma of a point contains the ray
-intersection's covariance, what its neighbours scatter by beyond it, and half of the curvature correction, for what remains of it.
+A point must agree with its neighbours and must belong to a large enough group. Its covariance is the sum of the intersection's, of the
+neighbours' scatter beyond it, and of half of the curvature correction, for its remaining error.
 
-Thinning a cloud evenly: the points in a cube of space are replaced by their centre of gravity (D'Apuzzo et al. 2000, §2.3).
-
+A written cloud may be thinned evenly: the points in a cube of space are replaced by their centre of gravity (D'Apuzzo et al. 2000, §2.2).
 With weights w_i ∝ 1 / tr K_i, Σ w_i = 1,
 
     X = Σ w_i X_i ,   K = Σ w_i K_i                                                                  (1)
 
-The patches of neighbouring points overlap, so their errors are alike: K is what the mean of wholly dependent points has, at most.
+The patches of neighbouring points overlap, so that their errors are correlated: K is the upper limit, that of fully dependent points.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -25,29 +24,33 @@ from ..matching.region_growing import MatchedField
 from ..motion.formats import ply
 from .local_surface import LocalSurface, local_surface
 
-FILTERS = ("other surface", "small island", "depth in doubt")  # what they find; why a point went is 1 + its filter's number
-OCCLUDED = 3  # what failed the occlusion check (matching/occlusion_check.py)
-REMAINING_BIAS = 0.5  # of the curvature correction
-LIMB_SCATTER = 0.06  # of the spacing on the surface: what a round limb's own shape makes neighbours scatter about a quadric
-ROUGHNESS = 0.7  # of the variance by which they scatter beyond that and beyond their own
-MAX_CORRECTION_PX = 3.0
+FILTERS = ("outlier", "small island", "occlusion")  # reasons for removal, numbered from 1
+OUTLIER, SMALL_ISLAND, OCCLUDED = 1, 2, 3  # the last by matching/occlusion_check.py
+MIN_NEIGHBOURS = 3  # of a point; one with fewer is an outlier
+MIN_DEVIATION = 0.5  # of the spacing on the surface: smaller scatter of the neighbours does not narrow the limit for outliers
+REMAINING_BIAS = 0.5  # of the curvature correction, the part that remains as an error
+LIMB_SCATTER = 0.06  # of the spacing on the surface, scatter about a quadric that the shape of a round limb explains
+ROUGHNESS = 0.7  # of the neighbours' variance beyond that and beyond their own, which enters a point's covariance
+MAX_CORRECTION_PX = 3.0  # px; a rounder surface than this implies is noise, not a body
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SurfaceSettings:
-    """What is kept of the measured surface."""
+    """The filters of the measured surface, and the thinning of its files."""
 
     min_island: int = knob(20, "Groups of fewer connected points than this are removed.", low=1, high=10_000)
     max_deviation: float = knob(4.0, "Largest distance from the neighbours' surface, in units of their scatter.", low=1.0, high=20.0)
-    correct_curvature: bool = knob(True, "Correct round surfaces' flattening by the patch; matching in object space needs no correction.")
+    correct_curvature: bool = knob(
+        True, "Correct the flattening of round surfaces by affine patches; matching in object space needs no correction."
+    )
     voxel_mm: float = knob(
-        0.0, "Side of the cubes in which the points of the written clouds are averaged; 0 writes all.", unit="mm", low=0.0, high=1000.0
+        0.0, "Side of the cubes in which points are averaged in the written clouds; 0 writes all points.", unit="mm", low=0.0, high=1000.0
     )
     voxel_points: int = knob(2, "Cubes with fewer points than this are left out.", low=1, high=1000)
 
     @property
     def of_measuring(self) -> "SurfaceSettings":
-        """These settings as far as they concern what is measured, and not how it is written."""
+        """These settings without those that concern only the written files."""
         return replace(self, voxel_mm=0.0, voxel_points=1)
 
 
@@ -60,8 +63,8 @@ class PointCloud:
     covariance_m2: np.ndarray  # (N, 3, 3)
     normals: np.ndarray  # (N, 3)
     intensity: np.ndarray  # (N,) grey value in the reference view
-    xy_px: np.ndarray  # (N, K, 2) where it was matched
-    residual_px: np.ndarray  # (N,) rms by which the rays miss
+    xy_px: np.ndarray  # (N, K, 2) where the points were matched
+    residual_px: np.ndarray  # (N,) RMS by which the rays miss each other
 
     def __post_init__(self) -> None:
         n, k = len(self.xyz_m), self.xy_px.shape[1]
@@ -72,7 +75,7 @@ class PointCloud:
 
     @property
     def sigma_m(self) -> np.ndarray:
-        """(N,) root of the trace of the covariance: the mean error of position."""
+        """(N,) root of the trace of the covariance: the standard error of position."""
         return np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
 
     @property
@@ -86,21 +89,21 @@ class PointCloud:
 
 
 def clean_field(field: MatchedField, camera: Camera, reference: int, settings: SurfaceSettings) -> MatchedField:
-    """The field without the points that disagree with their neighbours and without small islands."""
+    """The field without outliers and small islands."""
     return field.select(why_removed(field, camera, reference, settings) == 0)
 
 
 def why_removed(field: MatchedField, camera: Camera, reference: int, settings: SurfaceSettings) -> np.ndarray:
-    """Which of the first two `FILTERS` removes each point (N,) uint8, 1 for the first; 0 where neither does."""
+    """(N,) uint8, OUTLIER or SMALL_ISLAND where one of these filters removes the point, and 0."""
     why = np.zeros(len(field.cell), dtype=np.uint8)
     if not len(why):
         return why
     surface = local_surface(field, camera, reference)
     spacing_m = field.grid.spacing_px * surface.depth_m / camera.focal_px
-    limit = settings.max_deviation * np.maximum(surface.scatter_m, 0.5 * spacing_m)
-    agrees = (np.abs(surface.depth_m - surface.fitted_m) <= limit) & (surface.neighbours >= 3)
-    why[~agrees] = 1
-    why[agrees] = np.where(_island_size(field.select(agrees)) >= settings.min_island, 0, 2)
+    limit = settings.max_deviation * np.maximum(surface.scatter_m, MIN_DEVIATION * spacing_m)
+    agrees = (np.abs(surface.depth_m - surface.fitted_m) <= limit) & (surface.neighbours >= MIN_NEIGHBOURS)
+    why[~agrees] = OUTLIER
+    why[agrees] = np.where(_island_size(field.select(agrees)) >= settings.min_island, 0, SMALL_ISLAND)
     return why
 
 
@@ -129,20 +132,20 @@ def point_cloud(field: MatchedField, grey: np.ndarray, camera: Camera, reference
 
 
 def _roughness(covariance_m2: np.ndarray, rays: np.ndarray, scatter_m: np.ndarray, explained_m: np.ndarray) -> np.ndarray:
-    """Covariance (N, 3, 3) along the rays: by how much the neighbours scatter more than their covariances and what is explained say."""
+    """Covariance (N, 3, 3) along the rays: the neighbours' scatter beyond their covariances and beyond `explained_m`."""
     own = np.einsum("ni,nij,nj->n", rays, covariance_m2, rays) / np.einsum("ni,ni->n", rays, rays) ** 2
     more = ROUGHNESS * np.maximum(0.0, scatter_m**2 - own - explained_m**2)
     return more[:, None, None] * rays[:, :, None] * rays[:, None]
 
 
 def _correction_m(surface: LocalSurface, focal_px: float) -> np.ndarray:
-    """(N,) what is added to the depths for the curvature."""
-    limit = MAX_CORRECTION_PX * surface.depth_m / focal_px  # rounder than a body: the quadric follows noise there
+    """(N,) correction of the depths for the curvature."""
+    limit = MAX_CORRECTION_PX * surface.depth_m / focal_px
     return np.clip(surface.flattening_m, -limit, limit)
 
 
 def _island_size(field: MatchedField) -> np.ndarray:
-    """(N,) how many points hang together with each."""
+    """(N,) size of the connected group of each point."""
     taken = np.zeros(field.grid.shape, dtype=bool)
     taken.ravel()[field.cell] = True
     islands, _ = label(taken, structure=np.ones((3, 3)))
@@ -151,14 +154,14 @@ def _island_size(field: MatchedField) -> np.ndarray:
 
 
 def as_written(cloud: PointCloud, settings: SurfaceSettings) -> PointCloud:
-    """The cloud that is written to a file: thinned where that was asked for."""
+    """The cloud that is written to a file, thinned if the settings ask for it."""
     return voxel_filtered(cloud, 1e-3 * settings.voxel_mm, settings.voxel_points) if settings.voxel_mm else cloud
 
 
 def voxel_filtered(cloud: PointCloud, edge_m: float, fewest: int) -> PointCloud:
-    """The cloud with one point for every cube of side `edge_m` that holds `fewest` points or more, in the order of the cubes.
+    """The cloud with one point for every cube of side `edge_m` that contains `fewest` points or more, in the order of the cubes.
 
-    A point of cubes counts a view only if all of its points were measured there.
+    A view counts for a cube only if all of its points were matched there.
     """
     if not len(cloud.xyz_m):
         return cloud
@@ -166,12 +169,12 @@ def voxel_filtered(cloud: PointCloud, edge_m: float, fewest: int) -> PointCloud:
     cube = cube.reshape(-1)
     weight = 1 / np.maximum(np.trace(cloud.covariance_m2, axis1=1, axis2=2), 1e-18)
     weight /= np.bincount(cube, weight)[cube]
-    kept = count >= fewest
+    enough = count >= fewest
 
     def mean(values: np.ndarray) -> np.ndarray:
         flat = values.reshape(len(values), -1)
         columns = [np.bincount(cube, weight * column, minlength=len(count)) for column in flat.T]
-        return np.stack(columns, axis=1).reshape(-1, *values.shape[1:])[kept]
+        return np.stack(columns, axis=1).reshape(-1, *values.shape[1:])[enough]
 
     normals = mean(cloud.normals)
     return PointCloud(

@@ -1,7 +1,7 @@
-"""The measured frames of a take, however many: each is read from its checkpoint when it is asked for, and none is kept.
+"""The measured frames of a take: each is read from its checkpoint on access, and none stays in memory.
 
-A long recording thus needs no more memory than a short one. What is asked of all frames at once (how many points, how good) is noted when
-a frame is measured.
+A long recording thus needs no more memory than a short one. Figures of all frames (how many points, how precise) are summarised when a
+frame is measured.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,33 +19,33 @@ from .measure import MeasuredFrame, read_checkpoint
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class FrameNote:
-    """What is remembered of a measured frame. Medians are NaN where it has no points."""
+class FrameSummary:
+    """Figures of a measured frame that stay in memory. Medians are NaN where it has no points."""
 
     frame: int
     key: str  # of its checkpoint
     points: int
-    limit_px: float  # by how much rays were allowed to miss
+    limit_px: float  # by which rays were allowed to miss each other
     residual_px: float  # median
     sigma_m: float  # median
 
 
-def note_of(m: MeasuredFrame) -> FrameNote:
-    """The note of a frame that was measured."""
+def summary_of(m: MeasuredFrame) -> FrameSummary:
+    """The summary of a frame that was measured."""
     residual, sigma = (float(np.median(a)) if len(a) else np.nan for a in (m.cloud.residual_px, m.cloud.sigma_m))
-    return FrameNote(frame=m.frame, key=m.key, points=len(m.cloud.xyz_m), limit_px=m.field.limit_px, residual_px=residual, sigma_m=sigma)
+    return FrameSummary(frame=m.frame, key=m.key, points=len(m.cloud.xyz_m), limit_px=m.field.limit_px, residual_px=residual, sigma_m=sigma)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredFrames(Sequence[MeasuredFrame]):
-    """Measured frames in the order of time. Reading one raises InputError when its checkpoint was taken away."""
+    """Measured frames in the order of time. Reading one raises InputError if its checkpoint was deleted."""
 
     footage: Footage
     results: Results
-    notes: tuple[FrameNote, ...] = ()
+    summaries: tuple[FrameSummary, ...] = ()
 
     def __len__(self) -> int:
-        return len(self.notes)
+        return len(self.summaries)
 
     @overload
     def __getitem__(self, index: int) -> MeasuredFrame: ...
@@ -53,11 +53,11 @@ class MeasuredFrames(Sequence[MeasuredFrame]):
     def __getitem__(self, index: slice) -> "MeasuredFrames": ...
     def __getitem__(self, index: int | slice) -> "MeasuredFrame | MeasuredFrames":
         if isinstance(index, slice):
-            return MeasuredFrames(footage=self.footage, results=self.results, notes=self.notes[index])
-        note = self.notes[index]
-        measured = read_checkpoint(self.footage, self.results, note.frame, note.key)
+            return MeasuredFrames(footage=self.footage, results=self.results, summaries=self.summaries[index])
+        summary = self.summaries[index]
+        measured = read_checkpoint(self.footage, self.results, summary.frame, summary.key)
         if measured is None:
-            raise InputError(f"The checkpoint of frame {note.frame} in {self.results.path('cache')} was taken away; run again.")
+            raise InputError(f"The checkpoint of frame {summary.frame} in {self.results.path('cache')} was deleted. Run again.")
         return measured
 
     def __iter__(self) -> Iterator[MeasuredFrame]:
@@ -65,9 +65,9 @@ class MeasuredFrames(Sequence[MeasuredFrame]):
 
     @property
     def limit_px(self) -> float:
-        """The usual distance by which rays were allowed to miss."""
-        return float(np.median([n.limit_px for n in self.notes]))
+        """The median over the frames of the distance by which rays were allowed to miss each other."""
+        return float(np.median([s.limit_px for s in self.summaries]))
 
     def clouds(self, corrected: Callable[[PointCloud], PointCloud]) -> Sequence[PointCloud]:
-        """The frames' clouds, each read and corrected when it is asked for."""
+        """The frames' clouds, each read and corrected on access."""
         return LazySequence(self, lambda measured: corrected(measured.cloud))

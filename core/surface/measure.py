@@ -1,7 +1,7 @@
 """Surface measurement of a whole take: frame after frame from the frame of the clicks, each frame's depths from the one before.
 
-Every frame leaves a checkpoint whose key covers the images, the rig, the settings and the frame before, so that a killed run goes on where
-it stopped and ends with the same numbers.
+Every frame leaves a checkpoint whose key covers the images, the rig, the settings and the frame before, so that a killed run resumes where
+it stopped and gives the same numbers.
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,17 +34,17 @@ from ..take.take import Footage, footage_frames
 from .cloud import OCCLUDED, PointCloud, SurfaceSettings, point_cloud, why_removed
 
 ALGORITHM = "surface 18"  # part of every key: raise it when the same input gives other numbers
-MIN_MOVED = 20  # seeds that moved, from which the person is looked for among them alone
-ANY_DEPTH_M = (0.05, 1e3)  # m
-FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")
+MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
+ANY_DEPTH_M = (fg.NEAREST_M, 1e3)
+FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")  # stored in single precision
 
 
 class NothingMeasured(InputError):
-    """The first frame of a take gave no surface. `why` is what the footage says about it, if it was asked."""
+    """The first frame of a take gave no surface. `why` is the cause that a check of the footage found, if it did."""
 
     def __init__(self, frame: int, why: str = "") -> None:
         self.frame, self.why = frame, why
-        guess = "no texture is found alike in all views. Check that rig.toml belongs to this footage and that the views are not swapped, "
+        guess = "no matches were found in all views. Check that rig.toml belongs to this footage and that the views are not swapped, "
         super().__init__(f"No surface could be measured in frame {frame}: {why or guess + 'or click surface seeds.'}")
 
     def __reduce__(self) -> tuple[type, tuple[int, str]]:
@@ -68,14 +68,14 @@ class MeasuredFrame:
     cloud: PointCloud
     foreground: fg.Foreground
     key: str
-    removed_px: np.ndarray  # (M, K, 2) full-frame pixels of the points that the filters took out
+    removed_px: np.ndarray  # (M, K, 2) full-frame pixels of the points that the filters removed
     removed_why: np.ndarray  # (M,) see `why_removed`
 
 
 def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
-    """The measured rows (h', w) float32 of all views at one frame, of views that are late at the moment of the others.
+    """The rows (h', w) float32 of all views at one frame; views with a time offset are interpolated to the moment of the others.
 
-    What a late view showed before and after is asked of the same rows of the images before and after.
+    The interpolation uses the same rows of the images before and after.
 
     Raises:
         InputError: see `Footage.read`.
@@ -94,7 +94,7 @@ def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
 
 
 def load_images(footage: Footage, frame: int, enhance: EnhanceSettings | None = None) -> FrameImages:
-    """Read a frame and prepare it; what is matched may be enhanced, the grey values stay as they were taken.
+    """Read a frame and prepare it. The images for matching may be enhanced, the grey values are those of the files.
 
     Raises:
         InputError: see `Footage.read`.
@@ -143,8 +143,8 @@ def measure_frames(footage: Footage, settings: MeasureSettings, results: Results
         part.step("surface", 0, 1)
         if frame == first - 1:
             before = start
-        known = [before.key] if before else _image_digests(footage, _furthest_frame(footage, frame))  # the room is found with that frame
-        key = store.digest(base, *known, str(frame), *_image_digests(footage, frame), *_silhouette_digests(footage, frame))
+        needed = [before.key] if before else _image_digests(footage, _furthest_frame(footage, frame))  # the background is found with it
+        key = store.digest(base, *needed, str(frame), *_image_digests(footage, frame), *_silhouette_digests(footage, frame))
         measured = read_checkpoint(footage, results, frame, key)
         if measured is None:
             measured = _measure(_frame_views(footage, frame, settings, first=before is None), settings, before, key, part)
@@ -155,8 +155,8 @@ def measure_frames(footage: Footage, settings: MeasureSettings, results: Results
 
 
 def _image_digests(footage: Footage, frame: int) -> list[str]:
-    """What identifies the images of a frame: the content of image files; the size and date of a movie. With views put to the others'
-    moment the frames before and after count as well."""
+    """The identity of a frame's images: the content of image files; the size and date of a movie. With interpolated views it includes the
+    frames before and after."""
     step = footage.take.field_layout.per_image
     near = (frame - step, frame, frame + step) if any(footage.delay_images) else (frame,)
     parts = []
@@ -171,8 +171,8 @@ def _image_digests(footage: Footage, frame: int) -> list[str]:
 
 def _silhouette_digests(footage: Footage, frame: int) -> list[str]:
     """The content of the masks and backgrounds of a frame."""
-    told = (silhouette_file(footage, k, frame) for k in range(len(footage.take.views)))
-    return [store.digest(path) for path in told if path is not None and path.is_file()]
+    paths = (silhouette_file(footage, k, frame) for k in range(len(footage.take.views)))
+    return [store.digest(path) for path in paths if path is not None and path.is_file()]
 
 
 def _seed_table(footage: Footage) -> list[tuple[str, list[tuple[str, list[float]]]]]:
@@ -323,7 +323,7 @@ def _background_and_person(now: _FrameViews, seeds: Approximations) -> tuple[np.
 
 
 def _single(field: MatchedField) -> MatchedField:
-    """The field with its covariances in single precision, as a checkpoint keeps it: a resumed run continues with the same numbers."""
+    """The field with its covariances in single precision, as a checkpoint stores it: a resumed run continues with the same numbers."""
     return replace(field, **{name: getattr(field, name).astype(np.float32).astype(np.float64) for name in FIELD_SINGLE})
 
 
@@ -363,6 +363,6 @@ def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) ->
         **{k.removeprefix("cloud_"): v for k, v in a.items() if k.startswith("cloud_")},
     )
     where = fg.Foreground(depth_range_m=(float(a["where"][0]), float(a["where"][1])), method=str(a["method"]), planes=a["planes"])
-    why = a.get("removed_why", np.zeros(0, dtype=np.uint8))  # earlier versions did not keep it
+    why = a.get("removed_why", np.zeros(0, dtype=np.uint8))  # earlier versions did not store it
     removed = a.get("removed_px", np.zeros((0, field.xy.shape[1], 2), dtype=np.float32))
     return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key, removed_px=removed, removed_why=why)

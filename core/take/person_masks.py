@@ -1,7 +1,7 @@
-"""Where the views show the person, as the user said: by masks, white where she is, or by an image of the empty background.
+"""The silhouette of the person in the views, from the take's masks (white person), or from an image of the empty background.
 
-What is measured must lie inside the silhouette of every view that has one and sees the place. A view that differs from its background
-everywhere (black, lit otherwise) says nothing in that frame.
+A measured point must lie inside the silhouette of every view that has one and whose image contains it. In a frame in which a view differs
+from its background everywhere (black, other light) it has no silhouette.
 """
 
 from collections.abc import Sequence
@@ -17,8 +17,8 @@ from ..matching.foreground import Silhouette
 from .sources import PERSON_SOURCES, read_picture
 from .take import Footage
 
-WHITE = 127.0  # brighter pixels of a mask are the person
-HOLE_PX = 15  # in the person's silhouette, where she looks like the background
+WHITE = 127.0  # grey values; brighter pixels of a mask are the person
+HOLE_PX = 15  # px, side of the largest hole that is closed in a silhouette, where the person has the background's grey value
 
 
 def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, first: bool) -> tuple[Silhouette, ...]:
@@ -45,25 +45,25 @@ def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, fir
             found.append(Silhouette(camera=camera, rows=rows, mask=mask))
         elif first:
             raise InputError(
-                f"The background image {path} looks nothing like view {view.name} in frame {frame}; take it with the same camera and light."
+                f"The background image {path} looks nothing like view {view.name} in frame {frame}. Take it with the same camera and light."
             )
     return tuple(found)
 
 
 def silhouette_file(footage: Footage, view: int, frame: int) -> Path | None:
-    """The mask or background image that holds for a frame of a view, if it has one.
+    """The mask or background image of a view for a frame, if it has one.
 
     Raises:
         InputError: there are no masks, or too few.
     """
-    said, folder = footage.take.views[view], footage.take.folder
-    if said.masks is None:
-        name = said.mask or said.background
+    given, folder = footage.take.views[view], footage.take.folder
+    if given.masks is None:
+        name = given.mask or given.background
         return None if name is None else folder / name
-    files = open_sequence(folder, images=said.masks, movie=None, view=f"{said.name} (masks)").files()
+    files = open_sequence(folder, images=given.masks, movie=None, view=f"{given.name} (masks)").files()
     number = footage.number(view, frame)
     if not 0 <= number < len(files):
-        raise InputError(f"View {said.name} has {len(files)} masks, but none for frame {frame}; there must be one for every image.")
+        raise InputError(f"View {given.name} has {len(files)} masks, but none for frame {frame}. There must be one for every image.")
     return files[number]
 
 
@@ -76,7 +76,7 @@ def silhouette_sources(footage: Footage) -> str:
 
 
 def _unlike(background: np.ndarray, image: np.ndarray, row_step: int) -> np.ndarray | None:
-    """Where an image differs from the background, without specks and holes; None where it does so everywhere."""
+    """Where an image differs from the background, without specks and holes; None where it does everywhere."""
     empty = empty_view(background, image)
     if empty.noise > OTHER_ROOM:
         return None

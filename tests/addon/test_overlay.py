@@ -124,7 +124,7 @@ def test_points_before_the_filters_of_the_surface(run: Any, small_run: SmallRun)
     xy[2, 1] = np.nan  # C did not see it
     store.save(small_run.out / "cache" / "surface" / "0003.npz", dict(removed_px=xy, removed_why=np.array([1, 2, 2], np.uint8)), {})
     seen, counts = layers.removed_points(run, "C", 3)
-    assert np.array_equal(seen, xy[:2, 1]) and counts == [("other surface", 1), ("small island", 2)]
+    assert np.array_equal(seen, xy[:2, 1]) and counts == [("outlier", 1), ("small island", 2)]
     seen, counts = layers.removed_points(run, "L", 3, "2")
     assert np.array_equal(seen, xy[1:, 0]) and counts == [("small island", 2)]
     assert not len(layers.removed_points(run, "L", 4)[0]), "no checkpoint"

@@ -91,12 +91,12 @@ def test_filter_removes_what_is_unlike_and_matches_it_again(scene) -> None:
     one = begun(scene, MatchingSettings())
     one.cover()
     wrong = np.flatnonzero(one.found)[50:500:45]
-    truth = one.middle[wrong].copy()
-    one.middle[wrong] += 2.5
+    truth = one.centre[wrong].copy()
+    one.centre[wrong] += 2.5
     one.shape[wrong, 0, 1] += 0.4
     one.filter_and_repeat()
     assert one.found[wrong].mean() > 0.85
-    assert np.median(np.abs(one.middle[wrong] - truth)) < 0.05
+    assert np.median(np.abs(one.centre[wrong] - truth)) < 0.05
 
 
 @pytest.mark.slow

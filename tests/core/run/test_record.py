@@ -7,22 +7,22 @@ import pytest
 
 from tricap.core.foundation.errors import InputError
 from tricap.core.run.record import COLUMNS, FrameTable, frame_table, read_frame_table, write_frame_table
-from tricap.core.surface.frames import FrameNote
+from tricap.core.surface.frames import FrameSummary
 from tricap.core.tracking.trajectories import with_kinematics
 
 
-def note(frame: int, points: int, sigma_m: float, residual: float) -> FrameNote:
-    return FrameNote(frame=frame, key="", points=points, limit_px=1.0, residual_px=residual, sigma_m=sigma_m)
+def summary(frame: int, points: int, sigma_m: float, residual: float) -> FrameSummary:
+    return FrameSummary(frame=frame, key="", points=points, limit_px=1.0, residual_px=residual, sigma_m=sigma_m)
 
 
 def table() -> FrameTable:
-    notes = [note(4, 100, 1e-3, 0.1), note(5, 90, 1e-3, 0.4), note(6, 0, np.nan, np.nan), note(7, 110, 1.1e-3, 0.12)]
-    notes.append(note(8, 100, 1e-3, 0.1))
+    summaries = [summary(4, 100, 1e-3, 0.1), summary(5, 90, 1e-3, 0.4), summary(6, 0, np.nan, np.nan), summary(7, 110, 1.1e-3, 0.12)]
+    summaries.append(summary(8, 100, 1e-3, 0.1))
     xyz = np.zeros((4, 3, 3))
     xyz[2, :2] = np.nan
     tracks = with_kinematics(np.arange(4, 8), np.arange(4, 8) / 25, xyz, np.where(np.isfinite(xyz[..., 0]), 2e-3, np.nan),
                              np.ones((4, 3), dtype=np.int8), 0)  # fmt: skip
-    return frame_table(notes, tracks, None)
+    return frame_table(summaries, tracks, None)
 
 
 def test_what_stands_in_it() -> None:
