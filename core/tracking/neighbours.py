@@ -1,13 +1,13 @@
-"""What the neighbours of a point say about its motion: the rigid motion that they share, fitted robustly and without the point itself.
+"""The rigid motion that a point's neighbours share, fitted robustly and without the point itself.
 
-Of two instants with the neighbours' places p_j → q_j and weights w_j (p̄, q̄ their weighted means), the rotation R is found by
+For neighbours that move from p_j to q_j with weights w_j (p̄, q̄ their weighted means), the rotation R is the solution of
 
     (Σ w (|P|² I − P Pᵀ) + λ I) ω = Σ w P × (q − q̄ − P) ,   P = R (p − p̄) ,   R ← exp(ω) R                (1)
 
-and the point should move to R (x − p̄) + q̄. One step of (1) is the velocity field v = v0 + ω × (X − X̄) of a rigid body, which a
-rotating limb obeys and a common velocity does not; repeated, it holds for rotations of any size. λ keeps R = I about axes that the
-neighbours do not determine. A point on one limb whose neighbours lie mostly on another has a second fit, which starts from the
-neighbours whose distance from the point is the same at both instants: in a rigid body all distances are invariant.
+and the point is expected at R (x − p̄) + q̄. One step of (1) is the velocity field v = v0 + ω × (X − X̄) of a rigid body, which describes
+a rotating limb, unlike a common velocity; repeated, it converges for rotations of any size. λ keeps R = I about axes that the neighbours do
+not determine. For a point on one limb whose neighbours lie mostly on another there is a second fit, which starts from the neighbours whose
+distance from the point is the same at both instants: in a rigid body all distances are invariant.
 """
 
 from dataclasses import dataclass
@@ -18,25 +18,25 @@ from scipy.spatial import cKDTree
 from ..geometry.rotation import cross_matrix, rotation_from_vector
 
 NEIGHBOURS = 14
-STEPS = 6
-PLAIN_STEPS = 2  # without reweighting, while R is still far off
-NOISE_M = 2e-3  # of a neighbour: λ of (1)
+STEPS = 6  # of (1)
+PLAIN_STEPS = 2  # of these without reweighting, while R is far from the solution
+NOISE_M = 2e-3  # sigma of a neighbour: λ = NOISE_M² Σ w in (1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Expectation:
-    """Where N points should be by their neighbours. Metres."""
+    """Positions of N points predicted by their neighbours. Metres."""
 
     xyz_m: np.ndarray  # (N, 3); NaN with fewer than three neighbours
     spread_m: np.ndarray  # (N,) robust scatter of the neighbours about their common motion
     members: np.ndarray  # (N,) neighbours that share the motion
-    leverage: np.ndarray  # (N,) variance of the expected place in units of a neighbour's variance
+    leverage: np.ndarray  # (N,) variance of the predicted position, in units of a neighbour's variance
 
 
 def nearest_neighbours(xyz_m: np.ndarray, among_m: np.ndarray, radius_m: float, *, same: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (N, m) of `among_m` nearest to the points (N, 3) within the radius, and which of them are any.
+    """Rows (N, m) of `among_m` nearest to the points (N, 3) within the radius, and which of them exist.
 
-    `same`: the points are those of `among_m`, and none is its own neighbour.
+    `same`: the points are those of `among_m`, and no point counts as its own neighbour.
     """
     if not len(among_m):
         return np.zeros((len(xyz_m), 1), dtype=np.int64), np.zeros((len(xyz_m), 1), dtype=bool)
@@ -51,9 +51,9 @@ def nearest_neighbours(xyz_m: np.ndarray, among_m: np.ndarray, radius_m: float, 
 def common_motion(
     xyz_m: np.ndarray, before_m: np.ndarray, after_m: np.ndarray, weight: np.ndarray, scale_m: float | np.ndarray
 ) -> Expectation:
-    """Where points (N, 3) move with their neighbours, who went from `before_m` to `after_m` (N, m, 3). `weight` (N, m) of the start.
+    """Positions of points (N, 3) that move with their neighbours from `before_m` to `after_m` (N, m, 3), with initial weights (N, m).
 
-    `scale_m` is the scatter of neighbours that is certainly harmless.
+    `scale_m` is a scatter of neighbours that is always accepted.
     """
     R = np.tile(np.eye(3), (len(xyz_m), 1, 1))
     there, w = weight > 0, weight.astype(np.float64)
@@ -78,7 +78,7 @@ def common_motion(
 
 
 def _leverage(x: np.ndarray, p: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """1 / Σ w + tr([x]× J⁻¹ [x]×ᵀ) / 3, J the matrix of (1): how the errors of neighbours p (N, m, 3) act at x (N, 3)."""
+    """1 / Σ w + tr([x]× J⁻¹ [x]×ᵀ) / 3, J the matrix of (1): the effect at x (N, 3) of errors of the neighbours p (N, m, 3)."""
     J = -np.einsum("nm,nmi,nmj->nij", w, p, p, optimize=True)
     J += np.eye(3) * (np.einsum("nm,nmi,nmi->n", w, p, p, optimize=True) + w.sum(axis=1) * NOISE_M**2 + 1e-15)[:, None, None]
     X = cross_matrix(x)

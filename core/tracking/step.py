@@ -4,17 +4,16 @@
     search    the box about the prediction for the largest correlation with the patch of frame i                   (2)
     temporal  least squares matching of the patch of frame i in frame i + 1, in every view                         (3)
     control   the reference view's result is adjusted with a match of the point's key template (templates.py),     (4)
-              both corrected for the turning of a round body where the frame's surface is known (relief.py)
+              both corrected for the curvature of a turning body where the frame's surface was measured (relief.py)
     spatial   least squares matching of the reference view's patch in the other views of frame i + 1               (5)
-    verify    Δ = x_s − x_t,  Δᵀ (K_s + K_t + Q)⁻¹ Δ ≤ s² χ²(0.999; 2), else once more in a bigger box, else stop   (6)
+    verify    Δ = x_s − x_t,  Δᵀ (K_s + K_t + Q)⁻¹ Δ ≤ s² χ²(0.999; 2), else again in a larger box, else stop       (6)
 
-Most points move as predicted to within matching's range of convergence; they are matched from the prediction at once, and the boxes are
-searched for the others.
+Most predictions lie within matching's range of convergence, so the first attempt matches from the prediction without a search.
 
-s² in (6) is the variance component that the step's own points show, by their 90 % quantile: matching's covariances are too small where
-texture is weak against the noise, by a factor that differs from recording to recording. Kept: the reference view's controlled result,
-elsewhere the mean of temporal and spatial weighted by their covariances; then the point where the rays meet. Its covariance contains the
-drift over the body.
+s² in (6) is a variance component, estimated from the 90 % quantile of the step's own points: matching's covariances are too small where
+texture is weak against the noise, by a factor that differs from recording to recording. The result is the controlled match in the reference
+view, elsewhere the mean of the temporal and spatial matches weighted by their covariances, and in space the intersection of the rays. Its
+covariance includes the drift over the body.
 """
 
 from collections.abc import Sequence
@@ -36,12 +35,16 @@ from .settings import TrackingSettings, TrackStatus
 from .templates import REGULARISATION_PX2, Templates, TemplateState, at_least_best, control_drift, search_box
 from .tracked import TrackedFrame, rows_of
 
-CHI2, CHI2_90 = 13.82, 4.605  # two degrees of freedom: 0.999 and 0.9
-MODEL_SIGMA_PX = 0.12  # Q of (6): what an affine patch cannot follow
-LARGEST_SCALE, PRIOR_POINTS = 3.0, 20  # of s; as many points as would have s = 1
-KNOWN_BOX, UNKNOWN_BOX = (0.0, 0.4, 1.0), (0.0, 1.0, 2.0)  # of the box in each attempt, for points whose motion is known or not
-HARMLESS_M = 2e-3  # scatter of neighbours about their common motion
+CHI2 = 13.82  # χ²(0.999; 2) of (6)
+CHI2_90 = 4.605  # χ²(0.9; 2), for the variance component
+MODEL_SIGMA_PX = 0.12  # Q of (6): deformation that an affine patch does not model
+MAX_SCALE = 3.0  # of s
+PRIOR_POINTS = 20  # weight of the prior s = 1, in points
+ATTEMPT_BOX = (0.0, 0.4, 1.0)  # in units of `tracking.box_px`, by attempt, for points with a predicted motion
+ATTEMPT_BOX_NEW = (0.0, 1.0, 2.0)  # the same for points without
+HARMLESS_M = 2e-3  # scatter of neighbours about their common motion that is always accepted
 TEMPLATE_SIGMA_PX = 0.02  # of the reference view's point in the intersection; its drift is added afterwards
+NO_FAILURE = 127  # larger than every TrackStatus
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,13 +56,13 @@ class TrackingView:
     field_layout: FieldLayout
     matching: MatchingSettings
     tracking: TrackingSettings
-    limit_px: float  # by which rays may miss
-    frame: int = 0  # that is looked at
+    limit_px: float  # largest distance between a ray and the image point
+    frame: int = 0  # the frame that is measured
     dt_s: float = 0.04  # from one frame to the next
     curvature: CurvatureCorrection | None = None  # from the surface measured in that frame
 
     def at(self, frame: int) -> "TrackingView":
-        """The same, to look at this frame."""
+        """The same for another frame."""
         return replace(self, frame=frame)
 
     @property
@@ -101,26 +104,26 @@ def track_step(
     frame: int,
     monitor: Monitor,
 ) -> TrackedFrame:
-    """Follow all points of `current` to `frame`, the second of the two frames of `images`; frames between may be missing.
+    """Track all points of `current` to `frame`, the second of the two frames of `images`; frames between may be missing.
 
-    Points are in rows' pixels of their own frame: a patch of one field is found in the other where its place in the full frame says.
+    Points are in rows' pixels of their own frame; between two fields, positions are converted through the full frame.
     """
     view = view.at(frame)
     n = len(current.identity)
-    predicted, known = predict(current, before, frame, view.tracking.neighbourhood_m)
+    predicted, moving = predict(current, before, frame, view.tracking.neighbourhood_m)
     reason = np.full(n, TrackStatus.NOT_FOUND, dtype=np.int8)
     result, scale = current, None
-    rest = np.flatnonzero(known)
-    for attempt in range(3):
+    rest = np.flatnonzero(moving)
+    for attempt in range(len(ATTEMPT_BOX)):
         if len(rest):
             if monitor.cancelled:
-                monitor.step("tracks", attempt, 3)
-            box = view.tracking.box_px * np.where(known[rest], KNOWN_BOX[attempt], UNKNOWN_BOX[attempt])
+                monitor.step("tracks", attempt, len(ATTEMPT_BOX))
+            box = view.tracking.box_px * np.where(moving[rest], ATTEMPT_BOX[attempt], ATTEMPT_BOX_NEW[attempt])
             found, status, scale = _attempt(view, current.select(rest), predicted[rest], box, templates, images, scale)
             reason[rest] = status
             good = status == TrackStatus.MEASURED
             result = result.changed(rest[good], found.select(good))
-            predicted, known = _with_the_others(current, result, reason == TrackStatus.MEASURED, predicted, known, view.tracking)
+            predicted, moving = _with_neighbours(current, result, reason == TrackStatus.MEASURED, (predicted, moving), view.tracking)
         rest = np.flatnonzero((reason != TrackStatus.MEASURED) & (reason != TrackStatus.LEFT_IMAGE))
     return replace(result, frame=frame, ended=np.zeros(0, np.int64), reason=np.zeros(0, np.int8)).without(
         reason != TrackStatus.MEASURED, reason
@@ -128,7 +131,7 @@ def track_step(
 
 
 def predict(current: TrackedFrame, before: TrackedFrame | None, frame: int, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Predicted positions (N, 3), and for which points a motion is known: their own, or that of neighbours.  (1)"""
+    """Predicted positions (N, 3), and which points have a motion, their own or that of neighbours.  (1)"""
     if before is None or not len(before.identity):
         return current.xyz_m, np.zeros(len(current.identity), dtype=bool)
     at = rows_of(before.identity, current.identity)
@@ -144,11 +147,15 @@ def predict(current: TrackedFrame, before: TrackedFrame | None, frame: int, radi
     return goal, known
 
 
-def _with_the_others(
-    current: TrackedFrame, result: TrackedFrame, found: np.ndarray, predicted: np.ndarray, known: np.ndarray, settings: TrackingSettings
+def _with_neighbours(
+    current: TrackedFrame,
+    result: TrackedFrame,
+    found: np.ndarray,
+    prediction: tuple[np.ndarray, np.ndarray],
+    settings: TrackingSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Better predictions for the points that were not found: the motion of their neighbours that were."""
-    goal, known = predicted.copy(), known.copy()
+    """The prediction, see `predict`, with the points that were not found moved by their neighbours that were."""
+    goal, known = (a.copy() for a in prediction)
     lost = np.flatnonzero(~found)
     rows, there = nearest_neighbours(current.xyz_m[lost], current.xyz_m[found], settings.neighbourhood_m)
     if there.any():
@@ -167,7 +174,7 @@ def _attempt(
     images: FramePair,
     scale: float | None,
 ) -> tuple[TrackedFrame, np.ndarray, float]:
-    """Steps (2) to (6); gives the points, a status each, and s of (6), which is estimated when it is not given."""
+    """Steps (2) to (6): the points, a status each, and s of (6), which is estimated unless `scale` is given."""
     n, K = len(points.identity), len(view.cameras)
     status = np.where(np.isfinite(points.xy).all(axis=2), TrackStatus.MEASURED, TrackStatus.ABSENT).astype(np.int8)
     start = np.empty((n, K, 2))
@@ -187,12 +194,12 @@ def _attempt(
 
 
 def mark(status: np.ndarray, bad: np.ndarray, why: TrackStatus) -> None:
-    """Note why points failed, those that have not failed before."""
+    """Set the status of the `bad` points that have not failed before."""
     status[bad & (status == TrackStatus.MEASURED)] = why
 
 
 def match_temporally(view: TrackingView, points: TrackedFrame, start: np.ndarray, images: FramePair, status: np.ndarray) -> list[Matches]:
-    """The patch of frame i found in frame i + 1, per view.  (3)"""
+    """The patch of frame i matched in frame i + 1, per view.  (3)"""
     eye = np.tile(np.eye(2), (len(start), 1, 1))
     matches = []
     for k in range(len(view.cameras)):
@@ -234,7 +241,7 @@ def match_spatially(
 ) -> list[Matches]:
     """The reference view's patch matched in the other views of the same frame, from positions (N, 2) in every view.  (5)
 
-    `status` (N, K) is per view, here and below: a point goes on without the views in which it failed as long as three are left, or both
+    `status` (N, K) is per view, here and below: a point is tracked without the views in which it failed as long as three are left, or both
     of two.
     """
     good = status == TrackStatus.MEASURED
@@ -250,10 +257,10 @@ def match_spatially(
 
 
 def disagreement(view: TrackingView, temporal: Sequence[Matches], spatial: Sequence[Matches], status: np.ndarray) -> float:
-    """s of (6): by how much temporal and spatial results differ more than their covariances say."""
+    """s of (6): the ratio between the observed differences of temporal and spatial matches and those expected from their covariances."""
     d2 = np.concatenate([_distance2(temporal[k], s)[status[:, k] == TrackStatus.MEASURED] for k, s in zip(view.others, spatial)])
     observed = float(np.quantile(d2, 0.9)) / CHI2_90 if len(d2) else 1.0
-    return float(np.sqrt(np.clip((len(d2) * observed + PRIOR_POINTS) / (len(d2) + PRIOR_POINTS), 1.0, LARGEST_SCALE**2)))
+    return float(np.sqrt(np.clip((len(d2) * observed + PRIOR_POINTS) / (len(d2) + PRIOR_POINTS), 1.0, MAX_SCALE**2)))
 
 
 def _distance2(t: Matches, s: Matches) -> np.ndarray:
@@ -267,7 +274,7 @@ def _distance2(t: Matches, s: Matches) -> np.ndarray:
 def _verify(
     view: TrackingView, points: TrackedFrame, temporal: Sequence[Matches], spatial: Sequence[Matches], status: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, covariances and shapes in every view, where spatial and temporal matching agree.  (6)"""
+    """Positions, covariances and shapes in every view of the points whose spatial and temporal matches agree.  (6)"""
     xy = np.stack([m.xy for m in temporal], axis=1)
     covariance = np.stack([m.covariance for m in temporal], axis=1)
     covariance[:, view.reference] = np.eye(2) * TEMPLATE_SIGMA_PX**2
@@ -280,7 +287,7 @@ def _verify(
 
 
 def weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 2) and covariances of both weighted by their covariances for these rows (a mask), of `a` alone for the others."""
+    """Positions (N, 2) and covariances: of these rows (a mask) the weighted mean of both matches, of the others those of `a`."""
     xy, K = a.xy.copy(), a.covariance.copy()
     gain = K[rows] @ invert_spd(K[rows] + b.covariance[rows] + np.eye(2) * REGULARISATION_PX2)
     xy[rows] += np.einsum("nij,nj->ni", gain, (b.xy - a.xy)[rows])
@@ -291,7 +298,7 @@ def weighted_mean(a: Matches, b: Matches, rows: np.ndarray) -> tuple[np.ndarray,
 def intersect(
     view: TrackingView, points: TrackedFrame, xy: np.ndarray, covariance: np.ndarray, shape: np.ndarray, status: np.ndarray
 ) -> tuple[TrackedFrame, np.ndarray]:
-    """The points where the rays of the good views meet, and one status (N,) each, RAYS_MISS where they do not."""
+    """The points at the intersection of the good views' rays, and one status (N,) each, RAYS_MISS where the rays do not meet."""
     good = status == TrackStatus.MEASURED
     verdict = _verdict(view, status)
     usable = good & (verdict == TrackStatus.MEASURED)[:, None]
@@ -299,7 +306,7 @@ def intersect(
     point = forward_intersection(view.cameras, view.rows.to_frame(xy), view.rows.covariance_to_frame(covariance))
     with np.errstate(invalid="ignore"):
         mark(verdict, ~(point.rms_residual_px <= view.limit_px), TrackStatus.RAYS_MISS)
-    K = point.covariance_m2 + over_the_body(view, point.xyz_m, points.key_drift + points.drift)
+    K = point.covariance_m2 + drift_covariance(view, point.xyz_m, points.key_drift + points.drift)
     return replace(points, xy=xy, shape=shape, xyz_m=point.xyz_m, covariance_m2=K), verdict
 
 
@@ -316,17 +323,17 @@ def measured_at(
 
 
 def _verdict(view: TrackingView, status: np.ndarray) -> np.ndarray:
-    """One status (N,) of those in the views (N, K): why the reference, or the first other view, failed, where too few are left."""
+    """One status (N,) from those of the views (N, K): where too few views are left, why the reference or the first other view failed."""
     good = status == TrackStatus.MEASURED
     enough = good[:, view.reference] & (good.sum(axis=1) >= min(3, len(view.cameras)))
-    failed = np.where(good | (status == TrackStatus.ABSENT), 127, status)
-    first = np.where(failed[:, view.reference] < 127, failed[:, view.reference], failed.min(axis=1))
-    return np.where(enough, TrackStatus.MEASURED, np.where(first < 127, first, TrackStatus.NOT_FOUND)).astype(np.int8)
+    failed = np.where(good | (status == TrackStatus.ABSENT), NO_FAILURE, status)
+    first = np.where(failed[:, view.reference] < NO_FAILURE, failed[:, view.reference], failed.min(axis=1))
+    return np.where(enough, TrackStatus.MEASURED, np.where(first < NO_FAILURE, first, TrackStatus.NOT_FOUND)).astype(np.int8)
 
 
-def over_the_body(view: TrackingView, xyz_m: np.ndarray, drift_px2: np.ndarray) -> np.ndarray:
+def drift_covariance(view: TrackingView, xyz_m: np.ndarray, drift_px2: np.ndarray) -> np.ndarray:
     """Covariance (N, 3, 3) of drift (N, 2, 2) in the reference image, across the rays."""
     camera = view.cameras[view.reference]
     pixel_m = camera.to_camera(xyz_m)[:, 2] / camera.focal_px
-    across = camera.R_cam_world[:2]  # of a camera that looks at the person, near enough
+    across = camera.R_cam_world[:2]  # approximately across the rays, as the camera points at the person
     return np.einsum("ia,nij,jb->nab", across, view.rows.covariance_to_frame(drift_px2), across) * (pixel_m**2)[:, None, None]

@@ -1,21 +1,22 @@
-"""Key templates: the patch of each point's birth, kept so that a track cannot drift away from what it began with.
+"""Key templates: the patch of each point in its first frame, to which every frame is compared so that the track does not drift.
 
-From frame to frame small errors add up to a random walk over the body, σ √n after n frames. Each frame's result is therefore adjusted with
-a match of the key template itself, with P the point's covariance against the template, K_t and K_b those of the two matches:
+Small errors from frame to frame accumulate to a random walk over the body, σ √n after n frames. Each frame's result is therefore adjusted
+with a match of the key template itself, with P the point's covariance against the template, K_t and K_b those of the temporal match and of
+the key template's:
 
     P⁻¹ ← (P + K_t)⁻¹ + K_b⁻¹                                                  (1)
 
-but P is never less than the better of K_t and K_b: both matches look at the same new image, and the template's noise is always the same.
+but P is never less than the smaller of K_t and K_b: both matches use the same new image, and the template's noise is always the same.
 
-Where the template has become too unlike (its correlation is below a limit), the point's present patch becomes the template, and P is
-added to the drift of the template itself.
+Where the correlation with the template falls below a limit, the point's present patch replaces it, and P is added to the drift of the
+template itself.
 
-Only tiles are kept, not images: memory grows with the points, not with the frames. Their gradients and normal matrices are made once,
+Only tiles are stored, not images: memory grows with the points, not with the frames. Their gradients and normal matrices are computed once,
 when they are cut, from the new tiles laid out as one image.
 
 Control of drift: a point's temporal result adjusted with a match of its key template (equation (1) of templates.py).
 
-The box search: where in a box a patch correlates best, for many patches (equation (2) of step.py).
+The box search: the position in a box at which a patch correlates best, for many patches (equation (2) of step.py).
 """
 
 from collections.abc import Callable
@@ -38,14 +39,14 @@ from ..matching.least_squares import (
 from ..matching.patches import patch_offsets
 from .tracked import rows_of
 
-BORDER = 5  # pixels about a patch: gradients, and where the spline still feels the tile's border
-MAX_WIDTH_PX = 8000  # of an atlas, a limit of the look-up
-REACQUIRE_CORRELATION = 0.9  # of a lost point with its key template: more than in tracking, for nothing else supports the match
+BORDER = 5  # pixels around a patch, for gradients and for the effect of the tile's border on the spline
+MAX_WIDTH_PX = 8000  # of an atlas; OpenCV looks up at most 32,766 px
+REACQUIRE_CORRELATION = 0.9  # of a lost point with its key template: more than in tracking, as nothing else supports it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Tiles:
-    """Cut-outs of the reference view by ascending identity."""
+    """Cut-outs of the reference view, in ascending order of identity."""
 
     identity: np.ndarray  # (N,)
     tile: np.ndarray  # (N, h, w) float16: whole grey values of 8 bits are exact in it
@@ -64,7 +65,7 @@ class Templates:
     patches: PatchTemplates
 
     def with_tiles(self, new: Tiles, settings: MatchingSettings, row_step: int) -> "Templates":
-        """These templates and new ones, which replace those of the same identity."""
+        """These templates and new ones, which replace those of the same identities."""
         if not len(new.identity):
             return self
         old = ~np.isin(self.tiles.identity, new.identity)
@@ -79,25 +80,25 @@ class Templates:
         return Templates(tiles=both.select(order), patches=patches.select(order))
 
     def only(self, identities: np.ndarray) -> "Templates":
-        """The templates of these points; a point without one is left out."""
+        """The templates of these points, without those that have none."""
         rows = rows_of(self.tiles.identity, np.unique(identities))
         rows = rows[rows >= 0]
         return Templates(tiles=self.tiles.select(rows), patches=self.patches.select(rows))
 
     def match(self, identity: np.ndarray, image: SplineImage, start: np.ndarray, shape: np.ndarray) -> Matches:
-        """The templates of these points (each has one) matched in an image, from positions (N, 2) and shapes (N, 2, 2)."""
+        """The templates of these points, each of which has one, matched in an image from positions (N, 2) and shapes (N, 2, 2)."""
         return match_prepared(self.patches, rows_of(self.tiles.identity, identity), SearchImage(image=image, start=start, shape=shape))
 
 
 def no_templates(settings: MatchingSettings, row_step: int) -> Templates:
-    """None yet."""
+    """An empty set of templates."""
     w, h = _half_tile(settings, row_step)
     none = Tiles(identity=np.zeros(0, np.int64), tile=np.zeros((0, 2 * h + 1, 2 * w + 1), np.float16), offset=np.zeros((0, 2)))
     return Templates(tiles=none, patches=_prepared(none, settings, row_step))
 
 
 def cut_tiles(image: SplineImage, identity: np.ndarray, xy: np.ndarray, settings: MatchingSettings, row_step: int) -> Tiles:
-    """The tiles about points (N, 2) of an image; beyond its border the image is mirrored."""
+    """The tiles around points (N, 2) of an image, which is mirrored at its border."""
     w, h = _half_tile(settings, row_step)
     middle = np.rint(xy)
     v, u = np.mgrid[-h : h + 1, -w : w + 1]
@@ -107,7 +108,7 @@ def cut_tiles(image: SplineImage, identity: np.ndarray, xy: np.ndarray, settings
 
 
 def atlas(tiles: Tiles) -> tuple[np.ndarray, np.ndarray]:
-    """One image (H, W) float32 of the tiles, and where their points lie in it (N, 2)."""
+    """One image (H, W) float32 of all tiles, and the positions of their points in it (N, 2)."""
     n, (h, w) = max(1, len(tiles.identity)), tiles.tile.shape[1:]
     across = min(MAX_WIDTH_PX // w, int(np.ceil(np.sqrt(n * h / w))))
     down = -(-n // across)
@@ -205,8 +206,8 @@ def search_box(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) within `box` (N,) of `centre` (N, 2) where the patches about `xy` (N, 2) of `grey` correlate best in `next_grey`.
 
-    Gives the correlations (N,) too, −1 where a patch or its box leaves an image. Box sizes are full-frame pixels; without a box the
-    centre is the start. Cost: one call of OpenCV per point, 10 µs for a box of 5 px, 35 µs for 12 px.
+    Returns the correlations (N,) as well, −1 where a patch or its box leaves an image. Box sizes are full-frame pixels; with a box of 0 the
+    result is the centre itself. Cost: one call of OpenCV per point, 10 µs for a box of 5 px, 35 µs for 12 px.
     """
     _, _, (w, h) = patch_offsets(patch_px, row_step)
     best, start = np.full(len(xy), -1.0), np.array(centre)
@@ -216,7 +217,7 @@ def search_box(
     H, W = next_grey.shape
     x0, x1 = np.maximum(0, q[:, 0] - w - rx), np.minimum(W, q[:, 0] + w + rx + 1)
     y0, y1 = np.maximum(0, q[:, 1] - h - ry), np.minimum(H, q[:, 1] + h + ry + 1)
-    best[usable & (box == 0)] = 1.0  # nothing to search: the centre is the start
+    best[usable & (box == 0)] = 1.0  # no search: the result is the centre
     rows = np.flatnonzero(usable & (box > 0))
     spans = np.stack([p[:, 1] - h, p[:, 1] + h + 1, p[:, 0] - w, p[:, 0] + w + 1, y0, y1, x0, x1], axis=1)[rows].tolist()
     found = np.zeros((len(rows), 3))

@@ -3,12 +3,12 @@
 A frame in which next to no point is found, because one view is black or the recorder lost it, is left out: the points are tracked from
 the frame before it into the one after.
 
-Tracking the whole surface: which points are followed, where new ones start, and each frame's own surface as a control
+Tracking the whole surface: which points are tracked, where new ones start, and each frame's measured surface as a control
 (D'Apuzzo et al. 2000, §3.2).
 
-At the outline of a limb half of a patch shows what lies behind it. Such a point is neither on the one nor on the other: it slides along
-the outline, well correlated. So a point is followed only while its patch lies on the surface that was measured in the same frame, faces the
-camera, and is no deeper or nearer than that surface. From it the points take the correction for curvature, too (surface/cloud.py).
+At the outline of a limb, half of a patch shows the background. Such a point belongs to neither surface: it slides along the outline, with a
+high correlation. A point is therefore tracked only while its patch lies on the surface measured in the same frame, faces the camera, and
+has the depth of that surface. Its depth is then replaced by the surface's, which is corrected for curvature (surface/cloud.py).
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,38 +30,39 @@ from .curvature_correction import NEAREST_POINTS, CurvatureCorrection
 from .lost_points import Guide, LostPoints, none_lost
 from .published_step import STEPS
 from .settings import TrackingSettings, TrackStatus
-from .step import FramePair, TrackingView, over_the_body
+from .step import FramePair, TrackingView, drift_covariance
 from .templates import Templates, Tiles, cut_tiles, no_templates
 from .tracked import TrackedFrame, born, joined, nothing
 
-BARE = 0.85  # a surface point with no tracked point within this many spacings starts a new trajectory
-STEEPEST_COSINE = 0.3  # between the normal and the ray
-DEPTH_SIGMAS, DEPTH_CELLS = 4.0, 1.0
-STEEPEST_SLOPE = 3.0  # change of depth per distance across, within one surface
-MOVED_CELLS = 0.8  # a cell whose texture lies further from its middle is at the outline
+MIN_DISTANCE = 0.85  # in units of `tracking.spacing_px`: a surface point further from every tracked point starts a trajectory
+MIN_FACING = 0.3  # cosine between the normal and the ray to the camera
+MAX_DEPTH_SIGMAS = 4.0  # by which a point may lie off the surface
+MAX_DEPTH_CELLS = 1.0  # the same in cells of the grid; the larger limit counts
+MAX_SLOPE = 3.0  # change of depth per distance across, within one surface
+MAX_SHIFT_CELLS = 0.8  # of a cell's texture from its middle; a larger one is at the outline
 
 
 def start_tracks(field: MatchedField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
-    """The first tracked points: the measured surface, thinned to the tracking's spacing."""
+    """The first tracked points: the measured surface, thinned to the spacing of tracking."""
     rows = _thinned(field, view.tracking.spacing_px)
     return _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], 0, view)
 
 
 def regenerate(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, view: TrackingView, next_identity: int) -> TrackedFrame:
-    """The tracked points of a frame and new ones from the frame's own surface, where it has no tracked point near."""
+    """The tracked points of a frame, and new ones where no tracked point is near the frame's measured surface."""
     rows = _thinned(field, view.tracking.spacing_px)
     if len(tracked.identity) and len(rows):
         to_frame = field.grid.rows.to_frame
         distance, _ = cKDTree(to_frame(tracked.xy[:, view.reference])).query(to_frame(field.xy[rows, view.reference]))
-        rows = rows[distance > BARE * view.tracking.spacing_px]
+        rows = rows[distance > MIN_DISTANCE * view.tracking.spacing_px]
     return joined(tracked, _born(field, cloud, rows[_well_inside(field, cloud, rows, view)], next_identity, view))
 
 
 def on_surface(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, view: TrackingView) -> TrackedFrame:
-    """The points that lie on the frame's own surface; the others end. A frame in which no surface was measured says nothing.
+    """The points that lie on the frame's measured surface; the others end. In a frame without a surface all points stay.
 
-    The track says where on the surface a point is, the surface how deep: it was measured with all neighbours, and corrected for
-    curvature, which a patch alone sees too flat.
+    A point's direction comes from the track, its depth from the surface, which was measured together with its neighbours and corrected for
+    curvature.
     """
     if not len(field.cell) or not len(tracked.identity):
         return tracked
@@ -72,43 +73,43 @@ def on_surface(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, vi
     distance, near = distance.reshape(len(at), -1), near.reshape(len(at), -1)
     slope = np.einsum("nki,ni->nk", cloud.normals[near], ray)  # negative: towards the camera
     facing = -slope[:, 0] / np.linalg.norm(ray, axis=1)
-    met = np.einsum("nki,nki->nk", cloud.normals[near], cloud.xyz_m[near] - camera.centre_m) / np.minimum(slope, -STEEPEST_COSINE)
+    met = np.einsum("nki,nki->nk", cloud.normals[near], cloud.xyz_m[near] - camera.centre_m) / np.minimum(slope, -MIN_FACING)
     weight = 1 / np.maximum(distance, 1.0) ** 2
-    found = (weight * met).sum(axis=1) / weight.sum(axis=1)  # depth at which the ray meets the tangent planes of the nearest points
+    surface_depth = (weight * met).sum(axis=1) / weight.sum(axis=1)  # where the ray meets the nearest points' tangent planes
     cell_m = field.grid.spacing_px * depth / camera.focal_px
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", ray, tracked.covariance_m2 + cloud.covariance_m2[near[:, 0]], ray)) / (ray**2).sum(axis=1)
     covered = _coverage(field, tracked.xy[:, view.reference], depth, view) >= view.tracking.min_coverage
-    reason = np.where(covered & (facing >= STEEPEST_COSINE), TrackStatus.MEASURED, TrackStatus.AT_OUTLINE)
-    far = np.abs(found - depth) > np.maximum(DEPTH_SIGMAS * sigma, DEPTH_CELLS * cell_m)
+    reason = np.where(covered & (facing >= MIN_FACING), TrackStatus.MEASURED, TrackStatus.AT_OUTLINE)
+    far = np.abs(surface_depth - depth) > np.maximum(MAX_DEPTH_SIGMAS * sigma, MAX_DEPTH_CELLS * cell_m)
     reason[(reason == TrackStatus.MEASURED) & far] = TrackStatus.OFF_SURFACE
-    strayed = over_the_body(view, tracked.xyz_m, tracked.key_drift + tracked.drift)
-    placed = replace(tracked, xyz_m=camera.centre_m + ray * found[:, None], covariance_m2=cloud.covariance_m2[near[:, 0]] + strayed)
+    drift = drift_covariance(view, tracked.xyz_m, tracked.key_drift + tracked.drift)
+    placed = replace(tracked, xyz_m=camera.centre_m + ray * surface_depth[:, None], covariance_m2=cloud.covariance_m2[near[:, 0]] + drift)
     return _with_local_surface(placed, view).without(reason != TrackStatus.MEASURED, reason)
 
 
 def _well_inside(field: MatchedField, cloud: PointCloud, rows: np.ndarray, view: TrackingView) -> np.ndarray:
-    """Which of these rows of the field may become tracked points."""
+    """Which of these rows of the field may become tracked points: their patches lie on the surface, which faces the camera."""
     camera, xyz = view.cameras[view.reference], field.xyz_m[rows]
     back = camera.centre_m - xyz
     facing = np.einsum("ni,ni->n", cloud.normals[rows], back) / np.linalg.norm(back, axis=1)
     coverage = _coverage(field, field.xy[rows, view.reference], camera.to_camera(xyz)[:, 2], view)
     rays = np.isfinite(field.xy[rows]).all(axis=2).sum(axis=1)
-    return (coverage >= view.tracking.min_coverage) & (facing >= STEEPEST_COSINE) & (rays >= min(3, len(view.cameras)))
+    return (coverage >= view.tracking.min_coverage) & (facing >= MIN_FACING) & (rays >= min(3, len(view.cameras)))
 
 
 def _coverage(field: MatchedField, xy: np.ndarray, depth: np.ndarray, view: TrackingView) -> np.ndarray:
-    """Part (N,) of the patch about each point that the measured surface covers at the point's depth."""
+    """The part (N,) of each point's patch that the measured surface covers at about the point's depth."""
     gh, gw = field.grid.shape
     step, camera = field.grid.step, view.cameras[view.reference]
     surface = np.full((gh + 2, gw + 2), np.nan)
     moved = np.abs(field.xy[:, view.reference] - field.grid.xy(field.cell)) / step
-    inner = np.flatnonzero(moved.max(axis=1) <= MOVED_CELLS)
+    inner = np.flatnonzero(moved.max(axis=1) <= MAX_SHIFT_CELLS)
     surface[field.cell[inner] // gw + 1, field.cell[inner] % gw + 1] = camera.to_camera(field.xyz_m[inner])[:, 2]
     across, down = (max(1, int(p // s)) for p, s in zip(view.half_patch, step))
     j, i = (d.ravel() for d in np.mgrid[-down : down + 1, -across : across + 1])
     middle = np.rint(xy / step).astype(np.int64) + 1
     there = surface[np.clip(middle[:, 1, None] + j, 0, gh + 1), np.clip(middle[:, 0, None] + i, 0, gw + 1)]
-    reach = STEEPEST_SLOPE * field.grid.spacing_px * np.hypot(i, j).max() / camera.focal_px * depth
+    reach = MAX_SLOPE * field.grid.spacing_px * np.hypot(i, j).max() / camera.focal_px * depth
     with np.errstate(invalid="ignore"):
         return (np.abs(there - depth[:, None]) <= reach[:, None]).mean(axis=1)
 
