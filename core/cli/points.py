@@ -1,4 +1,4 @@
-"""`tricap track TAKE --points FILE`: points that a user chose, followed as single trajectories in the images and in space."""
+"""`tricap track TAKE --points FILE`: points that the user chose, tracked as single trajectories in the images and in space."""
 
 import argparse
 from collections.abc import Mapping
@@ -20,16 +20,16 @@ from .arguments import frame_range, overrides
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Join the arguments to those of `tricap track`."""
-    parser.add_argument("--points", type=Path, metavar="FILE", help="follow only the points of a CSV: point,view,x,y (two views or more)")
-    parser.add_argument("--points-frame", type=int, metavar="N", help="the frame of these pixels; by default the first")
+    """Add the arguments to those of `tricap track`."""
+    parser.add_argument("--points", type=Path, metavar="FILE", help="track only the points of a CSV: point,view,x,y (two views or more)")
+    parser.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Track the chosen points and write OUT/points3d.csv and OUT/points2d.csv; the lines to show.
 
     Raises:
-        InputError: the arguments, the points or the footage need mending.
+        InputError: the arguments, the points or the footage have an error.
     """
     take = read_take(args.take)
     settings = take_run.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
@@ -45,16 +45,16 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         tracked = follow_points(footage, points, first, settings, monitor)
         write_key_points(results.path("points3d.csv"), results.path("points2d.csv"), tuple(points), views, take.fps, tracked)
     whole = int((tracked.status == TrackStatus.MEASURED).all(axis=0).sum())
-    return [f"{results.folder}: {len(points)} points over {len(tracked.frames)} frames, {whole} of them seen in every frame."]
+    return [f"{results.folder}: {len(points)} points over {len(tracked.frames)} frames, {whole} of them visible in every frame."]
 
 
 def follow_points(
     footage: Footage, points: Mapping[str, Mapping[str, np.ndarray]], first: int, settings: Mapping[str, Any], monitor: Monitor
 ) -> KeyPoints:
-    """The points, clicked in frame `first`, from it to the end of the footage and back to its beginning.
+    """Track points, clicked in frame `first`, to the end of the footage and back to its beginning.
 
     Raises:
-        InputError: a point has no place in space, or the images cannot be read.
+        InputError: the position of a point cannot be computed, or the images cannot be read.
     """
     view = TrackingRules(matching=settings["matching"], tracking=settings["tracking"]).view(footage)
 

@@ -1,4 +1,4 @@
-"""`tricap track2d`: the 2-D mode. Points chosen in the first frame of one camera are followed through its images."""
+"""`tricap track2d`: the 2-D mode. Points chosen in the first frame of one camera are tracked through its images."""
 
 import argparse
 from pathlib import Path
@@ -19,19 +19,20 @@ from ..tracking.point_tables import ChosenPoints, read_points, write_planar
 from ..tracking.settings import TrackingSettings, TrackStatus
 from .arguments import check_not_read, frame_range, overrides
 
-LOOSE = MatchingSettings(min_correlation=0.7, max_sigma_px=0.4)  # faces: weak texture, and they deform
-WAIT_FRAMES = 100  # nothing moves a point that waits but its own return
+MIN_CORRELATION = 0.7  # default of matching.min_correlation here: faces have weak texture and deform
+MAX_SIGMA_PX = 0.4  # default of matching.max_sigma_px here, for the same reason
+WAIT_FRAMES = 100  # default of tracking.wait_frames here: a lost point is searched for only at its last place
 
 
 def add_command(commands: Any) -> None:
-    """Join `track2d` to the parser's commands."""
-    about = "the 2-D mode: follow chosen points through the images of one camera"
+    """Add `track2d` to the parser's commands."""
+    about = "the 2-D mode: track chosen points through the images of one camera"
     parser = commands.add_parser("track2d", help=about, description=about[0].upper() + about[1:])
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a movie, or a folder of images")
     parser.add_argument("--points", type=Path, required=True, metavar="FILE", help="CSV with point,x,y in the first frame (and joined_to)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="CSV to write: frame,point,x,y,sigma,correlation,status")
     parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1; the points are those of frame A")
-    parser.add_argument("--interlaced", choices=INTERLACE, default="none", help="which lines of interlaced video to look at")
+    parser.add_argument("--interlaced", choices=INTERLACE, default="none", help="which lines of interlaced video to use")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw the points, joined with lines, over the images")
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
     parser.set_defaults(run=run, json=False)
@@ -41,12 +42,12 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Track and write; the lines to show.
 
     Raises:
-        InputError: the arguments, the points or the footage need mending.
+        InputError: the arguments, the points or the footage have an error.
     """
     tables = overrides(args.set)
     if set(tables) - {"matching", "tracking"}:
-        raise InputError("--set of track2d knows the groups matching and tracking.")
-    matching = from_table(MatchingSettings, {"min_correlation": LOOSE.min_correlation, "max_sigma_px": LOOSE.max_sigma_px,
+        raise InputError("--set of track2d accepts settings of the groups matching and tracking only.")
+    matching = from_table(MatchingSettings, {"min_correlation": MIN_CORRELATION, "max_sigma_px": MAX_SIGMA_PX,
                                              **tables.get("matching", {})}, "[matching]")  # fmt: skip
     tracking = from_table(TrackingSettings, {"wait_frames": WAIT_FRAMES, **tables.get("tracking", {})}, "[tracking]")
     points, sequence = read_points(args.points), open_footage(args.sequence)
@@ -62,19 +63,19 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if args.pictures is not None:
         _draw(args.pictures, sequence, points, tracks, monitor)
     whole = int((tracks.status == TrackStatus.MEASURED).all(axis=0).sum())
-    return [f"{args.out}: {len(points.names)} points over {len(frames)} frames, {whole} of them seen in every frame."]
+    return [f"{args.out}: {len(points.names)} points over {len(frames)} frames, {whole} of them visible in every frame."]
 
 
 def open_footage(path: Path) -> ImageSequence:
     """A movie, or the images of a folder.
 
     Raises:
-        InputError: there is none, or the folder holds images of several kinds.
+        InputError: there is none, or the folder has images of several kinds.
     """
     if path.is_dir():
         endings = sorted({p.suffix for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS})
         if len(endings) != 1:
-            raise InputError(f"The folder {path} holds {'no images' if not endings else 'images of several kinds'}; it needs one kind.")
+            raise InputError(f"The folder {path} has {'no images' if not endings else 'images of several kinds'}; it needs one kind.")
         return open_sequence(path, images=f"*{endings[0]}", movie=None, view=path.name)
     if not path.is_file():
         raise InputError(f"The footage {path} is missing; give a movie or a folder of images.")

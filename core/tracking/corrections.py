@@ -1,10 +1,10 @@
-"""What a user takes out of a recording by hand: trajectories that were clicked, and what lies inside a polygon drawn over a view.
+"""Corrections by the user: trajectories removed by a click, and points removed by a polygon drawn over a view.
 
-Pure functions of positions; which corrections a take has stands in take.toml, and measured frames and tracks stay valid under them.
+These are pure functions of positions. take.toml lists the corrections of a take; measured frames and tracks stay valid when they change.
 
-The user's corrections of a take (take.toml, [[corrections]]) applied to what was measured and tracked.
+The user's corrections of a take (take.toml, [[corrections]]), applied to clouds and trajectories.
 
-They come after measuring and tracking, whose checkpoints stay valid: a correction costs no new matching, and taking it back neither.
+They are applied after measuring and tracking, whose checkpoints stay valid: neither adding nor removing a correction needs new matching.
 """
 
 from collections.abc import Collection, Sequence
@@ -20,7 +20,7 @@ from ..take.take import Correction
 from .settings import TrackingSettings, TrackStatus
 from .trajectories import Filtered, Trajectories, filter_trajectories, picked
 
-CLICK_REACH_PX = 5.0
+CLICK_REACH_PX = 5.0  # distance from a click to the trajectory that it means
 
 
 def inside_polygon(xy: np.ndarray, polygon: np.ndarray) -> np.ndarray:
@@ -34,7 +34,7 @@ def inside_polygon(xy: np.ndarray, polygon: np.ndarray) -> np.ndarray:
 
 
 def in_region(raw: Trajectories, camera: Camera, polygon: np.ndarray, frames: range) -> np.ndarray:
-    """(T, N) which positions the camera sees inside a polygon (full-frame pixels) in these frames."""
+    """(T, N) the positions that project into a polygon (full-frame pixels) in these frames."""
     inside = np.zeros(raw.seen.shape, dtype=bool)
     for t in np.flatnonzero(np.isin(raw.frames, frames)):
         inside[t] = inside_polygon(camera.project(raw.xyz_m[t]), polygon)
@@ -42,9 +42,9 @@ def in_region(raw: Trajectories, camera: Camera, polygon: np.ndarray, frames: ra
 
 
 def clicked(filtered: Filtered, camera: Camera, xy: np.ndarray, frame: int) -> int | None:
-    """The column of the raw trajectory that the camera sees nearest to a pixel (2,) in a frame; None where none is near.
+    """The column of the raw trajectory whose projection is nearest to a pixel (2,) in a frame; None where none is near.
 
-    One that the filters kept is meant before one that they removed.
+    A trajectory that passed the filters has precedence over one that was removed.
     """
     t = np.flatnonzero(filtered.raw.frames == frame)
     for candidates in (filtered.kept.xyz_m, filtered.raw.xyz_m) if len(t) else ():
@@ -57,7 +57,7 @@ def clicked(filtered: Filtered, camera: Camera, xy: np.ndarray, frame: int) -> i
 
 
 def without(filtered: Filtered, source: int) -> Filtered:
-    """The trajectories without that of a raw column, all of its pieces."""
+    """The trajectories without all pieces of that of a raw column."""
     verdict = filtered.raw.status.copy()
     verdict[filtered.raw.seen[:, source], source] = TrackStatus.REMOVED_BY_USER
     left = filtered.source != source
@@ -76,9 +76,9 @@ def corrected_cloud(cloud: PointCloud, corrections: Sequence[Correction], rig: R
 def corrected_tracks(
     raw: Trajectories, corrections: Sequence[Correction], rig: Rig, settings: TrackingSettings, monitor: Monitor, rows: range | None = None
 ) -> tuple[Filtered, dict[int, int]]:
-    """The filtered trajectories without what the user took out; and, by the number of a correction, the column of `raw` that its click hit.
+    """The filtered trajectories without those that the user removed, and the column of `raw` that each click hit, by number of correction.
 
-    Clicks in other frames than those of the `rows` (None: all) hit nothing.
+    Clicks in frames outside the `rows` (None: all) hit nothing.
     """
     left_out = np.zeros(raw.seen.shape, dtype=bool)
     for c in corrections:
@@ -95,7 +95,7 @@ def corrected_tracks(
 
 
 def missed_clicks(corrections: Sequence[Correction], hit: Collection[int]) -> list[str]:
-    """A sentence for each click of the corrections whose number is not among those that hit a trajectory."""
+    """A sentence for each correction by a click whose number is not among those that hit a trajectory."""
     missed = [c for number, c in enumerate(corrections) if c.kind == "trajectory" and number not in hit]
     where = [f"({c.xy_px[0][0]:g}, {c.xy_px[0][1]:g}) of view {c.view} in frame {c.frames.start}" for c in missed]
-    return [f"The correction at {place} has no trajectory near it." for place in where]
+    return [f"There is no trajectory near the correction at {place}; click it again or remove it." for place in where]

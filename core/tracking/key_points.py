@@ -1,11 +1,11 @@
-"""Key points: points that a user chose, followed as single trajectories in the images and in space.
+"""Key points: points that the user chose, tracked as single trajectories in the images and in space.
 
-Unlike the surface's points they have no neighbours and no measured surface that would speak for them: only what the views say to each other
-counts, temporal against spatial matching and the rays' residuals (step.py). A frame in which no point is found is left out, as long as
-few are; a point that is lost alone waits: where it should be by its own motion its key template is looked for, and from there the other
-views.
+Unlike the surface's points they have no neighbours and no measured surface to confirm them. They are verified by the views alone: temporal
+against spatial matching, and the residuals of the rays (step.py). Up to `tracking.bridge_frames` frames in which no point is found are left
+out. For a point that is lost alone, its key template is searched for where its own motion predicts it, and from there the point is matched
+in the other views.
 
-A round marker looks the same however it is turned, so that matching finds no other point of it than its middle: that one is meant there.
+A round marker looks the same in every orientation, so only its centre can be matched: a click on a marker means its centre.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,14 +27,19 @@ from .templates import REACQUIRE_CORRELATION, Templates, Tiles, atlas, cut_tiles
 from .tracked import TrackedFrame, born, joined, nothing, rows_of
 
 DEFAULT_SETTINGS = KeyPointSettings()
-CLICK_SIGMA_PX, CLICK_REACH_PX = 2.0, 6.0
-SLOPES = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))  # of the surface about a point: up to 35° either way
-LARGEST_MISFIT_PX, MISFITS = 4.0, 2.5  # rays may miss by so much, and by so many of their median in the frame
+CLICK_SIGMA_PX = 2.0
+CLICK_REACH_PX = 6.0  # a click may be wrong by as much
+SLOPES = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))  # tried for the surface at a point: up to 35° each way
+MAX_MISFIT_PX = 4.0  # of a point's rays
+MAX_MISFIT_MEDIANS = 2.5  # the same, in units of the median of the frame's points
+MIN_DETERMINANT = 0.05  # of a shape; a flatter one has no usable inverse
+FIXED_SIGMA_PX = 0.01  # of a click in the reference view, which defines the point
+REACQUIRE_BOX = 2.0  # of a lost point, in units of `tracking.box_px`
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class KeyPoints:
-    """N points over T frames: full-frame pixels in every view, and the world. NaN where a point is not seen."""
+    """N points over T frames: full-frame pixels in every view, and world positions. NaN where a point is not visible."""
 
     frames: np.ndarray  # (T,)
     xy_px: np.ndarray  # (T, N, K, 2)
@@ -51,13 +56,13 @@ def track_key_points(
     monitor: Monitor,
     settings: KeyPointSettings = DEFAULT_SETTINGS,
 ) -> KeyPoints:
-    """Follow points, clicked in the first of `frames` in two views or more (name → view → full-frame pixel), through the others.
+    """Track points, clicked in the first of `frames` in two views or more (name → view → full-frame pixel), through the others.
 
-    `read(frame)` gives the rows (h', w) of all views. In the reference view a point stays where it was clicked, or where its other clicks
-    meet; in the other views matching finds it.
+    `read(frame)` gives the rows (h', w) of all views. In the reference view the click defines the point, or the projection of its other
+    clicks; in the other views the point is matched.
 
     Raises:
-        InputError: a point is clicked in fewer than two views, or has no marker where it must have one.
+        InputError: a point is clicked in fewer than two views, or a marker is missing at a click.
     """
     clicks = _clicked(points, view.at(frames[0]))
     if settings.markers:
@@ -74,13 +79,13 @@ def track_key_points(
 
 
 def _clicked(points: Mapping[str, Mapping[str, np.ndarray]], view: TrackingView) -> np.ndarray:
-    """Clicks (N, K, 2) in rows' pixels; where a view has none, the projection of the point that the others give."""
+    """Clicks (N, K, 2) in rows' pixels; in a view without one, the projection of the point from its other clicks."""
     xy = np.array([[at.get(c.name, (np.nan, np.nan)) for c in view.cameras] for at in points.values()], dtype=np.float64)
     xy = xy.reshape(-1, len(view.cameras), 2)
     point = forward_intersection(view.cameras, xy, np.tile(np.eye(2) * CLICK_SIGMA_PX**2, (*xy.shape[:2], 1, 1)))
     for name, X in zip(points, point.xyz_m):
         if not np.isfinite(X).all():
-            raise InputError(f"The key point “{name}” has no place in space; click it in two views at least.")
+            raise InputError(f"The position of the key point “{name}” cannot be computed; click it in at least two views.")
     for k, camera in enumerate(view.cameras):
         missing = np.isnan(xy[:, k, 0])
         xy[missing, k] = camera.project(point.xyz_m[missing])
@@ -88,35 +93,37 @@ def _clicked(points: Mapping[str, Mapping[str, np.ndarray]], view: TrackingView)
 
 
 def _on_markers(grey: Sequence[np.ndarray], clicks: np.ndarray, names: tuple[str, ...], view: TrackingView) -> np.ndarray:
-    """The clicks (N, K, 2), each in the middle of the nearest bright round target within reach; a view may lack one, the reference not.
+    """The clicks (N, K, 2) moved to the centres of the nearest bright round targets within reach.
+
+    A click without a target stays in place, except in the reference view.
 
     Raises:
         InputError: there is no target near a click in the reference view.
     """
-    middles = clicks.copy()
+    centres = clicks.copy()
     for k, image in enumerate(grey):
         found = find_targets(np.asarray(image, dtype=np.float32))
         xy = found.xy_px[found.status == TargetStatus.OK]
         away = np.linalg.norm((clicks[:, None, k] - xy) * (1.0, view.rows.step), axis=2)
         for n, name in enumerate(names):
             if len(xy) and away[n].min() <= CLICK_REACH_PX:
-                middles[n, k] = xy[away[n].argmin()]
+                centres[n, k] = xy[away[n].argmin()]
             elif k == view.reference:
                 where = f"“{name}” in view {view.cameras[k].name}"
-                raise InputError(f"No bright round marker lies near the click on {where}; click its middle.")
-    return middles
+                raise InputError(f"There is no bright round marker near the click on {where}; click its centre.")
+    return centres
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Lost:
-    """N lost points as they were last seen, in each one's own frame."""
+    """N lost points, each as it was in the last frame in which it was visible."""
 
     points: TrackedFrame
-    velocity_m: np.ndarray  # (N, 3) per frame; zero where not known
-    last: np.ndarray  # (N,) the frame
+    velocity_m: np.ndarray  # (N, 3) per frame; zero where unknown
+    last: np.ndarray  # (N,) that frame
 
     def after(self, current: TrackedFrame, before: TrackedFrame | None, tracked: TrackedFrame, wait_frames: int) -> "_Lost":
-        """Those that wait when `current` has become `tracked`: with the newly lost, without the regained and those that waited too long."""
+        """The points that are lost after `current` has become `tracked`: without those reacquired or lost for too long."""
         gone = np.isin(current.identity, tracked.ended[tracked.reason != TrackStatus.LEFT_IMAGE])
         points = joined(self.points, current.select(gone))
         velocity, last = np.zeros((len(points.identity), 3)), np.full(len(points.identity), current.frame)
@@ -132,23 +139,23 @@ class _Lost:
     def reacquired(
         self, view: TrackingView, templates: Templates, grey: Sequence[np.ndarray], spline: Sequence[SplineImage]
     ) -> TrackedFrame:
-        """Those that are seen again in the frame of the view, about where their motion takes them."""
+        """Those that are visible again in the frame of the view, near where their motion predicts them."""
         ahead = np.abs(view.frame - self.last)[:, None]
         p, ref = replace(self.points, xyz_m=self.points.xyz_m + ahead * self.velocity_m), view.reference
         if not len(p.identity):
             return p
         centre = view.projected(p.xyz_m)
         picture, tiles = atlas(templates.only(p.identity).tiles)
-        box = np.full(len(p.identity), 2.0 * view.tracking.box_px)
+        box = np.full(len(p.identity), REACQUIRE_BOX * view.tracking.box_px)
         start, best = search_box(picture, grey[ref], tiles, centre[:, ref], box, view.matching.patch_px, view.rows.step)
         start = np.where((best >= view.tracking.min_correlation)[:, None], start, np.nan)
         key = templates.match(p.identity, spline[ref], start, p.key_shape)
         status = np.full(p.xy.shape[:2], TrackStatus.MEASURED, dtype=np.int8)
-        least = max(REACQUIRE_CORRELATION, view.tracking.drift_correlation)
-        status[~(key.ok & (key.correlation >= least)), ref] = TrackStatus.NOT_FOUND
+        min_correlation = max(REACQUIRE_CORRELATION, view.tracking.drift_correlation)
+        status[~(key.ok & (key.correlation >= min_correlation)), ref] = TrackStatus.NOT_FOUND
         shift = np.nan_to_num(key.xy - centre[:, ref])
         at = [centre[:, k] + np.einsum("nij,nj->ni", p.shape[:, k], shift) for k in range(len(view.cameras))]
-        at = [key.xy if k == ref else _searched(spline[ref], grey[k], key.xy, at[k], p.shape[:, k], view) for k in range(len(at))]
+        at = [key.xy if k == ref else _search_warped(spline[ref], grey[k], key.xy, at[k], p.shape[:, k], view) for k in range(len(at))]
         found, verdict = measured_at(view, replace(p, key_shape=key.shape, drift=key.covariance), at, spline, status)
         return replace(found.select(verdict == TrackStatus.MEASURED), frame=view.frame)
 
@@ -158,8 +165,8 @@ def _follow(
 ) -> Iterator[TrackedFrame]:
     view = view.at(frames[0])
     grey, spline = _prepared(read(frames[0]))
-    loose = replace(view, limit_px=max(view.limit_px, LARGEST_MISFIT_PX))
-    current, before = _meeting(_first(grey, spline, clicks, frames[0], loose), view), None
+    lenient = replace(view, limit_px=max(view.limit_px, MAX_MISFIT_PX))
+    current, before = _intersecting(_first(grey, spline, clicks, frames[0], lenient), view), None
     ref = view.reference
     how = view.matching, view.rows.step
     templates = no_templates(*how).with_tiles(cut_tiles(spline[ref], current.identity, current.xy[:, ref], *how), *how)
@@ -169,15 +176,15 @@ def _follow(
         monitor.step("tracks", i, len(frames) - 1)
         next_grey, next_spline = _prepared(read(frame))
         pair = FramePair(grey=grey, spline=spline, next_grey=next_grey, next_spline=next_spline)
-        tracked = STEPS[view.tracking.scheme](loose, before, current, templates, pair, frame, monitor)
-        regained = lost.reacquired(loose.at(frame), templates, next_grey, next_spline)
-        tracked = _meeting(joined(tracked, regained), view.at(frame))
+        tracked = STEPS[view.tracking.scheme](lenient, before, current, templates, pair, frame, monitor)
+        reacquired = lost.reacquired(lenient.at(frame), templates, next_grey, next_spline)
+        tracked = _intersecting(joined(tracked, reacquired), view.at(frame))
         yield tracked
         if len(current.identity) and not len(tracked.identity) and abs(frame - current.frame) <= view.tracking.bridge_frames:
-            continue  # it is the frame that is missing
+            continue  # the frame is missing, and not the points
         lost = lost.after(current, before, tracked, view.tracking.wait_frames)
-        fresh = (tracked.key_shape == np.eye(2)).all(axis=(1, 2))
-        new = cut_tiles(next_spline[ref], tracked.identity[fresh], tracked.xy[fresh, ref], *how)
+        renewed = tracked.renewed
+        new = cut_tiles(next_spline[ref], tracked.identity[renewed], tracked.xy[renewed, ref], *how)
         templates = templates.only(np.concatenate([tracked.identity, lost.points.identity])).with_tiles(new, *how)
         before, current, grey, spline = current, tracked, next_grey, next_spline
 
@@ -186,10 +193,10 @@ def _prepared(images: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[Spli
     return list(images), [SplineImage(g) for g in images]
 
 
-def _meeting(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
-    """The points whose rays miss each other no more than is usual in this frame; what is usual there goes into the sigmas.
+def _intersecting(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
+    """The points whose rays miss each other by no more than is usual in this frame; the usual misfit enters the sigmas.
 
-    The rig and the synchronization have their share in it: a frame's points can all miss by the same.
+    Errors of the rig and of the synchronization are common to all points of a frame.
     """
     away = [view.rows.to_frame(points.xy[:, k]) - camera.project(points.xyz_m) for k, camera in enumerate(view.cameras)]
     miss = np.sqrt(np.nanmean(np.sum(np.square(away), axis=2), axis=0))
@@ -198,25 +205,25 @@ def _meeting(points: TrackedFrame, view: TrackingView) -> TrackedFrame:
     xy = view.rows.to_frame(points.xy)
     common = forward_intersection(view.cameras, xy, np.tile(excess + np.eye(2) * 1e-6, (*xy.shape[:2], 1, 1))).covariance_m2
     met = replace(points, covariance_m2=points.covariance_m2 + common)
-    return met.without(miss > max(view.limit_px, MISFITS * usual), TrackStatus.RAYS_MISS)
+    return met.without(miss > max(view.limit_px, MAX_MISFIT_MEDIANS * usual), TrackStatus.RAYS_MISS)
 
 
 def _first(grey: Sequence[np.ndarray], spline: Sequence[SplineImage], clicks: np.ndarray, frame: int, view: TrackingView) -> TrackedFrame:
-    """The points in the frame of the clicks: matched from the reference view in the others, as far as clicks are wrong.
+    """The points in the frame of the clicks: searched for around the clicks in the other views, and matched with the reference view.
 
-    Nothing is known of the surface's slope, so several are tried; the one with the best correlation counts.
+    The surface's slope is unknown, so several are tried; the one with the best correlation counts.
     """
     n, K = clicks.shape[:2]
-    xy, covariance, shape = clicks.copy(), np.tile(np.eye(2) * 1e-4, (n, K, 1, 1)), np.tile(np.eye(2), (n, K, 1, 1))
+    xy, covariance, shape = clicks.copy(), np.tile(np.eye(2) * FIXED_SIGMA_PX**2, (n, K, 1, 1)), np.tile(np.eye(2), (n, K, 1, 1))
     status = np.full((n, K), TrackStatus.NOT_FOUND, dtype=np.int8)
     status[:, view.reference] = TrackStatus.MEASURED
     best = np.zeros((n, K))
     for slope in SLOPES:
         induced = _induced_shapes(clicks, np.array(slope), view)
         for k in view.others:
-            start = _searched(spline[view.reference], grey[k], clicks[:, view.reference], clicks[:, k], induced[:, k], view)
-            template = TemplatePoints(image=spline[view.reference], xy=clicks[:, view.reference], row_step=view.rows.step)
-            m = match_patches(template, [SearchImage(image=spline[k], start=start, shape=induced[:, k])], view.matching)[0]
+            start = _search_warped(spline[view.reference], grey[k], clicks[:, view.reference], clicks[:, k], induced[:, k], view)
+            m = match_patches(spline[view.reference], clicks[:, view.reference], [spline[k]], [start], [induced[:, k]], view.matching,
+                              row_step=view.rows.step)[0]  # fmt: skip
             better = m.ok & (m.correlation > best[:, k])
             xy[better, k], covariance[better, k], shape[better, k] = m.xy[better], m.covariance[better], m.shape[better]
             best[better, k], status[better, k] = m.correlation[better], TrackStatus.MEASURED
@@ -228,7 +235,7 @@ def _first(grey: Sequence[np.ndarray], spline: Sequence[SplineImage], clicks: np
 def _induced_shapes(clicks: np.ndarray, slope: np.ndarray, view: TrackingView) -> np.ndarray:
     """Shapes (N, K, 2, 2) from the reference view to each view, of planes through the clicked points.
 
-    Their depth, relative to the point's, grows by `slope` (2,) per width that equals the depth; (0, 0) faces the reference camera.
+    `slope` (2,) is the relative growth of their depth per distance across, in units of the depth; (0, 0) faces the reference camera.
     """
     base, to_frame = view.cameras[view.reference], view.rows.to_frame
     point = forward_intersection(view.cameras, to_frame(clicks), np.tile(np.eye(2) * CLICK_SIGMA_PX**2, (*clicks.shape[:2], 1, 1)))
@@ -239,16 +246,16 @@ def _induced_shapes(clicks: np.ndarray, slope: np.ndarray, view: TrackingView) -
     return np.stack([image[:, :, 1] - image[:, :, 0], image[:, :, 2] - image[:, :, 0]], axis=-1)
 
 
-def _searched(
+def _search_warped(
     reference: SplineImage, grey: np.ndarray, xy: np.ndarray, clicks: np.ndarray, shape: np.ndarray, view: TrackingView
 ) -> np.ndarray:
-    """Where (N, 2) about the clicks the reference's patches, drawn in these shapes, correlate best."""
+    """Positions (N, 2) near the clicks at which the reference's patches, warped to these shapes, correlate best."""
     u, v, (w, h) = patch_offsets(view.matching.patch_px, view.rows.step)
-    usable = np.abs(np.linalg.det(shape)) > 0.05
+    usable = np.abs(np.linalg.det(shape)) > MIN_DETERMINANT
     inverse = np.linalg.inv(np.where(usable[:, None, None], shape, np.eye(2)))
     tile = reference.sample_patches(xy, inverse, np.stack([np.ones_like(u), u, v])).reshape(-1, 2 * h + 1, 2 * w + 1)
-    drawn, at = atlas(Tiles(identity=np.arange(len(xy)), tile=tile, offset=np.zeros((len(xy), 2))))
-    start, _ = search_box(drawn, grey, at, clicks, np.full(len(xy), CLICK_REACH_PX), view.matching.patch_px, view.rows.step)
+    warped, at = atlas(Tiles(identity=np.arange(len(xy)), tile=tile, offset=np.zeros((len(xy), 2))))
+    start, _ = search_box(warped, grey, at, clicks, np.full(len(xy), CLICK_REACH_PX), view.matching.patch_px, view.rows.step)
     return np.where(usable[:, None], start, np.nan)
 
 

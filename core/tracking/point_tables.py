@@ -1,4 +1,4 @@
-"""Tables of points that a user chose, and of where they went (CSV)."""
+"""Tables of points that the user chose, and of their tracks (CSV)."""
 
 import csv
 import io
@@ -17,12 +17,12 @@ from .key_points import KeyPoints
 from .planar import PlanarTracks
 from .settings import TrackStatus
 
-MOST_COMPARED = 1000  # names, when the nearest is looked for
+MAX_COMPARED = 1000  # names among which the nearest to a misspelt one is searched
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ChosenPoints:
-    """Points by name. `views` is "" for each in a table of one camera; `joined` holds pairs of names to join with lines."""
+    """Points by name. In a table of one camera each of `views` is ""; `joined` lists pairs of names to be joined by lines."""
 
     names: tuple[str, ...]  # (N,)
     views: tuple[str, ...]  # (N,)
@@ -31,10 +31,10 @@ class ChosenPoints:
 
 
 def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
-    """Read a CSV with the columns point, x, y, of which `joined_to` (the name of another point) may be one, and `view` must if asked for.
+    """Read a CSV with the columns point, x, y, with `with_views` also view, and optionally joined_to (the name of another point).
 
     Raises:
-        InputError: the file cannot be read, lacks a column, or has a row that is none.
+        InputError: the file cannot be read, lacks a column, or has an invalid row.
     """
     needed = ("point", "x", "y", *(("view",) if with_views else ()))
     try:
@@ -44,11 +44,11 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} is not a CSV table ({error}); save it as CSV in UTF-8.") from error
     if not rows:
-        raise InputError(f"{path} holds no points; write a line {','.join(needed)} and one line for each point.")
+        raise InputError(f"{path} has no points; write a line {','.join(needed)} and one line for each point.")
     for name in needed:
         if name not in rows[0]:
-            mend = "separate them by commas, not semicolons" if ";" in str(next(iter(rows[0]))) else "its first line must name them"
-            raise InputError(f"{path} has no column “{name}”; the columns are {', '.join(needed)}: {mend}.")
+            hint = "separate them by commas, not semicolons" if ";" in str(next(iter(rows[0]))) else "its first line must name them"
+            raise InputError(f"{path} has no column “{name}”; the columns are {', '.join(needed)}: {hint}.")
     xy = np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])
     names = tuple((row["point"] or "").strip() for row in rows)
     views = tuple((row["view"] or "").strip() if with_views else "" for row in rows)
@@ -58,7 +58,7 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
     known = set(names)
     for name, other in joined:
         if other not in known:
-            raise InputError(f"{path} joins “{name}” to “{other}”, which is no point.{nearest_name(other, names[:MOST_COMPARED])}")
+            raise InputError(f"{path} joins “{name}” to “{other}”, which is no point of it.{nearest_name(other, names[:MAX_COMPARED])}")
     return ChosenPoints(names=names, views=views, xy_px=xy, joined=joined)
 
 
@@ -73,7 +73,7 @@ def _number(text: str | None, path: Path, line: int, column: str) -> float:
 
 
 def write_planar(path: Path, names: tuple[str, ...], tracks: PlanarTracks) -> None:
-    """CSV of frame, point, x, y, sigma, correlation, status; a point that is not seen has empty cells and says why.
+    """CSV of frame, point, x, y, sigma, correlation, status; a point that is not visible has empty cells, and the reason as its status.
 
     Raises:
         InputError: the file cannot be written.
@@ -89,7 +89,7 @@ def write_planar(path: Path, names: tuple[str, ...], tracks: PlanarTracks) -> No
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PlanarTable:
-    """What `write_planar` wrote: N points over T frames; NaN where a point is not seen."""
+    """The table of `write_planar`: N points over T frames; NaN where a point is not visible."""
 
     frames: np.ndarray  # (T,) ascending
     names: tuple[str, ...]  # (N,)
@@ -97,10 +97,10 @@ class PlanarTable:
 
 
 def read_planar(path: Path) -> PlanarTable:
-    """The table that `write_planar` wrote.
+    """Read the table of `write_planar`.
 
     Raises:
-        InputError: it cannot be read, or is no such table.
+        InputError: it cannot be read, or is another kind of table.
     """
     try:
         rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
@@ -108,9 +108,9 @@ def read_planar(path: Path) -> PlanarTable:
     except OSError as error:
         raise InputError(f"Cannot read the tracks {path}: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} is no table of 2-D tracks ({error}); choose what `tricap track2d` wrote.") from error
+        raise InputError(f"{path} is not a table of 2-D tracks ({error}); choose a file written by `tricap track2d`.") from error
     if not places:
-        raise InputError(f"{path} holds no tracks; choose what `tricap track2d` wrote.")
+        raise InputError(f"{path} has no tracks; choose a file written by `tricap track2d`.")
     frames, names = sorted({frame for frame, _ in places}), tuple(dict.fromkeys(name for _, name in places))
     check_sparse(len(places), len(frames), len(names), path)
     xy = np.array([[places.get((frame, name), (np.nan, np.nan)) for name in names] for frame in frames])
@@ -120,7 +120,7 @@ def read_planar(path: Path) -> PlanarTable:
 def write_key_points(space: Path, images: Path, names: tuple[str, ...], views: tuple[str, ...], fps: float, points: KeyPoints) -> None:
     """Two CSVs: frame, time_s, point, x, y, z, sigma, status (metres, world); and frame, view, point, x, y (full-frame pixels).
 
-    A point that is not seen has empty cells and says why. In a view that does not show it, it has no row.
+    A point that is not visible has empty cells, and the reason as its status. In a view that does not show it, it has no row.
 
     Raises:
         InputError: a file cannot be written.
@@ -131,8 +131,8 @@ def write_key_points(space: Path, images: Path, names: tuple[str, ...], views: t
             cells = [f"{v:.6f}" if np.isfinite(v) else "" for v in (*points.xyz_m[t, n], points.sigma_m[t, n])]
             status = TrackStatus(int(points.status[t, n])).name.lower()
             lines.append(",".join([str(frame), f"{frame_time_s(frame, fps):.6f}", name, *cells, status]))
-            seen = [(view, *xy) for view, xy in zip(views, points.xy_px[t, n]) if np.isfinite(xy).all()]
-            pixels.extend(f"{frame},{_quoted(view)},{name},{x:.4f},{y:.4f}" for view, x, y in seen)
+            shown = [(view, *xy) for view, xy in zip(views, points.xy_px[t, n]) if np.isfinite(xy).all()]
+            pixels.extend(f"{frame},{_quoted(view)},{name},{x:.4f},{y:.4f}" for view, x, y in shown)
     for path, text in ((space, lines), (images, pixels)):
         store.write_text(path, "\n".join(text) + "\n")
 
@@ -152,5 +152,5 @@ def read_polygon(path: Path) -> np.ndarray:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"Cannot read the polygon {path}: {error}.") from error
     if len(rows) < 3 or not {"x", "y"} <= set(rows[0]):
-        raise InputError(f"{path} is no polygon; write a line x,y and three lines of pixel coordinates or more.")
+        raise InputError(f"{path} is not a polygon; write a line x,y and three or more lines of pixel coordinates.")
     return np.array([[_number(row[axis], path, number + 2, axis) for axis in "xy"] for number, row in enumerate(rows)])

@@ -5,12 +5,12 @@ Velocity and acceleration of trajectories, raw and smoothed, with their sigmas.
     v_i = (X_{i+1} − X_{i−1}) / 2 dt ,   a_i = (X_{i+1} − 2 X_i + X_{i−1}) / dt²                            (1)
     σ_v = √(σ²_{i+1} + σ²_{i−1}) / 2 dt ,   σ_a = √(σ²_{i+1} + 4 σ²_i + σ²_{i−1}) / dt²                     (2)
 
-Of single differences the noise is large: with σ = 1 mm at 25 frames/s, σ_a is 1.5 m/s². Smoothed values come from a cubic, by least
-squares, through the frames that are nearest in time (Savitzky & Golay 1964, doi:10.1021/ac60214a047): at the ends of a trajectory they lie
-on one side. With the coefficients c of the estimate, σ² = Σ c_j² σ_j². Beyond a gap nothing is taken, so gaps stay gaps.
+Single differences are noisy: with σ = 1 mm at 25 frames/s, σ_a is 1.5 m/s². Smoothed values come from a cubic fitted by least squares to
+the frames that are nearest in time (Savitzky & Golay 1964, doi:10.1021/ac60214a047), which lie on one side at the ends of a trajectory.
+With the coefficients c of the estimate, σ² = Σ c_j² σ_j². Frames beyond a gap are not used, so gaps stay gaps.
 
-Sigmas here are those of the whole vector (root of the summed variances), as `sigma_m` is, with errors of different frames independent; what
-they have in common (calibration, the place on the body) does not move.
+Sigmas here are those of the whole vector (root of the summed variances), like `sigma_m`. Errors of different frames count as independent;
+errors that they share (calibration, the point's place on the body) are constant and cancel.
 """
 
 from collections.abc import Iterable, Sequence
@@ -33,7 +33,7 @@ DEGREE = 3
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Kinematics:
-    """Derivatives of N trajectories over T frames. NaN where the frames do not suffice."""
+    """Derivatives of N trajectories over T frames. NaN where there are too few frames."""
 
     velocity_m_s: np.ndarray  # (T, N, 3)
     acceleration_m_s2: np.ndarray  # (T, N, 3)
@@ -42,7 +42,7 @@ class Kinematics:
 
 
 def differences(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float) -> Kinematics:
-    """Raw values of positions (T, N, 3), (1) and (2); at the ends of a trajectory v is the one-sided difference, a NaN."""
+    """Raw derivatives of positions (T, N, 3), (1) and (2); at the ends of a trajectory v is the one-sided difference and a is NaN."""
     velocity, acceleration = np.full(xyz_m.shape, np.nan), np.full(xyz_m.shape, np.nan)
     sigma_v, sigma_a = np.full(sigma_m.shape, np.nan), np.full(sigma_m.shape, np.nan)
     if len(xyz_m) > 1:
@@ -60,7 +60,7 @@ def differences(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float) -> Kinematics
 
 
 def smoothed(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float, frames: int) -> Kinematics:
-    """Smoothed values over `frames` frames (odd, 5 at least), of trajectories that have a frame more than the cubic needs."""
+    """Derivatives smoothed over `frames` frames (odd, at least 5), where a trajectory has one frame more than the cubic needs."""
     T, N = sigma_m.shape
     most = 2 * max(2, frames // 2) + 1
     half = most - 1
@@ -68,7 +68,7 @@ def smoothed(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float, frames: int) -> 
     nearest = np.argsort(np.abs(window), kind="stable")
     values = np.pad(np.nan_to_num(xyz_m), ((half, half), (0, 0), (0, 0)))
     variance = np.pad(np.nan_to_num(sigma_m) ** 2, ((half, half), (0, 0)))
-    seen = np.pad(np.isfinite(xyz_m[..., 0]), ((half, half), (0, 0)))
+    visible = np.pad(np.isfinite(xyz_m[..., 0]), ((half, half), (0, 0)))
     basis = (window[:, None] * dt) ** np.arange(DEGREE + 1)  # (w, 4)
     result = Kinematics(
         velocity_m_s=np.full((T, N, 3), np.nan),
@@ -77,13 +77,13 @@ def smoothed(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float, frames: int) -> 
         sigma_acceleration_m_s2=np.full((T, N), np.nan),
     )
     for t in range(T):
-        there = _unbroken(seen[t : t + len(window)], half)
+        there = _unbroken(visible[t : t + len(window)], half)
         there[nearest] &= np.cumsum(there[nearest], axis=0) <= most
         rows = np.flatnonzero(there.sum(axis=0) > DEGREE + 1)
         patterns, which = np.unique(there[:, rows], axis=1, return_inverse=True)
-        for p, pattern in enumerate(patterns.T):  # few: whole windows, and the ends of trajectories
+        for p, pattern in enumerate(patterns.T):  # few patterns: whole windows, and the ends of trajectories
             n = rows[which.reshape(-1) == p]
-            c = np.linalg.pinv(basis[pattern])  # (4, frames seen)
+            c = np.linalg.pinv(basis[pattern])  # (4, frames)
             X, s2 = values[t : t + len(window)][pattern][:, n], variance[t : t + len(window)][pattern][:, n]
             result.velocity_m_s[t, n] = np.tensordot(c[1], X, axes=1)
             result.acceleration_m_s2[t, n] = 2 * np.tensordot(c[2], X, axes=1)
@@ -92,21 +92,21 @@ def smoothed(xyz_m: np.ndarray, sigma_m: np.ndarray, dt: float, frames: int) -> 
     return result
 
 
-def _unbroken(seen: np.ndarray, middle: int) -> np.ndarray:
-    """Of windows (w, N), the frames that are seen without a gap from the middle one."""
-    ahead = np.logical_and.accumulate(seen[middle:], axis=0)
-    behind = np.logical_and.accumulate(seen[middle::-1], axis=0)[::-1]
+def _unbroken(visible: np.ndarray, middle: int) -> np.ndarray:
+    """The frames of windows (w, N) that are visible without a gap from the middle one."""
+    ahead = np.logical_and.accumulate(visible[middle:], axis=0)
+    behind = np.logical_and.accumulate(visible[middle::-1], axis=0)[::-1]
     return np.concatenate([behind[:-1], ahead])
 
 
-SMOOTH_FRAMES = 7
+SMOOTH_FRAMES = 7  # the default of `tracking.smooth_frames`
 
 Seen = tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # frame, identity, xyz_m, sigma_m, ended, reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Trajectories:
-    """N points over T frames, world metres and seconds. NaN = not seen; `status` (T, N) is a TrackStatus."""
+    """N points over T frames, world metres and seconds. NaN where a point is not visible; `status` (T, N) is a TrackStatus."""
 
     frames: np.ndarray  # (T,)
     time_s: np.ndarray  # (T,)
@@ -117,8 +117,8 @@ class Trajectories:
     status: np.ndarray  # (T, N)
     raw: Kinematics | None = None  # the same velocities and accelerations with their sigmas
     smooth: Kinematics | None = None  # smoothed ones with theirs
-    track: np.ndarray | None = None  # (T, N) which trajectory it is, −1 for none, where several share a column (long_tracks.py)
-    omitted: int = 0  # shorter ones that found no room in the table
+    track: np.ndarray | None = None  # (T, N) number of the trajectory, −1 for none, where several share a column (long_tracks.py)
+    omitted: int = 0  # trajectories that the table has no room for
 
     def __post_init__(self) -> None:
         t, n = self.sigma_m.shape
@@ -128,7 +128,7 @@ class Trajectories:
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All arrays by the names that they have in trajectories.npz."""
+        """All arrays by their names in trajectories.npz."""
         arrays = {n: getattr(self, n) for n in ("frames", "time_s", "xyz_m", "velocity_m_s", "acceleration_m_s2", "sigma_m", "status")}
         for prefix, kinematics in (("", self.raw), ("smooth_", self.smooth)):
             if kinematics is not None:
@@ -142,17 +142,17 @@ class Trajectories:
 
 
 def assemble(steps: Iterable[TrackedFrame], fps: float, smooth_frames: int = SMOOTH_FRAMES) -> Trajectories:
-    """The trajectories of consecutive tracked frames, in the order of their identities; derivatives smoothed over so many frames (or 0)."""
+    """The trajectories of consecutive tracked frames, by ascending identity; derivatives smoothed over `smooth_frames` (or 0)."""
     return assembled([seen_of(step) for step in steps], fps, smooth_frames)[0]
 
 
 def seen_of(step: TrackedFrame) -> Seen:
-    """What a tracked frame says of trajectories."""
+    """The part of a tracked frame that belongs to trajectories."""
     return step.frame, step.identity, step.xyz_m, np.sqrt(np.trace(step.covariance_m2, axis1=1, axis2=2)), step.ended, step.reason
 
 
 def assembled(seen: Sequence[Seen], fps: float, smooth_frames: int) -> tuple[Trajectories, np.ndarray]:
-    """The trajectories of these frames, and their identities (N,), ascending."""
+    """The trajectories of these frames, and their identities (N,) in ascending order."""
     identities = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(identity for _, identity, *_ in seen)]))
     T, N = len(seen), len(identities)
     xyz, sigma = np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
@@ -167,17 +167,17 @@ def assembled(seen: Sequence[Seen], fps: float, smooth_frames: int) -> tuple[Tra
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Filtered:
-    """Trajectories after the filters, and all of them as they were before, with the verdict on each frame."""
+    """Trajectories after the filters, and all trajectories before them with the verdict on each frame."""
 
     kept: Trajectories  # pieces, M
-    source: np.ndarray  # (M,) the column of `raw` that a piece is of; −1 where columns are shared
-    raw: Trajectories  # N; status: MEASURED where kept, or why the frame went, or why the trajectory ended there
+    source: np.ndarray  # (M,) the column of `raw` to which a piece belongs; −1 where columns are shared
+    raw: Trajectories  # N; status: MEASURED, or why the frame was removed, or why the trajectory ended there
 
     @property
     def reason(self) -> np.ndarray:
-        """(N,) one TrackStatus for each raw trajectory: the end of one that was kept, what removed most frames of one that was not.
+        """(N,) a TrackStatus for each raw trajectory: why it ended, or if it was removed, the most frequent reason.
 
-        MEASURED: it was kept to the end of the recording. Of a column that several share, the last one's.
+        MEASURED: it lasts to the end of the recording. Of a column that several share, that of the last one.
         """
         status, seen = self.raw.status, self.raw.seen
         against = np.stack([(status == s).sum(axis=0) for s in TrackStatus])
@@ -197,11 +197,11 @@ class Filtered:
 def filter_trajectories(
     raw: Trajectories, settings: TrackingSettings, monitor: Monitor | None = None, left_out: np.ndarray | None = None
 ) -> Filtered:
-    """What is left of the trajectories after the filters (filters.py), in pieces; the frames that went carry the reason.
+    """The trajectories after the filters (filters.py), in pieces; every removed frame has the reason as its status.
 
-    What the user takes out, `left_out` (T, N), is seen by no filter, and leaves gaps.
+    Positions that the user removed, `left_out` (T, N), become gaps before the filters.
     """
-    monitor, every = monitor or Monitor(), raw
+    monitor, unchanged = monitor or Monitor(), raw
     if left_out is not None and left_out.any():
         raw = _without(raw, left_out)
     dt = float(np.median(np.diff(raw.time_s))) if len(raw.time_s) > 1 else 1.0
@@ -218,7 +218,7 @@ def filter_trajectories(
     xyz, sigma = raw.xyz_m[:, pieces.source].copy(), raw.sigma_m[:, pieces.source].copy()
     xyz[~pieces.kept], sigma[~pieces.kept] = np.nan, np.nan
     kept = with_kinematics(raw.frames, raw.time_s, xyz, sigma, pieces.status, settings.smooth_frames)
-    return Filtered(kept=kept, source=pieces.source, raw=replace(every, status=pieces.verdict))
+    return Filtered(kept=kept, source=pieces.source, raw=replace(unchanged, status=pieces.verdict))
 
 
 def _without(raw: Trajectories, gone: np.ndarray) -> Trajectories:

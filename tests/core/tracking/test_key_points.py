@@ -124,7 +124,7 @@ def test_retroreflective_markers(scenes: Any) -> None:
     assert error[..., :2].max() < 1e-4 and error[..., 2].max() < 5e-4
     z = np.linalg.norm(points.xyz_m - truth, axis=2) / points.sigma_m
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.8  # twenty points
-    with pytest.raises(InputError, match="No bright round marker.*“knee” in view C"):
+    with pytest.raises(InputError, match="no bright round marker.*“knee” in view C"):
         knee = {c.name: c.project(np.array([0.1, 0.1, 2.1])) for c in rig.cameras}
         track_key_points(read, range(10), {"knee": knee}, view, Monitor(), markers)
 
