@@ -1,4 +1,4 @@
-"""What the fit gives: a body's shape, and its motion with the quality of every number."""
+"""The results of a fit: a body's shape, and its motion with the quality of every number."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,8 @@ STATUSES = (FITTED, PARTIAL, BRIDGED, SUSPECT)
 class BodyMotion:
     """T frames of D DOFs and J joints.
 
-    status, the most serious that holds: "bridged": nothing is seen, the whole posture is predicted; "suspect": the residuals are far
-    larger, or what is seen far less, than in the other frames; "partial": a limb is hardly seen and rests on prediction; "fitted".
+    status, the most serious that applies: "bridged": no observations, the whole pose is predicted; "suspect": far larger residuals or far
+    fewer observations than in the other frames; "partial": a limb has hardly any observations and rests on prediction; "fitted".
     """
 
     frames: np.ndarray  # (T,) the take's frame numbers
@@ -47,11 +47,11 @@ class BodyMotion:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BodyFit:
-    """The person and how the person moved."""
+    """The person's shape and motion, and the quality of the fit."""
 
     shape: BodyShape
     motion: BodyMotion
     iterations: int  # of the adjustment over the whole sequence
     converged: bool
-    points: np.ndarray  # (T, B) points that each bone's surface had in each frame
-    outline_m: np.ndarray  # (K,) distances of the views' outlines from the limbs that they touch; none without contours
+    points: np.ndarray  # (T, B) number of points on each bone's surface in each frame
+    outline_m: np.ndarray  # (K,) distances of the views' outlines from the limbs that they touch; empty without contours

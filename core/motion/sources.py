@@ -1,4 +1,4 @@
-"""Motions from anywhere: a run's folder, BVH, TRC, C3D and CSV."""
+"""Reading motions: a run's folder, BVH, TRC, C3D and CSV files."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +18,7 @@ from .retarget.roles import model_roles
 from .tables import read_motion
 
 Z_UP = {"": "Z up", "Y": "Y up", "Z": "Z up"}
-POINTS: dict[str, tuple[Callable[..., Markers], dict[str, str]]] = {  # the reader of each kind, and its axes by the axis that is up
+POINTS: dict[str, tuple[Callable[..., Markers], dict[str, str]]] = {  # the reader of each kind, and its axes by the up axis
     ".trc": (read_trc, {"": "OpenSim", "Y": "OpenSim", "Z": "Z up"}),
     ".c3d": (read_c3d, Z_UP),
     ".csv": (read_points_csv, Z_UP),
@@ -29,16 +29,16 @@ FILES = (".bvh", *POINTS)
 def read_motion_source(path: Path, *, up: str = "", unit: str = "") -> Motion:
     """The motion in a run's folder or a file; frame numbers are the file's own, a BVH file's begin at 1 as in Blender.
 
-    `up`: "Y" or "Z", `unit`: "m", "cm", … of a file that does not say so itself; empty: as is the custom of its kind.
+    `up`: "Y" or "Z", `unit`: "m", "cm", … of a file that does not define them; empty: the convention of its kind.
 
     Raises:
-        InputError: it cannot be read, holds no motion, or the unit is not known.
+        InputError: it cannot be read, has no motion, or the unit is unknown.
     """
     path = Path(path)
     if path.is_dir():
         return from_run(path)
     if not path.exists():
-        raise InputError(f"There is no motion {path}; check its name.")
+        raise InputError(f"There is no file or folder {path}; check its name.")
     kind = path.suffix.lower()
     if kind == ".bvh":
         motion = read_bvh(path, unit_m=metres_per(unit, path) if unit else None, up=up or None)
@@ -46,20 +46,20 @@ def read_motion_source(path: Path, *, up: str = "", unit: str = "") -> Motion:
     if kind in POINTS:
         read, axes = POINTS[kind]
         return motion_from_points(read(path, axes=axes[up], unit=unit))
-    raise InputError(f"{path.name} is no motion that can be read; give a run's folder or one of {', '.join(FILES)}.")
+    raise InputError(f"{path.name} is not a motion that can be read; give a run's folder or one of {', '.join(FILES)}.")
 
 
 def from_run(out: Path) -> Motion:
-    """The motion of the body in a run's folder; frames that were not solved are filled on straight lines.
+    """The motion of the body in a run's folder; frames without a solution are interpolated linearly.
 
     Raises:
-        InputError: body.toml or motion.csv are missing or damaged, or no frame was solved.
+        InputError: body.toml or motion.csv are missing or damaged, or no frame has a solution.
     """
     shape = read_body(out / "body.toml")
     table = read_motion(out / "motion.csv", shape.skeleton)
     known = np.isfinite(table.values).all(axis=1)
     if not known.any():
-        raise InputError(f"{out / 'motion.csv'} has no frame that was solved; run the fit again.")
+        raise InputError(f"{out / 'motion.csv'} has no frame with a solution; run the fit again.")
     first, last = np.flatnonzero(known)[[0, -1]]
     frames = table.frames[first : last + 1]
     values = np.stack([np.interp(frames, table.frames[known], column) for column in table.values[known].T], axis=1)
@@ -70,7 +70,7 @@ def body_motion(shape: BodyShape, values: np.ndarray, frames: np.ndarray, fps: f
     """The motion of a body whose DOFs are `values` (T, D) [rad, m] at `frames` (T,)."""
     skeleton = shape.skeleton
     R_rest, head = bone_frames(skeleton, shape.lengths_m, np.zeros(len(skeleton.dof_names)))
-    R, places = bone_frames(skeleton, shape.lengths_m, values)
+    R, heads = bone_frames(skeleton, shape.lengths_m, values)
     names = tuple(bone.name for bone in skeleton.bones)
     rig = Rig(
         names=names,
@@ -82,4 +82,4 @@ def body_motion(shape: BodyShape, values: np.ndarray, frames: np.ndarray, fps: f
         inherits_rotation=np.ones(len(names), dtype=bool),
         roles=model_roles(names),
     )
-    return Motion(rig=rig, fps=fps, frames=frames, R=R, head_m=places)
+    return Motion(rig=rig, fps=fps, frames=frames, R=R, head_m=heads)

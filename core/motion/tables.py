@@ -25,7 +25,7 @@ JOINT_COLUMNS = ("frame", "time_s", "joint", "x", "y", "z", "sigma")
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class MotionTable:
-    """What motion.csv holds. Radians, and metres for the base."""
+    """The content of motion.csv, in radians, and metres for the base."""
 
     frames: np.ndarray  # (T,)
     time_s: np.ndarray  # (T,)
@@ -42,7 +42,7 @@ class MotionTable:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class JointTable:
-    """What joints.csv holds: positions (T, 3) [m] and sigmas (T,) by joint; NaN where a frame lacks the joint."""
+    """The content of joints.csv: positions (T, 3) [m] and sigmas (T,) by joint; NaN where a frame lacks the joint."""
 
     frames: np.ndarray  # (T,)
     time_s: np.ndarray  # (T,)
@@ -65,7 +65,7 @@ def write_joints(path: Path, motion: BodyMotion) -> None:
 
 
 def write_motion(path: Path, motion: BodyMotion, skeleton: Skeleton) -> None:
-    """Write motion.csv. `skeleton` tells which DOFs are angles.
+    """Write motion.csv. `skeleton` defines which DOFs are angles.
 
     Raises:
         InputError: the file cannot be written.
@@ -149,7 +149,7 @@ def _read(path: Path) -> tuple[list[str], list[list[str]]]:
 
 def _column(header: Sequence[str], name: str, path: Path) -> int:
     if name not in header:
-        raise InputError(f"The table {path} has no column “{name}”; it belongs to another body, or run the fit again.")
+        raise InputError(f"The table {path} has no column “{name}”; if it belongs to this body, run the fit again.")
     return list(header).index(name)
 
 

@@ -1,4 +1,4 @@
-"""What a run measured, as rows that can be quoted: name, value, sigma, unit. For people in report.html, for programs in report.json.
+"""The figures of a run: name, value, sigma, unit. For people in report.html, for programs in report.json.
 
 Curves as SVG: over the frames, with a band of one sigma; fields of metaballs over the radius.
 """
@@ -26,10 +26,10 @@ def figure_rows(
     body: BodyFit | None,
     silhouettes: Sequence[SilhouetteFit] = (),
 ) -> list[Row]:
-    """The rows; `sigma_of` says what each sigma is made of. NaN, where there is nothing to make it of, becomes null in the file."""
+    """The rows; `sigma_of` is the origin of each sigma. NaN, where there is none, becomes null in the file."""
     per_frame = {
         ("points a frame", "points"): [float(len(c.xyz_m)) for c in clouds],
-        ("rays miss each other by (median)", "px"): [float(np.median(c.residual_px)) for c in clouds if len(c.residual_px)],
+        ("residual of the rays (median)", "px"): [float(np.median(c.residual_px)) for c in clouds if len(c.residual_px)],
         ("sigma of a point (median)", "mm"): [1e3 * float(np.median(c.sigma_m)) for c in clouds if len(c.sigma_m)],
     }
     if trajectories is not None:
@@ -57,12 +57,12 @@ def _of_silhouettes(fits: Sequence[SilhouetteFit]) -> list[Row]:
 
 
 def number(value: float) -> float | None:
-    """A number for JSON: null where there is none."""
+    """A number for JSON: null if it is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
 def _of_body(body: BodyFit) -> list[Row]:
-    """Lengths of bones, and of each joint angle the least and the greatest."""
+    """Lengths of bones, and the least and the greatest value of each joint angle."""
     skeleton, motion, rows = body.shape.skeleton, body.motion, []
     for bone, length, sigma in zip(skeleton.bones, body.shape.lengths_m, body.shape.length_sigma_m):
         rows.append(_row(f"length of {bone.name}", 1e3 * length, 1e3 * sigma, "mm", ESTIMATED))
@@ -72,8 +72,8 @@ def _of_body(body: BodyFit) -> list[Row]:
         if d in base or not np.isfinite(values).any():
             continue
         for word, at in (("least", int(np.nanargmin(values))), ("greatest", int(np.nanargmax(values)))):
-            said = f"{name}, {word} (frame {motion.frames[at]})"
-            rows.append(_row(said, values[at], np.degrees(motion.sigma[at, d]), "°", ESTIMATED))
+            label = f"{name}, {word} (frame {motion.frames[at]})"
+            rows.append(_row(label, values[at], np.degrees(motion.sigma[at, d]), "°", ESTIMATED))
     return rows
 
 
@@ -82,7 +82,7 @@ def _row(name: str, value: float, sigma: float, unit: str, sigma_of: str) -> Row
 
 
 def quoted(value: float, sigma: float) -> tuple[str, str]:
-    """Value and sigma as they are printed: the sigma with two digits that count, the value to the same place."""
+    """Value and sigma as printed: the sigma with two significant digits, the value to the same decimal place."""
     if not np.isfinite(sigma) or sigma <= 0:
         return f"{value:.4g}", "–"
     places = max(0, 1 - int(np.floor(np.log10(sigma))))
@@ -91,7 +91,7 @@ def quoted(value: float, sigma: float) -> tuple[str, str]:
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 520, 170, 56, 26, 26
 COLOURS = ("#c0392b", "#2471a3", "#1e8449", "#b9770e", "#7d3c98", "#515a5a")
-MOST_PER_CURVE = 1200  # frames, two for each pixel of the width: of more only what is lowest and highest in a stretch can be seen
+MOST_PER_CURVE = 1200  # frames, about two for each pixel of the width: of longer curves only the extremes of each interval are visible
 
 
 def curve_graph(title: str, unit: str, frames: np.ndarray, curves: Mapping[str, np.ndarray], sigma: np.ndarray | None = None) -> str:
@@ -160,12 +160,12 @@ def field_graph(
     ]
     parts += [f'<text x="{x(r):.1f}" y="{high - 8}" text-anchor="middle">{r:g}</text>' for r in np.arange(0, radius[-1], 0.25)]
     for i, ((name, curve), stroke) in enumerate(zip(curves.items(), COLOURS)):
-        seen, ends = marks[name]
-        row = f"{name}: r_t {seen:.3f}, r_a {ends:.3f}"
+        visible, influence = marks[name]
+        row = f"{name}: r_t {visible:.3f}, r_a {influence:.3f}"
         parts += [
             f'<polyline points="{_points(x(radius), y(curve))}" fill="none" stroke="{stroke}" stroke-width="1.6"/>',
-            f'<circle cx="{x(seen):.1f}" cy="{y(threshold):.1f}" r="3.5" fill="{stroke}"/>',
-            line.format(x(ends), x(ends), y(0) - 7, y(0) + 5, stroke),
+            f'<circle cx="{x(visible):.1f}" cy="{y(threshold):.1f}" r="3.5" fill="{stroke}"/>',
+            line.format(x(influence), x(influence), y(0) - 7, y(0) + 5, stroke),
             f'<text x="{WIDTH - 14}" y="{TOP + 14 * (i + 1)}" text-anchor="end" fill="{stroke}">{html.escape(row)}</text>',
         ]
     return "".join(parts) + "</svg>"

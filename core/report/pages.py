@@ -1,4 +1,4 @@
-"""report/report.html: one page that needs nothing beside it, and its pictures as files."""
+"""report/report.html: one self-contained page, and its pictures as files."""
 
 import base64
 import html
@@ -28,7 +28,7 @@ STYLE = (
 )
 LABELS = {
     "points_per_frame": "points a frame",
-    "residual_px": "rays miss by [px], median",
+    "residual_px": "residual of the rays [px], median",
     "sigma_mm": "sigma of a position [mm], median",
     "joint_sigma_mm": "sigma of a joint's coordinate [mm], median",
     "outline_mm": "outlines from the body [mm], median",
@@ -37,10 +37,10 @@ LABELS = {
 
 
 def check_pictured(frames: range, wanted: Sequence[int]) -> None:
-    """The frames of the report's pictures, all of them there.
+    """Check that all frames of the report's pictures exist.
 
     Raises:
-        InputError: one is not.
+        InputError: one does not.
     """
     for frame in wanted:
         if frame not in frames:
@@ -78,8 +78,8 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
     per_frame = [asdict(f) | {key: number(getattr(f, key)) for key in ("iou", "inside", "distance_px")} for f in fits]
-    said = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
-    store.write_json(results.path("report", "report.json"), said)
+    table = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
+    store.write_json(results.path("report", "report.json"), table)
     store.write_text(results.path("report", "report.html"), page)
 
 
@@ -114,8 +114,8 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int]) -> dict
             if body is not None:
                 person = silhouettes.outlines.get(name, {}).get(frame)
                 picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
-                said = _agreement_caption(silhouettes, name, frame)
-                add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body{said}", picture)
+                agreement = _agreement_caption(silhouettes, name, frame)
+                add(f"body_{frame:04d}_{name}.png", f"Frame {frame}, view {name}: the fitted body{agreement}", picture)
     return found
 
 
@@ -185,7 +185,7 @@ def _page(record: Mapping[str, Any], rows: Sequence[Row], files: Mapping[str, tu
 
 
 def _quotable(rows: Sequence[Row]) -> str:
-    """The table of what was measured."""
+    """The table of the figures."""
     cells = []
     for row in rows:
         value, sigma = quoted(row["value"], row["sigma"])
@@ -195,15 +195,15 @@ def _quotable(rows: Sequence[Row]) -> str:
 
 
 def _figures(figures: Mapping[str, Any]) -> str:
-    said = []
+    rows = []
     for name, value in figures.items():
         if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
             continue  # a table of its own among the figures
         text = (
             f"{value:.3g}" if isinstance(value, float) and abs(value) < 1000 else f"{value:.0f}" if isinstance(value, float) else str(value)
         )
-        said.append(f"{html.escape(LABELS.get(name, name.replace('_', ' ')))}: {html.escape(text)}")
-    return "; ".join(said)
+        rows.append(f"{html.escape(LABELS.get(name, name.replace('_', ' ')))}: {html.escape(text)}")
+    return "; ".join(rows)
 
 
 def _median(values: np.ndarray) -> float:

@@ -26,7 +26,7 @@ TAIL_FRAMES = 10
 def body_over_footage(
     grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings, person_px: np.ndarray | None = None
 ) -> np.ndarray:
-    """The skin of one posture, shaded, with its bones and outline, over one view (h, w, 3) uint8. `values` (D,) are the posture's DOFs.
+    """The skin of one pose, shaded, with its bones and outline, over one view (h, w, 3) uint8. `values` (D,) are the pose's DOFs.
 
     `person_px` (V, 2): the outline of the person in the footage, drawn as well.
     """
@@ -56,14 +56,14 @@ def _draw_bones(picture: np.ndarray, camera: Camera, shape: BodyShape, values: n
 
 
 def tracks_over_footage(grey: np.ndarray, camera: Camera, trajectories: Trajectories, index: int) -> np.ndarray:
-    """The points seen at one frame with the way they came, coloured by speed (blue slow, red fast), over one view."""
+    """The points visible in one frame with their paths up to it, coloured by speed (blue slow, red fast), over one view."""
     picture = colour(grey)
     first = max(0, index - TAIL_FRAMES)
-    seen = trajectories.seen[index]
-    way = camera.project(trajectories.xyz_m[first : index + 1, seen])
-    speed = np.nan_to_num(np.linalg.norm(trajectories.velocity_m_s[index, seen], axis=1))
+    visible = trajectories.seen[index]
+    paths = camera.project(trajectories.xyz_m[first : index + 1, visible])
+    speed = np.nan_to_num(np.linalg.norm(trajectories.velocity_m_s[index, visible], axis=1))
     colours = _colours(speed, 0.0, max(0.2, float(np.percentile(speed, 98)) if len(speed) else 0.2))
-    for xy, c in zip(way.transpose(1, 0, 2), colours):
+    for xy, c in zip(paths.transpose(1, 0, 2), colours):
         xy = xy[np.isfinite(xy).all(axis=1)]
         cv2.polylines(picture, [np.rint(xy * 8).astype(np.int32)], False, c, 1, cv2.LINE_AA, 3)
         cv2.circle(picture, _point(xy[-1]), 1, c, -1, cv2.LINE_AA)

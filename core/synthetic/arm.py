@@ -1,12 +1,12 @@
-"""A recording with known truth: a person's right arm in a patterned sleeve swings before three cameras in a row.
+"""A recording with known truth: a person's right arm in a patterned sleeve swings in front of three cameras in a row.
 
-The folder holds a complete take (FORMATS: take.toml with clicks, rig.toml, L/ C/ R/) and truth.npz beside it:
+The folder has a complete take (docs/formats.md: take.toml with clicks, rig.toml, L/ C/ R/) and truth.npz:
 
-    vertices_m (T, V, 3) f4, triangles (F, 3) i4, textured (V,) bool (cloth), visible (T, ⌈V/8⌉) u1 packed bits: seen by all three
-    cameras, joints_m (T, J, 3), joint_names (as motion capture files have them), time_s (T,), and what the body model knows:
+    vertices_m (T, V, 3) f4, triangles (F, 3) i4, textured (V,) bool (cloth), visible (T, ⌈V/8⌉) u1 packed bits: visible in all three
+    cameras, joints_m (T, J, 3), joint_names (those of motion capture files), time_s (T,), and the values of the body model:
     dof_names, motion_values (T, D) rad and m, bone_names, lengths_m (B,), radii_m (M, 3), ball_bone (M,)
 
-all at the instants of the rows that take.toml keeps; the other field is exposed half a frame later.
+all at the instants of the field that take.toml selects; the other field is exposed half a frame later.
 """
 
 import io
@@ -30,13 +30,13 @@ from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
 from ..images.interlace import BOTH, INTERLACE, field_layout, frame_time_s
 from .figure import Part, arm_parts, joined, torso_parts, wall
-from .film import Layer, Sensor, SolidNoise, digitize, expose, paint, seen_vertices, solid_noise
+from .film import Layer, Sensor, SolidNoise, digitize, expose, paint, solid_noise, visible_vertices
 from .truth import motion_capture_name
 
 STAGE = "sample recording"
 SHOULDER_M = np.array([-0.185, -0.010, 1.450])
 LENGTHS_M = np.array([0.272, 0.248])  # upper arm, forearm
-SEEN_RADII_M = np.array([[[0.053, 0.050], [0.047, 0.045], [0.043, 0.041]], [[0.044, 0.041], [0.039, 0.036], [0.032, 0.029]]])  # x, z
+VISIBLE_RADII_M = np.array([[[0.053, 0.050], [0.047, 0.045], [0.043, 0.041]], [[0.044, 0.041], [0.039, 0.036], [0.032, 0.029]]])  # x, z
 TARGET_M = np.array([-0.34, -0.06, 1.35])  # where the cameras look
 WALL_Y_M = 1.20
 SWING_S = 1.36  # there and back
@@ -55,21 +55,21 @@ class ArmTakeSettings:
     width_px: int = knob(768, "Width of the pictures; the height is three quarters of it.", unit="px", low=96, high=4096)
     interlaced: str = knob("odd", "Lines that take.toml keeps; the others are exposed half a frame later.", choices=(*INTERLACE, BOTH))
     noise: float = knob(1.0, "Multiplies the sensors' noise.", low=0.0, high=20.0)
-    click_error_px: float = knob(4.0, "Clicks on the joints are wrong by up to this much, in x and in y.", unit="px", low=0.0, high=100.0)
-    late_frames: float = knob(0.0, "View R is exposed this much later than the others.", unit="frames", low=-100.0, high=100.0)
-    seed: int = knob(1, "Another seed: other textures, noise and clicks.", low=0, high=2**31 - 1)
+    click_error_px: float = knob(4.0, "Largest error of the joint clicks, in x and in y.", unit="px", low=0.0, high=100.0)
+    late_frames: float = knob(0.0, "Frame offset of view R relative to the others.", unit="frames", low=-100.0, high=100.0)
+    seed: int = knob(1, "Seed of the random textures, noise and clicks.", low=0, high=2**31 - 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Studio:
-    """What does not change during the recording."""
+    """The constant parts of the recording."""
 
     settings: ArmTakeSettings
     rig: Rig
     shape: BodyShape
     at_rest: tuple[Part, ...]
     noise: SolidNoise
-    backdrops: tuple[Layer, ...]  # the wall, as each camera sees it
+    backdrops: tuple[Layer, ...]  # the wall in each camera
 
     def body(self, time_s: float) -> tuple[Part, ...]:
         """The person at one moment."""
@@ -84,8 +84,8 @@ def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor
     take.toml is written last: as long as it is missing, the recording is not complete.
 
     Raises:
-        InputError: the folder holds something that was not made by this function, or cannot be written.
-        Cancelled: the monitor was cancelled; the folder then holds no take.
+        InputError: the folder has other content than a recording of this function, or cannot be written.
+        Cancelled: the monitor was cancelled; the folder then has no take.
     """
     settings, monitor, folder = settings or ArmTakeSettings(), monitor or Monitor(), Path(folder)
     _clear(folder)
@@ -125,7 +125,7 @@ def _studio(settings: ArmTakeSettings) -> _Studio:
 def arm_shape() -> BodyShape:
     """The person's true arm."""
     model = read_model("arm.R")
-    balls = three_balls(np.array([0, 1]), LENGTHS_M, SEEN_RADII_M)
+    balls = three_balls(np.array([0, 1]), LENGTHS_M, VISIBLE_RADII_M)
     return BodyShape(
         model=model.name,
         skeleton=model.skeleton,
@@ -183,7 +183,7 @@ def arm_rig(width_px: int) -> Rig:
 
 
 def _clear(folder: Path) -> None:
-    """Make way for a new recording. Only a recording of ours is removed; rig.toml, which marks it, stays until it is replaced."""
+    """Clear the folder for a new recording. Only a synthetic recording is removed; rig.toml, which marks it, stays until it is replaced."""
     try:
         if folder.exists() and not _made_here(folder) and any(folder.iterdir()):
             raise InputError(f"{folder} is not empty and holds no sample recording; choose a new folder for it.")
@@ -197,7 +197,7 @@ def _clear(folder: Path) -> None:
 
 
 def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> np.ndarray:
-    """Write one image of all views; return which vertices (V,) all of them see, a row for each instant that is kept."""
+    """Write one image of all views; return the vertices (V,) visible in all of them, a row for each instant of the selected fields."""
     settings, kept = studio.settings, field_layout(studio.settings.interlaced).first
     moments = [frame_time_s(frame, settings.fps)] + ([frame_time_s(frame + 0.5, settings.fps)] if kept.step == 2 else [])
     bodies = [studio.body(time) for time in moments]
@@ -209,7 +209,7 @@ def _film_frame(folder: Path, studio: _Studio, frame: int, monitor: Monitor) -> 
         sensor = SENSORS[camera.name]
         layers = [paint(camera, parts, studio.noise, studio.backdrops[i]) for parts in (late if camera.name == LATE else bodies)]
         for row, scene, layer in zip(seen, scenes, layers):
-            row &= seen_vertices(camera, scene.vertices_m, scene.normals, layer)
+            row &= visible_vertices(camera, scene.vertices_m, scene.normals, layer)
         picture = expose(layers[0], sensor)
         if kept.step == 2:
             picture[1 - kept.offset :: 2] = expose(layers[1], sensor)[1 - kept.offset :: 2]

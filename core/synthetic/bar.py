@@ -1,4 +1,4 @@
-"""A waved reference bar before synthetic cameras: its image points with noise, gaps and blunders, for tests and benchmarks.
+"""A waved reference bar in front of synthetic cameras: its image points with noise, gaps and gross errors, for tests and benchmarks.
 
 The wave is a Lissajous figure through the volume with the bar turning through all directions; cameras are those of CALIBRATION's
 benchmark (a row of three) or drawn at random: in a row, exactly in a row, parallel, in a triangle, wide apart.
@@ -26,7 +26,7 @@ VOLUME_CENTRE_M, VOLUME_SIZE_M = np.array([0.0, 0.0, 2.5]), np.array([1.0, 1.5, 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BarNoise:
-    """What is wrong with the image points."""
+    """The errors of the image points."""
 
     sigma_px: float = 0.05
     missing: float = 0.10  # fraction of the image points
@@ -36,7 +36,7 @@ class BarNoise:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class WavedBar:
-    """The truth and what the cameras saw."""
+    """The truth and the image points."""
 
     cameras: tuple[Camera, ...]
     length_m: float

@@ -1,4 +1,4 @@
-"""What stands before the cameras: an arm of metaballs with a sleeve, a hand, a torso, a neck and a head, and a wall behind.
+"""The scene of a synthetic recording: an arm of metaballs with a sleeve, a hand, a torso, a neck and a head, and a wall.
 
 Every part is a closed mesh (the wall: a grid) with the rest-pose coordinates at which its solid texture is looked up.
 """
@@ -21,7 +21,7 @@ HAND_CENTRE_M = 0.070  # beyond the wrist
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Material:
-    """A solid texture in grey values, as lit from straight ahead: mean, standard deviation, and the stretch of the noise."""
+    """A solid texture in grey values under frontal light: mean, standard deviation, and the scale of the noise."""
 
     mean: float
     contrast: float
@@ -52,7 +52,7 @@ class Part:
 
 
 def arm_parts(shape: BodyShape, motion: np.ndarray, rest: Sequence["Part"] | None = None) -> tuple[Part, ...]:
-    """The sleeve and the hand in one posture (D,). `rest`: the same parts in the rest pose, as made without it."""
+    """The sleeve and the hand in one pose (D,). `rest`: the same parts in the rest pose, made without it."""
     skin = limb_skin(shape, motion, SKIN)
     centre = np.array([0.0, shape.lengths_m[-1] + HAND_CENTRE_M, 0.0])  # in the forearm's axes
     hand, hand_triangles = superellipsoid(centre, np.array(HAND_SEMI_AXES_M), 2.3, 40, 40)
@@ -79,7 +79,7 @@ def torso_parts(shoulder_m: np.ndarray) -> tuple[Part, ...]:
 
 
 def wall(y_m: float, cells: int = 80, half_m: float = 2.0, centre_m: tuple[float, float] = (-0.3, 1.3)) -> Part:
-    """A wall across y, seen from smaller y. Cells small enough for a distorting camera."""
+    """A wall across y, visible from smaller y. Its cells are small enough for a camera with distortion."""
     t = np.linspace(-half_m, half_m, cells + 1)
     x, z = np.meshgrid(centre_m[0] + t, centre_m[1] + t)
     vertices = np.stack([x.ravel(), np.full(x.size, y_m), z.ravel()], axis=1)

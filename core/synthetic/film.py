@@ -1,4 +1,4 @@
-"""Filming a scene: what each camera's sensor would have stored, frame after frame, with optics, interlace and noise.
+"""Filming a scene: the images that each camera's sensor stores, with optics, interlace and noise.
 
 L = (m + s · noise(X_rest)) · (ambient + (1 − ambient) max(0, n·l))          grey value on the surface, Lambert        (1)
 μ = offset + gain · (PSF ∗ L)                                              the camera's own gain and offset           (2)
@@ -52,8 +52,8 @@ def solid_noise(seed: int, *, cells: int = 160, pitch_m: float = 0.002, shortest
 
 
 SAMPLES = 2  # per pixel and direction
-OUTLINE_STEP_M = 0.006  # samples of one pixel that lie farther apart in depth are on an outline
-AMBIENT = 0.45
+OUTLINE_STEP_M = 0.006  # a pixel whose samples differ more in depth is on an outline
+AMBIENT = 0.45  # fraction of the light without direction in (1)
 LIGHT = np.array([-0.40, -0.75, 0.53])  # towards the light: from the left, the front and above
 
 
@@ -70,8 +70,8 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Layer:
-    """What a camera sees of some parts: light (H, W) float32 of each pixel, and depth z_cam [m] of `SAMPLES`² samples a pixel
-    (H · SAMPLES, W · SAMPLES) float32, inf where there is nothing."""
+    """The image of some parts: light (H, W) float32 of each pixel, and depth z_cam [m] of `SAMPLES`² samples a pixel
+    (H · SAMPLES, W · SAMPLES) float32, inf where there is no surface."""
 
     light: np.ndarray
     depth_m: np.ndarray
@@ -82,10 +82,10 @@ class Layer:
 
 
 def paint(camera: Camera, parts: Sequence[Part], noise: SolidNoise, behind: Layer | None = None) -> Layer:
-    """The parts before what lies behind them.
+    """The image of the parts in front of the layer `behind`.
 
-    Pixels inside a part are shaded at their centres, which is enough for textures that are smooth over a pixel; pixels on an outline are
-    the mean of their samples.
+    Pixels inside a part are shaded at their centres, which suffices for textures that are smooth over a pixel; pixels on an outline are the
+    mean of their samples.
     """
     scene = joined(parts)
     raster = rasterize(camera, scene.vertices_m, scene.triangles, factor=SAMPLES)
@@ -111,8 +111,8 @@ def _planes(samples: np.ndarray) -> list[np.ndarray]:
 
 
 def _inner_and_outline(hit: np.ndarray, depth: np.ndarray, part_of_hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (flat) whose samples all show one smooth stretch of one part, and the other pixels that show something."""
-    part = np.append(part_of_hit, -1).astype(np.int8)[hit]  # −1: what lies behind
+    """Pixels (flat) whose samples all show one smooth piece of one part, and the other pixels of parts."""
+    part = np.append(part_of_hit, -1).astype(np.int8)[hit]  # −1: the layer behind
     touched, alike = np.zeros(_planes(part)[0].shape, dtype=bool), np.ones(_planes(part)[0].shape, dtype=bool)
     first, near, far = _planes(part)[0], _planes(depth)[0], _planes(depth)[0]
     for p, d in zip(_planes(part), _planes(depth)):
@@ -124,7 +124,7 @@ def _inner_and_outline(hit: np.ndarray, depth: np.ndarray, part_of_hit: np.ndarr
 
 
 def _reflected(scene: Scene, raster: Raster, which: np.ndarray, xy_px: np.ndarray, noise: SolidNoise) -> np.ndarray:
-    """Light (K,) of the surfaces behind the raster's samples `which`, at pixels (K, 2).  (1)"""
+    """Light (K,) of the surfaces at the raster's samples `which`, at pixels (K, 2).  (1)"""
     at = raster.interpolate_at(which, xy_px, np.concatenate([scene.rest_m, scene.normals], axis=1), scene.triangles)
     rest, normal = at[:, :3], at[:, 3:]
     length = np.sqrt(np.einsum("ni,ni->n", normal, normal) * (LIGHT @ LIGHT))
@@ -137,19 +137,19 @@ def _reflected(scene: Scene, raster: Raster, which: np.ndarray, xy_px: np.ndarra
 
 
 def expose(layer: Layer, sensor: Sensor) -> np.ndarray:
-    """The expected grey values (H, W) of a picture without noise.  (2)"""
+    """The expected grey values (H, W) of an image without noise.  (2)"""
     return sensor.offset + sensor.gain * cv2.GaussianBlur(layer.light, (0, 0), sensor.blur_px, borderType=cv2.BORDER_REPLICATE)
 
 
 def digitize(expected: np.ndarray, sensor: Sensor, noise_level: float, rng: np.random.Generator) -> np.ndarray:
-    """The stored picture (H, W) uint8; `noise_level` multiplies the sensor's noise (1 as it is, 0 none).  (3)"""
+    """The stored image (H, W) uint8; `noise_level` multiplies the sensor's noise (0: none).  (3)"""
     sigma = noise_level * np.sqrt(sensor.dark_sigma**2 + sensor.noise_per_grey * np.maximum(expected, 0))
     noisy = expected + sigma * rng.standard_normal(expected.shape, dtype=np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def seen_vertices(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, layer: Layer, tolerance_m: float = 0.006) -> np.ndarray:
-    """Which vertices (V,) the camera sees: inside the frame, facing it, and not behind anything by more than the tolerance."""
+def visible_vertices(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, layer: Layer, tolerance_m: float = 0.006) -> np.ndarray:
+    """The vertices (V,) visible in a camera: inside the frame, facing it, and not occluded by more than the tolerance."""
     xy = camera.project(vertices_m)
     inside = camera.sees(xy)
     at = np.zeros((len(xy), 2), dtype=np.intp)

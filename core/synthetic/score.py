@@ -1,8 +1,8 @@
-"""Scoring a run against the truth beside its recording: how far, how many, how complete. Distances in millimetres, angles in degrees.
+"""Scoring a run against the truth of its recording: accuracy, counts and completeness. Distances in millimetres, angles in degrees.
 
-Gross errors (10 mm and more) are counted, and kept out of the clouds' median and percentile. A trajectory is tied to the point of
-the true surface that is nearest when it begins; where that point goes is where it should go. "Motion" figures leave the mean
-over time out: a joint inside the body has no exact place, but it must not wander.
+Gross errors (10 mm and more) are counted, and excluded from the clouds' median and percentile. The truth of a trajectory is the path of the
+point of the true surface nearest to its beginning. "Motion" figures are without the mean over time: a joint inside the body has no exact
+position, but must not drift.
 """
 
 import csv
@@ -20,8 +20,8 @@ from ..motion.formats.ply import Ply, read_ply
 from .truth import Truth, motion_capture_name, read_truth
 
 STAGE = "score"
-GROSS_MM = 10.0
-COVERED_M = 0.012
+GROSS_MM = 10.0  # errors from here on are gross
+COVERED_M = 0.012  # a surface point with a measured point within this distance is covered
 HINGES = {"elbow": ("shoulder", "wrist"), "knee": ("hip", "ankle")}
 
 
@@ -34,7 +34,7 @@ class CloudScore:
     median_mm: float
     p95_mm: float
     gross_fraction: float  # mean over the frames
-    coverage: float  # share of the textured surface seen by all cameras that has a point within 12 mm
+    coverage: float  # fraction of the textured surface visible in all cameras that has a point within 12 mm
 
     def __str__(self) -> str:
         return (
@@ -51,7 +51,7 @@ class TrajectoryScore:
     mean_length_frames: float
     median_mm: float
     p95_mm: float
-    false_fraction: float  # share of the positions after the first that are 10 mm or more off
+    false_fraction: float  # fraction of the positions after the first with an error of 10 mm or more
 
     def __str__(self) -> str:
         return (
@@ -103,7 +103,7 @@ class ShapeScore:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SkinScore:
-    """Vertices of the skin that lie next to surface seen by all cameras, against the true surface."""
+    """Vertices of the skin next to surface visible in all cameras, against the true surface."""
 
     frames: int
     median_mm: float
@@ -116,7 +116,7 @@ class SkinScore:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Score:
-    """What a run measured against the truth. None: the run, or the truth, has nothing of the kind."""
+    """The scores of a run. None: the run, or the truth, lacks this result."""
 
     clouds: CloudScore | None
     trajectories: TrajectoryScore | None
@@ -127,7 +127,7 @@ class Score:
     skin: SkinScore | None
 
     def __str__(self) -> str:
-        """One line for each thing."""
+        """One line for each score."""
         rows = [("clouds", self.clouds), ("trajectories", self.trajectories), ("joints", self.joints)]
         rows += [(f"{name} bend", score) for name, score in self.hinges.items()] + list(self.angles.items())  # type: ignore[arg-type]
         rows += [("body shape", self.shape), ("skin", self.skin)]  # type: ignore[list-item]
@@ -161,7 +161,7 @@ def _meshes(folder: Path, truth: Truth, monitor: Monitor) -> list[tuple[int, Ply
     for i, path in enumerate(paths):
         monitor.step(STAGE, i, len(paths))
         if not path.stem.isdecimal() or int(path.stem) >= len(truth.vertices_m):
-            raise InputError(f"{path} is no frame of the recording, which has {len(truth.vertices_m)}; score the run with its own take.")
+            raise InputError(f"{path} is not a frame of the recording, which has {len(truth.vertices_m)}; score the run with its own take.")
         ply = read_ply(path)
         if len(ply.xyz_m):
             found.append((int(path.stem), ply))
@@ -195,7 +195,7 @@ def _score_trajectories(truth: Truth, path: Path, monitor: Monitor) -> Trajector
         with np.load(path, allow_pickle=False) as file:
             frames, xyz, shared = file["frames"].astype(np.intp), file["xyz_m"].astype(np.float64), "track" in file.files
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} holds no trajectories or is damaged; run the tracking again.") from error
+        raise InputError(f"{path} has no trajectories or is damaged; run the tracking again.") from error
     if shared:
         raise InputError(f"{path} has several trajectories in a column, which cannot be scored; run fewer frames of the take (--frames).")
     if len(frames) and frames.max() >= len(truth.vertices_m):
@@ -218,7 +218,7 @@ def _score_trajectories(truth: Truth, path: Path, monitor: Monitor) -> Trajector
 
 
 def _true_paths(truth: Truth, frames: np.ndarray, xyz: np.ndarray, first: np.ndarray, monitor: Monitor) -> np.ndarray:
-    """Where the surface points (T, N, 3) go that are nearest to the trajectories in their `first` (N,) steps."""
+    """The paths (T, N, 3) of the surface points nearest to the trajectories in their `first` (N,) steps."""
     paths = np.empty_like(xyz)
     for step in range(len(frames)):
         monitor.step(STAGE, step, len(frames))
@@ -247,11 +247,11 @@ def _numbers(table: dict[str, list[str]], name: str, path: Path) -> np.ndarray:
     try:
         return np.array([float(text) for text in table[name]])
     except ValueError as error:
-        raise InputError(f"Column “{name}” of {path} has an entry that is no number ({error}); run the fit again.") from error
+        raise InputError(f"Column “{name}” of {path} has an entry that is not a number ({error}); run the fit again.") from error
 
 
 def _read_joints(path: Path, truth: Truth) -> dict[str, np.ndarray]:
-    """Estimated joints by name, each (T, 3), NaN where there is none; only those that the truth has."""
+    """Estimated joints by name, each (T, 3), NaN where missing; only those that the truth has."""
     if not path.exists():
         return {}
     table = _table(path, ("frame", "joint", "x", "y", "z"))
@@ -328,8 +328,8 @@ def _score_shape(truth: Truth, path: Path) -> ShapeScore | None:
 def _score_skin(truth: Truth, out: Path, monitor: Monitor) -> SkinScore | None:
     distances = []
     for frame, ply in _meshes(out / "skin", truth, monitor):
-        beside = cKDTree(truth.vertices_m[frame]).query(ply.xyz_m)[1]
-        distances.append(truth.closest(frame, ply.xyz_m[truth.visible[frame][beside]])[0] * 1e3)
+        nearest = cKDTree(truth.vertices_m[frame]).query(ply.xyz_m)[1]
+        distances.append(truth.closest(frame, ply.xyz_m[truth.visible[frame][nearest]])[0] * 1e3)
     d = np.concatenate(distances) if distances else np.zeros(0)
     if not len(d):
         return None

@@ -1,7 +1,7 @@
-"""truth.npz, the truth beside a recording, and distances from it.
+"""truth.npz, the truth of a recording, and distances from it.
 
 vertices_m (T, V, 3), triangles (F, 3), textured (V,), visible (T, ⌈V/8⌉) packed bits, joints_m (T, J, 3), joint_names, time_s (T,)
-and, where a body model made the recording: dof_names, motion_values (T, D), bone_names, lengths_m (B,), radii_m (M, 3)
+and, for recordings of a body model: dof_names, motion_values (T, D), bone_names, lengths_m (B,), radii_m (M, 3)
 """
 
 import zipfile
@@ -29,7 +29,7 @@ def motion_capture_name(joint: str) -> str:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Truth:
-    """The true surface, what of it all cameras see, the true joints, and (or None) the values of the body model behind them."""
+    """The true surface, its part visible in all cameras, the true joints, and the values of the body model (or None)."""
 
     vertices_m: np.ndarray  # (T, V, 3)
     triangles: np.ndarray  # (F, 3)

@@ -72,9 +72,9 @@ def seam_jumps(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np.
     middle = corner.mean(axis=1)
     turn = np.arccos(np.clip(np.einsum("fk,fik->fi", normal, normal[beyond]), -1.0, 1.0))
     turn *= np.sign(np.einsum("fk,fik->fi", normal, middle[beyond] - middle[:, None]))  # valleys positive
-    beside = (np.roll(turn, -2, axis=1) + turn[beyond, (edge + 2) % 4]) / 2
+    nearby = (np.roll(turn, -2, axis=1) + turn[beyond, (edge + 2) % 4]) / 2
     own = _most_frequent(part[faces])
-    return np.asarray(np.where(own[:, None] != own[beyond], np.abs(turn - beside), 0.0))
+    return np.asarray(np.where(own[:, None] != own[beyond], np.abs(turn - nearby), 0.0))
 
 
 def in_a_fold(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

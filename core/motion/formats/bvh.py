@@ -1,7 +1,7 @@
 """BVH: a skeleton and its motion as text (Biovision). Read into a `Motion` in the world's metres, Z up; written for many readers.
 
-A joint's rotation channels apply in the order in which they stand: "Zrotation Xrotation Yrotation" is R_z · R_x · R_y.
-The format knows no unit and no up axis: both are found from the skeleton's size and posture unless they are given.
+A joint's rotation channels apply in the order of the file: "Zrotation Xrotation Yrotation" is R_z · R_x · R_y.
+The format has no unit and no up axis: both are estimated from the skeleton's size and pose unless they are given.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,11 @@ from ..retarget.rig import Motion, Rig
 LARGEST_BYTES = 1 << 30
 MOST_JOINTS = 4096
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
-TALL_M = 1.7
+TALL_M = 1.7  # height of a person, for the unit
+TINY = 1e-6  # by the skeleton's size: bones below it have no length
+STUB = 0.05  # by the skeleton's size: length of a bone without length
+UPRIGHT = 1.5  # by its extent along Y: the extent along Z of a skeleton whose Z is up
+MOVED_M = 1e-5  # a head that moves further relative to its parent needs position channels
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 CHANNELS = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 
@@ -37,7 +41,7 @@ def read_bvh(path: Path, *, unit_m: float | None = None, up: str | None = None) 
     """The motion in a BVH file; bones point from joint to joint. `unit_m`: metres per unit; `up`: "Y" or "Z".
 
     Raises:
-        InputError: it cannot be read, is no BVH file, or is shorter than it says.
+        InputError: it cannot be read, is no BVH file, or is shorter than its header says.
     """
     try:
         if Path(path).stat().st_size > LARGEST_BYTES:
@@ -86,7 +90,7 @@ def _joints(text: str, path: Path) -> list[_Joint]:
                 raise InputError(f"{path} closes more brackets than it opens; it is damaged, export it again.")
             stack.pop()
         elif kind != "HIERARCHY":
-            raise InputError(f"{path} holds “{word[:40]}” in its HIERARCHY, which makes no sense there; export it again.")
+            raise InputError(f"{path} holds “{word[:40]}” in its HIERARCHY, which is not valid there; export it again.")
         if len(joints) > MOST_JOINTS:
             raise InputError(f"{path} has more than {MOST_JOINTS} joints; that is no skeleton.")
     if stack or not joints:
@@ -182,7 +186,7 @@ def _moves(joint: _Joint) -> bool:
 
 
 def _channels(joint: _Joint, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (T, 3, 3) and offset (T, 3) of a joint against its parent."""
+    """Rotation (T, 3, 3) and offset (T, 3) of a joint relative to its parent."""
     R = np.broadcast_to(np.eye(3), (len(values), 3, 3))
     shift = np.tile(joint.offset, (len(values), 1))
     for channel, column in zip(joint.channels, joint.columns):
@@ -195,26 +199,26 @@ def _channels(joint: _Joint, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _tails(joints: list[_Joint], head: np.ndarray) -> np.ndarray:
-    """A bone ends at the mean of its children, or at its End Site; a bone of no length is as long as its parent's tenth."""
+    """A bone ends at the mean of its children, or at its End Site; a bone without length continues its parent for STUB of the size."""
     tails = []
     size = float(np.ptp(head, axis=0).max()) or 1.0
     for b, joint in enumerate(joints):
-        children = [c for c, other in enumerate(joints) if other.parent == b and np.linalg.norm(head[c] - head[b]) > 1e-6 * size]
+        children = [c for c, other in enumerate(joints) if other.parent == b and np.linalg.norm(head[c] - head[b]) > TINY * size]
         tail = head[children].mean(axis=0) if children else head[b] + (joint.end if joint.end is not None else 0.0)
-        if np.linalg.norm(tail - head[b]) < 1e-6 * size:
+        if np.linalg.norm(tail - head[b]) < TINY * size:
             p = joint.parent
-            tail = head[b] + 0.05 * size * (unit(head[b] - head[p]) if p >= 0 and unit(head[b] - head[p]).any() else np.array([0, 1.0, 0]))
+            tail = head[b] + STUB * size * (unit(head[b] - head[p]) if p >= 0 and unit(head[b] - head[p]).any() else np.array([0, 1.0, 0]))
         tails.append(tail)
     return np.array(tails)
 
 
 def _up_axis(head: np.ndarray, tail: np.ndarray) -> str:
     extent = np.ptp(np.concatenate([head, tail]), axis=0)
-    return "Z" if extent[2] > 1.5 * extent[1] else "Y"
+    return "Z" if extent[2] > UPRIGHT * extent[1] else "Y"
 
 
 def _unit(places: np.ndarray) -> float:
-    """Metres per unit: the one with which the skeleton is nearest to a person's height."""
+    """Metres per unit: the unit for which the skeleton is nearest to a person's height."""
     height = float(np.ptp(places[:, 2]))
     return min(UNITS_M.values(), key=lambda factor: abs(np.log(max(height, 1e-9) * factor / TALL_M)))
 
@@ -229,7 +233,7 @@ def _distinct(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def write_bvh(path: Path, motion: Motion, *, unit_m: float = 1.0, order: str = "ZXY", names: dict[str, str] | None = None) -> None:
-    """Write a motion, Y up. `order`: in which the rotation channels stand; `names`: other names for bones.
+    """Write a motion, Y up. `order`: of the rotation channels; `names`: other names for bones.
 
     Raises:
         InputError: the file cannot be written.
@@ -275,13 +279,13 @@ def write_bvh(path: Path, motion: Motion, *, unit_m: float = 1.0, order: str = "
 
 
 def _free_heads(motion: Motion) -> np.ndarray:
-    """Bones (B,) whose heads move against their parents: they need position channels."""
+    """Bones (B,) whose heads move relative to their parents: they need position channels."""
     rig = motion.rig
     free = np.zeros(len(rig.names), dtype=bool)
     for b, p in enumerate(rig.parents):
         if p >= 0:
             rigid = motion.head_m[:, p] + motion.R[:, p] @ (rig.R_rest[p].T @ (rig.head_m[b] - rig.head_m[p]))
-            free[b] = np.abs(motion.head_m[:, b] - rigid).max() > 1e-5
+            free[b] = np.abs(motion.head_m[:, b] - rigid).max() > MOVED_M
     return free
 
 

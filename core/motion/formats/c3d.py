@@ -1,12 +1,12 @@
 """C3D: points over time with residuals, binary (The C3D File Format User Guide, Motion Lab Systems, 2008).
 
-Own and small: only the points are read and written, no analogue channels. The library `c3d` would be one more wheel to carry for these
-lines, trusts the counts in a file's header, and leaves sigmas to its user; it serves the tests as an independent reader.
+Only the points are read and written, no analogue channels. The library `c3d` would be one more wheel in the extension, trusts the counts in
+a file's header, and leaves sigmas to its user; it serves the tests as an independent reader.
 
 Blocks of 512 bytes: header, parameters (groups and entries with relative pointers), then per frame and point x, y, z and a fourth word:
-negative for an unknown point, else its low byte times the scale is the residual; here that is the point's sigma, 0 if that is unknown.
-Frames are numbered from 1 and without gaps: frames that are not there are written as unknown points, and TRICAP:FRAME_OFFSET says how far
-a take's own numbers, which may begin at 0, are from the file's.
+negative for a missing point, else its low byte times the scale is the residual; here that is the point's sigma, 0 if unknown.
+Frames are numbered from 1 and without gaps: missing frames are written as missing points, and TRICAP:FRAME_OFFSET is the difference of a
+take's own frame numbers, which may begin at 0, from the file's.
 """
 
 import struct
@@ -21,10 +21,10 @@ from ...foundation.errors import InputError
 from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
 
 BLOCK = 512
-INTEL, DEC, MIPS = 84, 85, 86
+INTEL, DEC, MIPS = 84, 85, 86  # processor types: byte order and floats
 RESIDUAL_SCALE_MM = 0.1
 LARGEST_BYTES = 1 << 30
-MOST_WORD = 65535
+MOST_WORD = 65535  # of the header's 16-bit numbers
 BATCH = 255  # labels in one parameter
 
 
@@ -51,10 +51,10 @@ def write_c3d(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "
 
 
 def without_gaps(markers: Markers, where: object) -> Markers:
-    """The points with a row for every frame number from the first to the last; those that were not there are unknown.
+    """The points with a row for every frame number from the first to the last; points of added frames are missing.
 
     Raises:
-        InputError: the numbers do not rise, or are too far apart.
+        InputError: the numbers do not increase, or are too far apart.
     """
     steps = np.diff(markers.frames)
     if (steps == 1).all():
@@ -63,7 +63,7 @@ def without_gaps(markers: Markers, where: object) -> Markers:
     if (steps < 1).any() or t * n * 4 > MOST_VALUES:
         raise InputError(
             f"{where} cannot be written: C3D needs every frame from the first to the last, and these ({markers.frames[0]} … "
-            f"{markers.frames[-1]}) do not rise or are too far apart; mend the frame numbers."
+            f"{markers.frames[-1]}) do not increase or are too far apart; correct the frame numbers."
         )
     xyz, sigma = np.full((t, n, 3), np.nan), np.full((t, n), np.nan)
     rows = markers.frames - markers.frames[0]
@@ -127,7 +127,7 @@ def _value(value: Any) -> bytes:
 
 @dataclass
 class _Number:
-    """How a file writes numbers."""
+    """The encoding of a file's numbers."""
 
     order: str
     dec: bool
@@ -197,7 +197,7 @@ def _range(table: dict[tuple[str, str], Any], first: int, last: int) -> tuple[in
 
 
 def _offset(table: dict[tuple[str, str], Any]) -> int:
-    """By how much the numbers of the take's frames are greater than the file's."""
+    """The take's frame numbers minus the file's."""
     pair = table.get(("TRICAP", "FRAME_OFFSET"))
     if pair is None or np.size(pair) != 2:
         return 0

@@ -1,7 +1,7 @@
-"""2-D keypoints of people as JSON: OpenPose (a file per frame, or one), COCO annotations and COCO results. Read with distrust.
+"""2-D keypoints of people as JSON: OpenPose (a file per frame, or one), COCO annotations and COCO results. Input is validated.
 
-Where several people are seen the one is followed that is nearest to the one before; the first is the largest and surest. The centre of the
-top-left pixel is (0, 0), as everywhere here.
+Of several people, the one nearest to the person in the image before is tracked; in the first image, the largest and most confident one.
+The centre of the top-left pixel is (0, 0), as everywhere in Tricap.
 """
 
 import json
@@ -49,7 +49,7 @@ Person = np.ndarray  # (K, 3) x, y, confidence
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ImagePoints:
-    """K named points of one person over T images of one view; NaN where a point was not found."""
+    """K named points of one person over T images of one view; NaN where a point was not detected."""
 
     names: tuple[str, ...]
     number: np.ndarray  # (T,) of the image
@@ -64,11 +64,11 @@ class ImagePoints:
 
 
 def read_keypoints(paths: Sequence[Path]) -> ImagePoints:
-    """Read one file of all images, or one file per image: its number is the one at the end of its name ("_keypoints" aside), so that a
+    """Read one file of all images, or one file per image: its number is the one at the end of its name ("_keypoints" ignored), so that a
     missing file shifts no other; files without such numbers are counted in the order of `paths`.
 
     Raises:
-        InputError: a file cannot be read, is of none of the kinds, or nobody is in any of them.
+        InputError: a file cannot be read, is of another kind, or there is no person in any of them.
     """
     people: list[tuple[int, list[Person]]] = []
     names: tuple[str, ...] = ()
@@ -83,10 +83,10 @@ def read_keypoints(paths: Sequence[Path]) -> ImagePoints:
     counts = {len(person) for _, those in people for person in those if len(person)}
     if len(counts) != 1:
         raise InputError(
-            f"{paths[0]} and the files beside it hold {'nobody' if not counts else 'people of different kinds'}; "
+            f"{paths[0]} and the files next to it have {'no person' if not counts else 'people with different numbers of keypoints'}; "
             "give the keypoints of one detector."
         )
-    return _followed(people, names or _layout(counts.pop(), paths[0]))
+    return _tracked(people, names or _layout(counts.pop(), paths[0]))
 
 
 def _numbers_of(paths: Sequence[Path]) -> Sequence[int]:
@@ -95,7 +95,7 @@ def _numbers_of(paths: Sequence[Path]) -> Sequence[int]:
     return numbers if len(set(numbers)) == len(paths) else range(len(paths))
 
 
-def _followed(people: list[tuple[int, list[Person]]], names: tuple[str, ...]) -> ImagePoints:
+def _tracked(people: list[tuple[int, list[Person]]], names: tuple[str, ...]) -> ImagePoints:
     """One person through the images."""
     k = len(names)
     check_sparse(sum(p.size for _, those in people for p in those), len(people), k, "The file of keypoints")

@@ -1,4 +1,4 @@
-"""Points with names over time: what TRC, C3D and CSV files hold, in the world's metres, Z up.
+"""Named points over time, the content of TRC, C3D and CSV files, in the world's metres, Z up.
 
 Axes of other worlds are given by the rows of a rotation: `file = rotation @ world`. In OpenSim's, X is forward, Y up and Z to the
 right of a person who faces −Y here.
@@ -32,13 +32,13 @@ MOST_VALUES = 1 << 28  # 2 GB of float64
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Markers:
-    """N points over T frames; NaN where a point is not known."""
+    """N points over T frames; NaN where a point is missing."""
 
     names: tuple[str, ...]
     fps: float
     frames: np.ndarray  # (T,) integer frame numbers
     xyz_m: np.ndarray  # (T, N, 3) world
-    sigma_m: np.ndarray  # (T, N); NaN: not known
+    sigma_m: np.ndarray  # (T, N); NaN: unknown
 
     def __post_init__(self) -> None:
         t, n = len(self.frames), len(self.names)
@@ -52,14 +52,14 @@ class Markers:
 
 
 def metres_per(unit: str, where: object) -> float:
-    """The factor of a unit's name.
+    """Metres per unit, by the unit's name.
 
     Raises:
-        InputError: nobody knows that unit.
+        InputError: the unit is unknown.
     """
     factor = UNITS_M.get(unit.strip().lower())
     if factor is None:
-        raise InputError(f"{where} is in the unit “{unit.strip()[:20]}”, which is not known; write it in m or mm.")
+        raise InputError(f"{where} is in the unit “{unit.strip()[:20]}”, which is unknown; write it in m or mm.")
     return factor
 
 
@@ -75,10 +75,10 @@ def axes_of(name: str) -> np.ndarray:
 
 
 def check_size(counts: Sequence[int], available: int, where: object) -> None:
-    """See that a header's counts can be true, before memory is asked for.
+    """Check that a header's counts are possible, before memory is allocated.
 
     Raises:
-        InputError: they cannot.
+        InputError: they are not.
     """
     total = 1
     for count in counts:
@@ -89,15 +89,15 @@ def check_size(counts: Sequence[int], available: int, where: object) -> None:
 
 
 def filled(markers: Markers) -> Markers:
-    """Gaps filled on straight lines, and the ends with the nearest place; points that are never known are left out.
+    """Gaps filled linearly, and the ends with the nearest position; points without any position are left out.
 
     Raises:
-        InputError: no point is ever known.
+        InputError: no point has a position.
     """
     known = np.isfinite(markers.xyz_m).all(axis=2)
     keep = np.flatnonzero(known.any(axis=0))
     if not len(keep):
-        raise InputError("None of the points is ever known; choose a file with points.")
+        raise InputError("None of the points has a position in any frame; choose a file with points.")
     xyz = np.stack(
         [
             np.stack([np.interp(markers.frames, markers.frames[known[:, n]], markers.xyz_m[known[:, n], n, i]) for i in range(3)], axis=1)
@@ -115,7 +115,7 @@ DEFAULT_FPS = 25.0
 
 
 def write_points_csv(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "m") -> None:
-    """Write points like joints.csv; unknown ones have no row. joints.csv itself has metres and Z up.
+    """Write points like joints.csv; missing ones have no row. joints.csv itself has metres and Z up.
 
     Raises:
         InputError: axes or unit are not known, or the file cannot be written.
@@ -146,7 +146,7 @@ def read_points_csv(path: Path, *, axes: str = "Z up", unit: str = "") -> Marker
 
 
 def _read(path: Path) -> Markers:
-    """Points as they stand in the file."""
+    """Points in the file's axes and unit."""
     try:
         if Path(path).stat().st_size > LARGEST_BYTES:
             raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")

@@ -1,7 +1,7 @@
-"""PLY files, binary little-endian: clouds and meshes, written whole or not at all, and read with distrust.
+"""PLY files, binary little-endian: clouds and meshes, written atomically; input is validated.
 
-A cloud has the vertex properties x y z [m], sigma [m], nx ny nz and intensity, all float32, and rays, a uchar, where it is known in how
-many views each point was measured; a mesh has x y z and faces, each a list (uchar count, int indices). World coordinates.
+A cloud has the vertex properties x y z [m], sigma [m], nx ny nz and intensity, all float32, and optionally rays, a uchar: the number of
+views in which each point was measured. A mesh has x y z and faces, each a list (uchar count, int indices). World coordinates.
 Format: G. Turk, The PLY Polygon File Format, 1994.
 """
 
@@ -38,7 +38,7 @@ END = b"end_header\n"
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Ply:
-    """What a PLY file holds: vertex properties by name, each (N,), in the file's types, and faces (F, K) of vertex indices;
+    """The content of a PLY file: vertex properties by name, each (N,), in the file's types, and faces (F, K) of vertex indices;
     −1 fills the rows of faces with fewer corners than the largest."""
 
     vertex: Mapping[str, np.ndarray]

@@ -1,4 +1,4 @@
-"""TRC: points over time as text (Motion Analysis; OpenSim). Read with distrust, written as OpenSim reads it: Y up."""
+"""TRC: points over time as text (Motion Analysis; OpenSim). Input is validated; written for OpenSim: Y up."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ LARGEST_BYTES = 1 << 30
 
 
 def write_trc(path: Path, markers: Markers, *, axes: str = "OpenSim", unit: str = "m") -> None:
-    """Write points; unknown ones are left empty.
+    """Write points; missing ones are left empty.
 
     Raises:
         InputError: axes or unit are not known, or the file cannot be written.
@@ -86,7 +86,7 @@ def _rate(text: str, path: Path) -> float:
 
 
 def _row(row: list[str], n: int, path: Path) -> list[float]:
-    """Frame number and 3 n coordinates; empty fields are unknown points."""
+    """Frame number and 3 n coordinates; empty fields are missing points."""
     fields = [row[0], *row[2 : 2 + 3 * n]]
     fields += [""] * (1 + 3 * n - len(fields))
     try:

@@ -381,13 +381,13 @@ def _completed(rig: Rig, found: RigMap) -> RigMap:
                 line = [rig.names[b] for b in rig.path(first, rig.index[following[0]])[:-1]]
                 bones[role] = tuple(n for n in line if n in bones[role] or n not in used) or bones[role]
             line_bones = {rig.index[n] for n in bones[role]}
-            beside = [
+            twist_bones = [
                 n
                 for b, n in enumerate(rig.names)
                 if n not in used and n not in bones[role] and rig.parents[b] in line_bones and read_name(n).twist and not rig.children[b]
             ]
-            if beside:
-                twist[role] = (*twist.get(role, ()), *beside)
+            if twist_bones:
+                twist[role] = (*twist.get(role, ()), *twist_bones)
     bones |= _up_to_the_head(rig, bones)
     known = {name for chain in bones.values() for name in chain}
     unrecognised = {role: "no bone was recognised" for role in NEEDED if role not in bones and role not in found.missing}

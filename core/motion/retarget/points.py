@@ -1,7 +1,7 @@
 """A rig and its motion from named points: joints measured or digitised, without rotations.
 
-Each part points from joint to joint. Its twist is that of the part before it, carried along by the smallest rotation, so that nothing
-flips; hips and chest take theirs from the line between the hip joints or shoulders.
+Each part points from joint to joint. Its twist is that of its parent, carried along by the smallest rotation, so that nothing flips; the
+twist of hips and chest follows from the line between the hip joints or shoulders.
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ CENTRAL = {
     "spine": "spine",
     "thorax": "chest",
 }
-# part, the joint it begins at, the joint it ends at, the part it hangs on, where the left one points in the rest pose
+# part, joint at its head, joint at its tail, parent part, direction of the left one in the rest pose
 LIMBS = (
     ("upper_arm", "upper_arm", "forearm", "spine", (1.0, 0.0, 0.0)),
     ("forearm", "forearm", "hand", "upper_arm", (1.0, 0.0, 0.0)),
@@ -54,7 +54,7 @@ LIMBS = (
 
 
 def joint_of(name: str) -> str:
-    """ "RKnee", "knee.R", "right_knee" -> "shin.R"; "" for points that are no joint of ours."""
+    """ "RKnee", "knee.R", "right_knee" -> "shin.R"; "" for points that are not joints of the body."""
     words = [word.lower() for word in WORD.findall(name)]
     side, words = side_of_words(words)
     core = "".join(word for word in words if not word.isdigit() and word not in ("joint", "center", "centre", "jc"))
@@ -66,7 +66,7 @@ def joint_of(name: str) -> str:
 
 
 def joint_of_bone(name: str) -> str:
-    """The joint at the head of a bone, for points that are named like bones: "lfemur" -> "thigh.L"."""
+    """The joint at the head of a bone, for points named like bones: "lfemur" -> "thigh.L"."""
     reading = read_name(name)
     return sided(reading.part, reading.side) if reading.part and reading.side else reading.part if reading.part in ("hips", "head") else ""
 
@@ -97,7 +97,7 @@ def motion_from_points(markers: Markers) -> Motion:
     return _motion(rows, points)
 
 
-Row = tuple[np.ndarray, np.ndarray | None, str, np.ndarray]  # from, to (T, 3), part it hangs on, direction at rest
+Row = tuple[np.ndarray, np.ndarray | None, str, np.ndarray]  # from, to (T, 3), parent part, direction in the rest pose
 
 
 def _torso(places: dict[str, np.ndarray]) -> dict[str, Row]:
@@ -170,7 +170,7 @@ def _facing(rows: Mapping[str, Row], name: str, along: np.ndarray, before: np.nd
 def _rest_head(
     rows: Mapping[str, Row], name: str, above: str, heads: Mapping[str, np.ndarray], a: np.ndarray, turned: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """In the rest pose a part begins where it mostly lies as seen from what it hangs on."""
+    """The head of a part in the rest pose: its median position in its parent's axes."""
     if not above:
         return np.array([0.0, 0.0, 1.0]) if name == "hips" else np.median(a, axis=0)
     start = rows[above][0]

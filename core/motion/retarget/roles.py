@@ -1,16 +1,16 @@
-"""The parts of a body that rigs have in common, and how they hang together. Names are Blender's, as everywhere in Tricap.
+"""The parts of a body that rigs have in common, and their hierarchy. Names are Blender's, as everywhere in Tricap.
 
-A limb's bones are rigid parts: their directions are what a motion looks like. The spine, the neck and the hand are chains that
-bend, of as many bones as a rig happens to have.
+A limb's bones are rigid parts, whose directions define what a motion looks like. The spine, the neck and the hand are chains that bend, of
+any number of bones.
 
-What a bone's name says: its side, and which part of the body it may be.
+Reading a bone's name: its side, and the part of the body it may be.
 
 Names are cut into words ("mixamorig:LeftUpLeg" -> left, up, leg; "lShldrBend" -> l, shldr, bend), prefixes of tools and other noise are
-dropped, and what is left is looked up. Some words mean different parts in different families ("LeftLeg" is a shin beside
-"LeftUpLeg", but a thigh beside "LeftKnee"; "LeftShoulder" is a collar bone beside "LeftArm", but an upper arm beside "LeftCollar"):
-these are kept as second guesses, for parts that nothing else is called.
+dropped, and the rest is looked up. Some words mean different parts in different families ("LeftLeg" is a shin next to
+"LeftUpLeg", but a thigh next to "LeftKnee"; "LeftShoulder" is a collar bone next to "LeftArm", but an upper arm next to "LeftCollar"):
+these are second guesses, for parts without a bone of an unambiguous name.
 
-What a VRM file says its bones are: the humanoid table in the JSON of a binary glTF file (VRM 0.x and 1.0 specifications).
+The roles of bones in a VRM file: the humanoid table in the JSON of a binary glTF file (VRM 0.x and 1.0 specifications).
 """
 
 import json
@@ -70,7 +70,7 @@ def model_roles(names: Iterable[str]) -> dict[str, str]:
 
 
 def above(role: str, among: Container[str]) -> str:
-    """The nearest role that a role hangs on, of those `among` which one is looked for; "" where there is none."""
+    """The nearest ancestor of a role in `among`; "" if there is none."""
     found = parent_role(role)
     while found and found not in among:
         found = parent_role(found)
@@ -78,7 +78,7 @@ def above(role: str, among: Container[str]) -> str:
 
 
 def parent_role(role: str) -> str:
-    """The role that a role hangs on; "" for the hips."""
+    """The parent of a role; "" for the hips."""
     part, side = part_of(role), side_of(role)
     if part in ("clavicle", "neck"):
         return "spine"
@@ -101,13 +101,13 @@ NOISE = set(
     """j bip bip01 b bn sk c cc base def org jnt joint bone bones mixamorig neo character ctr m f avg valve biped g rig skin bind jt
     bend stretch sub x armature bone1 metarig anim human skeleton""".split()
 )
-# bones that steer others or carry things: never a part of the body
-STEERING = set(
+# controls of other bones, and attachments: never a part of the body
+CONTROLS = set(
     """ik pole control ctrl target end nub tip slot socket heel goal helper mch vis tweak gizmo prop weapon attach site lock
     parent master widget roll pivot offset handle look aim fk2 leaf eff effector secondary
     hair skirt cloth breast bust eye jaw tongue""".split()
 )
-ENDS = {"end", "nub", "tip", "leaf", "site", "eff", "effector"}  # bones that only tell where the one before ends
+ENDS = {"end", "nub", "tip", "leaf", "site", "eff", "effector"}  # bones that only mark the end of their parent
 TWIST = {"twist", "twst", "roll"}
 
 SURE = {
@@ -140,7 +140,7 @@ _SIDED_WORDS = {*_SURE, *_PERHAPS, "fingers", "thumb", "index", "middle", "ring"
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Reading:
-    """What a name says. `part` for certain, or one of `perhaps`; `finger` such as "thumb.1"; `twist`: it shares a part's twist."""
+    """The meaning of a name. `part` for certain, or one of `perhaps`; `finger` such as "thumb.1"; `twist`: a twist bone."""
 
     side: str = ""
     part: str = ""
@@ -150,12 +150,12 @@ class Reading:
 
 
 def read_name(name: str) -> Reading:
-    """What the name of a bone says; an empty Reading if nothing."""
+    """The meaning of a bone's name; an empty Reading if it has none."""
     words = [word.lower() for word in WORD.findall(_without_prefix(name))]
     side, words = side_of_words(words)
     twist = bool(TWIST & set(words)) and not ({"control", "ctrl", "ik"} & set(words))
     words = [word for word in words if word not in TWIST or not twist]
-    if STEERING & set(words):
+    if CONTROLS & set(words):
         return Reading(side=side)
     plain = [word for word in words if not word.isdigit() and word not in NOISE]
     core = "".join(plain)
@@ -171,7 +171,7 @@ def read_name(name: str) -> Reading:
 
 
 def marks_an_end(name: str) -> bool:
-    """Whether a bone's name says that it only tells where another one ends ("head_end", "HeadTop_End", "Bip01 HeadNub")."""
+    """Whether a bone only marks the end of its parent, by its name ("head_end", "HeadTop_End", "Bip01 HeadNub")."""
     return bool(ENDS & {word.lower() for word in WORD.findall(name)})
 
 
@@ -248,7 +248,7 @@ def read_humanoid(path: Path) -> dict[str, str]:
 
 
 def role_of(bone: str) -> str:
-    """ "leftUpperArm" -> "upper_arm.L"; "" for bones that are no role of ours."""
+    """ "leftUpperArm" -> "upper_arm.L"; "" for bones without a role."""
     if bone in ("hips", "head", "neck"):
         return bone if bone != "neck" else ""
     for word, side in (("left", "L"), ("right", "R")):

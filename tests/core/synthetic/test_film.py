@@ -6,7 +6,7 @@ import pytest
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.raster import vertex_normals
 from tricap.core.synthetic.figure import BARE_SKIN, CLOTH, Material, Part, superellipsoid, wall
-from tricap.core.synthetic.film import AMBIENT, LIGHT, Sensor, digitize, expose, paint, seen_vertices, solid_noise
+from tricap.core.synthetic.film import AMBIENT, LIGHT, Sensor, digitize, expose, paint, solid_noise, visible_vertices
 
 CAMERA = Camera(
     name="C",
@@ -65,9 +65,9 @@ def test_exposure_is_blurred_and_has_the_camera_s_gain() -> None:
 def test_seen_vertices_face_the_camera_and_are_not_hidden() -> None:
     near, far = ball(1.0, 0.05), ball(2.0, 0.2)
     layer = paint(CAMERA, [near, far], NOISE)
-    seen = seen_vertices(CAMERA, near.vertices_m, vertex_normals(near.vertices_m, near.triangles), layer)
+    seen = visible_vertices(CAMERA, near.vertices_m, vertex_normals(near.vertices_m, near.triangles), layer)
     assert 0.3 < seen.mean() < 0.5 and near.vertices_m[seen, 1].max() < 1.0  # a bit less than half of a ball
-    seen = seen_vertices(CAMERA, far.vertices_m, vertex_normals(far.vertices_m, far.triangles), layer)
+    seen = visible_vertices(CAMERA, far.vertices_m, vertex_normals(far.vertices_m, far.triangles), layer)
     across = np.linalg.norm(far.vertices_m[:, [0, 2]] / far.vertices_m[:, 1:2], axis=1)  # tangent of the angle from the axis
     assert seen.any() and across[seen].min() > 0.05 * 0.98 and not seen[far.vertices_m[:, 1] > 2].any()
 
@@ -75,7 +75,7 @@ def test_seen_vertices_face_the_camera_and_are_not_hidden() -> None:
 def test_vertices_outside_the_frame_are_not_seen() -> None:
     beside = superellipsoid(np.array([2.0, 1.0, 0.0]), np.full(3, 0.05), 2.0, 10, 10)
     layer = paint(CAMERA, [ball(1.0, 0.05)], NOISE)
-    assert not seen_vertices(CAMERA, beside[0], vertex_normals(*beside), layer).any()
+    assert not visible_vertices(CAMERA, beside[0], vertex_normals(*beside), layer).any()
 
 
 @pytest.mark.parametrize("power", [2.0, 3.0])

@@ -157,7 +157,7 @@ def test_results_of_something_else_are_refused(take: Path, truth: Truth, tmp_pat
         score_run(tmp_path, tmp_path)
     put_cloud(tmp_path, truth, 0, 1.0)
     (tmp_path / "clouds" / "0000.ply").rename(tmp_path / "clouds" / "0099.ply")
-    with pytest.raises(InputError, match="no frame of the recording"):
+    with pytest.raises(InputError, match="not a frame of the recording"):
         score_run(take, tmp_path)
     (tmp_path / "clouds" / "0099.ply").unlink()
     for name, text in (
