@@ -274,7 +274,7 @@ def test_damaged_points_are_said(tmp_path: Path) -> None:
         ("b.csv", b"", "no columns"),
         ("b.csv", b"a,b\n1,2\n", "no columns"),
         ("b.csv", b"frame,p x,p y,p z\n1,2\n", "rows"),
-        ("b.xyz", b"", "no motion that can be read"),
+        ("b.xyz", b"", "not a motion that can be read"),
     ]
     for name, content, word in cases:
         (tmp_path / name).write_bytes(content)
