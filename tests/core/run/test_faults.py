@@ -44,14 +44,14 @@ def files(out: Path) -> dict[str, bytes]:
 
 def at_the_frame(monkeypatch: pytest.MonkeyPatch, frame: int, fault: Callable[[], object]) -> None:
     """Let something happen when a frame is about to be measured."""
-    once = measure._measure
+    read = measure._frame_views
 
-    def measured(*args: object) -> object:
-        if args[4] == frame:
+    def fault_then_read(*args: object, **more: object) -> object:
+        if args[1] == frame:
             fault()
-        return once(*args)  # type: ignore[arg-type]
+        return read(*args, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(measure, "_measure", measured)
+    monkeypatch.setattr(measure, "_frame_views", fault_then_read)
 
 
 def said(capfd: Capture) -> str:
