@@ -4,13 +4,10 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import command, jobs, operators, properties, session
-    from .calibrate import registration as calibrate
-    from .clicking import registration as clicking
+    from . import calibrate, clicking, command, jobs, operators, properties, session, steps
     from .correcting import registration as correcting
     from .overlay import registration as overlay
     from .retarget import registration as retarget
-    from .steps import registration as steps
 
     return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, command
 

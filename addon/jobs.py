@@ -23,7 +23,7 @@ import bpy
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Cancelled, Monitor
 from ..core.foundation.threads import one_thread_in_linear_algebra
-from . import status
+from .panels import show_status
 from .session import get_session
 
 log = logging.getLogger(__name__)
@@ -279,7 +279,7 @@ class JobOperator:
         before, since = self.shown
         if words != before and (job.monitor.cancelled or time.monotonic() - since >= SHOW_S):
             self.shown = words, time.monotonic()
-            status.tell(context, f"Tricap: {words}")
+            show_status(context, f"Tricap: {words}")
             redraw(context)
 
     def clear(self, context: bpy.types.Context) -> None:
@@ -292,7 +292,7 @@ class JobOperator:
             self.timer = None
         if session.job is self.job:
             session.job = None
-        status.tell(context, None)
+        show_status(context, None)
         redraw(context)
 
 

@@ -1,8 +1,10 @@
-"""What all panels share: where they live, and sentences that are wrapped to the sidebar's width. draw() only draws."""
+"""Shared by all panels: where they are, sentences wrapped to the sidebar's width, and the status bar. draw() only draws."""
 
 import textwrap
 
 import bpy
+
+from .session import get_session
 
 CHARACTER_PX, MARGIN_PX, NARROW = 6.6, 40, 20
 
@@ -28,3 +30,23 @@ def sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, 
 def wrapped(text: str, width: int) -> list[str]:
     """The lines of a text."""
     return [line for part in text.splitlines() for line in textwrap.wrap(part, width)]
+
+
+def show_status(context: bpy.types.Context, words: str | None) -> None:
+    """Show a text in the status bar of the workspace that is shown, and in no other; None takes ours away."""
+    here = context.window.workspace if context.window is not None else context.workspace  # the context's may be the one before
+    shown = get_session().status_workspaces  # Blender keeps a text with each workspace
+    for name in shown:
+        there = bpy.data.workspaces.get(name)
+        if there is not None and there != here:
+            _set_status(context, there, None)
+    shown.clear()
+    if here is not None:
+        _set_status(context, here, words)
+        if words:
+            shown.add(here.name)
+
+
+def _set_status(context: bpy.types.Context, workspace: bpy.types.WorkSpace, words: str | None) -> None:
+    with context.temp_override(workspace=workspace):  # Blender asks the context which workspace is meant
+        workspace.status_text_set(words)

@@ -23,7 +23,7 @@ from ..core.take.sources import PERSON_SOURCES
 from ..core.take.take import NO_BODY, Take
 from ..core.take.take import body_model as take_body_model
 from ..core.take.writing import Table, new_table, read_table, renumbered, take_of_table, write_table
-from . import folders, properties, seeds
+from . import clicks, folders, properties
 from .scene import clips
 from .session import get_session
 
@@ -328,22 +328,22 @@ def _put_clicks(scene: bpy.types.Scene, made: Table) -> None:
     """[seeds] and [[keyframes]] from the clips; a pixel that the file has in more decimals than Blender is left as it is."""
     shown, frame = clips_of(scene), scene.tricap.seed_frame
     sizes = {view: tuple(clip.size) for view, clip in shown.items()}
-    joints, surface = seeds.clicks(shown, frame)
+    joints, surface = clicks.clicks_of_frame(shown, frame)
     old, old_keys = made.get("seeds", {}), {k.get("frame", 0): k for k in made.get("keyframes", [])}
     joints = _same_pixels(joints, old.get("joints", {}), sizes)
     before = dict(enumerate(old.get("surface", [])))
     surface = [*_same_pixels(dict(enumerate(surface)), before, sizes).values()]
     said = {"frame": frame, "surface": surface, "joints": joints}
     _put(made, "seeds", {k: v for k, v in said.items() if v or k == "frame"} if frame or joints or surface else None)
-    others = sorted({f for clip in shown.values() for f in seeds.frames_of(clip)} - {frame})
-    keyframes = [(f, _same_pixels(seeds.clicks(shown, f)[0], old_keys.get(f, {}).get("joints", {}), sizes)) for f in others]
+    others = sorted({f for clip in shown.values() for f in clicks.clicked_frames(clip)} - {frame})
+    keyframes = [(f, _same_pixels(clicks.clicks_of_frame(shown, f)[0], old_keys.get(f, {}).get("joints", {}), sizes)) for f in others]
     _put(made, "keyframes", [{"frame": f, "joints": clicked} for f, clicked in keyframes if clicked])
 
 
 def _same_pixels(new: dict[Any, Any], old: dict[Any, Any], sizes: dict[str, tuple[int, int]]) -> dict[Any, Any]:
     def same(name: Any, view: str, xy: list[float]) -> list[float]:
         before = old.get(name, {}).get(view)
-        return before if before is not None and seeds.alike(before, xy, sizes[view]) else xy
+        return before if before is not None and clicks.is_same_pixel(before, xy, sizes[view]) else xy
 
     return {name: {view: same(name, view, xy) for view, xy in at.items()} for name, at in new.items()}
 
@@ -352,12 +352,12 @@ def show_clicks(scene: bpy.types.Scene, said: Table, views: Collection[str]) -> 
     """Show the clicks of a take.toml's table in the clips of these views, in the place of those that are there."""
     shown = {view: clip for view, clip in clips_of(scene).items() if view in views}
     for clip in shown.values():
-        seeds.clear(clip)
+        clicks.clear(clip)
     for group in (said.get("seeds", {}), *said.get("keyframes", [])):
         numbered = {f"seed {i + 1}": at for i, at in enumerate(group.get("surface", []))}
         for name, at in {**group.get("joints", {}), **numbered}.items():
             for view in at.keys() & shown.keys():
-                seeds.set_click(shown[view], name, group.get("frame", 0), at[view])
+                clicks.set_click(shown[view], name, group.get("frame", 0), at[view])
 
 
 def _kept_alike(new: Any, old: Any) -> Any:

@@ -17,8 +17,8 @@ from ...core.geometry.rig import write_rig
 from ...core.take.bar_file import write_bar
 from .. import folders, project
 from ..jobs import JobOperator
+from ..session import get_session
 from ..steps.cameras import use_rig
-from . import live
 from .cameras import build_cameras, rig_of_scene
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -91,11 +91,11 @@ class Calibrate(JobOperator, bpy.types.Operator):
         focal = props.focal_px if props.focal_px > 0 else None
         like = rig_of_scene(context.scene) if props.like_scene else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
-        live.begin()
+        get_session().file.bar_counts.clear()
 
         def read_and_calibrate(monitor: Monitor) -> Done:
             footage = open_bar(folder, interlaced, mask, first_field)
-            return compute(footage, measure_bar(footage, length, monitor, live.note, diameter or None), focal, world, out, monitor)
+            return compute(footage, measure_bar(footage, length, monitor, note_count, diameter or None), focal, world, out, monitor)
 
         return read_and_calibrate
 
@@ -117,6 +117,11 @@ class Calibrate(JobOperator, bpy.types.Operator):
                 f"{result.footage.folder}; rename the view or the footage, and load {result.written}.",
             )
         return {"FINISHED"}
+
+
+def note_count(view: str, images: int, whole: int) -> None:
+    """`whole` of the first `images` images of a view show both targets; the panel shows it while the job runs."""
+    get_session().file.bar_counts[view] = images, whole
 
 
 def frame_numbers(text: str) -> tuple[int, ...]:

@@ -4,9 +4,10 @@ import bpy
 
 from ...core.images.interlace import BOTH
 from ..panels import sentence
-from . import live
+from ..session import get_session
 
 LIGHTS = {"green": "STRIP_COLOR_04", "yellow": "STRIP_COLOR_03", "red": "STRIP_COLOR_01"}
+GOOD_COUNT, FAIR_COUNT = 100, 30  # images of a view that show the whole bar
 
 
 def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -27,8 +28,8 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     row.scale_y = 1.3
     row.enabled = bool(props.bar)
     row.operator("tricap.calibrate", icon="OUTLINER_OB_CAMERA")
-    for view, (frames, whole) in live.counts().items():
-        layout.label(text=f"{view}: {whole} whole bars in {frames} images", icon=live.light(whole))
+    for view, (frames, whole) in list(get_session().file.bar_counts.items()):
+        layout.label(text=f"{view}: {whole} whole bars in {frames} images", icon=LIGHTS[light_of(whole)])
     if props.verdict and not running:
         box = layout.box()
         sentence(box, context, props.verdict, LIGHTS.get(props.light, "NONE"))
@@ -37,3 +38,8 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     row = layout.row(align=True)
     row.operator("tricap.import_rig", icon="IMPORT")
     row.operator("tricap.export_rig", icon="EXPORT")
+
+
+def light_of(whole: int) -> str:
+    """The traffic light of a count of whole bars."""
+    return "green" if whole >= GOOD_COUNT else "yellow" if whole >= FAIR_COUNT else "red"

@@ -7,7 +7,7 @@ from mathutils import Matrix
 from ...core.calibration.world_frame import frame_of_clicks
 from ...core.foundation.errors import InputError
 from ...core.geometry.rig import Rig
-from .. import project, seeds
+from .. import clicks, project
 from ..scene import axes
 from ..steps.cameras import use_rig
 from ..steps.footage import Told
@@ -43,20 +43,20 @@ def world_clicks(scene: bpy.types.Scene) -> dict[str, dict[str, list[float]]]:
     Raises:
         InputError: no camera has footage behind it.
     """
-    clicks: dict[str, dict[str, list[float]]] = {point: {} for point in TRACKS}
+    found: dict[str, dict[str, list[float]]] = {point: {} for point in TRACKS}
     clips = {o: clip for o in scene.objects if o.type == "CAMERA" and (clip := clip_behind(o)) is not None}
     if not clips:
         raise InputError("No camera of the scene has a movie clip behind it; calibrate first, or import the cameras and add their footage.")
     for camera_object, clip in clips.items():
         for point, name in TRACKS.items():
             track = clip.tracking.tracks.get(name)
-            marker = track.markers.find_frame(seeds.clip_frame(clip, scene.frame_current), exact=False) if track else None
+            marker = track.markers.find_frame(clicks.clip_frame(clip, scene.frame_current), exact=False) if track else None
             if marker is not None and not marker.mute:
-                clicks[point][str(camera_object.get("tricap_view", camera_object.name))] = seeds.pixel_of(marker.co, tuple(clip.size))
+                found[point][str(camera_object.get("tricap_view", camera_object.name))] = clicks.pixel_of(marker.co, tuple(clip.size))
     for point, name in TRACKS.items():
-        if len(clicks[point]) < 2:
-            raise InputError(f"The track “{name}” is needed in the clips of two cameras at least; it is in {len(clicks[point])}.")
-    return clicks
+        if len(found[point]) < 2:
+            raise InputError(f"The track “{name}” is needed in the clips of two cameras at least; it is in {len(found[point])}.")
+    return found
 
 
 def place(scene: bpy.types.Scene, rig: Rig, change: Matrix) -> None:

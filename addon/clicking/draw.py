@@ -1,17 +1,18 @@
 """What is drawn over the footage while clicking: the name at the cursor, the figure, epipolar lines, and proposals."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import bpy
 import numpy as np
 
+from ...core.body.model_file import read_model
+from ...core.body.skeleton import joint_positions
 from ..overlay import canvas
 from ..overlay.canvas import Canvas, Colour
 from ..session import get_session
-from .figure import figure
-from .labels import MARK, place_labels
-from .session import ClickSession
+from .click_session import ClickSession
 
 PRESENT: Colour = (1.0, 0.75, 0.1, 1.0)
 OFFER: Colour = (0.3, 1.0, 0.45, 1.0)
@@ -23,6 +24,9 @@ OPEN: Colour = (0.25, 0.25, 0.28, 1.0)
 FIGURE_PX, MARGIN_PX, TIMELINE_PX = 190.0, 12.0, 22.0
 OFFER_PX = 11.0
 NAME_PX, UNDER_MOUSE_PX = 11.0, 12.0
+MARK = 6.0  # half the size of a mark, in pixels of the region as everything here
+GAP = 3.0  # to what is beside
+CORNERS = 16
 
 
 @dataclass(eq=False, kw_only=True)
@@ -166,5 +170,75 @@ def draw_figure(session: ClickSession, sheet: Canvas) -> None:
 
 def _dot(centre: np.ndarray, radius: float, corners: int = 12) -> np.ndarray:
     angle = np.linspace(0, 2 * np.pi, corners + 1)
+    rim = centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.stack([np.broadcast_to(centre, rim[1:].shape), rim[:-1], rim[1:]], axis=1)
+
+
+def place_labels(marks: np.ndarray, widths: np.ndarray, height: float, region: tuple[float, float]) -> np.ndarray:
+    """The lower left corners (N, 2) of names of these widths (N,) beside their marks (N, 2); NaN where there is no room for one.
+
+    Earlier names are given room first. All in pixels of a region of this width and height.
+    """
+    found, taken = np.full((len(marks), 2), np.nan), np.concatenate([marks - MARK, marks + MARK], axis=1)
+    for i, (mark, width) in enumerate(zip(marks, widths)):
+        corners = mark + _around(width, height)
+        boxes = np.concatenate([corners - GAP / 2, corners + (width + GAP / 2, height + GAP / 2)], axis=1)
+        inside = (boxes[:, :2] >= 0).all(axis=1) & (boxes[:, 2:] <= region).all(axis=1)
+        apart = (boxes[:, None, 2:] <= taken[:, :2]) | (boxes[:, None, :2] >= taken[:, 2:])
+        free = np.flatnonzero(inside & apart.any(axis=2).all(axis=1))
+        if len(free):
+            found[i], taken = corners[free[0]], np.concatenate([taken, boxes[free[:1]]])
+    return found
+
+
+def _around(width: float, height: float) -> np.ndarray:
+    """Corners (K, 2) of a name about a mark: above it first, clear of Blender's own marker and its handle, then beside, then below."""
+    near, high = MARK + GAP, 18.0
+    return np.array([(-10.0, high), (near, -height / 2), (-near - width, -height / 2), (near - width, high), (-width / 2, -near - height),
+                     (near, near), (-near - width, near), (near, -near - height), (-near - width, -near - height)])  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Figure:
+    """The figure in a unit of its height; x to the right as one who faces the person sees it, y up, the origin at its lower left."""
+
+    triangles: np.ndarray  # (N, 3, 2) of its body
+    joints: dict[str, np.ndarray]  # (2,) by name
+    width: float
+
+
+@cache
+def figure() -> Figure:
+    """The whole body's model at rest. The person faces −y of the world and is seen from there: its right is on the left."""
+    model = read_model("full")
+    skeleton = model.skeleton
+    lengths = np.array([bone.nominal_length_m for bone in skeleton.bones])
+    places = {name: X[[0, 2]] for name, X in joint_positions(skeleton, lengths, np.zeros(len(skeleton.dof_names))).items()}
+    limbs = [(places[b.head_joint], places[b.tail_joint], radii[:, 0]) for b, radii in zip(skeleton.bones, model.visible_radii_m)]
+    outline = np.concatenate([_limb(a, b, r) for a, b, r in limbs if np.isfinite(r).all()])
+    low, high = outline.reshape(-1, 2).min(axis=0), outline.reshape(-1, 2).max(axis=0)
+    size = high[1] - low[1]
+    return Figure(
+        triangles=(outline - low) / size,
+        joints={name: (p - low) / size for name, p in places.items()},
+        width=float((high[0] - low[0]) / size),
+    )
+
+
+def _limb(a: np.ndarray, b: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """A bone's silhouette: discs at 1/6, 1/2 and 5/6 of it, and what lies between them, as triangles (N, 3, 2)."""
+    centres = [a + share * (b - a) for share in (0.0, 1 / 6, 0.5, 5 / 6, 1.0)]
+    widths = [0.8 * radii[0], *radii, 0.8 * radii[2]]
+    along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+    across = np.array([-along[1], along[0]])
+    parts = [_disc(c, w) for c, w in zip(centres, widths)]
+    for (c, w), (d, v) in zip(zip(centres, widths), zip(centres[1:], widths[1:])):
+        p, q, r, s = c - w * across, c + w * across, d + v * across, d - v * across
+        parts.append(np.array([[p, q, r], [p, r, s]]))
+    return np.concatenate(parts)
+
+
+def _disc(centre: np.ndarray, radius: float) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, CORNERS + 1)
     rim = centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.stack([np.broadcast_to(centre, rim[1:].shape), rim[:-1], rim[1:]], axis=1)

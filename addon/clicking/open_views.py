@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 import bpy
 
 from ...core.foundation.errors import InputError
-from .. import project, seeds
+from .. import clicks, project
 from ..overlay import canvas
 
 NAME = "Tricap Clicks"
@@ -57,7 +57,7 @@ class OpenViews(bpy.types.Operator):
             window.workspace = known
         if self.show != "nothing":
             setattr(context.scene.tricap_overlay, self.show, True)
-        if not any(seeds.frames_of(clip) for clip in clips):
+        if not any(clicks.clicked_frames(clip) for clip in clips):
             context.scene.frame_set(context.scene.tricap.seed_frame)
         names = [clip.name for clip in clips]
         bpy.app.timers.register(_waiter(window, names, switches=self.show != "nothing"), first_interval=SOON_S)

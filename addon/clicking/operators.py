@@ -10,12 +10,13 @@ from ...core.body.model_file import BodyModel, joint_depths_m, read_model
 from ...core.foundation.errors import InputError
 from ...core.run import take_run
 from ...core.take.take import JOINTS, Seeds, open_take
-from .. import project, properties, seeds, status
+from .. import clicks, project, properties
 from ..overlay import canvas
+from ..panels import show_status
 from ..session import get_session
 from . import draw
+from .click_session import ClickSession, free_seed_names, joints_of
 from .finder import Finder
-from .session import ClickSession, free_seed_names, joints_of
 
 TICK_S, SNAP_PX = 0.05, 6.0
 NUMBERS = ("ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE")
@@ -93,7 +94,7 @@ class ClickOperator:
         if self.timer is not None:
             context.window_manager.event_timer_remove(self.timer)
             self.timer = None
-        status.tell(context, None)
+        show_status(context, None)
         canvas.redraw_clips(context)
 
     def _act(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -149,7 +150,7 @@ class ClickOperator:
         return self.session.view_of(canvas.clip_of(area))
 
     def _show(self, context: bpy.types.Context) -> None:
-        status.tell(context, f"{self.session.name}    {KEYS}")
+        show_status(context, f"{self.session.name}    {KEYS}")
         canvas.redraw_clips(context)
 
     def _end(self, context: bpy.types.Context) -> set[str]:
@@ -213,7 +214,7 @@ class ClickSeeds(ClickOperator, bpy.types.Operator):
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
         """Seeds without end, in the frame of the first clicks."""
-        if any(seeds.frames_of(clip) for clip in clips.values()):
+        if any(clicks.clicked_frames(clip) for clip in clips.values()):
             context.scene.frame_set(context.scene.tricap.seed_frame)
         return free_seed_names(clips, context.scene.frame_current)
 
@@ -250,7 +251,7 @@ class Click(bpy.types.Operator):
         """Set or take back one click."""
         try:
             clips = project.clips_of(context.scene)
-            if not seeds.is_seed(self.name):
+            if not clicks.is_click(self.name):
                 raise InputError(f"“{self.name}” is no joint; known are {', '.join(JOINTS)} and “seed 1”, “seed 2”, …")
             if self.view not in clips:
                 raise InputError(f"There is no view “{self.view}”; known are {', '.join(clips) or 'none, add footage first'}.")
@@ -261,10 +262,10 @@ class Click(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if self.remove:
-            return {"FINISHED"} if seeds.remove_click(clip, self.name, frame) else {"CANCELLED"}
+            return {"FINISHED"} if clicks.remove_click(clip, self.name, frame) else {"CANCELLED"}
         note_first_frame(context.scene, clips, frame)
         exact = properties.exact
-        seeds.set_click(clip, self.name, frame, (exact(self.x), exact(self.y)))
+        clicks.set_click(clip, self.name, frame, (exact(self.x), exact(self.y)))
         return {"FINISHED"}
 
 
@@ -327,7 +328,7 @@ def _known_model(name: str) -> BodyModel:
 
 def note_first_frame(scene: bpy.types.Scene, clips: dict[str, bpy.types.MovieClip], frame: int) -> None:
     """The first clicks of all say which frame is that of the seeds."""
-    if not any(seeds.frames_of(clip) for clip in clips.values()):
+    if not any(clicks.clicked_frames(clip) for clip in clips.values()):
         scene.tricap.seed_frame = frame
 
 

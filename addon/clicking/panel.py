@@ -3,10 +3,10 @@
 import bpy
 
 from ...core.foundation.errors import InputError
-from .. import project, seeds
+from .. import clicks, project
 from ..panels import sentence
+from .click_session import joints_of
 from .operators import model_joints
-from .session import joints_of
 
 
 class ClipPanel:
@@ -56,7 +56,7 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
             return
         grid = layout.column(align=True)
         for name in names:
-            at = [view for view, clip in clips.items() if seeds.click(clip, name, scene.frame_current) is not None]
+            at = [view for view, clip in clips.items() if clicks.get_click(clip, name, scene.frame_current) is not None]
             row = grid.row(align=True)
             row.label(text=f"{name}   {' '.join(at)}", icon="CHECKMARK" if len(at) > 1 else "LAYER_USED" if at else "BLANK1")
             row.operator("tricap.click_joints", text="", icon="EYEDROPPER").only = name

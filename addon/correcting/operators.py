@@ -8,9 +8,10 @@ import numpy as np
 
 from ...core.foundation.errors import InputError
 from ...core.take.writing import take_of_table
-from .. import project, status
+from .. import project
 from ..overlay import canvas, draw, layers, results
 from ..overlay.operators import pointed
+from ..panels import show_status
 from . import tables
 
 
@@ -32,7 +33,7 @@ class Correct:
             self.report({"ERROR"}, "Press this in the sidebar of a Clip Editor that shows a view; Open the Views opens one for each view.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         Correct.running = True
-        status.tell(context, self.hint)
+        show_status(context, self.hint)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -41,7 +42,7 @@ class Correct:
         Correct.running = False
         draw.show_region("", [])
         draw.show_inspection(-1, None)
-        status.tell(context, None)
+        show_status(context, None)
         canvas.redraw_clips(context)
         return how
 

@@ -3,17 +3,17 @@
 import bpy
 
 from .. import jobs
-from . import build_scene, cancel, import_tracks, load_sample, run, stages
+from . import build_scene, import_tracks, run, stages
 
 CLASSES = (
-    load_sample.LoadSample,
+    run.LoadSample,
     stages.Measure,
     stages.Track,
     stages.Fit,
     run.Run,
     build_scene.BuildScene,
     import_tracks.ImportTracks2d,
-    cancel.Cancel,
+    run.Cancel,
 )
 
 

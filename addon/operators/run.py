@@ -1,4 +1,4 @@
-"""bpy.ops.tricap.run(take="…", out="…", build=True)"""
+"""bpy.ops.tricap.run(take="…", out="…", build=True), bpy.ops.tricap.load_sample(), bpy.ops.tricap.cancel()"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,12 +6,20 @@ from typing import Any
 
 import bpy
 
+from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.run import pipeline, take_run
-from .. import project
+from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
+from .. import folders, project
+from ..jobs import JobOperator
 from ..scene.contents import Contents, read_contents
+from ..session import get_session
 from .build_scene import RELATIVE, put_into_scene
 from .stages import StageOperator, report_run
+
+SAMPLE_NAME = "tricap_sample"
+EXTENSION = __package__.rpartition(".addon")[0]
+SAMPLE = ArmTakeSettings(frames=12, fps=15.0, width_px=512, interlaced="none")
 
 
 class Run(StageOperator, bpy.types.Operator):
@@ -63,3 +71,56 @@ def measure(
         if not pipeline.is_complete(run):
             pipeline.all_stages(run, monitor)
     return run, read_contents(out, monitor) if build else None
+
+
+class LoadSample(JobOperator, bpy.types.Operator):
+    """Make a small sample recording of a moving arm on this computer, measure it, and build the scene; about half a minute"""
+
+    bl_idname = "tricap.load_sample"
+    bl_label = "Load Sample and Run"
+    bl_options = {"UNDO"}
+
+    def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, take_run.Run, Contents | None]]:
+        """Where the recording and its results go: beside the .blend, or among the extension's own files while there is none."""
+        base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
+        take = base / SAMPLE_NAME
+        if project.bound(context.scene) and project.folder_of(context.scene) != take.resolve():
+            raise InputError("This file has footage of its own; make an empty one (File > New > General) and press this there.")
+        folders.check_writable(base)
+        return lambda monitor: make_sample(take, monitor)
+
+    def finish(self, context: bpy.types.Context, result: tuple[Path, take_run.Run, Contents | None]) -> set[str]:
+        """The sample becomes the scene's project; build the scene."""
+        take, run, contents = result
+        project.open_take(context.scene, take)
+        context.scene.tricap.out = folders.for_user(take / project.RESULTS)
+        if contents is not None:
+            put_into_scene(self, context, contents)
+        report_run(self, context, run)
+        return {"FINISHED"}
+
+
+def make_sample(take: Path, monitor: Monitor) -> tuple[Path, take_run.Run, Contents | None]:
+    """The computation, free of bpy. A sample that is there already, with whatever was changed in it, is measured as it is."""
+    if not is_arm_take(take):
+        make_arm_take(take, SAMPLE, monitor)
+    return take, *measure(take, take / project.RESULTS, {}, True, monitor)
+
+
+class Cancel(bpy.types.Operator):
+    """Stop the running job; what was finished is kept"""
+
+    bl_idname = "tricap.cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only while a job runs."""
+        return get_session().job is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Ask the job to stop; the operator that watches it ends it."""
+        job = get_session().job
+        if job is not None:
+            job.monitor.cancel()
+        return {"FINISHED"}

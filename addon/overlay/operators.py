@@ -9,8 +9,9 @@ import numpy as np
 from ...core.cli.contour import Start, write_contours
 from ...core.foundation.progress import Monitor
 from ...core.run import take_run
-from .. import project, status
+from .. import project
 from ..jobs import JobOperator
+from ..panels import show_status
 from . import canvas, draw, layers, results
 
 REACH_SCREEN_PX = 14.0  # around the pointer
@@ -37,7 +38,7 @@ class InspectPoints(bpy.types.Operator):
             self.report({"ERROR"}, f"There is nothing to inspect: {results.problem()}")
             return {"CANCELLED"}
         InspectPoints.running = True
-        status.tell(context, "Point at the footage    Click: leave it shown    Esc: end")
+        show_status(context, "Point at the footage    Click: leave it shown    Esc: end")
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -63,7 +64,7 @@ class InspectPoints(bpy.types.Operator):
 
     def _end(self, context: bpy.types.Context, how: set[str]) -> set[str]:
         InspectPoints.running = False
-        status.tell(context, None)
+        show_status(context, None)
         canvas.redraw_clips(context)
         return how
 

@@ -1,1 +1,30 @@
 """The eight numbered steps from footage to a rig that moves: the state of each, what it offers, and how it is drawn."""
+
+import bpy
+
+
+def _classes() -> tuple[type, ...]:
+    from . import cameras, check, export, footage, panel, person
+
+    return (*footage.CLASSES, *person.CLASSES, *cameras.CLASSES, *check.CLASSES, *export.CLASSES, *panel.CLASSES)
+
+
+def register() -> None:
+    """Register the operators and the panel, and keep the states up to date."""
+    from . import watch
+
+    for cls in _classes():
+        bpy.utils.register_class(cls)
+    watch.register()
+
+
+def unregister() -> None:
+    """Take everything away again, in reverse order."""
+    from .. import jobs
+    from . import watch
+
+    jobs.stop_current()
+    jobs.stop_watching()
+    watch.unregister()
+    for cls in reversed(_classes()):
+        bpy.utils.unregister_class(cls)

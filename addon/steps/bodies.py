@@ -9,7 +9,7 @@ import bpy
 from ...core.foundation.errors import InputError
 from ...core.images.interlace import BOTH
 from ...core.run.stages import STAGE_INPUTS
-from .. import project, properties, seeds
+from .. import clicks, project, properties
 from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
 from ..panels import sentence
@@ -120,7 +120,7 @@ def seeds_of(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
     frame = scene.tricap.seed_frame
     model = project.body_model(scene)
     wanted = states.joints_of(model) if model else ()
-    return [(name, [view for view, clip in clips.items() if seeds.click(clip, name, frame) is not None]) for name in wanted]
+    return [(name, [view for view, clip in clips.items() if clicks.get_click(clip, name, frame) is not None]) for name in wanted]
 
 
 def _seeds(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:

@@ -22,7 +22,7 @@ from ...core.run.take_run import settings_of
 from ...core.take.clicked_points import clicked_depth
 from ...core.take.take import Footage, Take, footage_frames, open_take
 from .. import folders, project
-from ..clicking import session
+from ..clicking.click_session import joints_of as joints_in_order
 from ..scene.build import KEYS_KEY, OUT_KEY
 from ..session import get_session
 
@@ -280,7 +280,7 @@ def joints_of(model: str) -> tuple[str, ...]:
     """
     known = get_session().file.joints
     if model not in known or model.endswith(".toml"):  # a file may change
-        known[model] = tuple(session.joints_of(read_model(model).skeleton.joint_names))
+        known[model] = tuple(joints_in_order(read_model(model).skeleton.joint_names))
     return known[model]
 
 

@@ -34,7 +34,7 @@ def scene(blender: ModuleType, arm_take: Path) -> Iterator[Any]:
     module("project").open_take(scene, arm_take)
     scene.frame_set(0)
     for clip in module("project").clips_of(scene).values():
-        module("seeds").clear(clip)
+        module("clicks").clear(clip)
     yield scene
     module("clicking.finder").close_all()
 
@@ -42,7 +42,7 @@ def scene(blender: ModuleType, arm_take: Path) -> Iterator[Any]:
 @pytest.fixture
 def session(scene: Any) -> Any:
     operators = module("clicking.operators")
-    names = lambda context, clips: module("clicking.session").joints_of(operators.model_joints(context.scene))  # noqa: E731
+    names = lambda context, clips: module("clicking.click_session").joints_of(operators.model_joints(context.scene))  # noqa: E731
     session, said = operators.begin_session(scene, names)
     assert not said
     return session
@@ -136,7 +136,7 @@ def test_what_is_dragged_is_looked_for_again(session: Any, truth: Truth, scene: 
     before = session.proposals["L"].xy_px
     assert not session.poll()
     to = camera["C"].project(sleeve_point(session, truth, 1))
-    module("seeds").set_click(module("project").clips_of(scene)["C"], session.name, 0, (float(to[0]), float(to[1])))  # as G does
+    module("clicks").set_click(module("project").clips_of(scene)["C"], session.name, 0, (float(to[0]), float(to[1])))  # as G does
     assert session.poll() and session.asking and not session.proposals
     assert session.take_answer(session.finder.wait()) and np.linalg.norm(session.proposals["L"].xy_px - before) > 5
 
@@ -318,7 +318,7 @@ def test_the_canvas_goes_there_and_back(blender: ModuleType) -> None:
 
 
 def test_the_figure_stands_upright_with_its_right_on_the_left() -> None:
-    from tricap.addon.clicking.figure import figure
+    from tricap.addon.clicking.draw import figure
 
     shape = figure()
     assert shape.triangles.reshape(-1, 2).min() >= 0 and shape.triangles[..., 1].max() == pytest.approx(1.0)
@@ -336,7 +336,7 @@ def _holds(t: np.ndarray, p: np.ndarray) -> bool:
 
 
 def test_the_order_of_the_joints(blender: ModuleType) -> None:
-    joints_of = module("clicking.session").joints_of
+    joints_of = module("clicking.click_session").joints_of
     from tricap.core.body.model_file import read_model
 
     every = read_model("full").skeleton.joint_names
@@ -348,7 +348,7 @@ def test_the_order_of_the_joints(blender: ModuleType) -> None:
 @pytest.mark.parametrize("height_px", [600.0, 150.0, 60.0])
 def test_names_of_joints_lie_over_nothing(blender: ModuleType, height_px: float) -> None:
     """On a small figure some names are left out rather than written over others."""
-    labels, shape = module("clicking.labels"), module("clicking.figure").figure()
+    labels, shape = module("clicking.draw"), module("clicking.draw").figure()
     marks = np.array([300.0, 60.0]) + height_px * np.array([*shape.joints.values()])
     widths = np.array([7.0 * len(name) for name in shape.joints])
     corners = labels.place_labels(marks, widths, 11.0, (800, 700))

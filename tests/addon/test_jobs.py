@@ -85,30 +85,30 @@ def test_the_window_gets_its_turn_while_python_computes(jobs: ModuleType) -> Non
 
 
 def test_words_are_told_in_one_workspace(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    status, told = importlib.import_module(f"{ADDON}.status"), {}
+    panels, told = importlib.import_module(f"{ADDON}.panels"), {}
 
     class Workspace(SimpleNamespace):
         def status_text_set(self, words: str | None) -> None:
             told[self.name] = words
 
     layout, clicks = Workspace(name="Layout"), Workspace(name="Clicks")
-    monkeypatch.setattr(status, "bpy", SimpleNamespace(data=SimpleNamespace(workspaces={"Layout": layout, "Clicks": clicks})))
+    monkeypatch.setattr(panels, "bpy", SimpleNamespace(data=SimpleNamespace(workspaces={"Layout": layout, "Clicks": clicks})))
     override, meant = lambda workspace: meant.append(workspace.name) or nullcontext(), []
 
     def showing(workspace: Workspace) -> SimpleNamespace:
         return SimpleNamespace(workspace=layout, window=SimpleNamespace(workspace=workspace), temp_override=override)
 
-    status.tell(showing(layout), "elbow.R")
-    status.tell(showing(clicks), "wrist.R")
+    panels.show_status(showing(layout), "elbow.R")
+    panels.show_status(showing(clicks), "wrist.R")
     assert told == {"Layout": None, "Clicks": "wrist.R"} and meant == ["Layout", "Layout", "Clicks"]
-    status.tell(showing(layout), None)
+    panels.show_status(showing(layout), None)
     assert told == {"Layout": None, "Clicks": None}
 
 
 def test_progress_is_drawn_a_few_times_a_second(jobs: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """And not at all where nothing new is to be told; that it is stopping is told at once."""
     told, now = list[str](), [100.0]
-    monkeypatch.setattr(jobs.status, "tell", lambda context, words: told.append(words))
+    monkeypatch.setattr(jobs, "show_status", lambda context, words: told.append(words))
     monkeypatch.setattr(jobs, "redraw", lambda context: None)
     monkeypatch.setattr(jobs, "time", SimpleNamespace(monotonic=lambda: now[0]))
     watcher = jobs.JobOperator()
@@ -161,7 +161,7 @@ def test_disabling_the_extension_stops_the_job(blender: ModuleType) -> None:
 
 
 def test_wrong_input_is_one_sentence(jobs: ModuleType, blender: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
-    with pytest.raises(RuntimeError, match=r"holds no results of Tricap \(no run.json\)"):
+    with pytest.raises(RuntimeError, match=r"has no results of Tricap \(no run.json\)"):
         blender.ops.tricap.build_scene(out=str(tmp_path))
     with pytest.raises(RuntimeError, match="Choose the take first"):
         blender.ops.tricap.run()

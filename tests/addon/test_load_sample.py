@@ -14,11 +14,11 @@ from tricap.core.synthetic.score import score_run
 @pytest.fixture
 def small(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The operator's module, with a recording that is quicker to make."""
-    from bl_ext.user_default.tricap.addon.operators import load_sample
+    from bl_ext.user_default.tricap.addon.operators import run
 
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    monkeypatch.setattr(load_sample, "SAMPLE", dataclasses.replace(load_sample.SAMPLE, frames=4, width_px=256))
-    return load_sample
+    monkeypatch.setattr(run, "SAMPLE", dataclasses.replace(run.SAMPLE, frames=4, width_px=256))
+    return run
 
 
 def test_beside_the_file_with_the_commands_numbers(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:

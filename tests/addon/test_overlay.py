@@ -233,7 +233,7 @@ def test_it_is_drawn_where_it_is(drawn: Any, run: Any, small_run: SmallRun) -> N
 
 
 def test_the_clicks_are_drawn_where_they_are(blender: ModuleType, drawn: Any, scene: Any, run: Any) -> None:
-    draw, sessions = module("clicking.draw"), module("clicking.session")
+    draw, sessions = module("clicking.draw"), module("clicking.click_session")
     finder = SimpleNamespace(cameras=list(run.cameras.values()), ask=id)
     session = sessions.ClickSession(module("project").clips_of(scene), ["elbow.R"], 3, finder)
     session.click("L", np.array([60.0, 70.0]))

@@ -27,8 +27,8 @@ def project(blender: ModuleType) -> ModuleType:
 
 
 @pytest.fixture
-def seeds(project: ModuleType) -> ModuleType:
-    return importlib.import_module("bl_ext.user_default.tricap.addon.seeds")
+def clicks(project: ModuleType) -> ModuleType:
+    return importlib.import_module("bl_ext.user_default.tricap.addon.clicks")
 
 
 @pytest.fixture
@@ -58,21 +58,21 @@ def test_a_take_goes_into_the_scene_and_out_exactly(project: ModuleType, blender
     assert project.table(scene) == again
 
 
-def test_clicks_lie_where_the_image_shows_them(project: ModuleType, seeds: ModuleType, blender: ModuleType, take: Path) -> None:
+def test_clicks_lie_where_the_image_shows_them(project: ModuleType, clicks: ModuleType, blender: ModuleType, take: Path) -> None:
     scene = blender.context.scene
     project.open_take(scene, take)
     clip = project.clips_of(scene)["L"]  # its image of take frame 3 is number 5, the clip's own 6
     assert clip.frame_start == -2 and clip["tricap_view"] == "L"
     marker = clip.tracking.tracks["elbow.R"].markers.find_frame(6)
     assert marker.co[:] == pytest.approx([(61.2 + 0.5) / 192, 1 - (80.5 + 0.5) / 144], abs=1e-6)
-    seeds.set_click(clip, "elbow.R", 3, (62.0, 81.0))
+    clicks.set_click(clip, "elbow.R", 3, (62.0, 81.0))
     assert project.table(scene)["seeds"]["joints"]["elbow.R"] == {"L": [62.0, 81.0], "R": [59.13, 79.0]}
     marker.co = (0.5, 0.5)  # as by dragging
-    assert seeds.click(clip, "elbow.R", 3) == [95.5, 71.5]
-    assert seeds.remove_click(clip, "elbow.R", 3) and not seeds.remove_click(clip, "elbow.R", 3)
-    assert seeds.remove_click(clip, "elbow.R", 6) and len(clip.tracking.tracks["elbow.R"].markers) == 1, "the last one is only disabled"
-    assert seeds.click(clip, "elbow.R", 6) is None and seeds.frames_of(clip) == {3}
-    seeds.set_click(clip, "elbow.R", 4, (1.0, 2.0))
+    assert clicks.get_click(clip, "elbow.R", 3) == [95.5, 71.5]
+    assert clicks.remove_click(clip, "elbow.R", 3) and not clicks.remove_click(clip, "elbow.R", 3)
+    assert clicks.remove_click(clip, "elbow.R", 6) and len(clip.tracking.tracks["elbow.R"].markers) == 1, "the last one is only disabled"
+    assert clicks.get_click(clip, "elbow.R", 6) is None and clicks.clicked_frames(clip) == {3}
+    clicks.set_click(clip, "elbow.R", 4, (1.0, 2.0))
     assert [(m.frame, m.mute) for m in clip.tracking.tracks["elbow.R"].markers] == [(7, False)]
 
 

@@ -104,11 +104,11 @@ def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, 
 
 
 def click(blender: ModuleType, joints: dict[str, dict[str, list[float]]]) -> None:
-    project, seeds = (importlib.import_module(f"{NAME}.{name}") for name in ("project", "seeds"))
+    project, clicks = (importlib.import_module(f"{NAME}.{name}") for name in ("project", "clicks"))
     clips = project.clips_of(blender.context.scene)
     for name, at in joints.items():
         for view, xy in at.items():
-            seeds.set_click(clips[view], name, 0, xy)
+            clicks.set_click(clips[view], name, 0, xy)
 
 
 def same_numbers_as_the_command(folder: Path) -> None:

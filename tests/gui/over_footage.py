@@ -23,7 +23,7 @@ def steps() -> drive.Steps:
     bpy.ops.tricap.open_take(directory=str(take))
     scene = bpy.context.scene
     for clip in module("addon.project").clips_of(scene).values():
-        module("addon.seeds").clear(clip)
+        module("addon.clicks").clear(clip)
     scene.tricap.out = str(take / "results")
     bpy.ops.ed.undo_push(message="Opened")
     yield from opened()

@@ -28,7 +28,7 @@ def scene_frame(clip: bpy.types.MovieClip, own: int) -> int:
     return own + clip.frame_start - 1
 
 
-def is_seed(name: str) -> bool:
+def is_click(name: str) -> bool:
     """Whether a track of this name is a click of ours."""
     return name in JOINTS or SURFACE.fullmatch(name) is not None
 
@@ -62,19 +62,19 @@ def remove_click(clip: bpy.types.MovieClip, name: str, frame: int) -> bool:
     return True
 
 
-def click(clip: bpy.types.MovieClip, name: str, frame: int) -> list[float] | None:
+def get_click(clip: bpy.types.MovieClip, name: str, frame: int) -> list[float] | None:
     """The pixel [x, y] of a click, or None where there is none in that frame."""
     track = clip.tracking.tracks.get(name)
     marker = _keyed(track, clip_frame(clip, frame)) if track is not None else None
     return None if marker is None else pixel_of(marker.co, tuple(clip.size))
 
 
-def frames_of(clip: bpy.types.MovieClip) -> set[int]:
+def clicked_frames(clip: bpy.types.MovieClip) -> set[int]:
     """The scene's frames in which the clip has clicks."""
     return {scene_frame(clip, m.frame) for track in _tracks(clip) for m in track.markers if m.is_keyed and not m.mute}
 
 
-def clicks(clips: dict[str, bpy.types.MovieClip], frame: int) -> tuple[Clicks, list[dict[str, list[float]]]]:
+def clicks_of_frame(clips: dict[str, bpy.types.MovieClip], frame: int) -> tuple[Clicks, list[dict[str, list[float]]]]:
     """The clicks of one frame in all views: joints by name, in the skeleton's order, and surface seeds in the order of their numbers."""
     found: Clicks = {}
     for view, clip in clips.items():
@@ -105,14 +105,14 @@ def pixel_of(co: tuple[float, float], size_px: tuple[int, int]) -> list[float]:
     return [float(v) for v in exact]
 
 
-def alike(a: list[float], b: list[float], size_px: tuple[int, int]) -> bool:
+def is_same_pixel(a: list[float], b: list[float], size_px: tuple[int, int]) -> bool:
     """Whether two pixels are one marker to Blender."""
     uv = [np.float32(axes.uv_from_pixel(np.array(xy, dtype=np.float64), size_px)) for xy in (a, b)]
     return bool(np.array_equal(uv[0], uv[1]))
 
 
 def _tracks(clip: bpy.types.MovieClip) -> Iterator[bpy.types.MovieTrackingTrack]:
-    return (track for track in clip.tracking.tracks if is_seed(track.name))
+    return (track for track in clip.tracking.tracks if is_click(track.name))
 
 
 def _keyed(track: bpy.types.MovieTrackingTrack, own: int) -> bpy.types.MovieTrackingMarker | None:

@@ -14,7 +14,7 @@ from ...core.fitting.inputs.clicks import intersection
 from ...core.foundation.errors import InputError
 from ...core.matching.foreground import around_clicks
 from ...core.matching.proposals import Proposal, below_surface, epipolar_curve, where_rays_meet
-from .. import seeds
+from .. import clicks
 from .finder import Answer, Finder, Question
 
 CLICK_SIGMA_PX = 3.0
@@ -98,7 +98,7 @@ class ClickSession:
     def clicks(self, name: str | None = None) -> dict[str, np.ndarray]:
         """Where a joint (the present one) was clicked in this frame: view → pixel (2,)."""
         name = self.name if name is None else name
-        found = {view: seeds.click(clip, name, self.frame) for view, clip in self.clips.items()} if name else {}
+        found = {view: clicks.get_click(clip, name, self.frame) for view, clip in self.clips.items()} if name else {}
         return {view: np.array(xy) for view, xy in found.items() if xy is not None}
 
     def click(self, view: str, xy_px: np.ndarray, snap_px: float = 0.0) -> None:
@@ -130,9 +130,9 @@ class ClickSession:
             self.turn = step.turn
             for frame, name, view, xy in reversed(step.before):
                 if xy is None:
-                    seeds.remove_click(self.clips[view], name, frame)
+                    clicks.remove_click(self.clips[view], name, frame)
                 else:
-                    seeds.set_click(self.clips[view], name, frame, (xy[0], xy[1]))
+                    clicks.set_click(self.clips[view], name, frame, (xy[0], xy[1]))
         elif self.turn > 0:
             self.turn -= 1
         else:
@@ -213,8 +213,8 @@ class ClickSession:
         for view, xy in at.items():
             clip = self.clips[view]
             inside = np.clip(xy, -0.5, np.array(clip.size) - 0.5)
-            step.before.append((self.frame, self.name, view, seeds.click(clip, self.name, self.frame)))
-            _select(clip, seeds.set_click(clip, self.name, self.frame, (float(inside[0]), float(inside[1]))))
+            step.before.append((self.frame, self.name, view, clicks.get_click(clip, self.name, self.frame)))
+            _select(clip, clicks.set_click(clip, self.name, self.frame, (float(inside[0]), float(inside[1]))))
         self._history.append(step)
         if len(self.clicks()) == len(self.views):
             self.go_to_next(self.turn + 1)
@@ -255,6 +255,6 @@ def free_seed_names(clips: Mapping[str, bpy.types.MovieClip], frame: int, count:
     taken = {
         name
         for name in (f"seed {i}" for i in range(1, count))
-        if sum(seeds.click(clip, name, frame) is not None for clip in clips.values()) > 1
+        if sum(clicks.get_click(clip, name, frame) is not None for clip in clips.values()) > 1
     }
     return [name for name in (f"seed {i}" for i in range(1, count)) if name not in taken]

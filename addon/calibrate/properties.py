@@ -1,10 +1,8 @@
-"""What Blender is told of calibration: properties and operators."""
+"""The settings of the wand calibration, in the scene: `scene.tricap_calibrate`."""
 
 import bpy
 
-from .. import jobs
 from ..take_properties import FIELDS, LINES
-from . import operators, world
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
@@ -72,22 +70,3 @@ class TricapCalibrate(bpy.types.PropertyGroup):
     verdict: bpy.props.StringProperty(name="Verdict")  # type: ignore[valid-type]
     advice: bpy.props.StringProperty(name="Advice")  # type: ignore[valid-type]
     rig: bpy.props.StringProperty(name="Rig", subtype="FILE_PATH")  # type: ignore[valid-type]
-
-
-CLASSES = (TricapCalibrate, *operators.CLASSES, *world.CLASSES)
-
-
-def register() -> None:
-    """Register everything, in order."""
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-    bpy.types.Scene.tricap_calibrate = bpy.props.PointerProperty(type=TricapCalibrate)
-
-
-def unregister() -> None:
-    """Stop a running job and take everything away again, in reverse order."""
-    jobs.stop_current()
-    jobs.stop_watching()
-    del bpy.types.Scene.tricap_calibrate
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
