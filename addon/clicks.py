@@ -1,8 +1,8 @@
-"""What was clicked: native tracking tracks in the clips of the views, one track per joint or surface seed, a marker per clicked frame.
+"""Clicks: native tracking tracks in the clips of the views, one track per joint or surface seed, one marker per clicked frame.
 
-A track is named exactly like the joint ("elbow.R"); surface seeds are "seed 1", "seed 2", … Frame t of the take is frame t of the scene; a
-clip counts its own frames from 1. Markers that a tracker set (not keyed) and disabled ones are no clicks. Blender cannot be without the
-last marker of a track, so a click that is taken back there is disabled.
+A track has the name of its joint ("elbow.R"); surface seeds are "seed 1", "seed 2", … Frame t of the take is frame t of the scene; a
+clip counts its own frames from 1. Disabled markers, and those that a tracker set (not keyed), are not clicks. Blender cannot delete the
+last marker of a track, so a click that is removed there is disabled.
 """
 
 import re
@@ -14,27 +14,27 @@ import numpy as np
 from ..core.take.take import JOINTS
 from .scene import axes
 
-SURFACE = re.compile(r"seed (\d+)")
+SURFACE_SEED = re.compile(r"seed (\d+)")
 Clicks = dict[str, dict[str, list[float]]]  # name -> view -> [x, y] in full-frame pixels
 
 
 def clip_frame(clip: bpy.types.MovieClip, frame: int) -> int:
-    """The clip's own number of the scene's frame `frame`."""
+    """The clip's own number of a frame of the scene."""
     return frame - clip.frame_start + 1
 
 
 def scene_frame(clip: bpy.types.MovieClip, own: int) -> int:
-    """The scene's number of the clip's own frame."""
+    """The scene's number of the clip's frame `own`."""
     return own + clip.frame_start - 1
 
 
 def is_click(name: str) -> bool:
-    """Whether a track of this name is a click of ours."""
-    return name in JOINTS or SURFACE.fullmatch(name) is not None
+    """Whether a track of this name is a joint or a surface seed."""
+    return name in JOINTS or SURFACE_SEED.fullmatch(name) is not None
 
 
 def set_click(clip: bpy.types.MovieClip, name: str, frame: int, xy_px: tuple[float, float]) -> bpy.types.MovieTrackingTrack:
-    """Put a click (pixels; the centre of the top-left pixel is (0, 0)) into a frame of the scene; gives its track."""
+    """Set a click (pixels; the centre of the top-left pixel is (0, 0)) in a frame of the scene; returns its track."""
     own = clip_frame(clip, frame)
     track = clip.tracking.tracks.get(name)
     if track is None:
@@ -49,7 +49,7 @@ def set_click(clip: bpy.types.MovieClip, name: str, frame: int, xy_px: tuple[flo
 
 
 def remove_click(clip: bpy.types.MovieClip, name: str, frame: int) -> bool:
-    """Take a click back; False where there was none."""
+    """Remove a click; False if there was none."""
     track = clip.tracking.tracks.get(name)
     own = clip_frame(clip, frame)
     marker = _keyed(track, own) if track is not None else None
@@ -63,7 +63,7 @@ def remove_click(clip: bpy.types.MovieClip, name: str, frame: int) -> bool:
 
 
 def get_click(clip: bpy.types.MovieClip, name: str, frame: int) -> list[float] | None:
-    """The pixel [x, y] of a click, or None where there is none in that frame."""
+    """The pixel [x, y] of a click, None if there is none in that frame."""
     track = clip.tracking.tracks.get(name)
     marker = _keyed(track, clip_frame(clip, frame)) if track is not None else None
     return None if marker is None else pixel_of(marker.co, tuple(clip.size))
@@ -83,19 +83,19 @@ def clicks_of_frame(clips: dict[str, bpy.types.MovieClip], frame: int) -> tuple[
             if marker is not None:
                 found.setdefault(track.name, {})[view] = pixel_of(marker.co, tuple(clip.size))
     joints = {name: found[name] for name in JOINTS if name in found}
-    numbered = sorted((int(n[1]), name) for name in found if (n := SURFACE.fullmatch(name)))
+    numbered = sorted((int(n[1]), name) for name in found if (n := SURFACE_SEED.fullmatch(name)))
     return joints, [found[name] for _, name in numbered]
 
 
 def clear(clip: bpy.types.MovieClip) -> None:
-    """Take back every click in the clip."""
+    """Remove every click from the clip."""
     for track in list(_tracks(clip)):
         for own in [m.frame for m in track.markers]:
             remove_click(clip, track.name, scene_frame(clip, own))
 
 
 def pixel_of(co: tuple[float, float], size_px: tuple[int, int]) -> list[float]:
-    """The pixel [x, y] with the fewest decimals among those that Blender, in single precision, keeps alike."""
+    """The pixel [x, y] with the fewest decimals that Blender, in single precision, stores as these coordinates."""
     exact = axes.pixel_from_uv(np.array(co, dtype=np.float64), size_px)
     stored = np.float32(co)
     for digits in range(10):
@@ -106,7 +106,7 @@ def pixel_of(co: tuple[float, float], size_px: tuple[int, int]) -> list[float]:
 
 
 def is_same_pixel(a: list[float], b: list[float], size_px: tuple[int, int]) -> bool:
-    """Whether two pixels are one marker to Blender."""
+    """Whether two pixels are the same marker in single precision."""
     uv = [np.float32(axes.uv_from_pixel(np.array(xy, dtype=np.float64), size_px)) for xy in (a, b)]
     return bool(np.array_equal(uv[0], uv[1]))
 

@@ -1,4 +1,4 @@
-"""Which folders a user means: the take's and the output's, from the panel or from an operator's arguments."""
+"""The take's and the output's folder, from the panel or from an operator's arguments."""
 
 import os
 from pathlib import Path
@@ -12,19 +12,19 @@ def take_folder(given: str, scene: bpy.types.Scene) -> Path:
     """The folder of the take: `given`, or the panel's.
 
     Raises:
-        InputError: none was chosen, or it is no folder.
+        InputError: none was chosen, or it is not a folder.
     """
     chosen = given or scene.tricap.take
     if not chosen:
-        raise InputError("Choose the take first: the folder of a recording, with take.toml in it.")
+        raise InputError("Choose the take first: the folder of a recording that contains take.toml.")
     folder = absolute(chosen)
     if not folder.is_dir():
-        raise InputError(f"The take {folder} is no folder; choose the folder that holds take.toml.")
+        raise InputError(f"The take {folder} is not a folder; choose the folder that contains take.toml.")
     return folder
 
 
 def output_folder(given: str, scene: bpy.types.Scene, take: str = "") -> Path:
-    """The output folder: `given`, or the panel's, or one named after the take beside the .blend (if it is saved) or the take.
+    """The output folder: `given`, or the panel's, or one named after the take next to the .blend (if it is saved) or the take.
 
     Raises:
         InputError: it is relative to a .blend that was never saved.
@@ -38,7 +38,7 @@ def output_folder(given: str, scene: bpy.types.Scene, take: str = "") -> Path:
 
 
 def check_writable(folder: Path) -> None:
-    """See that `folder` can be written to, or be made.
+    """Check that `folder` can be written to, or created.
 
     Raises:
         InputError: it cannot.
@@ -49,18 +49,18 @@ def check_writable(folder: Path) -> None:
 
 
 def absolute(path: str) -> Path:
-    """The full path of one that a user chose.
+    """The full path of what a user chose.
 
     Raises:
         InputError: it is relative to a .blend that was never saved.
     """
     if path.startswith("//") and not bpy.data.filepath:
-        raise InputError(f"The folder {path} is relative to the Blender file, which was never saved; save it or choose a full path.")
+        raise InputError(f"The folder {path} is relative to the Blender file, which was never saved. Save it, or choose a full path.")
     return Path(bpy.path.abspath(path)).resolve()
 
 
 def for_user(path: Path) -> str:
-    """A path as the panel keeps it: relative to the .blend where that is saved on the same disk, so that both can be moved together."""
+    """A path for the panel: relative to the .blend if that is saved on the same disk, so that both can be moved together."""
     try:
         return bpy.path.relpath(str(path)) if bpy.data.filepath else str(path)
     except ValueError:  # another drive

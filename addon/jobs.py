@@ -1,8 +1,8 @@
-"""Long work: one job, two drivers.
+"""Long computations: one job, two drivers.
 
-A job is a function of a `Monitor` that knows nothing of Blender. `Job.run()` computes it here and now (scripts, background);
-`Job.start()` computes it on a worker thread while a modal operator watches. Whatever ends the session (Esc, another file, quitting,
-disabling the add-on) cancels the job AND waits for its thread.
+A job is a function of a `Monitor` that is independent of Blender. `Job.run()` computes it at once (scripts, background); `Job.start()`
+computes it on a worker thread while a modal operator watches. Whatever ends the session (Esc, another file, quitting, disabling the
+add-on) cancels the job AND waits for its thread.
 
 `JobOperator` gives an operator three moves: `snapshot` (main thread: read what is needed from Blender) → the function it returns
 (any thread, no bpy) → `finish` (main thread: write the result into the scene).
@@ -15,7 +15,8 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import bpy
@@ -28,40 +29,41 @@ from .session import get_session
 
 log = logging.getLogger(__name__)
 
-TICK_S, SHOW_S = 0.1, 0.25  # how often a job is looked at, and its progress drawn: where the machine is busy, drawing is what takes long
-PACE_S, PACE_PARTS = 20.0, 200  # the time left is told from the pace of the last seconds
-ENOUGH = 0.05  # of a stage, or one of its parts: how a part begins says nothing of the whole
-SWITCH_S = 0.0005  # how soon the worker hands the interpreter to the window: redrawn after 30…90 ms at worst; Python's 5 ms: 130 ms
-BUG = "Tricap made a mistake ({error}); the console shows where. Please report it with that text."
+TICK_S = 0.1  # between two looks at a job
+SHOW_S = 0.25  # between two drawings of its progress: on a busy machine drawing takes the most time
+PACE_S, PACE_PARTS = 20.0, 200  # the time left is estimated from the pace of the last seconds, or parts
+ENOUGH = 0.05  # of a stage, or one of its parts, before the time left is estimated
+SWITCH_S = 0.0005  # after which the worker hands the interpreter to the window: redrawn after 30…90 ms at worst; with Python's 5 ms 130 ms
+BUG = "Internal error in Tricap ({error}). Please report it with the text in the system console."
 
 
 class Job:
     """One computation with its progress, and afterwards its `result` or `error` (with `trace`, the traceback as text)."""
 
-    def __init__(self, compute: Callable[[Monitor], Any], step_at: Callable[[str], str] = str) -> None:
-        self._compute, self._step_at = compute, step_at
+    def __init__(self, compute: Callable[[Monitor], Any], steps: Mapping[str, str] | None = None, first_step: str = "") -> None:
+        self._compute, self._steps, self._first_step = compute, steps or {}, first_step
         self._thread: threading.Thread | None = None
         self.monitor = Monitor(self._note)
         self.stage, self.done, self.total = "", 0.0, 0.0
-        self._pace: deque[tuple[float, float]] = deque(maxlen=PACE_PARTS)  # when, and which fraction of the present stage was done
+        self._pace: deque[tuple[float, float]] = deque(maxlen=PACE_PARTS)  # time, and fraction of the current stage
         self.result: Any = None
         self.error: BaseException | None = None
         self.trace = ""
 
     def run(self) -> None:
-        """Compute here and now; never raises: look at `error`."""
+        """Compute at once; never raises: see `error`."""
         try:
             with one_thread_in_linear_algebra():
                 self.result = self._compute(self.monitor)
-        except BaseException as error:  # the edge of the thread: whatever happens is told by the operator
+        except BaseException as error:  # the edge of the thread: the operator reports whatever happens
             self.error, self.trace = error, traceback.format_exc()
 
     def start(self) -> None:
         """Compute on a worker thread."""
-        self._thread = threading.Thread(target=self._run_beside, name="tricap job", daemon=True)
+        self._thread = threading.Thread(target=self._run_in_thread, name="tricap job", daemon=True)
         self._thread.start()
 
-    def _run_beside(self) -> None:
+    def _run_in_thread(self) -> None:
         before = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         try:
@@ -76,7 +78,7 @@ class Job:
 
     @property
     def fraction(self) -> float:
-        """How far the present stage is, 0…1."""
+        """The fraction of the current stage that is done, 0…1."""
         return min(max(self.done / self.total, 0.0), 1.0) if self.total > 0 else 0.0
 
     def cancel_and_join(self) -> None:
@@ -87,8 +89,8 @@ class Job:
 
     @property
     def seconds_left(self) -> float | None:
-        """Until the end of the present stage, at the pace until the last sign of life; None as long as too little is done to tell it, and
-        once it is over and the stage is not."""
+        """Until the end of the current stage, at its recent pace; None as long as too little is done for an estimate, and when that time
+        has passed."""
         pace = list(self._pace)
         if len(pace) < 2 or pace[-1][1] - pace[0][1] < min(ENOUGH, 1.0 / max(self.total, 1.0)):
             return None
@@ -97,20 +99,20 @@ class Job:
         return left if left > 0 else None
 
     @property
-    def stage_words(self) -> str:
-        """What is being done, for people."""
+    def stage_text(self) -> str:
+        """What is computed now, for people."""
         return "Stopping" if self.monitor.cancelled else self.stage or "Starting"
 
     @property
-    def left_words(self) -> str:
-        """The time left of the present stage, "" where it cannot be told."""
+    def left_text(self) -> str:
+        """The time left in the current stage, "" without an estimate."""
         left = self.seconds_left
-        return "" if left is None or self.monitor.cancelled else f"{time_words(left)} left"
+        return "" if left is None or self.monitor.cancelled else f"{time_text(left)} left"
 
     @property
     def step(self) -> str:
-        """The step of the workflow to which the present stage belongs."""
-        return self._step_at(self.stage)
+        """The step of the panel to which the monitor's task belongs."""
+        return self._steps.get(self.monitor.task, self._first_step)
 
     def _note(self, stage: str, done: float, total: float) -> None:
         if stage != self.stage:
@@ -123,8 +125,8 @@ class Job:
             self._pace.popleft()
 
 
-def time_words(seconds: float) -> str:
-    """A time left in words: "40 s", "3 min", "1 h 20 min"."""
+def time_text(seconds: float) -> str:
+    """A time left: "40 s", "3 min", "1 h 20 min"."""
     whole = max(0, round(seconds))
     if whole < 90:
         return f"{whole} s"
@@ -133,7 +135,7 @@ def time_words(seconds: float) -> str:
 
 
 class JobState(bpy.types.PropertyGroup):
-    """What the panel shows of the running job. Only read: setting a property would draw the whole window again, the 3-D view with it."""
+    """What the panel shows of the running job. Read-only: setting a property would redraw the whole window, including the 3-D view."""
 
     running: bpy.props.BoolProperty(name="Running", get=lambda _: _watched() is not None)  # type: ignore[valid-type]
     progress: bpy.props.FloatProperty(
@@ -142,8 +144,8 @@ class JobState(bpy.types.PropertyGroup):
         max=1.0,  # type: ignore[valid-type]
         get=lambda _: job.fraction if (job := _watched()) else 0.0,
     )
-    stage: bpy.props.StringProperty(name="Stage", get=lambda _: job.stage_words if (job := _watched()) else "")  # type: ignore[valid-type]
-    left: bpy.props.StringProperty(name="Time Left", get=lambda _: job.left_words if (job := _watched()) else "")  # type: ignore[valid-type]
+    stage: bpy.props.StringProperty(name="Stage", get=lambda _: job.stage_text if (job := _watched()) else "")  # type: ignore[valid-type]
+    left: bpy.props.StringProperty(name="Time Left", get=lambda _: job.left_text if (job := _watched()) else "")  # type: ignore[valid-type]
     step: bpy.props.StringProperty(name="Step", get=lambda _: job.step if (job := _watched()) else "")  # type: ignore[valid-type]
 
 
@@ -181,21 +183,17 @@ class JobOperator:
 
     job: Job
     timer: Any = None
-    shown: tuple[str, float] = ("", 0.0)  # the words that tell the progress, and since when
-    step: ClassVar[str] = ""  # of the workflow, in which the job is at its beginning
-    last_words: ClassVar[str] = ""
+    shown: tuple[str, float] = ("", 0.0)  # the text in the status bar, and since when
+    step: ClassVar[str] = ""  # of the panel, with which the job begins
+    steps: ClassVar[Mapping[str, str]] = MappingProxyType({})  # of the panel, by the monitor's task
+    if_stopped: ClassVar[str] = ""  # a sentence for those who stop it
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Any]:
         """Main thread: read everything from Blender and return the computation."""
         raise NotImplementedError
 
-    @classmethod
-    def step_at(cls, stage: str) -> str:
-        """The step of the workflow to which a stage of the computation belongs."""
-        return cls.step
-
     def finish(self, context: bpy.types.Context, result: Any) -> set[str]:
-        """Main thread: write the result into the scene; returns the operator's result."""
+        """Main thread: write the result to the scene; returns the operator's result."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -207,10 +205,10 @@ class JobOperator:
         return self._conclude(context, job)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Modal driver: starts the thread and watches it."""
+        """Modal driver: start the thread and watch it."""
         session = get_session()
         if session.job is not None:
-            self.report({"ERROR"}, "Another Tricap job is running; wait for it or press Esc.")  # type: ignore[attr-defined]
+            self.report({"ERROR"}, "Another Tricap job is running. Wait for it, or press Esc.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         job = self._prepare(context)
         if job is None:
@@ -224,7 +222,7 @@ class JobOperator:
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Shows the progress; Esc cancels: the window stays alive until the thread has seen it."""
+        """Show the progress; Esc cancels, and the window stays responsive until the thread has stopped."""
         if event.type == "ESC" and event.value == "PRESS":
             self.job.monitor.cancel()
         elif event.type != "TIMER":
@@ -242,7 +240,7 @@ class JobOperator:
 
     def _prepare(self, context: bpy.types.Context) -> Job | None:
         try:
-            return Job(self.snapshot(context), type(self).step_at)
+            return Job(self.snapshot(context), self.steps, self.step)
         except InputError as error:
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
             return None
@@ -254,36 +252,36 @@ class JobOperator:
                 ended = self.finish(context, job.result)
             except InputError as mistake:
                 error = mistake
-            except Exception as bug:  # the edge of the job: whatever happens is told, and the panel hears that the job has ended
+            except Exception as bug:  # the edge of the job: whatever happens is reported, and the panel learns that the job has ended
                 error, job.trace = bug, traceback.format_exc()
         if error is not None:
-            self._tell(job, error)
+            self._report_error(job, error)
         stopped = str(error) if isinstance(error, Cancelled) else ""
-        failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else _sentence(error)
+        failed = "" if error is None or isinstance(error, (Cancelled, KeyboardInterrupt)) else _message(error)
         for listener in get_session().on_job_end:
             listener(context, job.step, failed, stopped)
         return ended
 
-    def _tell(self, job: Job, error: BaseException) -> None:
+    def _report_error(self, job: Job, error: BaseException) -> None:
         if isinstance(error, InputError):
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
         elif isinstance(error, (Cancelled, KeyboardInterrupt)):
-            self.report({"WARNING"}, f"{error} {self.last_words}".strip())  # type: ignore[attr-defined]
+            self.report({"WARNING"}, f"{error} {self.if_stopped}".strip())  # type: ignore[attr-defined]
         else:
             log.error("A Tricap job failed.\n%s", job.trace)
-            self.report({"ERROR"}, _sentence(error))  # type: ignore[attr-defined]
+            self.report({"ERROR"}, _message(error))  # type: ignore[attr-defined]
 
     def _show(self, context: bpy.types.Context) -> None:
         job = self.job
-        words = job.stage_words + ("" if job.monitor.cancelled else f" {job.fraction:.0%}  {job.left_words}  (Esc stops)")
+        text = job.stage_text + ("" if job.monitor.cancelled else f" {job.fraction:.0%}  {job.left_text}  (Esc stops)")
         before, since = self.shown
-        if words != before and (job.monitor.cancelled or time.monotonic() - since >= SHOW_S):
-            self.shown = words, time.monotonic()
-            show_status(context, f"Tricap: {words}")
+        if text != before and (job.monitor.cancelled or time.monotonic() - since >= SHOW_S):
+            self.shown = text, time.monotonic()
+            show_status(context, f"Tricap: {text}")
             redraw(context)
 
     def clear(self, context: bpy.types.Context) -> None:
-        """The watching is over: no timer, no progress."""
+        """Remove the timer and the progress."""
         session = get_session()
         session.job_operator = None
         wm = context.window_manager
@@ -296,12 +294,12 @@ class JobOperator:
         redraw(context)
 
 
-def _sentence(error: BaseException) -> str:
+def _message(error: BaseException) -> str:
     return str(error) if isinstance(error, InputError) else BUG.format(error=f"{type(error).__name__}: {error}")
 
 
 def redraw(context: bpy.types.Context) -> None:
-    """Draw the sidebars again, where our panels are; not the views themselves: a heavy scene would be drawn ten times a second."""
+    """Redraw the sidebars with our panels; not the views themselves: a heavy scene would be drawn ten times a second."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in ("VIEW_3D", "CLIP_EDITOR"):
@@ -319,7 +317,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Stop what runs, and take everything away again."""
+    """Stop the running job and unregister everything."""
     stop_current()
     atexit.unregister(stop_current)
     bpy.app.handlers.load_pre.remove(_stop_before_load)

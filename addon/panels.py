@@ -10,7 +10,7 @@ CHARACTER_PX, MARGIN_PX, NARROW = 6.6, 40, 20
 
 
 class TricapPanel:
-    """Where all panels live."""
+    """The place of all panels of the 3-D view."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -18,7 +18,7 @@ class TricapPanel:
 
 
 def sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
-    """A sentence in as many lines as the sidebar's width needs, the icon before the first."""
+    """A sentence, wrapped to the sidebar's width, with the icon before its first line."""
     region = context.region
     width = region.width / context.preferences.system.ui_scale if region is not None else 0
     column = layout.column(align=True)

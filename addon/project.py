@@ -1,11 +1,11 @@
-"""The project: a take on disk, beside the .blend, that says in take.toml what the scene says, so that the panel's buttons and the `tricap`
-command give the same numbers.
+"""The project: a take on disk, next to the .blend, whose take.toml has the same values as the scene, so that the panel's buttons and the
+`tricap` command give the same numbers.
 
-    scene (views, clips, clicks, knobs)  ── write ──▶  TAKE/take.toml, footage linked into TAKE
+    scene (views, clips, clicks, settings)  ── write ──▶  TAKE/take.toml, footage linked into TAKE
     TAKE/take.toml                       ── open_take ──▶  scene
 
-A scene is bound to a take once it has views of its own. Without views, a take that is merely named is run as its file stands.
-Other parts of the add-on that keep something of take.toml in the scene add a function to `Session.take_writers` and `take_readers`.
+A scene is bound to a take once it has views. Without views, the take that the panel names is run as its file is.
+Other parts of the add-on that have values of take.toml in the scene add a function to `Session.take_writers` and `take_readers`.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -28,11 +28,12 @@ from .scene import clips
 from .session import get_session
 
 ENDING, RESULTS, VIEW_KEY = "_tricap", "results", "tricap_view"
-OTHER_LINES = "The footage is shown in other frames than Lines now asks for; press Reload Footage to show it so."
+OTHER_FIELDS = "The footage does not show the chosen fields. Press Reload Footage."
+CHANGED_OUTSIDE = "take.toml was changed outside Blender. Reload Take uses these changes, Overwrite Take discards them."
 
 
 def bound(scene: bpy.types.Scene) -> bool:
-    """Whether the scene has footage of its own, so that its take.toml is written from it."""
+    """Whether the scene has footage, so that take.toml is written from the scene."""
     return len(scene.tricap.views) > 0
 
 
@@ -45,25 +46,25 @@ def folder_of(scene: bpy.types.Scene) -> Path:
     if scene.tricap.take:
         return folders.absolute(scene.tricap.take)
     if not bpy.data.filepath:
-        raise InputError("Save the Blender file first (the project's folder is made beside it), or choose a folder for the project.")
+        raise InputError("Save the Blender file first: the project folder is created next to it. Or choose a folder for the project.")
     blend = Path(bpy.data.filepath)
     return blend.with_name(blend.stem + ENDING).resolve()
 
 
 def make_folder(scene: bpy.types.Scene) -> Path:
-    """The project's folder, made where it was not there; the scene remembers it and the folder for results in it.
+    """The project's folder, created if needed; the scene stores it and the folder for the results in it.
 
     Raises:
-        InputError: see `folder_of`; it cannot be written to, or holds the take of another file.
+        InputError: see `folder_of`; it cannot be written to, or contains the take of another file.
     """
     folder = folder_of(scene)
     if not bound(scene) and (folder / "take.toml").exists():
-        raise InputError(f"{folder} holds a take already; press Open Take to go on with it, or choose another folder for the project.")
+        raise InputError(f"{folder} already contains a take. Press Open Take to use it, or choose another folder for the project.")
     folders.check_writable(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"Cannot make the folder {folder}: {error.strerror or error}. Choose another place for the project.") from error
+        raise InputError(f"Cannot create the folder {folder}: {error.strerror or error}. Choose another place for the project.") from error
     scene.tricap.take = folders.for_user(folder)
     if not scene.tricap.out:
         scene.tricap.out = folders.for_user(folder / RESULTS)
@@ -98,47 +99,47 @@ def rig_of(scene: bpy.types.Scene) -> Rig | None:
 
 
 def take(scene: bpy.types.Scene) -> Take:
-    """The take as the scene says it now; nothing is written.
+    """The take with the scene's current values; nothing is written.
 
     Raises:
-        InputError: something is missing or cannot be.
+        InputError: something is missing or invalid.
     """
     folder = folder_of(scene)
     return take_of_table(folder, table(scene))
 
 
 def write(scene: bpy.types.Scene, *, overwrite: bool = False) -> Path:
-    """Write take.toml as the scene says it, if it differs; gives the project's folder.
+    """Write take.toml from the scene, if it differs; returns the project's folder.
 
     Raises:
-        InputError: the folder is gone or read-only, the scene's values cannot be, or somebody else changed the file (unless `overwrite`).
+        InputError: the folder is missing or read-only, a value is invalid, or the file was changed outside (unless `overwrite`).
     """
     folder = existing_folder(scene)
-    if shows_other_lines(scene):
-        raise InputError(OTHER_LINES)
+    if shows_other_fields(scene):
+        raise InputError(OTHER_FIELDS)
     if not overwrite and changed_outside(scene):
-        raise InputError(f"{folder / 'take.toml'} was changed outside this file; press Reload Take to take that over, or Keep Mine.")
+        raise InputError(CHANGED_OUTSIDE)
     write_table(folder, table(scene))
     remember(scene, folder)
     return folder
 
 
 def fields_of(scene: bpy.types.Scene) -> FieldLayout:
-    """Where in the footage's images the scene's frames are."""
+    """Which images and fields of the footage are the scene's frames."""
     return field_layout(scene.tricap.interlaced, scene.tricap.first_field)
 
 
-def shows_other_lines(scene: bpy.types.Scene) -> bool:
-    """Whether the clips show whole images where fields are wanted, or the other way about: frames have other numbers then."""
+def shows_other_fields(scene: bpy.types.Scene) -> bool:
+    """Whether the clips show whole images where fields are chosen, or the reverse: their frame numbers differ."""
     wanted = _first_field(scene)
     return any(view.clip is not None and view.clip.get(clips.FIELDS_KEY, "") != wanted for view in scene.tricap.views)
 
 
-def show_lines(scene: bpy.types.Scene) -> None:
-    """Show the footage as `interlaced` wants it, with every frame's number in take.toml, clicks and corrections changed to suit.
+def show_fields(scene: bpy.types.Scene) -> None:
+    """Show the chosen fields of the footage; the frame numbers in take.toml, of clicks and corrections are converted.
 
     Raises:
-        InputError: take.toml cannot be written, or the fields' pictures cannot be made.
+        InputError: take.toml cannot be written, or the images of the fields cannot be made.
     """
     folder = existing_folder(scene)
     shown = max(clips.frames_per_image(clip) for clip in clips_of(scene).values())
@@ -149,12 +150,12 @@ def show_lines(scene: bpy.types.Scene) -> None:
 
 
 def _first_field(scene: bpy.types.Scene) -> str:
-    """The field that is first where both are measured, else ""."""
+    """The field that comes first if both are measured, else ""."""
     return str(scene.tricap.first_field) if scene.tricap.interlaced == BOTH else ""
 
 
 def files_of(folder: Path, entries: Sequence[Table], fields: FieldLayout) -> dict[str, Path]:
-    """By view, the file by which Blender opens the footage of every entry of [[views]].
+    """By view, the file with which Blender opens the footage of every entry of [[views]].
 
     Raises:
         InputError: footage is missing.
@@ -163,10 +164,10 @@ def files_of(folder: Path, entries: Sequence[Table], fields: FieldLayout) -> dic
 
 
 def edit(scene: bpy.types.Scene, change: Callable[[Table], None]) -> None:
-    """Write take.toml with a change of something that the scene does not keep itself.
+    """Change something in take.toml that the scene has no value for.
 
     Raises:
-        InputError: see `write`; the changed table is no take.
+        InputError: see `write`; the changed table is not a valid take.
     """
     folder = write(scene)
     edited = read_table(folder)
@@ -179,39 +180,39 @@ def existing_folder(scene: bpy.types.Scene) -> Path:
     """The project's folder.
 
     Raises:
-        InputError: it is not there any more.
+        InputError: it no longer exists.
     """
     folder = folder_of(scene)
     if not folder.is_dir():
-        raise InputError(f"The project's folder {folder} is not there; move it back, or choose where it is now.")
+        raise InputError(f"The project folder {folder} does not exist. Move it back, or choose where it is now in step 1.")
     return folder
 
 
 def changed_outside(scene: bpy.types.Scene) -> bool:
-    """Whether take.toml says something that this scene neither read nor wrote."""
+    """Whether take.toml is in a version that this scene neither read nor wrote."""
     path = folder_of(scene) / "take.toml"
     return path.exists() and store.digest(path) not in {scene.tricap.take_digest, *get_session().take_digests}
 
 
 def remember(scene: bpy.types.Scene, folder: Path) -> None:
-    """The file is now what the scene says."""
+    """The file and the scene now agree."""
     digest = store.digest(folder / "take.toml")
     get_session().take_digests.add(digest)
     scene.tricap.take_digest = digest
 
 
 def table(scene: bpy.types.Scene) -> Table:
-    """What take.toml is to say: what the file says, with what the scene keeps put in its place.
+    """The table for take.toml: that of the file, with the scene's values.
 
     Raises:
-        InputError: a clip was deleted, or the file that is there is no take.
+        InputError: a clip was deleted, or the existing file is not a valid take.
     """
     props, old = scene.tricap, read_table(folder_of(scene))
     made = dict(old) or new_table([])
     views = [view_entry(view) for view in props.views]
     made |= {"fps": properties.exact(props.fps), "interlaced": props.interlaced, "views": views}
-    said = props.first_field != "odd" or "first_field" in old  # odd need not be said
-    _put(made, "first_field", _first_field(scene) if said else "")
+    needed = props.first_field != "odd" or "first_field" in old  # odd is the default
+    _put(made, "first_field", _first_field(scene) if needed else "")
     _put(made, "reference_view", props.reference_view if props.reference_view in [view.name for view in props.views] else "")
     _put(made, "frames", None if props.all_frames else [props.first_frame, props.last_frame + 1])
     _put(made, "body", _body(scene, old))
@@ -219,47 +220,47 @@ def table(scene: bpy.types.Scene) -> Table:
     _put(made, "settings", properties.overrides(scene))
     for writer in get_session().take_writers:
         writer(scene, made)
-    return _kept_alike(made, old)
+    return _same_numbers(made, old)
 
 
 def open_take(scene: bpy.types.Scene, folder: Path) -> None:
     """Show a take in the scene: its footage as clips, its clicks as tracks, its values and settings in the panel.
 
     Raises:
-        InputError: it is no take, or its footage cannot be opened; the scene is as it was.
+        InputError: it is not a take, or its footage cannot be opened; the scene is unchanged.
     """
-    said = read_table(folder)
-    if not said:
-        raise InputError(f"{folder} is not a take: there is no take.toml in it. Add footage to make one.")
-    opened = take_of_table(folder, said)
+    saved = read_table(folder)
+    if not saved:
+        raise InputError(f"{folder} is not a take: it has no take.toml. Press Add Footage to make a new one.")
+    opened = take_of_table(folder, saved)
     properties.check_settings(opened.settings, str(folder / "take.toml"))
-    files = files_of(folder, said["views"], opened.field_layout)
+    files = files_of(folder, saved["views"], opened.field_layout)
     props = scene.tricap
     props.take = folders.for_user(folder)
-    props.fps, props.interlaced, props.first_field = said["fps"], opened.interlaced, opened.first_field
-    show_views(scene, said["views"], files)
-    props.reference_view = said.get("reference_view", "")
+    props.fps, props.interlaced, props.first_field = saved["fps"], opened.interlaced, opened.first_field
+    show_views(scene, saved["views"], files)
+    props.reference_view = saved.get("reference_view", "")
     props.all_frames = opened.frames is None
     if opened.frames:
         props.first_frame, props.last_frame = opened.frames[0], opened.frames[1] - 1
-    _show_model(scene, said.get("body", {}).get("model", ""))
+    _show_model(scene, saved.get("body", {}).get("model", ""))
     props.seed_frame = opened.seeds.frame
-    show_clicks(scene, said, [view.name for view in opened.views])
+    show_clicks(scene, saved, [view.name for view in opened.views])
     properties.show_settings(scene, opened.settings)
     for reader in get_session().take_readers:
-        reader(scene, said)
+        reader(scene, saved)
     remember(scene, folder)
 
 
 def show_views(scene: bpy.types.Scene, entries: list[Table], files: dict[str, Path]) -> None:
-    """Make the scene's views those of `entries` ([[views]]), with a clip each; a clip that shows the file already is kept.
+    """Make the scene's views those of `entries` ([[views]]), with a clip each; a clip that already shows the file is reused.
 
     Raises:
-        InputError: Blender cannot read a file; the views are as they were.
+        InputError: Blender cannot read a file; the views are unchanged.
     """
     props = scene.tricap
-    kept = {view.name: view.clip for view in props.views if view.clip is not None}
-    shown = {name: _clip_of(kept.get(name), name, path) for name, path in files.items()}
+    before = {view.name: view.clip for view in props.views if view.clip is not None}
+    shown = {name: _clip_of(before.get(name), name, path) for name, path in files.items()}
     props.views.clear()
     for entry in entries:
         view = props.views.add()
@@ -272,15 +273,15 @@ def show_views(scene: bpy.types.Scene, entries: list[Table], files: dict[str, Pa
         view.person_files = entry.get(view.person, "")
 
 
-def _clip_of(known: bpy.types.MovieClip | None, name: str, path: Path) -> bpy.types.MovieClip:
-    """The clip that is there, if it shows the file, else a new one."""
-    if known is not None and Path(bpy.path.abspath(known.filepath)).resolve() == path.resolve():
-        return known
+def _clip_of(clip: bpy.types.MovieClip | None, name: str, path: Path) -> bpy.types.MovieClip:
+    """This clip, if it shows the file, else a new one."""
+    if clip is not None and Path(bpy.path.abspath(clip.filepath)).resolve() == path.resolve():
+        return clip
     return clips.open_clip(f"Footage {name}", path)
 
 
 def _body(scene: bpy.types.Scene, old: Table) -> Table | None:
-    """[body]; a file that has none stays without while no body is chosen."""
+    """[body]; left out if no body is chosen and the file has none."""
     if model_of(scene):
         return {**old.get("body", {}), "model": model_of(scene)}
     return {"model": NO_BODY} if "body" in old or not old else None
@@ -296,7 +297,7 @@ def body_model(scene: bpy.types.Scene) -> str | None:
     """The body model as `read_model` takes it, a file of the project with its path; None for none.
 
     Raises:
-        InputError: the file does not lie in the project's folder.
+        InputError: the file is not in the project's folder.
     """
     return take_body_model(folder_of(scene), model_of(scene) or None, "the panel")
 
@@ -309,7 +310,7 @@ def _show_model(scene: bpy.types.Scene, name: str) -> None:
 
 
 def view_entry(view: Any) -> Table:
-    """What [[views]] says of a view."""
+    """The entry of a view in [[views]]."""
     entry = {"name": view.name, "images": view.images, "movie": view.movie, "offset_frames": view.offset_frames}
     if view.person:
         entry[view.person] = view.person_files
@@ -317,7 +318,7 @@ def view_entry(view: Any) -> Table:
 
 
 def _put(made: Table, key: str, value: Any) -> None:
-    """A key with its value, or no such key where there is nothing to say."""
+    """Set a key to its value, or remove it if the value is empty."""
     if value:
         made[key] = value
     else:
@@ -325,7 +326,7 @@ def _put(made: Table, key: str, value: Any) -> None:
 
 
 def _put_clicks(scene: bpy.types.Scene, made: Table) -> None:
-    """[seeds] and [[keyframes]] from the clips; a pixel that the file has in more decimals than Blender is left as it is."""
+    """[seeds] and [[keyframes]] from the clips; a pixel that has more decimals in the file than Blender can store stays as it is."""
     shown, frame = clips_of(scene), scene.tricap.seed_frame
     sizes = {view: tuple(clip.size) for view, clip in shown.items()}
     joints, surface = clicks.clicks_of_frame(shown, frame)
@@ -333,11 +334,11 @@ def _put_clicks(scene: bpy.types.Scene, made: Table) -> None:
     joints = _same_pixels(joints, old.get("joints", {}), sizes)
     before = dict(enumerate(old.get("surface", [])))
     surface = [*_same_pixels(dict(enumerate(surface)), before, sizes).values()]
-    said = {"frame": frame, "surface": surface, "joints": joints}
-    _put(made, "seeds", {k: v for k, v in said.items() if v or k == "frame"} if frame or joints or surface else None)
+    clicked = {"frame": frame, "surface": surface, "joints": joints}
+    _put(made, "seeds", {k: v for k, v in clicked.items() if v or k == "frame"} if frame or joints or surface else None)
     others = sorted({f for clip in shown.values() for f in clicks.clicked_frames(clip)} - {frame})
     keyframes = [(f, _same_pixels(clicks.clicks_of_frame(shown, f)[0], old_keys.get(f, {}).get("joints", {}), sizes)) for f in others]
-    _put(made, "keyframes", [{"frame": f, "joints": clicked} for f, clicked in keyframes if clicked])
+    _put(made, "keyframes", [{"frame": f, "joints": in_frame} for f, in_frame in keyframes if in_frame])
 
 
 def _same_pixels(new: dict[Any, Any], old: dict[Any, Any], sizes: dict[str, tuple[int, int]]) -> dict[Any, Any]:
@@ -348,33 +349,33 @@ def _same_pixels(new: dict[Any, Any], old: dict[Any, Any], sizes: dict[str, tupl
     return {name: {view: same(name, view, xy) for view, xy in at.items()} for name, at in new.items()}
 
 
-def show_clicks(scene: bpy.types.Scene, said: Table, views: Collection[str]) -> None:
-    """Show the clicks of a take.toml's table in the clips of these views, in the place of those that are there."""
+def show_clicks(scene: bpy.types.Scene, saved: Table, views: Collection[str]) -> None:
+    """Replace the clicks in the clips of these views by those of a take.toml's table."""
     shown = {view: clip for view, clip in clips_of(scene).items() if view in views}
     for clip in shown.values():
         clicks.clear(clip)
-    for group in (said.get("seeds", {}), *said.get("keyframes", [])):
+    for group in (saved.get("seeds", {}), *saved.get("keyframes", [])):
         numbered = {f"seed {i + 1}": at for i, at in enumerate(group.get("surface", []))}
         for name, at in {**group.get("joints", {}), **numbered}.items():
             for view in at.keys() & shown.keys():
                 clicks.set_click(shown[view], name, group.get("frame", 0), at[view])
 
 
-def _kept_alike(new: Any, old: Any) -> Any:
-    """`new`, where a number that single precision cannot tell from the old one is the old one."""
+def _same_numbers(new: Any, old: Any) -> Any:
+    """`new`, with the old numbers where they are equal in single precision."""
     if isinstance(new, dict) and isinstance(old, dict):
-        return {key: _kept_alike(value, old.get(key)) for key, value in new.items()}
+        return {key: _same_numbers(value, old.get(key)) for key, value in new.items()}
     numbers = isinstance(new, float) and isinstance(old, (int, float)) and not isinstance(old, bool)
     return old if numbers and np.float32(new) == np.float32(old) else new
 
 
 def chosen(scene: bpy.types.Scene, take: str, out: str) -> tuple[Path, Path, dict[str, dict[str, Any]]]:
-    """What an operator is to run: the take's folder, that for the results, and the knobs to put over the take's own.
+    """What an operator runs: the take's folder, the folder for the results, and the settings that override the take's own.
 
-    The scene's project is written to take.toml first, its knobs with it; another take is run as its file stands, with the panel's knobs.
+    The scene's project is first written to take.toml, settings included; another take is run as its file is, with the panel's settings.
 
     Raises:
-        InputError: no take is chosen, it cannot be, or a folder cannot be written to.
+        InputError: no take is chosen, it is invalid, or a folder cannot be written to.
     """
     ours = bound(scene) and (not take or folders.absolute(take) == folder_of(scene))
     folder = write(scene) if ours else folders.take_folder(take, scene)

@@ -1,7 +1,7 @@
-"""Properties of the scene: the take, the output folder, and the knobs of every stage.
+"""Properties of the scene: the take, the output folder, and the settings of every stage.
 
-The knobs are made from core's settings dataclasses: name, default, limits, unit and tooltip have one definition. Only what a user
-has touched in Blender is handed on, so that the take's own [settings] and the defaults keep their say.
+The settings are made from core's dataclasses: name, default, limits, unit and tooltip have one definition. Only those that a user has
+changed in Blender override the take's own [settings] and the defaults.
 """
 
 import dataclasses
@@ -20,15 +20,15 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
 def property_of(field: "dataclasses.Field[Any]") -> Any:
-    """The bpy property of one knob.
+    """The bpy property of one setting.
 
     Raises:
-        TypeError: the knob is of a kind that Blender has no property for.
+        TypeError: Blender has no property for its type.
     """
     meta, default = field.metadata, field.default
     unit = f" [{meta['unit']}]" if meta.get("unit") else ""
     words: dict[str, Any] = dict(name=title(field.name, meta.get("unit", "")) + unit, description=meta.get("about", "").rstrip("."))
-    words["update"] = take_properties.tell_touched
+    words["update"] = take_properties.notify_change
     if isinstance(default, bool):
         return bpy.props.BoolProperty(default=default, **words)
     if isinstance(default, str) and meta.get("choices"):
@@ -40,23 +40,23 @@ def property_of(field: "dataclasses.Field[Any]") -> Any:
         return bpy.props.IntProperty(default=default, **limits, **words)
     if isinstance(default, float):
         return bpy.props.FloatProperty(default=default, precision=4, **limits, **words)
-    raise TypeError(f"Knob {field.name} is a {type(default).__name__}, for which there is no property")
+    raise TypeError(f"Setting {field.name} is a {type(default).__name__}, for which there is no property")
 
 
 def title(name: str, unit: str) -> str:
-    """What a knob is called on screen: "patch_px" in px is Patch."""
+    """The label of a setting: "patch_px" in px is Patch."""
     short = name.removesuffix("_" + unit.replace("/", "_").replace("²", "2")) if unit else name
     return short.replace("_", " ").title()
 
 
 def group_class(name: str, settings: type) -> type:
-    """A PropertyGroup class with one property per knob of the frozen dataclass `settings`."""
+    """A PropertyGroup class with a property for every field of the frozen dataclass `settings`."""
     annotations = {field.name: property_of(field) for field in dataclasses.fields(settings)}
     return type(f"Tricap_{name}", (bpy.types.PropertyGroup,), {"__annotations__": annotations, "__doc__": settings.__doc__ or name})
 
 
 def touched(group: bpy.types.PropertyGroup, settings: type) -> dict[str, Any]:
-    """The knobs that were set in Blender, as a plain table for `from_table`."""
+    """The settings that were changed in Blender, as a plain table for `from_table`."""
     return {
         field.name: exact(getattr(group, field.name), field.default)
         for field in dataclasses.fields(settings)
@@ -65,27 +65,27 @@ def touched(group: bpy.types.PropertyGroup, settings: type) -> dict[str, Any]:
 
 
 def snapshot(group: bpy.types.PropertyGroup, settings: type) -> Any:
-    """The frozen settings that the group shows: what was touched, and defaults."""
+    """The frozen settings that the group shows: those that were changed, and defaults."""
     return knobs.from_table(settings, touched(group, settings), f"The panel “{settings.__name__}”")
 
 
 def overrides(scene: bpy.types.Scene) -> dict[str, dict[str, Any]]:
-    """What was touched in every stage: {"matching": {"patch_px": 17}}, the form of take.toml's [settings]."""
+    """What was changed in every stage: {"matching": {"patch_px": 17}}, the form of take.toml's [settings]."""
     tables = {name: touched(getattr(scene.tricap, name), settings) for name, settings in stages().items()}
     return {name: table for name, table in tables.items() if table}
 
 
 def check_settings(tables: Mapping[str, Mapping[str, Any]], where: str) -> None:
-    """See that a take's [settings] are what the stages know.
+    """Check a take's [settings].
 
     Raises:
-        InputError: an unknown name, or a value that cannot be.
+        InputError: a name is unknown or a value invalid.
     """
     take_run.settings_of(tables, {}, where)
 
 
 def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]]) -> None:
-    """Show a take's [settings] as what was touched, and nothing else."""
+    """Show a take's [settings] as the settings that were changed; reset all others."""
     current = knobs.current_tables(tables, stages(), "")
     for name, settings in stages().items():
         group, table = getattr(scene.tricap, name), current[name]
@@ -97,34 +97,34 @@ def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]
 
 
 def stages() -> Mapping[str, type]:
-    """Settings class of every stage, by the name it has in take.toml."""
+    """The settings class of every stage, by its name in take.toml."""
     return take_run.SETTINGS
 
 
 def exact(value: Any, default: Any = 0.0) -> Any:
-    """Blender keeps floats in single precision; the shortest decimal that is stored alike is what the user typed."""
+    """What the user typed: the shortest decimal that Blender, in single precision, stores as this value."""
     return float(str(np.float32(value))) if isinstance(default, float) else value
 
 
 def register() -> None:
-    """Make the classes of all stages and hang them onto the scene as `scene.tricap`."""
+    """Make the classes of all stages and register them as `scene.tricap`."""
     groups = {name: group_class(name, settings) for name, settings in stages().items()}
     annotations: dict[str, Any] = {
         "take": bpy.props.StringProperty(
             name="Take",
             subtype="DIR_PATH",
             options=RELATIVE,
-            update=take_properties.tell_touched,
-            description="Folder of the recording; it holds take.toml",
+            update=take_properties.notify_change,
+            description="Folder of the take, which contains take.toml",
         ),
         "out": bpy.props.StringProperty(
             name="Output",
             subtype="DIR_PATH",
             options=RELATIVE,
-            update=take_properties.tell_touched,
-            description="Folder for the results; empty: beside the .blend, or beside the take",
+            update=take_properties.notify_change,
+            description="Folder for the results. Empty: next to the .blend file, or next to the take",
         ),
-        "last": bpy.props.StringProperty(name="Result", description="What the last run found"),
+        "last": bpy.props.StringProperty(name="Result", description="Summary of the last run"),
     }
     annotations |= take_properties.annotations()
     annotations |= {name: bpy.props.PointerProperty(type=group) for name, group in groups.items()}
@@ -137,7 +137,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take the properties away again."""
+    """Remove the properties."""
     del bpy.types.Scene.tricap
     for group in reversed(get_session().property_groups):
         bpy.utils.unregister_class(group)

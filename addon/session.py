@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .jobs import Job, JobEnded, JobOperator
     from .overlay.layers import Inspection
     from .overlay.results import RunResults
-    from .steps.states import Look
+    from .steps.states import StepStates
     from .steps.watch import StepEnd
 
 TakePart = Callable[[bpy.types.Scene, "Table"], None]
@@ -38,9 +38,9 @@ class OpenResults:
 class FileState:
     """What belongs to the open file."""
 
-    changed: bool = True  # something changed in a scene since the steps were looked at
-    looks: "dict[str, Look]" = field(default_factory=dict)  # by scene: the states of its steps
-    stamps: dict[str, Any] = field(default_factory=dict)  # by scene: the files on which these states depend
+    changed: bool = True  # something changed in a scene since the states of its steps were computed
+    step_states: "dict[str, StepStates]" = field(default_factory=dict)  # by scene
+    stamps: dict[str, Any] = field(default_factory=dict)  # by scene: times and sizes of the files on which these states depend
     step_ends: "dict[tuple[str, str], StepEnd]" = field(default_factory=dict)  # by scene and step: how it failed or was stopped
     sequences: "dict[tuple[Any, ...], ImageSequence]" = field(default_factory=dict)  # the opened footage, by file
     joints: dict[str, tuple[str, ...]] = field(default_factory=dict)  # those to click, by body model

@@ -1,4 +1,4 @@
-"""What the scene keeps of a take besides its clips and clicks: the views in their order, and what take.toml says of the whole recording."""
+"""The values of a take in the scene, apart from clips and clicks: its views in order, and what take.toml has for the whole recording."""
 
 from typing import Any
 
@@ -16,22 +16,22 @@ MODELS = (
     ("arm.L", "Left Arm", "Shoulder, elbow, wrist"),
     ("leg.R", "Right Leg", "Hip, knee, ankle"),
     ("leg.L", "Left Leg", "Hip, knee, ankle"),
-    ("own", "Own Model", "A .toml model in the project's folder"),
+    ("own", "Custom Model", "A .toml model in the project folder"),
 )
-LINES = {
-    "none": ("Progressive", "Every image is whole"),
-    "odd": ("Odd Lines", "Interlaced video: keep lines 1, 3, 5 …"),
-    "even": ("Even Lines", "Interlaced video: keep lines 2, 4, 6 …"),
-    "both": ("Both Fields", "Interlaced video: odd and even lines are two instants, twice as many frames a second"),
+FIELDS_USED = {
+    "none": ("Progressive", "The footage is not interlaced"),
+    "odd": ("Upper Field", "Interlaced footage: use lines 1, 3, 5, … only"),
+    "even": ("Lower Field", "Interlaced footage: use lines 2, 4, 6, … only"),
+    "both": ("Both Fields", "Interlaced footage: use each field as a frame, which doubles the frame rate"),
 }
-FIELDS = (
-    ("odd", "Odd Lines First", "Lines 1, 3, 5 … were exposed first"),
-    ("even", "Even Lines First", "Lines 2, 4, 6 … were exposed first"),
+FIELD_ORDERS = (
+    ("odd", "Upper First", "Lines 1, 3, 5, … were exposed first"),
+    ("even", "Lower First", "Lines 2, 4, 6, … were exposed first"),
 )
 
 
-def tell_touched(_: Any, __: Any) -> None:
-    """Somebody changed a value; Blender does not tell of changes by scripts otherwise."""
+def notify_change(_: Any, __: Any) -> None:
+    """A value was changed; Blender does not report changes by scripts in another way."""
     for listener in get_session().on_value_change:
         listener()
 
@@ -39,22 +39,22 @@ def tell_touched(_: Any, __: Any) -> None:
 def _renamed(view: Any, _: bpy.types.Context) -> None:
     if view.clip is not None:
         view.clip["tricap_view"] = view.name
-    tell_touched(view, _)
+    notify_change(view, _)
 
 
 def _shifted(view: Any, _: bpy.types.Context) -> None:
     if view.clip is not None:
         view.clip.frame_start = -frames_per_image(view.clip) * view.offset_frames
-    tell_touched(view, _)
+    notify_change(view, _)
 
 
 class View(bpy.types.PropertyGroup):
-    """One camera's footage: its clip, and where it lies in the project's folder."""
+    """One camera's footage: its clip, and its place in the project's folder."""
 
     name: bpy.props.StringProperty(
         name="View",
         update=_renamed,  # type: ignore[valid-type]
-        description="Name of the view; its camera has the same name, such as L, C, R from left to right",
+        description="Name of the view and of its camera, such as L, C, R from left to right",
     )
     clip: bpy.props.PointerProperty(type=bpy.types.MovieClip, name="Clip")  # type: ignore[valid-type]
     images: bpy.props.StringProperty(name="Images")  # type: ignore[valid-type]
@@ -64,40 +64,41 @@ class View(bpy.types.PropertyGroup):
     offset_frames: bpy.props.IntProperty(
         name="Offset",
         update=_shifted,  # type: ignore[valid-type]
-        description="Images by which this recorder was switched on earlier than the others",
+        description="Frame offset of this camera relative to the others; positive if it started recording earlier",
     )
 
 
 def annotations() -> dict[str, Any]:
     """The properties, for the group that hangs on the scene."""
-    props, told = bpy.props, dict(update=tell_touched)
+    props, watched = bpy.props, dict(update=notify_change)
     return {
         "views": props.CollectionProperty(type=View),
         "view_index": props.IntProperty(name="View"),
         "fps": props.FloatProperty(
-            name="Frame Rate", default=25.0, min=0.1, max=10_000.0, precision=3, description="Images per second of the footage", **told
+            name="FPS", default=25.0, min=0.1, max=10_000.0, precision=3, description="Frames per second of the footage", **watched
         ),
         "interlaced": props.EnumProperty(
-            name="Lines",
-            items=[(name, *LINES[name]) for name in (*INTERLACE, BOTH)],
-            description="Which lines of interlaced video are measured",
-            **told,
+            name="Interlacing",
+            items=[(name, *FIELDS_USED[name]) for name in (*INTERLACE, BOTH)],
+            description="Which fields of interlaced footage are measured",
+            **watched,
         ),
-        "first_field": props.EnumProperty(name="First Field", items=FIELDS, description="Which field is the earlier one", **told),
+        "first_field": props.EnumProperty(name="Field Order", items=FIELD_ORDERS, description="Which field was exposed first", **watched),
         "reference_view": props.StringProperty(
-            name="Reference View", description="The view that the others are compared with; empty: the middle one", **told
+            name="Reference View", description="The view to which the others are matched. Empty: the middle one", **watched
         ),
-        "all_frames": props.BoolProperty(name="All Frames", default=True, description="Measure all that the footage has", **told),
-        "first_frame": props.IntProperty(name="First", min=0, description="First frame to measure", **told),
-        "last_frame": props.IntProperty(name="Last", min=0, description="Last frame to measure", **told),
+        "all_frames": props.BoolProperty(name="All Frames", default=True, description="Measure every frame of the footage", **watched),
+        "first_frame": props.IntProperty(name="Frame Start", min=0, description="First frame to measure", **watched),
+        "last_frame": props.IntProperty(name="End", min=0, description="Last frame to measure", **watched),
         "model": props.EnumProperty(
-            name="Body", items=MODELS, default="full", description="Which part of the body is filmed and fitted", **told
+            name="Body", items=MODELS, default="full", description="The part of the body that was recorded and is fitted", **watched
         ),
-        "model_file": props.StringProperty(name="Model File", description="Name of the .toml model in the project's folder", **told),
+        "model_file": props.StringProperty(name="Model File", description="Name of the .toml model in the project folder", **watched),
         "seed_frame": props.IntProperty(
-            name="Seed Frame", min=0, description="The frame in which the joints are clicked; measuring starts from it", **told
+            name="Click Frame", min=0, description="The frame in which the joints are clicked; measuring starts there", **watched
         ),
-        "check_said": props.StringProperty(name="Check", description="What the check of footage and cameras found"),
+        "check_said": props.StringProperty(name="Check", description="Result of Check Footage, Cameras and Sync"),
+        "check_passed": props.BoolProperty(options={"HIDDEN"}),
         "check_key": props.StringProperty(options={"HIDDEN"}),
         "take_digest": props.StringProperty(options={"HIDDEN"}),
     }

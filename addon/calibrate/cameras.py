@@ -1,7 +1,7 @@
 """Calibrated cameras in the open scene, and the scene's cameras as a calibrated rig.
 
-Blender keeps lens, shift and pose in single precision. What was calibrated is therefore kept beside it in double precision and counts as
-long as nobody has changed the camera; a camera that was made or changed in Blender is read from Blender's own values.
+Blender stores lens, shift and pose in single precision. The calibrated values are therefore also stored in double precision, and used as
+long as the camera is unchanged; a camera that was made or changed in Blender is read from Blender's own values.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from ..scene.surroundings import add_bar
 
 COLLECTION = "Tricap Rig"
 EXACT = "tricap_exact"
-SAME = 2e-6  # relative: what single precision leaves of a number
+SAME = 2e-6  # relative tolerance of single precision
 
 
 def build_cameras(
@@ -28,11 +28,9 @@ def build_cameras(
     tracks: dict[str, np.ndarray],
     bar: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[bpy.types.Object]:
-    """Cameras in a collection of their own, with their footage behind them and the measured targets as tracks over it.
+    """Cameras in a collection of their own, with their footage as background and the measured targets as its tracks.
 
-    `bar`: frames (T,) and ends (T, 2, 3) [m] of the reference bar, which is shown as well.
-
-    A rig that was built before is replaced.
+    `bar`: frames (T,) and ends (T, 2, 3) [m] of the wand, which is built as well. Cameras that were built before are replaced.
     """
     old = bpy.data.collections.get(COLLECTION)
     if old is not None:
@@ -70,14 +68,14 @@ def add_tracks(clip: bpy.types.MovieClip, xy_px: np.ndarray, size_px: tuple[int,
 
 
 def rig_of_scene(scene: bpy.types.Scene) -> Rig:
-    """The scene's cameras as a rig, with the distortion of the movie clip behind each.
+    """The scene's cameras as a rig, with the lens distortion of their background clips.
 
     Raises:
-        InputError: there is no camera, or one cannot be said as a central projection.
+        InputError: there is no camera, or one is not a central projection.
     """
     found = [o for o in scene.objects if o.type == "CAMERA"]
     if not found:
-        raise InputError("The scene has no camera; add cameras, or calibrate first.")
+        raise InputError("The scene has no camera. Add cameras, or calibrate first.")
     return Rig(cameras=tuple(camera_of(scene, camera_object) for camera_object in found))
 
 
@@ -92,11 +90,11 @@ def camera_of(scene: bpy.types.Scene, camera_object: bpy.types.Object) -> Camera
     """One camera of the scene.
 
     Raises:
-        InputError: it is no perspective camera, or its clip's lens model is not ours.
+        InputError: it is not a perspective camera, or its clip has another lens model.
     """
     data = camera_object.data
     if data.type != "PERSP":
-        raise InputError(f"{camera_object.name} is no perspective camera; set its type in its properties.")
+        raise InputError(f"{camera_object.name} is not a perspective camera. Change the lens type in its properties.")
     clip = clip_behind(camera_object)
     own = camera_object.get("tricap_size_px")
     size = tuple(int(v) for v in (own or (clip.size if clip else (scene.render.resolution_x, scene.render.resolution_y))))
@@ -121,15 +119,17 @@ def _distortions(clip: bpy.types.MovieClip | None) -> np.ndarray:
     lens = clip.tracking.camera
     if lens.distortion_model == "BROWN":
         if lens.brown_k4:
-            raise InputError(f"The lens of the clip {clip.name} has a K4, which has no counterpart here; set it to 0 and solve again.")
+            raise InputError(
+                f"The lens of the clip {clip.name} has a coefficient K4, which Tricap does not support. Set it to 0 and solve again."
+            )
         return np.array([lens.brown_k1, lens.brown_k2, -lens.brown_p2, lens.brown_p1, lens.brown_k3])
     if lens.distortion_model == "POLYNOMIAL":
         return np.array([lens.k1, lens.k2, 0.0, 0.0, lens.k3])
-    raise InputError(f"The lens model “{lens.distortion_model}” of the clip {clip.name} cannot be read; choose Brown or Polynomial.")
+    raise InputError(f"The lens model “{lens.distortion_model}” of the clip {clip.name} is not supported. Choose Brown or Polynomial.")
 
 
 def exact_values(camera: Camera) -> list[float]:
-    """All numbers of a camera, as they are kept beside Blender's own."""
+    """All numbers of a camera in double precision."""
     parts = (camera.matrix, camera.distortions, camera.affinity, camera.R_cam_world, camera.t_cam_world_m)
     return [float(v) for part in parts for v in part.ravel()]
 
@@ -147,7 +147,7 @@ def _exact_camera(read: Camera, values: np.ndarray) -> Camera:
 
 
 def _unchanged(read: Camera, values: np.ndarray, has_lens: bool) -> bool:
-    """Whether Blender's values are still the calibrated camera's, as far as single precision can say; `has_lens`: a clip is behind it."""
+    """Whether Blender's values still equal the calibrated ones within single precision; `has_lens`: it has a background clip."""
     exact = _exact_camera(read, values)
     fx = exact.matrix[0, 0] * (1 + exact.affinity[0])
     expected = np.array([fx, exact.matrix[1, 1], *exact.matrix[:2, 2], *exact.R_cam_world.ravel(), *exact.t_cam_world_m])

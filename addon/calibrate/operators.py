@@ -26,7 +26,7 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Done:
-    """What the computation made."""
+    """The result of the computation."""
 
     footage: BarFootage
     measured: MeasuredBar
@@ -48,43 +48,43 @@ class Done:
 
 
 class Calibrate(JobOperator, bpy.types.Operator):
-    """Find the bar's targets in the footage, calibrate the cameras and put them into the scene"""
+    """Find the targets of the wand in the footage, calibrate the cameras and add them to the scene"""
 
     bl_idname = "tricap.calibrate"
-    bl_label = "Calibrate"
+    bl_label = "Calibrate Cameras"
     bl_options = {"UNDO"}
     step = "cameras"
-    last_words = "No camera was changed."
+    if_stopped = "No camera was changed."
 
     bar: bpy.props.StringProperty(
-        name="Bar Footage",
+        name="Wand Footage",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder with a folder of images, or a movie, per camera; empty: the panel's",
+        description="Folder that contains a folder of images, or a movie, for each camera. Empty: the one in the panel",
     )
     length_m: bpy.props.FloatProperty(
-        name="Bar Length",
+        name="Wand Length",
         min=0.0,
         unit="LENGTH",
         precision=4,  # type: ignore[valid-type]
-        description="Distance between the middles of the bar's targets; 0: the panel's",
+        description="Distance between the centres of the targets. 0: the length in the panel",
     )
     out: bpy.props.StringProperty(
         name="Rig",
         subtype="FILE_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="File for the rig; empty: rig.toml beside the bar's footage",
+        description="File for the cameras. Empty: rig.toml next to the wand footage",
     )
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Done]:
-        """Folder, length and switches as they are now."""
+        """Folder, length and options as they are now."""
         props = context.scene.tricap_calibrate
         if not (self.bar or props.bar):
-            raise InputError("Choose the bar's footage first: the folder with a folder of images, or a movie, per camera.")
+            raise InputError("Choose the wand footage first: the folder that contains a folder of images, or a movie, for each camera.")
         folder = folders.absolute(self.bar or props.bar)
         out = folders.absolute(self.out) if self.out else folder.parent / "rig.toml"
         folders.check_writable(out.parent)
-        # Blender keeps single precision; what was typed is the shortest decimal that is stored alike.
+        # What was typed is the shortest decimal that Blender, in single precision, stores as this value.
         length, diameter = (float(f"{value:.7g}") for value in (self.length_m or props.length_m, props.diameter_m))
         mask = folders.absolute(props.mask) if props.mask else None
         interlaced, first_field = props.interlaced, props.first_field
@@ -100,21 +100,21 @@ class Calibrate(JobOperator, bpy.types.Operator):
         return read_and_calibrate
 
     def finish(self, context: bpy.types.Context, result: Done) -> set[str]:
-        """Build the cameras and tell the verdict."""
+        """Build the cameras and report the verdict."""
         views = [view.name for view in context.scene.tricap.views] if project.bound(context.scene) else []
-        strangers = [name for name in views if name not in result.footage.names]
-        if views and not strangers:
+        missing = [name for name in views if name not in result.footage.names]
+        if views and not missing:
             use_rig(context.scene, result.result.rig, result.bar)
         files = {name: list(s.files()) for name, s in zip(result.footage.names, result.footage.sequences)}
         build_cameras(context.scene, result.result.rig, files, result.tracks, result.bar)
         verdict, props = result.result.verdict, context.scene.tricap_calibrate
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)
-        if strangers:
+        if missing:
             self.report(
                 {"WARNING"},
-                f"The project keeps its cameras, for its view {strangers[0]} has no footage of that name in "
-                f"{result.footage.folder}; rename the view or the footage, and load {result.written}.",
+                f"The cameras of the project were not replaced, because {result.footage.folder} has no footage named like view "
+                f"{missing[0]}. Rename the view or the footage, then import {result.written}.",
             )
         return {"FINISHED"}
 
@@ -125,19 +125,19 @@ def note_count(view: str, images: int, whole: int) -> None:
 
 
 def frame_numbers(text: str) -> tuple[int, ...]:
-    """The frames that a text such as "0, 40, 80" names.
+    """The frames in a text such as "0, 40, 80".
 
     Raises:
-        InputError: it names something else.
+        InputError: it is something else.
     """
     try:
         return tuple(int(part) for part in text.replace(",", " ").split())
     except ValueError as error:
-        raise InputError(f"“{text}” is no list of frames; write frame numbers, such as 0, 40, 80.") from error
+        raise InputError(f"“{text}” is not a list of frames. Write frame numbers, such as 0, 40, 80.") from error
 
 
 def compute(footage: BarFootage, measured: MeasuredBar, focal_px: float | None, world: WorldChoice, out: Path, monitor: Monitor) -> Done:
-    """The computation, free of bpy: from the measured bar to rig.toml, with the bar and its report beside it."""
+    """The computation, without bpy: from the measured wand to rig.toml, with its report."""
     result = calibrate_rig(measured.observations, monitor, focal_px=focal_px, world=world)
     write_report(out.parent / f"{out.stem}_report", result)
     write_rig(out, result.rig)
@@ -146,7 +146,7 @@ def compute(footage: BarFootage, measured: MeasuredBar, focal_px: float | None, 
 
 
 class ImportRig(ImportHelper, bpy.types.Operator):
-    """Put the cameras of a calibration into the scene: ours, Anipose, Pose2Sim, caliscope, OpenCV, EasyMocap, COLMAP, OpenPTV or Agisoft"""
+    """Add cameras from a calibration file: Tricap, Anipose, Pose2Sim, caliscope, OpenCV, EasyMocap, COLMAP, OpenPTV or Agisoft"""
 
     bl_idname = "tricap.import_rig"
     bl_label = "Import Cameras"
@@ -165,7 +165,7 @@ class ImportRig(ImportHelper, bpy.types.Operator):
 
 
 class ExportRig(ExportHelper, bpy.types.Operator):
-    """Write the scene's cameras, with the lens distortion of the movie clips behind them, as a calibration"""
+    """Export the scene's cameras, with the lens distortion of their background clips, as a calibration file"""
 
     bl_idname = "tricap.export_rig"
     bl_label = "Export Cameras"

@@ -1,4 +1,4 @@
-"""The section “From a Waved Bar” of the panel. draw() only draws."""
+"""The section “Wand Calibration” of the panel. draw() only draws."""
 
 import bpy
 
@@ -7,7 +7,7 @@ from ..panels import sentence
 from ..session import get_session
 
 LIGHTS = {"green": "STRIP_COLOR_04", "yellow": "STRIP_COLOR_03", "red": "STRIP_COLOR_01"}
-GOOD_COUNT, FAIR_COUNT = 100, 30  # images of a view that show the whole bar
+GOOD_COUNT, FAIR_COUNT = 100, 30  # images of a view that show both targets
 
 
 def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -29,11 +29,11 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     row.enabled = bool(props.bar)
     row.operator("tricap.calibrate", icon="OUTLINER_OB_CAMERA")
     for view, (frames, whole) in list(get_session().file.bar_counts.items()):
-        layout.label(text=f"{view}: {whole} whole bars in {frames} images", icon=LIGHTS[light_of(whole)])
+        layout.label(text=f"{view}: {whole} of {frames} images show the wand", icon=LIGHTS[light_of(whole)])
     if props.verdict and not running:
         box = layout.box()
         sentence(box, context, props.verdict, LIGHTS.get(props.light, "NONE"))
-        sentence(box, context, f"To do better: {props.advice}.", "INFO")
+        sentence(box, context, f"To improve it: {props.advice}.", "INFO")
     layout.operator("tricap.set_world", icon="EMPTY_AXIS")
     row = layout.row(align=True)
     row.operator("tricap.import_rig", icon="IMPORT")
@@ -41,5 +41,5 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
 
 
 def light_of(whole: int) -> str:
-    """The traffic light of a count of whole bars."""
+    """The traffic light of such a count."""
     return "green" if whole >= GOOD_COUNT else "yellow" if whole >= FAIR_COUNT else "red"

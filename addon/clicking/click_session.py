@@ -1,7 +1,7 @@
-"""What happens while joints or surface seeds are clicked, free of events and drawing: whose turn it is, what was clicked, what is proposed.
+"""Clicking joints or surface seeds, without events and drawing: the current joint, its clicks, and the proposals for them.
 
-The clicks themselves are native tracking tracks and are read from there each time, so that dragging one with G, Blender's undo and this
-session never contradict each other.
+The clicks themselves are native tracking tracks and are read from there each time, so that this session, Blender's undo and moving a
+marker with G never contradict each other.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,21 +21,21 @@ CLICK_SIGMA_PX = 3.0
 ARMS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("shoulder", "elbow", "wrist"))
 LEGS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("hip", "knee", "ankle", "toe"))
 ORDER = ("head", "neck", *ARMS, "pelvis", *LEGS)
-HIDDEN = ("chest", "spine", "clavicle.R", "clavicle.L")  # inside the trunk: hardly anyone can say where
+HIDDEN = ("chest", "spine", "clavicle.R", "clavicle.L")  # inside the trunk: hard to locate from outside
 
 
 @dataclass
-class _Step:
-    """What one action changed: whose turn it was before, and the clicks (frame, name, view) with what was there before."""
+class _Action:
+    """What undo needs: the current joint before an action, and the clicks (frame, name, view, pixel) that it replaced."""
 
-    turn: int
+    index: int
     before: list[tuple[int, str, str, list[float] | None]] = field(default_factory=list)
 
 
 class ClickSession:
     """Clicks of `names`, one after the other, in the clips of all views (in the order of the cameras).
 
-    `depths_m` says how deep a joint lies below the skin; what is not in it lies on the surface.
+    `depths_m`: depths of the joints below the skin; names without one are on the surface.
     """
 
     def __init__(
@@ -47,16 +47,16 @@ class ClickSession:
         depths_m: Mapping[str, float] | None = None,
     ) -> None:
         if not names:
-            raise InputError("There is nothing to click: choose a body model first.")
-        self._clip_names = {view: clip.name for view, clip in clips.items()}  # undo makes other objects of them
+            raise InputError("There is nothing to click. Choose a body in step 3 first.")
+        self._clip_names = {view: clip.name for view, clip in clips.items()}  # undo replaces the objects
         self.names, self.frame, self.finder, self.depths_m = list(names), frame, finder, dict(depths_m or {})
         self.views = list(clips)
-        self.turn = 0
+        self.index = 0
         self.proposals: dict[str, Proposal] = {}
         self.asking, self.problem = False, ""
-        self._history: list[_Step] = []
-        self._looked_at: dict[str, np.ndarray] = {}
-        self.go_to_next(from_turn=0)
+        self._history: list[_Action] = []
+        self._proposed_for: dict[str, np.ndarray] = {}
+        self.go_to_next(from_index=0)
 
     @property
     def clips(self) -> dict[str, bpy.types.MovieClip]:
@@ -68,17 +68,17 @@ class ClickSession:
         found = {view: bpy.data.movieclips.get(name) for view, name in self._clip_names.items()}
         for view, clip in found.items():
             if clip is None:
-                raise InputError(f"The movie clip of view {view} was deleted or renamed while clicking; what was clicked before is kept.")
+                raise InputError(f"The movie clip of view {view} was deleted or renamed while clicking. Earlier clicks are kept.")
         return found
 
     @property
     def endless(self) -> bool:
-        """Whether surface seeds are clicked, of which there are as many as one likes."""
-        return self.names[0].startswith("seed")
+        """Whether surface seeds are clicked, whose number is unlimited."""
+        return clicks.SURFACE_SEED.fullmatch(self.names[0]) is not None
 
     @property
-    def whole(self) -> bool:
-        """Whether all clips are still there under their names."""
+    def has_all_clips(self) -> bool:
+        """Whether all clips still exist under their names."""
         return all(name in bpy.data.movieclips for name in self._clip_names.values())
 
     def view_of(self, clip: bpy.types.MovieClip | None) -> str | None:
@@ -87,22 +87,22 @@ class ClickSession:
 
     @property
     def name(self) -> str:
-        """What is to be clicked now; "" when all is done."""
-        return self.names[self.turn] if self.turn < len(self.names) else ""
+        """The current joint or seed; "" when all are done."""
+        return self.names[self.index] if self.index < len(self.names) else ""
 
     @property
     def changed(self) -> bool:
-        """Whether anything was clicked that stands."""
-        return any(step.before for step in self._history)
+        """Whether the session has changed a click."""
+        return any(action.before for action in self._history)
 
     def clicks(self, name: str | None = None) -> dict[str, np.ndarray]:
-        """Where a joint (the present one) was clicked in this frame: view → pixel (2,)."""
+        """The clicks of a joint (by default the current one) in this frame: view → pixel (2,)."""
         name = self.name if name is None else name
         found = {view: clicks.get_click(clip, name, self.frame) for view, clip in self.clips.items()} if name else {}
         return {view: np.array(xy) for view, xy in found.items() if xy is not None}
 
     def click(self, view: str, xy_px: np.ndarray, snap_px: float = 0.0) -> None:
-        """Put the present joint there; a click within `snap_px` of the proposal takes the proposal."""
+        """Click the current joint; within `snap_px` of its proposal, the proposal is used."""
         if not self.name:
             return
         offer = self.proposals.get(view)
@@ -111,57 +111,57 @@ class ClickSession:
         self._put({view: xy_px})
 
     def accept(self) -> None:
-        """Take all proposals, and go on to the next joint."""
+        """Accept all proposals and go to the next joint."""
         if self.name and self.proposals:
             self._put({view: offer.xy_px for view, offer in self.proposals.items()})
         elif self.name:
             self.skip()
 
     def skip(self) -> None:
-        """Leave the present joint as it is and go on to the next."""
+        """Leave the current joint as it is and go to the next."""
         if self.name:
-            self._history.append(_Step(turn=self.turn))
-            self.go_to_next(self.turn + 1)
+            self._history.append(_Action(index=self.index))
+            self.go_to_next(self.index + 1)
 
     def back(self) -> bool:
-        """Undo the last action; without one, go to the joint before. False where there is none."""
+        """Undo the last action, or without one go to the previous joint. False if there is none."""
         if self._history:
-            step = self._history.pop()
-            self.turn = step.turn
-            for frame, name, view, xy in reversed(step.before):
+            action = self._history.pop()
+            self.index = action.index
+            for frame, name, view, xy in reversed(action.before):
                 if xy is None:
                     clicks.remove_click(self.clips[view], name, frame)
                 else:
                     clicks.set_click(self.clips[view], name, frame, (xy[0], xy[1]))
-        elif self.turn > 0:
-            self.turn -= 1
+        elif self.index > 0:
+            self.index -= 1
         else:
             return False
-        self.look()
+        self.propose()
         return True
 
     def go_to(self, name: str) -> None:
-        """Make it the turn of a joint."""
-        self.turn = self.names.index(name)
-        self.look()
+        """Make a joint the current one."""
+        self.index = self.names.index(name)
+        self.propose()
 
-    def go_to_next(self, from_turn: int) -> None:
-        """The turn of the first joint from there on that is not yet clicked in two views."""
-        self.turn = from_turn
+    def go_to_next(self, from_index: int) -> None:
+        """Make the first joint from this index on that is not clicked in two views the current one."""
+        self.index = from_index
         while self.name and len(self.clicks()) >= min(2, len(self.views)):
-            self.turn += 1
-        self.look()
+            self.index += 1
+        self.propose()
 
     def show_frame(self, frame: int) -> None:
-        """The scene shows another frame: what is clicked now belongs to it."""
+        """Click in another frame from now on."""
         if frame != self.frame:
             self.frame = frame
             self.go_to_next(0)
 
-    def look(self) -> None:
-        """Ask for the proposals that go with what is clicked now."""
+    def propose(self) -> None:
+        """Ask for proposals that agree with the current clicks."""
         self.proposals, self.problem, self.asking = {}, "", False
-        clicked = self._looked_at = self.clicks()
+        clicked = self._proposed_for = self.clicks()
         if self.finder is None or not clicked or len(clicked) == len(self.views):
             return
         if len(clicked) > 1:
@@ -174,16 +174,16 @@ class ClickSession:
         self.finder.ask(Question(name=self.name, frame=self.frame, view=at, xy_px=xy, depth_range_m=self._depth_range(at)))
 
     def poll(self) -> bool:
-        """Take the finder's answer when it is there, and see what was dragged meanwhile; True when something changed."""
-        now, before = self.clicks(), self._looked_at
+        """Use the finder's answer once it has one, and notice markers that were moved; True when something changed."""
+        now, before = self.clicks(), self._proposed_for
         if now.keys() != before.keys() or any(not np.array_equal(xy, before[view]) for view, xy in now.items()):
-            self.look()
+            self.propose()
             return True
         answer = self.finder.poll() if self.finder is not None else None
         return answer is not None and self.take_answer(answer)
 
     def take_answer(self, answer: Answer) -> bool:
-        """An answer that belongs to the present question; True when it does."""
+        """Use an answer, if it belongs to the current click; True if it does."""
         asked, clicked = answer.question, self.clicks()
         here = clicked.get(self.views[asked.view])
         if (asked.name, asked.frame, len(clicked)) != (self.name, self.frame, 1) or here is None or not np.array_equal(here, asked.xy_px):
@@ -196,7 +196,7 @@ class ClickSession:
         return True
 
     def curves(self, view: str) -> dict[str, np.ndarray]:
-        """The epipolar curves (M, 2) of the present joint's clicks in other views, by the view that was clicked."""
+        """The epipolar curves (M, 2) of the current joint's clicks in other views, by the view of the click."""
         if self.finder is None:
             return {}
         camera = dict(zip(self.views, self.finder.cameras))
@@ -204,38 +204,38 @@ class ClickSession:
         return {other: curve for other, curve in found.items() if len(curve) > 1}
 
     def next_view(self) -> str | None:
-        """The first view in which the present joint is not clicked yet."""
+        """The first view in which the current joint is not clicked yet."""
         clicked = self.clicks()
         return next((view for view in self.views if view not in clicked), None) if self.name else None
 
     def _put(self, at: Mapping[str, np.ndarray]) -> None:
-        step = _Step(turn=self.turn)
+        action = _Action(index=self.index)
         for view, xy in at.items():
             clip = self.clips[view]
             inside = np.clip(xy, -0.5, np.array(clip.size) - 0.5)
-            step.before.append((self.frame, self.name, view, clicks.get_click(clip, self.name, self.frame)))
+            action.before.append((self.frame, self.name, view, clicks.get_click(clip, self.name, self.frame)))
             _select(clip, clicks.set_click(clip, self.name, self.frame, (float(inside[0]), float(inside[1]))))
-        self._history.append(step)
+        self._history.append(action)
         if len(self.clicks()) == len(self.views):
-            self.go_to_next(self.turn + 1)
+            self.go_to_next(self.index + 1)
         else:
-            self.look()
+            self.propose()
 
     def _offer(self, proposals: Sequence[Proposal | None]) -> None:
         clicked = self.clicks()
         self.proposals = {view: p for view, p in zip(self.views, proposals) if p is not None and view not in clicked}
 
     def _depth_range(self, view: int) -> tuple[float, float] | None:
-        """Depths of the body in one camera, from the other joints clicked in this frame."""
+        """The range of depths of the body in one camera, from the other joints that are clicked in this frame."""
         assert self.finder is not None
         cameras, depths = self.finder.cameras, []
         for name in self.names:
             at = self.clicks(name) if name != self.name else {}
             if len(at) > 1:
-                seen = [cameras[self.views.index(v)] for v in at]
-                depths.append(cameras[view].to_camera(intersection(seen, np.array(list(at.values()))))[2])
-        known = [depth for depth in depths if np.isfinite(depth) and depth > 0]
-        return around_clicks(np.array(known)).depth_range_m if known else None
+                clicked = [cameras[self.views.index(v)] for v in at]
+                depths.append(cameras[view].to_camera(intersection(clicked, np.array(list(at.values()))))[2])
+        valid = [depth for depth in depths if np.isfinite(depth) and depth > 0]
+        return around_clicks(np.array(valid)).depth_range_m if valid else None
 
 
 def _select(clip: bpy.types.MovieClip, track: bpy.types.MovieTrackingTrack) -> None:
@@ -246,12 +246,12 @@ def _select(clip: bpy.types.MovieClip, track: bpy.types.MovieTrackingTrack) -> N
 
 
 def joints_of(model_joints: Sequence[str], *, hidden: bool = False) -> list[str]:
-    """The joints of a model in the order in which they are asked for; those inside the trunk come last, if at all."""
+    """The joints of a model in the order in which they are clicked; those inside the trunk come last, if at all."""
     return [name for name in (*ORDER, *(HIDDEN if hidden else ())) if name in model_joints]
 
 
 def free_seed_names(clips: Mapping[str, bpy.types.MovieClip], frame: int, count: int = 200) -> list[str]:
-    """Names for surface seeds: those half clicked in this frame, then new ones."""
+    """Names for surface seeds: those clicked in one view only, then new ones."""
     taken = {
         name
         for name in (f"seed {i}" for i in range(1, count))

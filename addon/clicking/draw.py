@@ -1,4 +1,4 @@
-"""What is drawn over the footage while clicking: the name at the cursor, the figure, epipolar lines, and proposals."""
+"""Draws over the footage while clicking: the name at the mouse, the figure, epipolar lines, and proposals."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -14,18 +14,18 @@ from ..overlay.canvas import Canvas, Colour
 from ..session import get_session
 from .click_session import ClickSession
 
-PRESENT: Colour = (1.0, 0.75, 0.1, 1.0)
+CURRENT: Colour = (1.0, 0.75, 0.1, 1.0)
 OFFER: Colour = (0.3, 1.0, 0.45, 1.0)
 LINES: tuple[Colour, ...] = ((0.35, 0.8, 1.0, 0.9), (1.0, 0.5, 0.9, 0.9), (1.0, 0.9, 0.4, 0.9), (0.6, 0.6, 1.0, 0.9))
-PAPER: Colour = (0.05, 0.05, 0.05, 0.65)
+BACKING: Colour = (0.05, 0.05, 0.05, 0.65)
 BODY: Colour = (0.75, 0.75, 0.78, 1.0)
 DONE: Colour = (0.3, 0.9, 0.4, 1.0)
-OPEN: Colour = (0.25, 0.25, 0.28, 1.0)
+MISSING: Colour = (0.25, 0.25, 0.28, 1.0)
 FIGURE_PX, MARGIN_PX, TIMELINE_PX = 190.0, 12.0, 22.0
 OFFER_PX = 11.0
 NAME_PX, UNDER_MOUSE_PX = 11.0, 12.0
-MARK = 6.0  # half the size of a mark, in pixels of the region as everything here
-GAP = 3.0  # to what is beside
+MARK = 6.0  # half the size of a mark, in pixels of the region
+GAP = 3.0  # between a name and its neighbours
 CORNERS = 16
 
 
@@ -63,13 +63,13 @@ def move_mouse(x: int, y: int) -> None:
 def _draw(drawing: Drawing) -> None:
     clicks, context = drawing.clicks, bpy.context
     clip = canvas.clip_of(context.area)
-    view = clicks.view_of(clip) if clicks.whole else None
+    view = clicks.view_of(clip) if clicks.has_all_clips else None
     if view is not None and clip is not None:
         draw_session(clicks, view, Canvas(context.region, tuple(clip.size)), drawing.mouse)
 
 
 def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[int, int]) -> None:
-    """Everything of a session in one region."""
+    """Draw a session in one region."""
     for other, curve in session.curves(view).items():
         colour = LINES[session.views.index(other) % len(LINES)]
         canvas.draw_lines(canvas.line_batch(canvas.chain(sheet.to_region(curve))), 1.5, colour)
@@ -77,7 +77,7 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
     _draw_others(session, view, sheet, np.array([x, y]))
     at = session.clicks().get(view)
     if at is not None:
-        canvas.draw_lines(canvas.line_batch(canvas.cross(sheet.to_region(at), 12.0, 3.0)), 2.0, PRESENT)
+        canvas.draw_lines(canvas.line_batch(canvas.cross(sheet.to_region(at), 12.0, 3.0)), 2.0, CURRENT)
     offer = session.proposals.get(view)
     if offer is not None:
         centre = sheet.to_region(offer.xy_px)
@@ -87,15 +87,15 @@ def draw_session(session: ClickSession, view: str, sheet: Canvas, mouse: tuple[i
     _draw_headline(session, view, sheet)
     draw_figure(session, sheet)
     if session.name and 0 <= x < sheet.region.width and 0 <= y < sheet.region.height:
-        canvas.text(session.name, x + 16, y + 10, PRESENT, size=15)
+        canvas.text(session.name, x + 16, y + 10, CURRENT, size=15)
 
 
 def _draw_others(session: ClickSession, view: str, sheet: Canvas, mouse: np.ndarray) -> None:
-    """What else was clicked in this frame: Blender's own markers are seen in frames in which nothing was clicked, too.
+    """The other clicks of this frame. (Blender's own markers are also shown in frames without clicks.)
 
-    With names, as far as there is room for them; that under the mouse in any case.
+    With names, as far as there is room for them; the name under the mouse is always drawn.
     """
-    names = session.names[: session.turn + 1] if session.endless else session.names
+    names = session.names[: session.index + 1] if session.endless else session.names
     clicked = {name: at for name in names if name != session.name and (at := session.clicks(name).get(view)) is not None}
     if not clicked:
         return
@@ -110,23 +110,23 @@ def _draw_others(session: ClickSession, view: str, sheet: Canvas, mouse: np.ndar
             canvas.text(name, *corners[i], DONE, size=NAME_PX)
         elif i == near and np.linalg.norm(marks[i] - mouse) < UNDER_MOUSE_PX:
             x, y = marks[i] + (-10.0, -3 * height)
-            canvas.fill(canvas.rectangle(x - 3, y - 4, widths[i] + 6, height + 8), PAPER)
+            canvas.fill(canvas.rectangle(x - 3, y - 4, widths[i] + 6, height + 8), BACKING)
             canvas.text(name, x, y, DONE, size=NAME_PX)
 
 
 def headline(session: ClickSession, view: str) -> str:
-    """What to do now in a view, in words."""
+    """What to do in a view."""
     if not session.name:
-        return "All clicked"
-    what = session.name if session.endless else f"{session.name} ({session.turn + 1}/{len(session.names)})"
+        return "All joints are clicked"
+    what = session.name if session.endless else f"{session.name} ({session.index + 1}/{len(session.names)})"
     if view in session.clicks():
-        return f"{what}: clicked here"
+        return f"{what}: clicked"
     if view in session.proposals:
-        return f"{what}: Return takes the ring"
+        return f"{what}: Return accepts the ring"
     if session.asking:
-        return f"{what}: looking for it…"
+        return f"{what}: searching…"
     if session.clicks():
-        return f"{what}: click on the line" if session.curves(view) else f"{what}: click here too"
+        return f"{what}: click on the line" if session.curves(view) else f"{what}: click in this view too"
     return f"{what}: click"
 
 
@@ -134,36 +134,36 @@ def _draw_headline(session: ClickSession, view: str, sheet: Canvas) -> None:
     scale = bpy.context.preferences.system.ui_scale
     top = sheet.region.height - 60 * scale
     canvas.text(f"View {view}   frame {session.frame}", 14 * scale + _left(sheet), top, (0.85, 0.85, 0.85, 1.0), size=12)
-    canvas.text(headline(session, view), 14 * scale + _left(sheet), top - 20 * scale, PRESENT, size=14)
+    canvas.text(headline(session, view), 14 * scale + _left(sheet), top - 20 * scale, CURRENT, size=14)
     if session.problem:
         canvas.text(session.problem, 14 * scale + _left(sheet), top - 40 * scale, (1.0, 0.5, 0.4, 1.0), size=11)
 
 
 def _left(sheet: Canvas) -> float:
-    """Width of what lies over the left of the region: the tool bar."""
+    """Width of the toolbar, which covers the left of the region."""
     tools = [r for r in bpy.context.area.regions if r.type == "TOOLS" and r.width > 1] if bpy.context.area else []
     return float(sum(r.width for r in tools if r.x < sheet.region.x + r.width))
 
 
 def draw_figure(session: ClickSession, sheet: Canvas) -> None:
-    """The figure in the lower left corner: the present joint ringed, clicked ones green."""
+    """The figure in the lower left corner: the current joint has a ring, clicked ones are green."""
     shape, scale = figure(), bpy.context.preferences.system.ui_scale
     size = min(FIGURE_PX * scale, 0.4 * sheet.region.height)
-    known = [name for name in session.names if name in shape.joints]
-    if not known or size < 60:
+    drawn = [name for name in session.names if name in shape.joints]
+    if not drawn or size < 60:
         return
     corner = np.array([MARGIN_PX * scale + _left(sheet), (MARGIN_PX + TIMELINE_PX) * scale])
     width, foot = shape.width * size + 24 * scale, 18 * scale
-    canvas.fill(canvas.rectangle(corner[0], corner[1], width, size + foot + 12 * scale), PAPER)
+    canvas.fill(canvas.rectangle(corner[0], corner[1], width, size + foot + 12 * scale), BACKING)
     base = corner + (12 * scale, foot + 4 * scale)
     canvas.fill(base + size * shape.triangles, BODY)
-    for name in known:
+    for name in drawn:
         clicked = len(session.clicks(name))
-        colour = PRESENT if name == session.name else DONE if clicked > 1 else OPEN
+        colour = CURRENT if name == session.name else DONE if clicked > 1 else MISSING
         canvas.fill(_dot(base + size * shape.joints[name], (4.5 if name == session.name else 3.0) * scale), colour)
     if session.name in shape.joints:
         at = base + size * shape.joints[session.name]
-        canvas.draw_lines(canvas.line_batch(canvas.ring(at, 9 * scale)), 2.5, PRESENT)
+        canvas.draw_lines(canvas.line_batch(canvas.ring(at, 9 * scale)), 2.5, CURRENT)
     canvas.text("R", base[0], corner[1] + 6 * scale, (0.8, 0.8, 0.8, 1.0), size=11)
     canvas.text("L", base[0] + shape.width * size - 8 * scale, corner[1] + 6 * scale, (0.8, 0.8, 0.8, 1.0), size=11)
 
@@ -175,9 +175,10 @@ def _dot(centre: np.ndarray, radius: float, corners: int = 12) -> np.ndarray:
 
 
 def place_labels(marks: np.ndarray, widths: np.ndarray, height: float, region: tuple[float, float]) -> np.ndarray:
-    """The lower left corners (N, 2) of names of these widths (N,) beside their marks (N, 2); NaN where there is no room for one.
+    """Lower left corners (N, 2) for names of these widths (N,) next to their marks (N, 2), so that none overlaps another name or a mark;
+    NaN for a name without room.
 
-    Earlier names are given room first. All in pixels of a region of this width and height.
+    Earlier names take precedence. All in pixels of a region of this width and height.
     """
     found, taken = np.full((len(marks), 2), np.nan), np.concatenate([marks - MARK, marks + MARK], axis=1)
     for i, (mark, width) in enumerate(zip(marks, widths)):
@@ -192,7 +193,7 @@ def place_labels(marks: np.ndarray, widths: np.ndarray, height: float, region: t
 
 
 def _around(width: float, height: float) -> np.ndarray:
-    """Corners (K, 2) of a name about a mark: above it first, clear of Blender's own marker and its handle, then beside, then below."""
+    """Corners (K, 2) of a name around a mark: above it first, clear of Blender's marker and its handle, then at its sides, then below."""
     near, high = MARK + GAP, 18.0
     return np.array([(-10.0, high), (near, -height / 2), (-near - width, -height / 2), (near - width, high), (-width / 2, -near - height),
                      (near, near), (-near - width, near), (near, -near - height), (-near - width, -near - height)])  # fmt: skip
@@ -200,16 +201,16 @@ def _around(width: float, height: float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Figure:
-    """The figure in a unit of its height; x to the right as one who faces the person sees it, y up, the origin at its lower left."""
+    """The figure, of height 1, seen from the front; x to the right, y up, the origin at its lower left."""
 
-    triangles: np.ndarray  # (N, 3, 2) of its body
+    triangles: np.ndarray  # (N, 3, 2)
     joints: dict[str, np.ndarray]  # (2,) by name
     width: float
 
 
 @cache
 def figure() -> Figure:
-    """The whole body's model at rest. The person faces −y of the world and is seen from there: its right is on the left."""
+    """The whole-body model in its rest pose. The person faces −y of the world and is drawn from there, so its right side is on the left."""
     model = read_model("full")
     skeleton = model.skeleton
     lengths = np.array([bone.nominal_length_m for bone in skeleton.bones])
@@ -226,7 +227,7 @@ def figure() -> Figure:
 
 
 def _limb(a: np.ndarray, b: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """A bone's silhouette: discs at 1/6, 1/2 and 5/6 of it, and what lies between them, as triangles (N, 3, 2)."""
+    """A bone's silhouette as triangles (N, 3, 2): discs at 1/6, 1/2 and 5/6 of its length, and the area between them."""
     centres = [a + share * (b - a) for share in (0.0, 1 / 6, 0.5, 5 / 6, 1.0)]
     widths = [0.8 * radii[0], *radii, 0.8 * radii[2]]
     along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)

@@ -1,4 +1,4 @@
-"""Finds a click's proposals on a thread of its own: the window stays alive while images are read and matched. No Blender in here."""
+"""Finds the proposals of a click on a thread of its own, so that the window stays responsive while images are matched. Without bpy."""
 
 import logging
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from ..session import get_session
 
 log = logging.getLogger(__name__)
 
-KEPT_FRAMES = 2
+CACHED_FRAMES = 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Question:
-    """A click: what was clicked where."""
+    """A click for which proposals are wanted."""
 
     name: str
     frame: int
@@ -35,7 +35,7 @@ class Question:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Answer:
-    """The proposals, one or None per view; or the sentence that says why there are none."""
+    """The proposals, one or None per view, or the reason why there are none."""
 
     question: Question
     proposals: tuple[Proposal | None, ...]
@@ -43,7 +43,7 @@ class Answer:
 
 
 class Finder:
-    """One question at a time; the latest replaces those that still wait."""
+    """Answers one question at a time; a new question replaces one that still waits."""
 
     def __init__(self, footage: Footage, settings: MatchingSettings) -> None:
         self._footage, self._settings = footage, settings
@@ -62,13 +62,13 @@ class Finder:
         self._pool.submit(self._load, frame)
 
     def ask(self, question: Question) -> None:
-        """Look for the proposals of a click; `poll` gives them."""
+        """Find the proposals of a click; `poll` returns them."""
         if self._pending is not None:
             self._pending.cancel()
         self._pending = self._pool.submit(self._answer, question)
 
     def poll(self) -> Answer | None:
-        """The answer to the latest question, once, when it is there."""
+        """The answer to the latest question, once, as soon as it is known."""
         if self._pending is None or not self._pending.done() or self._pending.cancelled():
             return None
         answer, self._pending = self._pending.result(), None
@@ -81,7 +81,7 @@ class Finder:
         return self.poll()
 
     def close(self) -> None:
-        """End the thread; what it is doing is finished first (well below a second)."""
+        """End the thread after its current computation (well below a second)."""
         self._pool.shutdown(wait=True, cancel_futures=True)
         if self in (open_finders := get_session().finders):
             open_finders.remove(self)
@@ -95,14 +95,14 @@ class Finder:
             found = propose(views, asked.xy_px, self._settings, asked.depth_range_m)
         except InputError as error:
             return Answer(question=question, proposals=nothing, problem=str(error))
-        except Exception as error:  # the edge of the thread: a mistake of ours takes no click away
+        except Exception as error:  # the edge of the thread: an error in here must not cost a click
             log.exception("No proposals for %s.", question.name)
-            return Answer(question=question, proposals=nothing, problem=f"Tricap made a mistake ({error}); the console shows where.")
+            return Answer(question=question, proposals=nothing, problem=f"Internal error ({error}); see the system console.")
         return Answer(question=question, proposals=found)
 
     def _load(self, frame: int) -> list[SplineImage]:
         if frame not in self._images:
-            while len(self._images) >= KEPT_FRAMES:
+            while len(self._images) >= CACHED_FRAMES:
                 self._images.pop(next(iter(self._images)))
             rows = self._footage.take.rows_at(frame)
             self._images[frame] = [SplineImage(rows.rows(image)) for image in self._footage.read(frame)]

@@ -9,12 +9,12 @@ from .. import clicks, project
 from ..overlay import canvas
 
 NAME = "Tricap Clicks"
-FROM_KEY = "tricap_from"  # of the workspace: the one from which it was opened
+FROM_KEY = "tricap_from"  # custom property of the workspace: the one from which it was opened
 SHOWN = (
     ("nothing", "Nothing", "The footage alone"),
-    ("points", "Points", "The matched points, coloured by sigma"),
-    ("tracks", "Trajectories", "What was followed, and what the filters took out"),
-    ("body", "Body", "The fitted body's outline"),
+    ("points", "Points", "The measured points, coloured by sigma"),
+    ("tracks", "Trajectories", "The trajectories, and those that the filters removed"),
+    ("body", "Body", "The outline of the fitted body"),
 )
 MOST_VIEWS = 9
 SOON_S, TRIES = 0.05, 40  # a workspace is shown only after the event that asked for it
@@ -22,11 +22,11 @@ CLOSED = ("OUTLINER", "PROPERTIES")
 
 
 class OpenViews(bpy.types.Operator):
-    """Show all views beside each other in a workspace of its own, “Tricap Clicks”; your other workspaces stay as they are. Before the first
-    click it goes to the seed frame"""
+    """Show all views side by side in the workspace “Tricap Clicks”. Your other workspaces do not change. As long as nothing is clicked, the
+    scene goes to the click frame"""
 
     bl_idname = "tricap.open_views"
-    bl_label = "Open the Views"
+    bl_label = "Open Views"
     bl_options = {"UNDO"}
 
     show: bpy.props.EnumProperty(name="Show", items=SHOWN, description="What to show over the footage")  # type: ignore[valid-type]
@@ -37,7 +37,7 @@ class OpenViews(bpy.types.Operator):
         return len(context.scene.tricap.views) > 0
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Go to the workspace, made if it is not there, and lay out the views once Blender shows it."""
+        """Go to the workspace, created if needed, and lay out the views once Blender shows it."""
         try:
             clips = list(project.clips_of(context.scene).values())[:MOST_VIEWS]
         except InputError as error:
@@ -45,7 +45,7 @@ class OpenViews(bpy.types.Operator):
             return {"CANCELLED"}
         window, known = context.window, bpy.data.workspaces.get(NAME)
         if window is None:
-            self.report({"ERROR"}, "The views can only be opened in Blender's window.")
+            self.report({"ERROR"}, "Views can only be opened in Blender's window, not in background mode.")
             return {"CANCELLED"}
         if known is None:
             before = set(bpy.data.workspaces)
@@ -65,10 +65,10 @@ class OpenViews(bpy.types.Operator):
 
 
 class BackToSteps(bpy.types.Operator):
-    """Go back to the workspace from which the views were opened, where Tricap's steps are"""
+    """Go back to the workspace from which the views were opened"""
 
     bl_idname = "tricap.back_to_steps"
-    bl_label = "Back to the Steps"
+    bl_label = "Back to Steps"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -76,20 +76,20 @@ class BackToSteps(bpy.types.Operator):
         return context.workspace is not None and context.workspace.name == NAME
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Show that workspace; where it is gone, any with a 3-D view."""
+        """Show that workspace; if it was deleted, any other with a 3-D view."""
         others = [w for w in bpy.data.workspaces if w.name != NAME]
         spatial = [w for w in others if any(a.type == "VIEW_3D" for screen in w.screens for a in screen.areas)]
         known = bpy.data.workspaces.get(context.workspace.get(FROM_KEY, ""))
         back = known if known in others else next(iter([*spatial, *others]), None)
         if back is None:
-            self.report({"ERROR"}, "There is no other workspace; add one by the + at the top of the window.")
+            self.report({"ERROR"}, "There is no other workspace. Add one with the + at the top of the window.")
             return {"CANCELLED"}
         context.window.workspace = back
         return {"FINISHED"}
 
 
 def draw_back(header: bpy.types.Header, context: bpy.types.Context) -> None:
-    """In the header of the first view: the way back."""
+    """The button Back to Steps in the header of the first view."""
     mine = canvas.clip_areas(context.window)
     if BackToSteps.poll(context) and mine and context.area == min(mine, key=lambda a: (-a.y, a.x)):
         header.layout.operator("tricap.back_to_steps", icon="LOOP_BACK")
@@ -114,7 +114,7 @@ def _waiter(window: bpy.types.Window, clip_names: Sequence[str], *, switches: bo
 
 
 def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip], *, switches: bool = False) -> Iterator[str]:
-    """A Clip Editor for each clip, in rows, in the place of the largest area; with `switches`, the last one's sidebar is open at Tricap.
+    """Replace the largest area by a Clip Editor for each clip, in rows; with `switches`, the last one's sidebar is open at Tricap.
 
     Between the steps Blender gives the new areas their sizes.
     """
@@ -145,10 +145,10 @@ def lay_out(window: bpy.types.Window, clips: Sequence[bpy.types.MovieClip], *, s
 
 
 def _split(window: bpy.types.Window, area: bpy.types.Area, parts: int, direction: str) -> list[bpy.types.Area]:
-    """Cut an area into equal parts, all of them Clip Editors."""
+    """Split an area into equal parts, all of them Clip Editors."""
     area.type = "CLIP_EDITOR"
     before = set(window.screen.areas) - {area}
-    for left in range(parts, 1, -1):  # the area itself is cut each time: a new one has no size yet
+    for left in range(parts, 1, -1):  # the area itself is split each time: a new one has no size yet
         with bpy.context.temp_override(window=window, area=area, region=canvas.window_region(area)):
             bpy.ops.screen.area_split(direction=direction, factor=1 / left)
     return [a for a in window.screen.areas if a not in before]
@@ -159,7 +159,7 @@ def _show(area: bpy.types.Area, clip: bpy.types.MovieClip) -> None:
     space = area.spaces.active
     space.mode, space.view = "TRACKING", "CLIP"
     space.clip = clip
-    space.show_disabled = False  # clicks that were taken back
+    space.show_disabled = False  # removed clicks
     space.show_region_toolbar = False
     space.show_region_ui = False
     space.clip_user.use_render_undistorted = False

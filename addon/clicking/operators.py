@@ -20,36 +20,36 @@ from .finder import Finder
 
 TICK_S, SNAP_PX = 0.05, 6.0
 NUMBERS = ("ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE")
-KEYS = "Click: set    Return: take the proposals    S / right click: skip    Backspace: back    Tab, 1…9: view    Esc: done"
+KEYS = "Click: set    Return: accept proposals    S / right click: skip    Backspace: undo    Tab, 1…9: view    Esc: finish"
 
 
 class ClickOperator:
-    """A modal operator about a `ClickSession`: turns events into its methods, everything else passes through (zoom, pan, G, time line)."""
+    """A modal operator around a `ClickSession`: maps events to its methods; all others pass through (zoom, pan, G, timeline)."""
 
     session: ClickSession
     timer: Any = None
-    seen = False  # whether views have been on show
+    visible = False  # whether a view is shown
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
-        """What is clicked, one after the other."""
+        """The names to click, in order."""
         raise NotImplementedError
 
     def follow(self, context: bpy.types.Context) -> None:
-        """The scene may show another frame now."""
+        """React to a change of the scene's frame."""
         self.session.show_frame(context.scene.frame_current)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Begin; opens the views where no Clip Editor shows one."""
+        """Begin; opens the views if no Clip Editor shows one."""
         if get_session().click_operator is not None:
-            self.report({"WARNING"}, "You are clicking already; press Esc in a view to end that.")  # type: ignore[attr-defined]
+            self.report({"WARNING"}, "Clicking is already active. Press Esc in a view to finish it.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         try:
-            self.session, said = begin_session(context.scene, self.names)
+            self.session, warning = begin_session(context.scene, self.names)
         except InputError as error:
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
             return {"CANCELLED"}
-        if said:
-            self.report({"WARNING"}, said)  # type: ignore[attr-defined]
+        if warning:
+            self.report({"WARNING"}, warning)  # type: ignore[attr-defined]
         if not [area for area in canvas.clip_areas(context.window) if self._view(area) is not None]:
             bpy.ops.tricap.open_views()
         draw.begin(self.session)
@@ -65,12 +65,12 @@ class ClickOperator:
         try:
             if event.type == "TIMER":
                 here = any(self._view(area) is not None for area in canvas.clip_areas(context.window))
-                if self.seen and not here:  # its user went elsewhere
+                if self.visible and not here:  # the user went to another workspace
                     return self._end(context)
                 self.follow(context)
-                if self.session.poll() or here != self.seen:  # cutting areas wiped the words away
+                if self.session.poll() or here != self.visible:  # splitting areas clears the status bar
                     self._show(context)
-                self.seen = here
+                self.visible = here
                 return {"PASS_THROUGH"}
             if event.type == "MOUSEMOVE":
                 draw.move_mouse(event.mouse_x, event.mouse_y)
@@ -86,7 +86,7 @@ class ClickOperator:
         self.clear(context)
 
     def clear(self, context: bpy.types.Context) -> None:
-        """Nothing is watched or drawn any more."""
+        """End the timer, the drawing and the finder."""
         draw.end()
         get_session().click_operator = None
         if self.session.finder is not None:
@@ -115,7 +115,7 @@ class ClickOperator:
         return {"RUNNING_MODAL"}
 
     def _act_in(self, area: bpy.types.Area, view: str, event: bpy.types.Event) -> bool:
-        """Do what an event over a view means; False where it is not ours."""
+        """Handle an event over a view; False if it is none of ours."""
         key, session = event.type, self.session
         ours = key in ("LEFTMOUSE", "RIGHTMOUSE", "RET", "NUMPAD_ENTER", "BACK_SPACE", "S", "TAB", *NUMBERS[: len(session.views)])
         if not ours or event.ctrl or event.alt or event.shift or event.oskey:
@@ -141,7 +141,7 @@ class ClickOperator:
         return True
 
     def _turn_to_next(self, area: bpy.types.Area, window: bpy.types.Window) -> None:
-        """With a single Clip Editor: show the next view in which the joint is not clicked yet."""
+        """With a single Clip Editor, show the next view in which the joint is not clicked yet."""
         mine, wanted = [a for a in canvas.clip_areas(window) if self._view(a) is not None], self.session.next_view()
         if len(mine) == 1 and wanted is not None:
             show_view(area, self.session.clips[wanted])
@@ -156,25 +156,25 @@ class ClickOperator:
     def _end(self, context: bpy.types.Context) -> set[str]:
         self.clear(context)
         session = self.session
-        if not session.changed or not session.whole:
+        if not session.changed or not session.has_all_clips:
             return {"FINISHED" if session.changed else "CANCELLED"}
         done = sum(len(session.clicks(name)) > 1 for name in session.names)
-        said = f"Frame {session.frame}: {done} of {len(session.names)} are clicked in two views or more."
-        self.report({"INFO"}, f"{said} Press Back to the Steps, above the left view.")  # type: ignore[attr-defined]
+        result = f"Frame {session.frame}: {done} of {len(session.names)} are clicked in two or more views."
+        self.report({"INFO"}, f"{result} Press Back to Steps, above the first view.")  # type: ignore[attr-defined]
         return {"FINISHED"}
 
 
 class ClickJoints(ClickOperator, bpy.types.Operator):
-    """Click the joints of the body model, one after the other, in each view. After a click in one view the others show the line on which
-    the joint lies, and where it probably is. In another frame than that of the first clicks this adds a keyframe for the fit"""
+    """Click the joints of the body, one after the other, in each view. After a click in one view the others show the epipolar line of the
+    joint and its probable position. In any frame other than the click frame, clicks are a keyframe for the fit"""
 
     bl_idname = "tricap.click_joints"
     bl_label = "Click Joints"
     bl_options = {"REGISTER", "UNDO"}
 
-    only: bpy.props.StringProperty(name="Only", description="Click this joint alone; empty: all of the model")  # type: ignore[valid-type]
+    only: bpy.props.StringProperty(name="Only", description="Click only this joint. Empty: all joints of the body")  # type: ignore[valid-type]
     hidden: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Ask for Hidden Joints", description="Ask also for chest, spine and collarbones, which hardly anyone can see from outside"
+        name="Include Hidden Joints", description="Also click chest, spine and collarbones, which are hard to locate from outside"
     )
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
@@ -185,7 +185,7 @@ class ClickJoints(ClickOperator, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Clicking needs a window."""
-        self.report({"ERROR"}, "Clicking needs Blender's window; scripts use bpy.ops.tricap.click(name=…, view=…, x=…, y=…).")
+        self.report({"ERROR"}, "Clicking needs Blender's window. Scripts use bpy.ops.tricap.click(name=…, view=…, x=…, y=…).")
         return {"CANCELLED"}
 
 
@@ -205,15 +205,15 @@ class GoToFrame(bpy.types.Operator):
 
 
 class ClickSeeds(ClickOperator, bpy.types.Operator):
-    """Click points of the surface, each in two views or more. You need not: they are found automatically. It helps where the person is
-    not the nearest thing in sight, or where there is little texture"""
+    """Click points of the surface, each in two or more views. Usually they are found automatically; clicks help if something is in front of
+    the person, or if there is little texture"""
 
     bl_idname = "tricap.click_seeds"
     bl_label = "Click Surface Seeds"
     bl_options = {"REGISTER", "UNDO"}
 
     def names(self, context: bpy.types.Context, clips: dict[str, bpy.types.MovieClip]) -> list[str]:
-        """Seeds without end, in the frame of the first clicks."""
+        """Any number of seeds, in the click frame."""
         if any(clicks.clicked_frames(clip) for clip in clips.values()):
             context.scene.frame_set(context.scene.tricap.seed_frame)
         return free_seed_names(clips, context.scene.frame_current)
@@ -225,16 +225,16 @@ class ClickSeeds(ClickOperator, bpy.types.Operator):
             InputError: the scene shows another one.
         """
         if context.scene.frame_current != self.session.frame:
-            raise InputError(f"Surface seeds belong to frame {self.session.frame}, where measuring starts; go back there for more.")
+            raise InputError(f"Surface seeds belong to the click frame. Go back to frame {self.session.frame} to click more.")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Clicking needs a window."""
-        self.report({"ERROR"}, 'Clicking needs Blender\'s window; scripts use bpy.ops.tricap.click(name="seed 1", view=…, x=…, y=…).')
+        self.report({"ERROR"}, 'Clicking needs Blender\'s window. Scripts use bpy.ops.tricap.click(name="seed 1", view=…, x=…, y=…).')
         return {"CANCELLED"}
 
 
 class Click(bpy.types.Operator):
-    """Put a joint or a surface seed at a pixel of a view, as a click would"""
+    """Set the click of a joint or a surface seed at a pixel of a view"""
 
     bl_idname = "tricap.click"
     bl_label = "Set a Click"
@@ -242,61 +242,61 @@ class Click(bpy.types.Operator):
 
     name: bpy.props.StringProperty(name="Name", description="A joint, such as elbow.R, or “seed 1”, “seed 2”, …")  # type: ignore[valid-type]
     view: bpy.props.StringProperty(name="View", description="Name of the view")  # type: ignore[valid-type]
-    x: bpy.props.FloatProperty(name="X", description="Pixels from the middle of the left column")  # type: ignore[valid-type]
-    y: bpy.props.FloatProperty(name="Y", description="Pixels from the middle of the top row, downwards")  # type: ignore[valid-type]
-    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the scene's present frame")  # type: ignore[valid-type]
-    remove: bpy.props.BoolProperty(name="Remove", description="Take the click back instead")  # type: ignore[valid-type]
+    x: bpy.props.FloatProperty(name="X", description="Pixels from the centre of the left column")  # type: ignore[valid-type]
+    y: bpy.props.FloatProperty(name="Y", description="Pixels from the centre of the top row, downwards")  # type: ignore[valid-type]
+    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="−1: the scene's current frame")  # type: ignore[valid-type]
+    remove: bpy.props.BoolProperty(name="Remove", description="Remove the click instead")  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Set or take back one click."""
+        """Set or remove one click."""
         try:
             clips = project.clips_of(context.scene)
             if not clicks.is_click(self.name):
-                raise InputError(f"“{self.name}” is no joint; known are {', '.join(JOINTS)} and “seed 1”, “seed 2”, …")
+                raise InputError(f"“{self.name}” is not a joint. Use {', '.join(JOINTS)}, or “seed 1”, “seed 2”, …")
             if self.view not in clips:
-                raise InputError(f"There is no view “{self.view}”; known are {', '.join(clips) or 'none, add footage first'}.")
+                raise InputError(f"There is no view “{self.view}”. The views are: {', '.join(clips) or 'none, add footage first'}.")
             clip, frame = clips[self.view], context.scene.frame_current if self.frame < 0 else self.frame
             if not (-0.5 <= self.x <= clip.size[0] - 0.5 and -0.5 <= self.y <= clip.size[1] - 0.5):
-                raise InputError(f"({self.x:g}, {self.y:g}) lies outside the image of {clip.size[0]}×{clip.size[1]} pixels.")
+                raise InputError(f"({self.x:g}, {self.y:g}) is outside the image of {clip.size[0]}×{clip.size[1]} pixels.")
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if self.remove:
             return {"FINISHED"} if clicks.remove_click(clip, self.name, frame) else {"CANCELLED"}
-        note_first_frame(context.scene, clips, frame)
+        set_click_frame(context.scene, clips, frame)
         exact = properties.exact
         clicks.set_click(clip, self.name, frame, (exact(self.x), exact(self.y)))
         return {"FINISHED"}
 
 
 def begin_session(scene: bpy.types.Scene, names: Any) -> tuple[ClickSession, str]:
-    """A session for the scene's present frame, and what to warn of.
+    """A session for the scene's current frame, and a warning or "".
 
     Raises:
         InputError: there is no footage, or no model to click joints of.
     """
     clips = project.clips_of(scene)
     if not clips:
-        raise InputError("Add the footage first: there is no view to click in.")
+        raise InputError("Add footage first: there is no view to click in.")
     wanted = names(bpy.context, clips)
-    finder, said = make_finder(scene)
-    note_first_frame(scene, clips, scene.frame_current)
+    finder, warning = make_finder(scene)
+    set_click_frame(scene, clips, scene.frame_current)
     session = ClickSession(clips, wanted, scene.frame_current, finder, _depths(scene))
-    if not session.name:  # all clicked already: begin again at the first, to look at them or to mend them
+    if not session.name:  # all are clicked: begin with the first, to check or correct them
         session.go_to(session.names[0])
     if finder is not None:
         finder.prepare(session.frame)
-    return session, said
+    return session, warning
 
 
 def make_finder(scene: bpy.types.Scene) -> tuple[Finder | None, str]:
-    """What finds proposals; None, and why, where cameras or images are missing."""
+    """The finder of proposals; None and the reason if cameras or images are missing."""
     try:
         take = project.take(scene)
         footage = open_take(replace(take, seeds=Seeds(), keyframes=(), corrections=(), frames=None))
         settings = take_run.settings_of(take.settings, properties.overrides(scene), "take.toml")["matching"]
     except InputError as error:
-        return None, f"No epipolar lines and proposals: {error}"
+        return None, f"Epipolar lines and proposals are not available: {error}"
     return Finder(footage, settings), ""
 
 
@@ -304,10 +304,10 @@ def model_joints(scene: bpy.types.Scene) -> tuple[str, ...]:
     """The joints of the scene's body model.
 
     Raises:
-        InputError: none is chosen, or its file is faulty.
+        InputError: none is chosen, or its file is invalid.
     """
     if not project.model_of(scene):
-        raise InputError("Choose a body model first: it tells which joints to click.")
+        raise InputError("Choose a body in step 3 first: it determines the joints to click.")
     return _model(scene).skeleton.joint_names
 
 
@@ -317,17 +317,17 @@ def _depths(scene: bpy.types.Scene) -> dict[str, float]:
 
 def _model(scene: bpy.types.Scene) -> BodyModel:
     name = str(project.body_model(scene))
-    return read_model(name) if name.endswith(".toml") else _known_model(name)
+    return read_model(name) if name.endswith(".toml") else _builtin_model(name)
 
 
 @cache
-def _known_model(name: str) -> BodyModel:
-    """One of Tricap's own; a panel asks for it each time that it is drawn."""
+def _builtin_model(name: str) -> BodyModel:
+    """A built-in model, cached because a panel needs it whenever it is drawn."""
     return read_model(name)
 
 
-def note_first_frame(scene: bpy.types.Scene, clips: dict[str, bpy.types.MovieClip], frame: int) -> None:
-    """The first clicks of all say which frame is that of the seeds."""
+def set_click_frame(scene: bpy.types.Scene, clips: dict[str, bpy.types.MovieClip], frame: int) -> None:
+    """The very first click sets the click frame."""
     if not any(clicks.clicked_frames(clip) for clip in clips.values()):
         scene.tricap.seed_frame = frame
 

@@ -1,4 +1,4 @@
-"""The section “Clicks” in the Clip Editor's sidebar."""
+"""The panel “Clicks” in the Clip Editor's sidebar."""
 
 import bpy
 
@@ -10,7 +10,7 @@ from .operators import model_joints
 
 
 class ClipPanel:
-    """Where Tricap's sections of the Clip Editor live."""
+    """The place of Tricap's panels in the Clip Editor."""
 
     bl_space_type = "CLIP_EDITOR"
     bl_region_type = "UI"
@@ -24,10 +24,10 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
     bl_order = 0
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Buttons, and which joints are clicked in how many views."""
+        """Buttons, and the joints with the views in which they are clicked."""
         layout, scene = self.layout, context.scene
         if not scene.tricap.views:
-            sentence(layout, context, "Add footage first: in the 3-D view's sidebar, tab Tricap.", "INFO")
+            sentence(layout, context, "Add footage first: tab Tricap in the sidebar of the 3-D view.", "INFO")
             return
         view = project.view_of(scene, context.space_data.clip)
         if view is not None:
@@ -36,17 +36,17 @@ class TRICAP_PT_clicks(ClipPanel, bpy.types.Panel):
         row = layout.row()
         row.scale_y = 1.4
         row.operator("tricap.click_joints", icon="RESTRICT_SELECT_OFF")
-        layout.operator("tricap.click_seeds", icon="STICKY_UVS_DISABLE", text="Click Seeds (optional)")
+        layout.operator("tricap.click_seeds", icon="STICKY_UVS_DISABLE", text="Click Surface Seeds (Optional)")
         self._draw_frame(layout, scene)
         self._draw_joints(layout, scene)
 
     def _draw_frame(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         first = scene.tricap.seed_frame
         if scene.frame_current == first:
-            layout.label(text=f"Frame {first}: the first clicks", icon="KEYTYPE_KEYFRAME_VEC")
+            layout.label(text=f"Frame {first}: click frame", icon="KEYTYPE_KEYFRAME_VEC")
         else:
-            layout.label(text=f"Frame {scene.frame_current}: for a keyframe", icon="KEYTYPE_EXTREME_VEC")
-            layout.operator("tricap.go_to_frame", text=f"To the First Clicks ({first})").frame = first
+            layout.label(text=f"Frame {scene.frame_current}: clicks are a keyframe", icon="KEYTYPE_EXTREME_VEC")
+            layout.operator("tricap.go_to_frame", text=f"Go to Click Frame ({first})").frame = first
 
     def _draw_joints(self, layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         try:

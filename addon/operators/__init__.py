@@ -1,4 +1,4 @@
-"""The steps of the workflow as operators, one file each; every one can be called from a script with all its arguments."""
+"""Operators that run the stages and build the scene; each can be called from a script with all its arguments."""
 
 import bpy
 

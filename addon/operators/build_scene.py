@@ -23,7 +23,7 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
 class BuildScene(JobOperator, bpy.types.Operator):
-    """Put the results of a run into this scene: cameras with footage, cloud, trajectories, armature, action and skin"""
+    """Build the results of a run in this scene: cameras with footage, point cloud, trajectories, armature, action and skin"""
 
     bl_idname = "tricap.build_scene"
     bl_label = "Build Scene"
@@ -31,44 +31,44 @@ class BuildScene(JobOperator, bpy.types.Operator):
     step = "rig"
 
     out: bpy.props.StringProperty(
-        name="Contents",
+        name="Results",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder of a run; empty: the panel's output folder",
+        description="Folder of a run. Empty: the output folder of the panel",
     )
     blend: bpy.props.StringProperty(
         name="Save As",
         subtype="FILE_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Also save a copy of the file under this name; empty: do not save",
+        description="Also save a copy of the file under this name. Empty: do not save",
     )
 
     rest_pose: bpy.props.EnumProperty(
         name="Rest Pose",
         items=[(pose, f"{pose}-pose", "") for pose in POSES],  # type: ignore[valid-type]
-        description="In A-pose every channel is a number of motion.csv",
+        description="Rest pose of the armature. In A-pose the channels equal the columns of motion.csv",
     )
     detail: bpy.props.IntProperty(
         name="Skin Detail",
         default=DEFAULTS.detail,
         min=1,
         max=8,  # type: ignore[valid-type]
-        description="Pieces of each edge of the skin",
+        description="Level of detail of the skin: subdivisions of each edge",
     )
     exact_skin: bpy.props.BoolProperty(
         name="Exact Skin",
         default=False,  # type: ignore[valid-type]
-        description="Also the skin of every frame as the run found it, in a .pc2 beside the saved file",
+        description="Also play the skin that was computed for every frame, from a .pc2 file next to the saved file",
     )
     implicit: bpy.props.BoolProperty(
         name="Implicit Surface",
         default=False,  # type: ignore[valid-type]
-        description="Also the surface of the exact field in the middle frame, to check skins against",
+        description="Also build the exact implicit surface in the middle frame, to compare skins with",
     )
     field: bpy.props.EnumProperty(
         name="Field",
         items=[(name, name.capitalize(), "") for name in POTENTIALS],  # type: ignore[valid-type]
-        description="The field of the implicit surface's balls; the exponential is the fitted one",
+        description="Field function of the metaballs of the implicit surface. The fit uses the exponential one",
     )
     simplify: bpy.props.FloatProperty(
         name="Simplify",
@@ -76,13 +76,13 @@ class BuildScene(JobOperator, bpy.types.Operator):
         min=0.0,
         max=math.radians(10),
         subtype="ANGLE",  # type: ignore[valid-type]
-        description="Play an action with few keys within this angle; the measured one is kept. 0: measured",
+        description="Play an action with fewer keyframes, within this angle of the measured one, which is kept. 0: play the measured one",
     )
     colour: bpy.props.EnumProperty(name="Cloud Colour", items=[(c, c.capitalize(), "") for c in COLOURS])  # type: ignore[valid-type]
     arrows: bpy.props.BoolProperty(name="Velocity Arrows", default=False)  # type: ignore[valid-type]
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Contents]:
-        """Which folder is meant."""
+        """The folder with the results."""
         out, skins = folders.output_folder(self.out, context.scene), self.exact_skin
         return lambda monitor: read_contents(out, monitor, skins=skins)
 
@@ -109,14 +109,14 @@ def put_into_scene(
     blend: Path | None = None,
     options: SceneOptions = DEFAULTS,
 ) -> None:
-    """Build the scene and tell what it has; the first time, turn the 3-D views to the body."""
+    """Build the scene and report its contents; the first time, frame the body in the 3-D views."""
     first = scene_build.COLLECTION not in bpy.data.collections
-    tell(operator, write_scene(contents, blend, options))
+    report_scene(operator, write_scene(contents, blend, options))
     body = bpy.data.objects.get(armature.NAME)
     if body is not None and context.scene.tricap_retarget.source is None:
         context.scene.tricap_retarget.source = body
     if first and body is not None and context.window is not None and not bpy.app.background:
-        _put_aside_cube(operator, context)
+        _hide_default_cube(operator, context)
         for item in context.selected_objects:
             item.select_set(False)
         body.select_set(True)
@@ -126,18 +126,18 @@ def put_into_scene(
                 bpy.ops.view3d.view_selected()
 
 
-def _put_aside_cube(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
-    """Hide the cube of Blender's start-up file, in which a body stands up to the chest, if nobody touched it."""
+def _hide_default_cube(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
+    """Hide the cube of Blender's startup file, in which the body would stand up to the chest, if it is unchanged."""
     cube = context.scene.objects.get("Cube")
     if cube is None or cube.type != "MESH" or cube.matrix_world != Matrix() or cube.modifiers or cube.animation_data or cube.hide_get():
         return
     if sorted(tuple(round(x) for x in v.co) for v in cube.data.vertices) == sorted(product((-1, 1), repeat=3)):
         cube.hide_set(True)
-        operator.report({"INFO"}, "The cube of the start-up file was hidden: the body stands in it.")
+        operator.report({"INFO"}, "The default cube was hidden, because the body stands in it.")
 
 
-def tell(operator: bpy.types.Operator, report: SceneReport) -> None:
-    """Show what was built, and what is missing."""
+def report_scene(operator: bpy.types.Operator, report: SceneReport) -> None:
+    """Report what was built, and what is missing."""
     for warning in report.warnings:
         operator.report({"WARNING"}, warning)
     operator.report({"INFO"}, f"The scene has {report}.")

@@ -15,7 +15,7 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
 class ImportTracks2d(bpy.types.Operator):
-    """Points that `tricap track2d` followed in one camera: an empty for each over the footage, and curves between those that are joined"""
+    """Import points that `tricap track2d` tracked in one camera: an empty for each over the footage, and curves between joined points"""
 
     bl_idname = "tricap.import_tracks2d"
     bl_label = "Tricap 2-D Tracks (.csv)"
@@ -24,10 +24,14 @@ class ImportTracks2d(bpy.types.Operator):
     filepath: bpy.props.StringProperty(subtype="FILE_PATH", options=RELATIVE)  # type: ignore[valid-type]
     filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})  # type: ignore[valid-type]
     points: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="Points", options=RELATIVE, description="The table of the chosen points, whose joined_to says what is joined; empty: nothing"
+        name="Points",
+        options=RELATIVE,
+        description="Table of the chosen points, whose column joined_to names the points to join. Empty: none are joined",
     )
     footage: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="Footage", options=RELATIVE, description="The movie or the folder of images that they were followed in; empty: none is shown"
+        name="Footage",
+        options=RELATIVE,
+        description="The movie or the folder of images in which they were tracked. Empty: no footage is shown",
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -53,7 +57,7 @@ def read_joints(path: Path, table: PlanarTable) -> tuple[tuple[str, str], ...]:
     """The pairs of points to join.
 
     Raises:
-        InputError: the file is no table of points, or joins one that was not followed.
+        InputError: the file is not a table of points, or joins a point that was not tracked.
     """
     joined = read_points(path).joined
     for name in (name for pair in joined for name in pair):

@@ -23,10 +23,10 @@ SAMPLE = ArmTakeSettings(frames=12, fps=15.0, width_px=512, interlaced="none")
 
 
 class Run(StageOperator, bpy.types.Operator):
-    """Do everything that is missing, from the first image to the rig; what is done already is kept, a stopped run goes on where it was"""
+    """Run all steps that are not done yet, from the footage to the rig. A stopped run resumes where it stopped"""
 
     bl_idname = "tricap.run"
-    bl_label = "Run"
+    bl_label = "Run Remaining Steps"
     bl_options = {"UNDO"}
     step, stages = "surface", ("measure", "track", "fit", "report")
 
@@ -34,18 +34,18 @@ class Run(StageOperator, bpy.types.Operator):
         name="Take",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder with take.toml; empty: the panel's",
+        description="Folder with take.toml. Empty: the one in the panel",
     )
     out: bpy.props.StringProperty(
         name="Output",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder for the results; empty: the panel's",
+        description="Folder for the results. Empty: the one in the panel",
     )
     build: bpy.props.BoolProperty(
         name="Build Scene",
         default=True,  # type: ignore[valid-type]
-        description="Put the results into this scene afterwards",
+        description="Build the results in this scene afterwards",
     )
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[take_run.Run, Contents | None]]:
@@ -66,31 +66,32 @@ class Run(StageOperator, bpy.types.Operator):
 def measure(
     take: Path, out: Path, overrides: dict[str, dict[str, Any]], build: bool, monitor: Monitor
 ) -> tuple[take_run.Run, Contents | None]:
-    """The computation, free of bpy: all that is not done yet, and its results read back for the scene."""
+    """The computation, without bpy: all stages that are not done, and their results read for the scene."""
     with take_run.open_run(take, out, overrides) as run:
         if not pipeline.is_complete(run):
             pipeline.all_stages(run, monitor)
+    monitor.begin("build")
     return run, read_contents(out, monitor) if build else None
 
 
 class LoadSample(JobOperator, bpy.types.Operator):
-    """Make a small sample recording of a moving arm on this computer, measure it, and build the scene; about half a minute"""
+    """Make a small synthetic recording of a moving arm, measure it, and build the scene. Takes about half a minute"""
 
     bl_idname = "tricap.load_sample"
     bl_label = "Load Sample and Run"
     bl_options = {"UNDO"}
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], tuple[Path, take_run.Run, Contents | None]]:
-        """Where the recording and its results go: beside the .blend, or among the extension's own files while there is none."""
+        """The folder of the recording: next to the .blend, or in the extension's user folder if the file was never saved."""
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
         take = base / SAMPLE_NAME
         if project.bound(context.scene) and project.folder_of(context.scene) != take.resolve():
-            raise InputError("This file has footage of its own; make an empty one (File > New > General) and press this there.")
+            raise InputError("This file already has footage. Open an empty one (File > New > General) and press Load Sample and Run there.")
         folders.check_writable(base)
         return lambda monitor: make_sample(take, monitor)
 
     def finish(self, context: bpy.types.Context, result: tuple[Path, take_run.Run, Contents | None]) -> set[str]:
-        """The sample becomes the scene's project; build the scene."""
+        """Open the sample as the scene's project, and build the scene."""
         take, run, contents = result
         project.open_take(context.scene, take)
         context.scene.tricap.out = folders.for_user(take / project.RESULTS)
@@ -101,14 +102,14 @@ class LoadSample(JobOperator, bpy.types.Operator):
 
 
 def make_sample(take: Path, monitor: Monitor) -> tuple[Path, take_run.Run, Contents | None]:
-    """The computation, free of bpy. A sample that is there already, with whatever was changed in it, is measured as it is."""
+    """The computation, without bpy. An existing sample is measured as it is, including changes."""
     if not is_arm_take(take):
         make_arm_take(take, SAMPLE, monitor)
     return take, *measure(take, take / project.RESULTS, {}, True, monitor)
 
 
 class Cancel(bpy.types.Operator):
-    """Stop the running job; what was finished is kept"""
+    """Stop the running job. Finished frames are kept"""
 
     bl_idname = "tricap.cancel"
     bl_label = "Cancel"
@@ -119,7 +120,7 @@ class Cancel(bpy.types.Operator):
         return get_session().job is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Ask the job to stop; the operator that watches it ends it."""
+        """Ask the job to stop; the operator that watches it then ends."""
         job = get_session().job
         if job is not None:
             job.monitor.cancel()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import bpy
@@ -13,29 +14,17 @@ from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE
 
-STEP_WORDS = {
-    "surface": "surface",
-    "seeds": "surface",
-    "matching": "surface",
-    "tracks": "tracks",
-    "filters": "tracks",
-    **dict.fromkeys(("thin", "background", "fit", "adjust", "refine", "sigmas", "skin", "silhouettes", "report"), "body"),
-    **dict.fromkeys(("reading", "preparing"), "rig"),
-}  # the first word of what a stage says of itself -> its step
+STEP_OF_TASK = MappingProxyType({"measure": "surface", "track": "tracks", "fit": "body", "report": "body", "build": "rig"})
 
 
 class StageOperator(JobOperator):
-    """Mix-in: one stage of the run, and those before it as far as they are not done."""
+    """Mix-in: one stage of the run, and earlier ones that are not done."""
 
     stages: ClassVar[tuple[str, ...]] = ()
-
-    @classmethod
-    def step_at(cls, stage: str) -> str:
-        """Measuring comes first wherever it is not done."""
-        return STEP_WORDS.get(stage.split()[0] if stage else "", cls.step)
+    steps = STEP_OF_TASK
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], take_run.Run]:
-        """Folders and settings as they are now; the project's take.toml is written."""
+        """Folders and settings as they are now; writes the project's take.toml."""
         take, out, overrides = project.chosen(context.scene, self.take, self.out)  # type: ignore[attr-defined]
         return lambda monitor: run_stages(take, out, overrides, self.stages, monitor)
 
@@ -54,17 +43,18 @@ def report_run(operator: Any, context: bpy.types.Context, run: take_run.Run) -> 
 
 
 def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]], names: tuple[str, ...], monitor: Monitor) -> take_run.Run:
-    """The computation, free of bpy. What is checkpointed is not computed again."""
+    """The computation, without bpy. Frames that have a checkpoint are not computed again."""
     with take_run.open_run(take, out, overrides) as run:
         if "fit" in names:
             check_body(run.footage, run.settings["fitting"])
         for name in names:
+            monitor.begin(name)
             getattr(pipeline, name)(run, monitor)
     return run
 
 
 class Measure(StageOperator, bpy.types.Operator):
-    """Measure the surface of the body in every frame; what was measured before with the same input is kept"""
+    """Measure the surface of the person in every frame. Frames that were measured with the same inputs are reused"""
 
     bl_idname = "tricap.measure"
     bl_label = "Measure Surface"
@@ -75,21 +65,21 @@ class Measure(StageOperator, bpy.types.Operator):
         name="Take",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder with take.toml; empty: this file's project",
+        description="Folder with take.toml. Empty: the project of this file",
     )
     out: bpy.props.StringProperty(
         name="Output",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder for the results; empty: the project's",
+        description="Folder for the results. Empty: the project's",
     )
 
 
 class Track(StageOperator, bpy.types.Operator):
-    """Follow the surface's points from frame to frame; the surface is measured first where that is needed"""
+    """Track points of the surface from frame to frame. The surface is measured first if needed"""
 
     bl_idname = "tricap.track"
-    bl_label = "Follow Points"
+    bl_label = "Track Points"
     bl_options = {"UNDO"}
     step, stages = "tracks", ("measure", "track")
 
@@ -97,18 +87,18 @@ class Track(StageOperator, bpy.types.Operator):
         name="Take",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder with take.toml; empty: this file's project",
+        description="Folder with take.toml. Empty: the project of this file",
     )
     out: bpy.props.StringProperty(
         name="Output",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder for the results; empty: the project's",
+        description="Folder for the results. Empty: the project's",
     )
 
 
 class Fit(StageOperator, bpy.types.Operator):
-    """Fit the body to surface and tracks, and write the report; both are made first where that is needed"""
+    """Fit the body to surface and tracks, and write the report. Surface and tracks are computed first if needed"""
 
     bl_idname = "tricap.fit"
     bl_label = "Fit Body"
@@ -119,11 +109,11 @@ class Fit(StageOperator, bpy.types.Operator):
         name="Take",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder with take.toml; empty: this file's project",
+        description="Folder with take.toml. Empty: the project of this file",
     )
     out: bpy.props.StringProperty(
         name="Output",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder for the results; empty: the project's",
+        description="Folder for the results. Empty: the project's",
     )

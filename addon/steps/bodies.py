@@ -1,4 +1,4 @@
-"""What each step offers when it is unfolded: the knobs that a person touches, the buttons, and all other knobs under Advanced."""
+"""The unfolded steps: their buttons, the settings that users change often, and all other settings under Advanced."""
 
 import dataclasses
 from pathlib import Path
@@ -16,8 +16,9 @@ from ..panels import sentence
 from ..retarget.panel import draw_retarget
 from . import check, states, watch
 from .person import draw_person
+from .states import Fix, Status
 
-KNOBS: dict[str, tuple[tuple[str, str], ...]] = {  # what a person touches; the others are under Advanced
+OFTEN_CHANGED: dict[str, tuple[tuple[str, str], ...]] = {  # changed often; the others are under Advanced
     "surface": (("matching", "patch_px"), ("growing", "spacing_px")),
     "tracks": (("tracking", "smooth_frames"), ("tracking", "min_length")),
     "body": (),
@@ -26,20 +27,20 @@ SHOWS = {"surface": "points", "tracks": "tracks", "body": "body"}  # over the fo
 
 
 def primary(layout: bpy.types.UILayout, operator: str, is_next: bool, **words: Any) -> Any:
-    """The step's own button; large and lit as long as it is the next thing to do."""
+    """The main button of a step; large and highlighted as long as the step is the next one."""
     row = layout.row()
     row.scale_y = 1.5 if is_next else 1.0
     return row.operator(operator, depress=is_next, **words)
 
 
 def offer(layout: bpy.types.UILayout, operator: str, **words: Any) -> None:
-    """A button of another part of the add-on, where that part is there."""
+    """A button of another part of the add-on, if that part is registered."""
     if hasattr(bpy.types, "TRICAP_OT_" + operator.removeprefix("tricap.")):
         layout.operator(operator, **words)
 
 
 def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Add or open; the list of views; how they were recorded."""
+    """Add footage or open a take; the list of views; how they were recorded."""
     props = context.scene.tricap
     if not project.bound(context.scene):
         _begin(layout, context)
@@ -52,7 +53,7 @@ def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
     side.operator("tricap.move_view", text="", icon="TRIA_UP").up = True
     side.operator("tricap.move_view", text="", icon="TRIA_DOWN").up = False
     draw_person(layout, context)
-    _mend_footage(layout, context, is_next)
+    _draw_fixes(layout, context, is_next)
     layout.prop(props, "fps")
     layout.prop(props, "interlaced")
     if props.interlaced == BOTH:
@@ -65,51 +66,51 @@ def footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: boo
 
 
 def _begin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Nothing is there: save, add footage, or open a take."""
+    """Without footage: save the file, add footage, or open a take."""
     props = context.scene.tricap
     if not bpy.data.filepath and not props.take:
-        primary(layout, "wm.save_mainfile", True, text="Save the File", icon="FILE_TICK")
+        primary(layout, "wm.save_mainfile", True, text="Save File", icon="FILE_TICK")
     else:
         primary(layout, "tricap.add_footage", not props.take, icon="FILE_MOVIE")
     named = bool(props.take) and (Path(bpy.path.abspath(props.take)) / "take.toml").exists()
     primary(layout, "tricap.open_take", named, icon="FILE_FOLDER")
-    layout.prop(props, "take", text="Folder", placeholder="beside this file")
+    layout.prop(props, "take", text="Folder", placeholder="next to this file")
 
 
-def _mend_footage(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Buttons for what can have happened to the footage."""
-    state, scene = watch.look(context.scene).states["footage"], context.scene
-    if any(view.clip is None for view in scene.tricap.views) or project.shows_other_lines(scene):
+def _draw_fixes(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """Buttons that repair what can have happened to the footage."""
+    state, scene = watch.current(context.scene).states["footage"], context.scene
+    if any(view.clip is None for view in scene.tricap.views) or project.shows_other_fields(scene):
         primary(layout, "tricap.reload_footage", True, icon="FILE_REFRESH")
-    elif states.FIND in state.why:
+    elif state.fix == Fix.FIND_FOOTAGE:
         primary(layout, "tricap.find_footage", True, icon="VIEWZOOM")
-    elif "changed outside" in state.why:
+    elif state.fix == Fix.CHOOSE_TAKE:
         row = layout.row()
         row.operator("tricap.reload_take", icon="FILE_REFRESH")
         row.operator("tricap.keep_mine", icon="FILE_TICK")
-    elif state.word == "failed" and "frame" in state.why:
+    elif state.fix == Fix.COMMON_FRAMES:
         primary(layout, "tricap.common_frames", True, icon="PREVIEW_RANGE")
     elif len(scene.tricap.views) < 2:
         primary(layout, "tricap.add_footage", is_next, icon="FILE_MOVIE")
 
 
 def cameras(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Three ways to cameras."""
+    """Cameras from a calibration file or from the scene; the check."""
     column = layout.column()
     column.enabled = project.bound(context.scene)
-    primary(column, "tricap.cameras_from_file", is_next, icon="FILE_CACHE", text="From a Calibration File")
-    column.operator("tricap.cameras_from_scene", icon="OUTLINER_OB_CAMERA", text="From This Scene's Cameras")
-    now, props = watch.look(context.scene), context.scene.tricap
-    if now.states["cameras"].word == "done":
+    primary(column, "tricap.cameras_from_file", is_next, icon="FILE_CACHE")
+    column.operator("tricap.cameras_from_scene", icon="OUTLINER_OB_CAMERA")
+    now, props = watch.current(context.scene), context.scene.tricap
+    if now.states["cameras"].status == Status.DONE:
         column.operator("tricap.check", icon="VIEWZOOM")
         if props.check_said and props.check_key == now.keys.get("measure"):
             for line in props.check_said.splitlines():
-                sentence(column.box(), context, line, "CHECKMARK" if line == check.GOOD else "INFO")
-            if "offset" in props.check_said:
+                sentence(column.box(), context, line, "CHECKMARK" if props.check_passed else "INFO")
+            if check.SetOffsets.poll(context):
                 column.operator("tricap.mend_offsets", icon="TIME")
 
 
-def seeds_of(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
+def clicked_views(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
     """Every joint to click, with the views in which it is clicked.
 
     Raises:
@@ -123,20 +124,20 @@ def seeds_of(context: bpy.types.Context) -> list[tuple[str, list[str]]]:
     return [(name, [view for view, clip in clips.items() if clicks.get_click(clip, name, frame) is not None]) for name in wanted]
 
 
-def _seeds(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Which body, in which frame; the views to click in; what is clicked."""
+def _clicks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
+    """The body, the click frame, the button to click, and the joints with their clicks."""
     props = context.scene.tricap
     layout.prop(props, "model")
     if props.model == "own":
         layout.prop(props, "model_file")
-    layout.prop(props, "seed_frame", text="Click in Frame")
+    layout.prop(props, "seed_frame")
     buttons = layout.column()
     buttons.enabled = project.bound(context.scene)
-    primary(buttons, "tricap.click_joints", is_next, icon="WINDOW", text="Open the Views and Click")
+    primary(buttons, "tricap.click_joints", is_next, icon="WINDOW", text="Open Views and Click")
     try:
-        clicked = seeds_of(context)
+        clicked = clicked_views(context)
     except InputError:
-        return  # the step's sentence says it
+        return  # the step's message has the reason
     column = layout.column(align=True)
     column.scale_y = 0.8
     for name, views in clicked:
@@ -146,51 +147,51 @@ def _seeds(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool
 
 
 def surface(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Measure."""
+    """Measure the surface."""
     _stage(layout, context, "surface", "tricap.measure", is_next, icon="POINTCLOUD_DATA")
 
 
 def tracks(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Follow."""
+    """Track points."""
     _stage(layout, context, "tracks", "tricap.track", is_next, icon="CURVE_PATH")
 
 
 def body(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Fit; what is locked or limited."""
+    """Fit the body; locked and limited degrees of freedom."""
     _stage(layout, context, "body", "tricap.fit", is_next, icon="ARMATURE_DATA")
     draw_dofs(layout, context.scene)
 
 
 def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, operator: str, is_next: bool, icon: str) -> None:
-    now = watch.look(context.scene).states
+    now = watch.current(context.scene).states
     column = layout.column()
-    column.use_property_split = False  # the whole width for their names
-    for group, name in KNOBS[step]:
+    column.use_property_split = False  # leaves the full width for their names
+    for group, name in OFTEN_CHANGED[step]:
         column.prop(getattr(context.scene.tricap, group), name)
     row = layout.column()
-    row.enabled = now["cameras"].word == "done"
+    row.enabled = now["cameras"].status == Status.DONE
     primary(row, operator, is_next, icon=icon)
-    if now[step].word in ("done", "stale"):
-        layout.operator("tricap.open_views", icon="SEQUENCE", text="Show It over the Footage").show = SHOWS[step]
+    if now[step].status in (Status.DONE, Status.STALE):
+        layout.operator("tricap.open_views", icon="SEQUENCE", text="Show over Footage").show = SHOWS[step]
 
 
 def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Build; options are offered after it (F9)."""
+    """Build the scene; its options are in the redo panel (F9)."""
     column = layout.column()
-    column.enabled = watch.look(context.scene).states["surface"].word != "empty" or bool(context.scene.tricap.out)
+    column.enabled = watch.current(context.scene).states["surface"].status != Status.EMPTY or bool(context.scene.tricap.out)
     primary(column, "tricap.build_scene", is_next, icon="OUTLINER_OB_ARMATURE", text="Build Rig and Scene")
 
 
 def retarget(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Onto another rig, or into a file."""
+    """Export; retargeting is a section of its own."""
     row = layout.row()
-    row.operator_menu_enum("tricap.export", "kind", text="Export the Motion", icon="EXPORT")
+    row.operator_menu_enum("tricap.export", "kind", text="Export Motion", icon="EXPORT")
 
 
 DRAW = {
     "footage": footage,
     "cameras": cameras,
-    "seeds": _seeds,
+    "clicks": _clicks,
     "surface": surface,
     "tracks": tracks,
     "body": body,
@@ -200,15 +201,15 @@ DRAW = {
 
 
 def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
-    """The further sections of a step: other ways, and all the knobs that a person seldom touches."""
+    """The further sections of a step: alternatives, and the settings that are seldom changed."""
     if step == "cameras":
-        _section(layout, context, "bar", "From a Waved Bar", draw_calibrate)
+        _section(layout, context, "bar", "Wand Calibration", draw_calibrate)
     if step == "retarget":
-        _section(layout, context, "onto", "Onto a Character", draw_retarget, closed=False)
+        _section(layout, context, "onto", "Retarget to Character", draw_retarget, closed=False)
     if step == "footage":
         _section(layout, context, "where", "Advanced", _where)
     if step in states.STAGE:
-        _section(layout, context, f"knobs_{step}", "Advanced", lambda inside, _: _knobs(inside, context, step))
+        _section(layout, context, f"settings_{step}", "Advanced", lambda inside, _: _settings(inside, context, step))
 
 
 def _section(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, title: str, draw: Any, *, closed: bool = True) -> None:
@@ -223,17 +224,17 @@ def _section(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, 
 def _where(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     props = context.scene.tricap
     layout.prop(props, "take", text="Project")
-    layout.prop(props, "out", placeholder="beside this file or the take")
+    layout.prop(props, "out", placeholder="next to this file or the take")
     layout.prop_search(props, "reference_view", props, "views", icon="CAMERA_DATA")
 
 
-def _knobs(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
-    """All the knobs of a step's groups, made from core's definitions."""
+def _settings(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
+    """All settings of a step's groups, from their definitions in core."""
     for group in STAGE_INPUTS[states.STAGE[step]].settings:
         header, inside = layout.panel(f"tricap_group_{group}", default_closed=True)
         header.label(text=group.capitalize())
         if inside is not None:
-            inside.use_property_split = False  # the whole width for their names
+            inside.use_property_split = False  # leaves the full width for their names
             for field in dataclasses.fields(properties.stages()[group]):
-                if (group, field.name) not in KNOBS[step]:
+                if (group, field.name) not in OFTEN_CHANGED[step]:
                     inside.prop(getattr(context.scene.tricap, group), field.name)

@@ -12,39 +12,40 @@ from .. import project
 from ..jobs import JobOperator
 from ..session import get_session
 from . import watch
-from .footage import Told
+from .footage import SimpleOperator
 
-GOOD = "Nothing to complain about."
+GOOD = "No problems found."
 
 
 class Check(JobOperator, bpy.types.Operator):
-    """See whether the footage is in step, the cameras belong to it, no views are swapped, and there is texture to measure"""
+    """Check whether the footage is synchronized, the cameras fit it, views are swapped, and the clothes have enough texture"""
 
     bl_idname = "tricap.check"
     bl_label = "Check Footage, Cameras and Sync"
     step = "cameras"
-    last_words = "Nothing was changed."
+    if_stopped = "Nothing was changed."
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Checked]:
-        """The project, as the scene says it."""
+        """The project with the scene's current values."""
         folder: Path = project.chosen(context.scene, "", "")[0]
         return lambda monitor: check_take(folder, monitor)
 
     def finish(self, context: bpy.types.Context, result: Checked) -> set[str]:
-        """Keep what was found, for the panel."""
+        """Store the findings for the panel."""
         props = context.scene.tricap
         props.check_said = "\n".join(str(finding) for finding in result.findings) or GOOD
+        props.check_passed = not result.findings
         props.check_key = watch.refresh(context.scene).keys.get("measure", "")
         offsets = result.figures.get("offsets", {})
         late = {view: round(o["late_frames"]) for view, o in offsets.items() if o["late_frames"] is not None}  # type: ignore
         get_session().file.late_frames[props.check_key] = late
         for line in props.check_said.splitlines():
-            self.report({"INFO" if line == GOOD else "WARNING"}, line)
+            self.report({"INFO" if props.check_passed else "WARNING"}, line)
         return {"FINISHED"}
 
 
-class MendOffsets(Told, bpy.types.Operator):
-    """Set the views' offsets as the check found them, in whole frames"""
+class SetOffsets(SimpleOperator, bpy.types.Operator):
+    """Set the offsets of the views to those that the check found, in whole frames"""
 
     bl_idname = "tricap.mend_offsets"
     bl_label = "Set Offsets"
@@ -52,7 +53,7 @@ class MendOffsets(Told, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Only with a check of this session that found something to set."""
+        """Only after a check in this session that found offsets."""
         return any(get_session().file.late_frames.get(context.scene.tricap.check_key, {}).values())
 
     def do(self, context: bpy.types.Context) -> str:
@@ -63,4 +64,4 @@ class MendOffsets(Told, bpy.types.Operator):
         return "Offsets: " + ", ".join(f"{view.name} {view.offset_frames}" for view in context.scene.tricap.views)
 
 
-CLASSES = (Check, MendOffsets)
+CLASSES = (Check, SetOffsets)

@@ -13,29 +13,29 @@ from ...core.take.footage_files import copy_take, find_footage, find_moved, name
 from ...core.take.writing import footage_entry, link_footage, read_table, relink_footage, unlink_footage
 from .. import folders, project
 from ..panels import sentence
-from . import states, watch
+from . import watch
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
-class Told:
-    """Mix-in: `do` is the work; what is wrong is told in its one sentence, and the panel looks again."""
+class SimpleOperator:
+    """Mix-in: `do` is the work; an error is reported in its sentence, and the steps' states are computed again."""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Do it."""
         try:
-            said = self.do(context)
+            message = self.do(context)
         except InputError as error:
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
             return {"CANCELLED"}
         finally:
             watch.refresh(context.scene)
-        if said:
-            self.report({"INFO"}, said)  # type: ignore[attr-defined]
+        if message:
+            self.report({"INFO"}, message)  # type: ignore[attr-defined]
         return {"FINISHED"}
 
     def do(self, context: bpy.types.Context) -> str:
-        """The work; gives a sentence to show, or "".
+        """The work; returns a sentence to report, or "".
 
         Raises:
             InputError: it cannot be done; nothing was changed.
@@ -43,8 +43,8 @@ class Told:
         raise NotImplementedError
 
 
-class AddFootage(Told, bpy.types.Operator):
-    """Choose the movies of all cameras at once, or the folder that has a folder of images for every camera"""
+class AddFootage(SimpleOperator, bpy.types.Operator):
+    """Choose the movies of all cameras at once, the folder that contains a folder of images for each camera, or a take"""
 
     bl_idname = "tricap.add_footage"
     bl_label = "Add Footage"
@@ -54,39 +54,39 @@ class AddFootage(Told, bpy.types.Operator):
     files: bpy.props.CollectionProperty(type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
     filename: bpy.props.StringProperty(subtype="FILE_NAME", options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
     fps: bpy.props.FloatProperty(
-        name="Images a Second",
+        name="FPS",
         default=0.0,
         min=0.0,
         max=10000.0,
         options={"SKIP_SAVE"},  # type: ignore[valid-type]
         description="Frame rate of image files; movies and takes have their own. 0: as in step 1",
     )
-    offered_fps: bpy.props.FloatProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]  # what the file browser began with
+    offered_fps: bpy.props.FloatProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]  # the value with which the file browser opened
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the files; where no project can be, say so first."""
+        """Ask for the files, unless the project's folder cannot be created."""
         try:
             folders.check_writable(project.folder_of(context.scene))
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.filename = ""  # not the name of what was saved last
+        self.filename = ""  # not the name of the file that was saved last
         self.fps = self.offered_fps = context.scene.tricap.fps
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Beside the file browser: what to choose."""
-        sentence(self.layout, context, "Movies: choose those of all cameras, with Shift or Ctrl.", "FILE_MOVIE")
-        sentence(self.layout, context, "Images: go into the folder that holds a folder for each camera, and choose nothing.", "FILE_IMAGE")
+        """In the file browser's sidebar: what to choose."""
+        sentence(self.layout, context, "Movies: select those of all cameras, with Shift or Ctrl.", "FILE_MOVIE")
+        sentence(self.layout, context, "Images: open the folder that contains a folder for each camera, and select nothing.", "FILE_IMAGE")
         if not project.bound(context.scene):
             self.layout.prop(self, "fps")
 
     def do(self, context: bpy.types.Context) -> str:
-        """Link the footage into the project and show it as clips; the values of a take come along."""
+        """Link the footage into the project and show it as clips; from a take also its values."""
         scene, place, names = context.scene, folders.absolute(self.directory), [f.name for f in self.files if f.name]
         fps = self.fps if self.fps != self.offered_fps else 0.0
         if not project.bound(scene) and take_files(place, names):
@@ -94,7 +94,7 @@ class AddFootage(Told, bpy.types.Operator):
         return self._add_files(scene, place, names)
 
     def _add_take(self, scene: bpy.types.Scene, place: Path, fps: float) -> str:
-        """A take: its footage is linked, and the project begins with its take.toml and cameras."""
+        """Link the footage of a take; copy its take.toml and cameras."""
         folder = project.make_folder(scene)
         copy_take(place, folder)
         project.open_take(scene, folder)
@@ -102,10 +102,10 @@ class AddFootage(Told, bpy.types.Operator):
         if fps:
             scene.tricap.fps = fps
         project.write(scene)
-        return f"{len(scene.tricap.views)} views, with the values of {place / 'take.toml'}. Check them in step 1."
+        return f"{len(scene.tricap.views)} views, with the settings of {place / 'take.toml'}. Check them in step 1."
 
     def _add_files(self, scene: bpy.types.Scene, place: Path, names: list[str]) -> str:
-        """Movies and folders of images."""
+        """Link movies and folders of images."""
         sources = find_footage(place, names)
         folder, first = project.make_folder(scene), not project.bound(scene)
         old = [project.view_entry(view) for view in scene.tricap.views]
@@ -126,12 +126,12 @@ class AddFootage(Told, bpy.types.Operator):
         if len(entries) > 1:
             project.write(scene)
         names = ", ".join(entry["name"] for entry, _ in made)
-        rate = f"{round(scene.tricap.fps, 3):g} frames a second"
-        return f"{len(made)} views added, {rate}, from left to right: {names}. Where that is not so, unfold step 1."
+        rate = f"{round(scene.tricap.fps, 3):g} fps"
+        return f"{len(made)} views added, {rate}, from left to right: {names}. If that is wrong, correct it in step 1."
 
 
-class OpenTake(Told, bpy.types.Operator):
-    """Open a recording that has a take.toml: its footage, cameras, clicks and settings"""
+class OpenTake(SimpleOperator, bpy.types.Operator):
+    """Open a folder that contains take.toml: its footage, cameras, clicks and settings"""
 
     bl_idname = "tricap.open_take"
     bl_label = "Open Take"
@@ -141,12 +141,12 @@ class OpenTake(Told, bpy.types.Operator):
         name="Take",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder with take.toml; empty: the panel's",
+        description="Folder with take.toml. Empty: the one in the panel",
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the folder, unless the panel names one that is not open yet."""
+        """Ask for the folder, unless the panel has one that is not open yet."""
         if context.scene.tricap.take and not project.bound(context.scene):
             return self.execute(context)
         context.window_manager.fileselect_add(self)
@@ -165,8 +165,8 @@ class OpenTake(Told, bpy.types.Operator):
         return f"{folder.name}: {len(scene.tricap.views)} views."
 
 
-class ReloadTake(Told, bpy.types.Operator):
-    """Read take.toml again; what it says takes the place of what this file has"""
+class ReloadTake(SimpleOperator, bpy.types.Operator):
+    """Read take.toml again; its values replace those in this file"""
 
     bl_idname = "tricap.reload_take"
     bl_label = "Reload Take"
@@ -175,23 +175,23 @@ class ReloadTake(Told, bpy.types.Operator):
     def do(self, context: bpy.types.Context) -> str:
         """Read it."""
         project.open_take(context.scene, project.existing_folder(context.scene))
-        return "take.toml was read again."
+        return "The take was reloaded."
 
 
-class KeepMine(Told, bpy.types.Operator):
-    """Write take.toml as this file has it, over what was changed in it outside"""
+class OverwriteTake(SimpleOperator, bpy.types.Operator):
+    """Write the values of this file to take.toml; changes that were made outside Blender are lost"""
 
     bl_idname = "tricap.keep_mine"
-    bl_label = "Keep Mine"
+    bl_label = "Overwrite Take"
 
     def do(self, context: bpy.types.Context) -> str:
         """Write it."""
         project.write(context.scene, overwrite=True)
-        return "take.toml says what this file says."
+        return "take.toml was overwritten."
 
 
 class MoveView(bpy.types.Operator):
-    """Move the view in the order in which the cameras stand, from left to right"""
+    """Move the view in the list; the cameras are listed from left to right"""
 
     bl_idname = "tricap.move_view"
     bl_label = "Move View"
@@ -212,14 +212,14 @@ class MoveView(bpy.types.Operator):
 
 
 class RemoveView(bpy.types.Operator):
-    """Take the view out of the recording; its files stay where they are"""
+    """Remove the view from the project; its files stay where they are"""
 
     bl_idname = "tricap.remove_view"
     bl_label = "Remove View"
     bl_options = {"UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Take it out."""
+        """Remove it."""
         props = context.scene.tricap
         if not 0 <= props.view_index < len(props.views):
             return {"CANCELLED"}
@@ -229,32 +229,32 @@ class RemoveView(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class ReloadFootage(Told, bpy.types.Operator):
-    """Make the movie clips again that were deleted, with the clicks that take.toml has of them, or show both fields one by one"""
+class ReloadFootage(SimpleOperator, bpy.types.Operator):
+    """Create deleted movie clips again, with their clicks from take.toml, or show the chosen fields of the footage"""
 
     bl_idname = "tricap.reload_footage"
     bl_label = "Reload Footage"
     bl_options = {"UNDO"}
 
     def do(self, context: bpy.types.Context) -> str:
-        """Make them again."""
+        """Create them again, or convert them."""
         scene, folder = context.scene, project.existing_folder(context.scene)
-        if project.shows_other_lines(scene):
-            project.show_lines(scene)
-            return "The footage is shown " + ("field by field." if scene.tricap.interlaced == BOTH else "image by image.")
+        if project.shows_other_fields(scene):
+            project.show_fields(scene)
+            return "Every field is a frame now." if scene.tricap.interlaced == BOTH else "Every image is a frame now."
         lost = [view.name for view in scene.tricap.views if view.clip is None]
         entries = [project.view_entry(view) for view in scene.tricap.views]
         files = project.files_of(folder, entries, project.fields_of(scene))
         project.show_views(scene, entries, files)
         project.show_clicks(scene, read_table(folder), lost)
-        return f"{len(lost)} clips were made again."
+        return f"{len(lost)} clips were created again."
 
 
-class FindFootage(Told, bpy.types.Operator):
-    """Say where the footage is now that was moved: the folder with the movies, or with a folder of images for every camera"""
+class FindFootage(SimpleOperator, bpy.types.Operator):
+    """Choose the folder to which the footage was moved: that with the movies, or with a folder of images for each camera"""
 
     bl_idname = "tricap.find_footage"
-    bl_label = states.FIND
+    bl_label = "Find Footage"
 
     directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=RELATIVE)  # type: ignore[valid-type]
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
@@ -266,57 +266,57 @@ class FindFootage(Told, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def do(self, context: bpy.types.Context) -> str:
-        """Let the project's links stand for what lies there; clicks, offsets and results stay."""
+        """Link the project to that footage; clicks, offsets and results stay."""
         folder, views = project.existing_folder(context.scene), context.scene.tricap.views
         links = {v.name: folder / v.movie if v.movie else (folder / v.images).parent for v in views}
         relink_footage(find_moved(links, folders.absolute(self.directory)))
         for view in views:
             if view.clip is not None:
                 view.clip.filepath = view.clip.filepath  # Blender reads it again
-        return "The footage is there again."
+        return "The footage was found."
 
 
-class CommonFrames(Told, bpy.types.Operator):
-    """Measure the frames that all views have"""
+class CommonFrames(SimpleOperator, bpy.types.Operator):
+    """Measure only the frames that all views have"""
 
     bl_idname = "tricap.common_frames"
     bl_label = "Use Common Frames"
     bl_options = {"UNDO"}
 
     def do(self, context: bpy.types.Context) -> str:
-        """Set first and last."""
+        """Set the first and the last frame."""
         use_common_frames(context.scene, project.existing_folder(context.scene))
         return ""
 
 
 def use_rate_of(scene: bpy.types.Scene, of_images: float) -> None:
-    """The frame rate of the first movie; images have none, theirs is told (0: it stays as it is)."""
+    """Set the frame rate of the first movie, or that of the images (0: no change)."""
     rate = next((view.clip.fps for view in scene.tricap.views if view.clip.source == "MOVIE" and view.clip.fps > 0), of_images)
     if rate:
         scene.tricap.fps = rate
 
 
 def show_frames(scene: bpy.types.Scene) -> None:
-    """The scene's frames are those of the footage, and it shows the one with the clicks."""
+    """Set the scene's frame range to that of the footage, and show the click frame."""
     scene.frame_start, scene.frame_end = 0, max(0, min(view.clip.frame_duration for view in scene.tricap.views) - 1)
     scene.frame_set(min(scene.tricap.seed_frame, scene.frame_end))
 
 
 def lengths_differ(scene: bpy.types.Scene, folder: Path) -> bool:
-    """Whether the views end or begin at different frames."""
+    """Whether the views begin or end with different frames."""
     return len({span for span in _spans(scene, folder)}) > 1
 
 
 def use_common_frames(scene: bpy.types.Scene, folder: Path) -> None:
-    """Measure the frames that all views have.
+    """Measure only the frames that all views have.
 
     Raises:
-        InputError: they have none in common.
+        InputError: there are none.
     """
     spans = _spans(scene, folder)
     first, stop = max(0, *(a for a, _ in spans)), min(b for _, b in spans)
     if stop <= first:
-        raise InputError("With these offsets the views have no frame in common; mend the offsets.")
+        raise InputError("With these offsets the views have no frame in common. Correct the offsets in step 1.")
     props = scene.tricap
     props.all_frames, props.first_frame, props.last_frame = False, first, stop - 1
 
@@ -329,4 +329,4 @@ def _spans(scene: bpy.types.Scene, folder: Path) -> list[tuple[int, int]]:
     return [(-per * view.offset_frames, per * (count(view) - view.offset_frames)) for view in scene.tricap.views]
 
 
-CLASSES = (AddFootage, OpenTake, ReloadTake, KeepMine, MoveView, RemoveView, ReloadFootage, FindFootage, CommonFrames)
+CLASSES = (AddFootage, OpenTake, ReloadTake, OverwriteTake, MoveView, RemoveView, ReloadFootage, FindFootage, CommonFrames)

@@ -1,4 +1,4 @@
-"""bpy.ops.tricap.person_from(kind="mask", view="L", filepath="…"): where a view shows the person, as masks or the empty background say."""
+"""bpy.ops.tricap.person_from(kind="mask", view="L", filepath="…"): how the person is separated from the background in a view."""
 
 from typing import Any
 
@@ -8,28 +8,28 @@ from ...core.foundation.errors import InputError
 from ...core.take.sources import person_files, read_picture
 from ...core.take.writing import link_footage
 from .. import folders, project
-from .footage import Told
+from .footage import SimpleOperator
 
-FOUND = "none"
+AUTO = "none"
 KINDS = (
-    (FOUND, "Found by Itself", "The person is found by clicks, depth and motion"),
-    ("mask", "One Mask", "An image of the view's size, white where the person is, for all frames"),
-    ("masks", "A Mask for Every Image", "A folder of such images, one for every image of the view; choose one of them"),
-    ("background", "The Empty Background", "An image that the same camera took without the person"),
+    (AUTO, "Auto", "Separate the person by clicks, depth and motion"),
+    ("mask", "One Mask", "One image for all frames, of the size of the footage and white where the person is"),
+    ("masks", "Mask Sequence", "A folder with a mask for every image of the view; choose one of them"),
+    ("background", "Background Plate", "An image of the same camera without the person"),
 )
 
 
-class PersonFrom(Told, bpy.types.Operator):
-    """Say where the chosen view shows the person: by masks, or by an image of the empty background. What is measured must lie inside"""
+class PersonFrom(SimpleOperator, bpy.types.Operator):
+    """Choose how the person is separated from the background in this view. Only the person is measured"""
 
     bl_idname = "tricap.person_from"
-    bl_label = "Person From"
+    bl_label = "Separate Person"
     bl_options = {"UNDO"}
 
-    kind: bpy.props.EnumProperty(name="From", items=KINDS)  # type: ignore[valid-type]
+    kind: bpy.props.EnumProperty(name="By", items=KINDS)  # type: ignore[valid-type]
     view: bpy.props.StringProperty(
         name="View",
-        description="Name of the view; empty: the one chosen in the list",  # type: ignore[valid-type]
+        description="Name of the view. Empty: the one selected in the list",  # type: ignore[valid-type]
         options={"SKIP_SAVE"},
     )
     filepath: bpy.props.StringProperty(name="Image", subtype="FILE_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
@@ -37,20 +37,20 @@ class PersonFrom(Told, bpy.types.Operator):
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask for the image where one is needed."""
-        if self.kind == FOUND:
+        """Ask for the image if one is needed."""
+        if self.kind == AUTO:
             return self.execute(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def do(self, context: bpy.types.Context) -> str:
-        """Link the images into the project and note them."""
+        """Link the images into the project and enter them in the take."""
         scene, view = context.scene, chosen_view(context.scene, self.view)
         before = view.person, view.person_files
-        if self.kind == FOUND:
+        if self.kind == AUTO:
             view.person = view.person_files = ""
             project.write(scene)
-            return f"{view.name}: the person is found by itself."
+            return f"{view.name}: the person is separated automatically."
         project.clips_of(scene)
         picture = folders.absolute(self.filepath)
         read_picture(picture, view.name, tuple(view.clip.size))
@@ -62,11 +62,11 @@ class PersonFrom(Told, bpy.types.Operator):
         except InputError:
             view.person, view.person_files = before
             raise
-        return f"{view.name}: the person is told by {files}."
+        return f"{view.name}: the person is separated by {files}."
 
 
 def chosen_view(scene: bpy.types.Scene, name: str) -> Any:
-    """The view of that name, or the one chosen in the list.
+    """The view of that name, or the one selected in the list.
 
     Raises:
         InputError: there is none.
@@ -74,12 +74,12 @@ def chosen_view(scene: bpy.types.Scene, name: str) -> Any:
     views, index = scene.tricap.views, scene.tricap.view_index
     found = views.get(name) if name else views[index] if 0 <= index < len(views) else None
     if found is None:
-        raise InputError(f"There is no view “{name}”." if name else "Add footage first, and choose a view in the list.")
+        raise InputError(f"There is no view “{name}”." if name else "Add footage first, and select a view in the list.")
     return found
 
 
 def draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """How the person is told from the background in the chosen view."""
+    """How the person is separated from the background in the selected view."""
     props = context.scene.tricap
     if not 0 <= props.view_index < len(props.views):
         return

@@ -1,11 +1,11 @@
-"""The state of every step, from what is on disk and in the scene. `compute` looks; nothing here changes anything.
+"""The state of every step, computed from the scene and the files on disk; nothing is changed here.
 
-A step is *empty* (something before it is missing), *ready* (it can be done now), *running*, *done*, *stale* (done with other input), or
-*failed*. Each state says in one sentence why, or what to do.
+Each state has a message of one sentence: a summary, the reason, or what to do.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum, StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -26,43 +26,71 @@ from ..clicking.click_session import joints_of as joints_in_order
 from ..scene.build import KEYS_KEY, OUT_KEY
 from ..session import get_session
 
-STEPS = ("footage", "cameras", "seeds", "surface", "tracks", "body", "rig", "retarget")
-TITLES = ("Footage", "Cameras", "Seeds (Joint Clicks)", "Surface", "Tracks", "Body", "Rig", "Retarget and Export")
-STAGE = {"surface": "measure", "tracks": "track", "body": "fit"}  # the stage of core that a step runs
+STEPS = ("footage", "cameras", "clicks", "surface", "tracks", "body", "rig", "retarget")
+TITLES = ("Footage", "Cameras", "Joint Clicks", "Surface", "Tracks", "Body", "Rig", "Retarget and Export")
+STAGE = {"surface": "measure", "tracks": "track", "body": "fit"}  # the stage of the pipeline that a step runs
 WRITES = {"surface": "clouds", "tracks": "trajectories.npz", "body": "motion.csv"}
-FIND = "Find Footage"
-SAVE_FIRST = "Save this file first: the project lies in a folder beside it. Then add the films of your cameras."
-NEEDED_JOINTS = 2  # the fit's own least number
-MOST_REMEMBERED = 500  # joints
-MOST_SEQUENCES = 50  # kept open
+SAVE_FIRST = "Save the Blender file first: the project folder is created next to it. Then add the footage of your cameras."
+OUTDATED = "Inputs have changed since this step ran. Run it again."
+NEEDED_JOINTS = 2  # the fewest that the fit accepts
+CACHED_CLICKS = 500  # joints whose clicks are remembered as checked
+CACHED_SEQUENCES = 50
+
+
+class Status(StrEnum):
+    """Where a step is."""
+
+    EMPTY = "empty"  # an earlier step comes first
+    READY = "ready"
+    RUNNING = "running"
+    DONE = "done"
+    STALE = "stale"  # done, but with other inputs
+    FAILED = "failed"
+
+
+class Fix(Enum):
+    """What repairs a failed step."""
+
+    FIND_FOOTAGE = "find footage"
+    CHOOSE_TAKE = "choose take"  # the one on disk or the scene's
+    COMMON_FRAMES = "common frames"
+
+
+class FixableError(InputError):
+    """Something that the panel has a button for."""
+
+    def __init__(self, message: str, fix: Fix) -> None:
+        super().__init__(message)
+        self.fix = fix
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """One of the words, and a sentence."""
+    """The status of a step, the sentence that explains it, and what repairs it if it failed."""
 
-    word: str
-    why: str = ""
+    status: Status
+    message: str = ""
+    fix: Fix | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
-    """What was found at one look: the states, the keys of the stages now, and the take's frames."""
+class StepStates:
+    """The states of all steps, and the keys of the inputs of every stage."""
 
     states: Mapping[str, State]
     keys: Mapping[str, str]
 
     @property
     def next(self) -> str | None:
-        """The step that is the next thing to do: the first that is not done."""
-        if self.states["footage"].word == "empty":
+        """The first step that is not done."""
+        if self.states["footage"].status == Status.EMPTY:
             return "footage"
-        return next((step for step in STEPS if self.states[step].word in ("ready", "stale", "failed")), None)
+        return next((step for step in STEPS if self.states[step].status in (Status.READY, Status.STALE, Status.FAILED)), None)
 
 
 @dataclass(kw_only=True)
-class _Found:
-    """What the later steps need of the earlier ones."""
+class _Project:
+    """What later steps need from earlier ones."""
 
     take: Take | None = None
     sequences: tuple[ImageSequence, ...] = ()
@@ -70,105 +98,109 @@ class _Found:
     footage: Footage | None = None
     keys: Mapping[str, str] | None = None
     run: Mapping[str, Any] | None = None
-    problem: str = ""  # why there is no `run` though there is a run.json
+    problem: str = ""  # why run.json cannot be read
     out: Path | None = None
 
 
-def compute(scene: bpy.types.Scene) -> Look:
-    """Look at everything; costs a few milliseconds."""
-    found = _Found()
+def compute(scene: bpy.types.Scene) -> StepStates:
+    """The states of all steps now; takes a few milliseconds."""
+    found = _Project()
     states: dict[str, State] = {}
-    for step, look in (("footage", _footage), ("cameras", _cameras), ("seeds", _seeds)):
-        states[step] = _or_failed(look, scene, found)
+    for step, compute_step in (("footage", _footage), ("cameras", _cameras), ("clicks", _clicks)):
+        states[step] = _or_failed(compute_step, scene, found)
     found.out = _or_none(lambda: folders.output_folder("", scene))
     found.keys = _or_none(lambda: _keys(found))
-    _look_into_run(found)
+    _read_run(found)
     for step in STAGE:
         states[step] = _stage(step, states, found)
     states["rig"] = _rig(scene, states, found)
     states["retarget"] = _retarget(scene, states["rig"])
-    return Look(states=states, keys=found.keys or {})
+    return StepStates(states=states, keys=found.keys or {})
 
 
-def _or_failed(look: Any, scene: bpy.types.Scene, found: _Found) -> State:
+def _or_failed(compute_step: Any, scene: bpy.types.Scene, found: _Project) -> State:
     try:
-        return look(scene, found)
+        return compute_step(scene, found)
     except InputError as error:
-        return State(word="failed", why=str(error))
+        return State(status=Status.FAILED, message=str(error), fix=error.fix if isinstance(error, FixableError) else None)
 
 
-def _or_none(look: Any) -> Any:
-    """What cannot be found out because an earlier step is not done is None; that step says why."""
+def _or_none(make: Any) -> Any:
+    """None where an earlier step is not done; that step's message has the reason."""
     try:
-        return look()
+        return make()
     except InputError:
         return None
 
 
-def _footage(scene: bpy.types.Scene, found: _Found) -> State:
+def _footage(scene: bpy.types.Scene, found: _Project) -> State:
     props = scene.tricap
     if not project.bound(scene):
         if props.take and (project.existing_folder(scene) / "take.toml").exists():
-            return State(word="ready", why="Press Open Take to show its footage.")
+            return State(status=Status.READY, message="Press Open Take to show its footage.")
         if not props.take and not bpy.data.filepath:
-            return State(word="empty", why=SAVE_FIRST)
-        return State(word="empty", why="Add the movies or image folders of your cameras.")
+            return State(status=Status.EMPTY, message=SAVE_FIRST)
+        return State(status=Status.EMPTY, message="Add the movies or image folders of your cameras.")
     folder = project.existing_folder(scene)
     if project.changed_outside(scene):
-        raise InputError("take.toml was changed outside this file: reload it, or keep what is here.")
+        raise FixableError(project.CHANGED_OUTSIDE, Fix.CHOOSE_TAKE)
     if len(props.views) < 2:
-        return State(word="ready", why="Add the footage of a second camera.")
-    if project.shows_other_lines(scene):
-        raise InputError(project.OTHER_LINES)
+        return State(status=Status.READY, message="Add the footage of a second camera.")
+    if project.shows_other_fields(scene):
+        raise InputError(project.OTHER_FIELDS)
     take = project.take(scene)
     found.sequences = tuple(_sequence(folder, view) for view in take.views)
     spans = [(-view.offset_frames, s.count - view.offset_frames) for view, s in zip(take.views, found.sequences)]
     if take.frames is None and len({stop for _, stop in spans}) > 1:
-        lengths = ", ".join(f"{view.name} to {stop - 1}" for view, (_, stop) in zip(take.views, spans))
-        raise InputError(f"The views do not end with the same frame ({lengths}): press Use Common Frames, or mend the offsets.")
-    found.frames, found.take = footage_frames(take, found.sequences), take
+        ends = ", ".join(f"{view.name} ends with frame {stop - 1}" for view, (_, stop) in zip(take.views, spans))
+        raise FixableError(f"The views differ in length: {ends}. Press Use Common Frames, or correct the offsets.", Fix.COMMON_FRAMES)
+    try:
+        found.frames, found.take = footage_frames(take, found.sequences), take
+    except InputError as error:
+        raise FixableError(str(error), Fix.COMMON_FRAMES) from error
     sizes = " and ".join(sorted({f"{view.clip.size[0]}×{view.clip.size[1]}" for view in props.views}))
-    rate = f"{round(props.fps * project.fields_of(scene).per_image, 3):g} a second"
-    return State(word="done", why=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.")
+    rate = f"{round(props.fps * project.fields_of(scene).per_image, 3):g} fps"
+    return State(status=Status.DONE, message=f"{len(take.views)} views, {len(found.frames)} frames of {sizes} pixels, {rate}.")
 
 
-def _cameras(scene: bpy.types.Scene, found: _Found) -> State:
+def _cameras(scene: bpy.types.Scene, found: _Project) -> State:
     if found.take is None:
-        return State(word="empty", why="Comes after the footage.")
+        return State(status=Status.EMPTY, message="Add the footage first.")
     path = found.take.rig_path
     if not path.exists():
-        return State(word="ready", why="Read a calibration file, or calibrate from a film of a waved bar.")
+        return State(status=Status.READY, message="Import a calibration file, or calibrate with a wand.")
     rig = read_rig(path)
     for view in scene.tricap.views:
         size = rig[view.name].size_px
         if tuple(view.clip.size) != size:
             raise InputError(
-                f"Camera {view.name} was calibrated with pictures of {size[0]}×{size[1]} pixels, its footage has "
-                f"{view.clip.size[0]}×{view.clip.size[1]}; use the footage as it was calibrated."
+                f"Camera {view.name} was calibrated with images of {size[0]}×{size[1]} pixels, its footage has "
+                f"{view.clip.size[0]}×{view.clip.size[1]}. Use the footage at the size at which it was calibrated."
             )
     found.footage = open_take(found.take, found.sequences)
-    return State(word="done", why=f"{len(found.footage.rig.cameras)} cameras, one for each view.")
+    return State(status=Status.DONE, message=f"{len(found.footage.rig.cameras)} cameras, one for each view.")
 
 
-def _seeds(scene: bpy.types.Scene, found: _Found) -> State:
+def _clicks(scene: bpy.types.Scene, found: _Project) -> State:
     take = found.take
     if take is None:
-        return State(word="empty", why="Comes after the footage.")
+        return State(status=Status.EMPTY, message="Add the footage first.")
     if take.body_model is None:
-        return State(word="done", why="No body is wanted: surface and tracks need no clicks.")
+        return State(status=Status.DONE, message="No body is fitted: surface and tracks need no clicks.")
     if take.keypoints:
-        return State(word="done", why="Keypoints of another system stand for clicks; clicks may be added.")
+        return State(status=Status.DONE, message="The take has keypoints of another system; clicks are optional.")
     wanted = joints_of(take.body_model)
     clicked = take.seeds.joints
     if found.footage is not None:
         _check_clicks(found.footage)
-    whole = [name for name in wanted if len(clicked.get(name, {})) >= 2]
-    if len(whole) < min(NEEDED_JOINTS, len(wanted)):
-        return State(word="ready", why=f"Click the joints in two views at least: {len(whole)} of {len(wanted)} so far.")
-    missing = [name for name in wanted if name not in whole]
+    complete = [name for name in wanted if len(clicked.get(name, {})) >= 2]
+    if len(complete) < min(NEEDED_JOINTS, len(wanted)):
+        return State(status=Status.READY, message=f"Click each joint in at least two views: {len(complete)} of {len(wanted)} so far.")
+    missing = [name for name in wanted if name not in complete]
     if missing:
-        return State(word="done", why=f"{len(whole)} of {len(wanted)} joints; {_and_others(missing)} would make it safer.")
-    return State(word="done", why=f"All {len(wanted)} joints are clicked.")
+        message = f"{len(complete)} of {len(wanted)} joints are clicked. Click {_and_others(missing)} for a more reliable fit."
+        return State(status=Status.DONE, message=message)
+    return State(status=Status.DONE, message=f"All {len(wanted)} joints are clicked.")
 
 
 def _and_others(names: list[str]) -> str:
@@ -176,7 +208,7 @@ def _and_others(names: list[str]) -> str:
 
 
 def _check_clicks(footage: Footage) -> None:
-    """Each joint's clicks meet in space; what was found of the same clicks and cameras is remembered.
+    """Check that the rays of each joint's clicks intersect; the answer is remembered for the same clicks and cameras.
 
     Raises:
         InputError: those of a joint do not.
@@ -187,7 +219,7 @@ def _check_clicks(footage: Footage) -> None:
         clicks = tuple((view, *xy.tolist()) for view, xy in sorted(at.items()))
         key = (take.rig_path, rig.st_mtime_ns, rig.st_size, take.reference, name, clicks)
         if key not in problems:
-            if len(problems) > MOST_REMEMBERED:
+            if len(problems) > CACHED_CLICKS:
                 problems.clear()
             try:
                 clicked_depth(footage, name, at)
@@ -198,82 +230,84 @@ def _check_clicks(footage: Footage) -> None:
             raise InputError(problems[key])
 
 
-def _stage(step: str, states: Mapping[str, State], found: _Found) -> State:
-    if states["footage"].word != "done" or states["cameras"].word != "done" or found.keys is None:
-        return State(word="empty", why="Comes after footage and cameras.")
+def _stage(step: str, states: Mapping[str, State], found: _Project) -> State:
+    if states["footage"].status != Status.DONE or states["cameras"].status != Status.DONE or found.keys is None:
+        return State(status=Status.EMPTY, message="Footage and cameras come first.")
     if step == "body" and found.take is not None and found.take.body_model is None:
-        return State(word="empty", why="No body is wanted (step 3).")
+        return State(status=Status.EMPTY, message="No body is chosen in step 3.")
     if found.problem:
-        return State(word="failed", why=found.problem) if step == "surface" else State(word="empty", why="Comes after the surface.")
+        first = step == "surface"
+        return State(status=Status.FAILED if first else Status.EMPTY, message=found.problem if first else "Measure the surface first.")
     stage = STAGE[step]
     entry = (found.run or {}).get("stages", {}).get(stage)
     if entry is None or found.out is None or not (found.out / WRITES[step]).exists() and "not_done" not in entry:
-        if step == "body" and states["seeds"].word != "done":
-            return State(word="empty", why="Comes after the clicks (step 3).")
-        before = states[STEPS[STEPS.index(step) - 1]].word if step != "surface" else "done"
-        return State(word="ready" if before == "done" else "empty", why=_READY[step])
+        if step == "body" and states["clicks"].status != Status.DONE:
+            return State(status=Status.EMPTY, message="Click the joints first (step 3).")
+        before = states[STEPS[STEPS.index(step) - 1]].status if step != "surface" else Status.DONE
+        return State(status=Status.READY if before == Status.DONE else Status.EMPTY, message=_READY[step])
     if entry.get("key") != found.keys[stage]:
-        return State(word="stale", why="Something that it depends on was changed since; run it again.")
+        return State(status=Status.STALE, message=OUTDATED)
     if "not_done" in entry and step != "body":
-        return State(word="done", why=f"Left out: {entry['not_done']}.")
+        return State(status=Status.DONE, message=f"Skipped: {entry['not_done']}.")
     if "not_done" in entry:
-        return State(word="ready" if states["seeds"].word == "done" else "empty", why=f"No body was fitted: {entry['not_done']}.")
-    return State(word="done", why=_figures(step, entry))
+        status = Status.READY if states["clicks"].status == Status.DONE else Status.EMPTY
+        return State(status=status, message=f"No body was fitted: {entry['not_done']}.")
+    return State(status=Status.DONE, message=_figures(step, entry))
 
 
 _READY = {
-    "surface": "Measure the surface of the body in every frame.",
-    "tracks": "Follow the surface's points from frame to frame.",
-    "body": "Fit the skeleton and its flesh to surface and tracks.",
+    "surface": "Measure the surface of the person in every frame.",
+    "tracks": "Track points of the surface through all frames.",
+    "body": "Fit skeleton and body shape to surface and tracks.",
 }
 
 
 def _figures(step: str, entry: Mapping[str, Any]) -> str:
     if step == "surface":
-        doubt = " Their rays miss each other by {:.1f} px: check the cameras, the offsets, and whether views are swapped."
+        doubt = " Rays miss each other by {:.1f} px: check the cameras, the offsets, and whether views are swapped."
         missed = doubt.format(entry["residual_px"]) if entry["residual_px"] > DOUBTFUL_RESIDUAL_PX else ""
-        return f"{entry['points_per_frame']:.0f} points a frame, sigma {entry['sigma_mm']:.2f} mm.{missed}"
+        return f"{entry['points_per_frame']:.0f} points per frame, accurate to {entry['sigma_mm']:.2f} mm (1 sigma).{missed}"
     if step == "tracks":
-        return f"{entry['trajectories']} trajectories of {entry['mean_length_frames']:.0f} frames on average."
-    return f"{sum(entry['frames'].values())} frames, joints to {entry['joint_sigma_mm']:.1f} mm."
+        return f"{entry['trajectories']} trajectories, {entry['mean_length_frames']:.0f} frames long on average."
+    return f"{sum(entry['frames'].values())} frames, joints accurate to {entry['joint_sigma_mm']:.1f} mm (1 sigma)."
 
 
-def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Found) -> State:
+def _rig(scene: bpy.types.Scene, states: Mapping[str, State], found: _Project) -> State:
     built = next((c for c in scene.collection.children_recursive if OUT_KEY in c), None)
     if built is None:
         last = "tracks" if found.take is not None and found.take.body_model is None else "body"
-        if states[last].word != "done":
-            return State(word="empty", why=f"Comes after the {last}.")
-        return State(word="ready", why="Build armature, skin and cameras into this scene.")
+        if states[last].status != Status.DONE:
+            return State(status=Status.EMPTY, message=f"Finish step {STEPS.index(last) + 1} first.")
+        return State(status=Status.READY, message="Build armature, skin and cameras in this scene.")
     moving = any(o.type == "ARMATURE" for o in built.all_objects)
-    if states["body"].word == "done" and not moving:
-        return State(word="stale", why="The body's armature is not in the scene; build it again.")
+    if states["body"].status == Status.DONE and not moving:
+        return State(status=Status.STALE, message="The body's armature is missing from the scene. Build it again.")
     now = found.keys or {}
     if found.keys is not None and any(now.get(stage) != key for stage, key in dict(built.get(KEYS_KEY, {})).items()):
-        return State(word="stale", why="It shows an earlier result; build it again once the steps before are done.")
-    if found.keys is not None and built_less(built, found):
-        return State(word="stale", why="There is more by now than it shows; build it again.")
-    return State(word="done", why="The armature plays the motion." if moving else "Surface and tracks are in the scene.")
+        return State(status=Status.STALE, message="The scene shows an earlier result. Run the steps before, then build it again.")
+    if found.keys is not None and lacks_results(built, found):
+        return State(status=Status.STALE, message="There are results that the scene does not show yet. Build it again.")
+    return State(status=Status.DONE, message="The armature plays the motion." if moving else "Surface and tracks are in the scene.")
 
 
-def built_less(built: bpy.types.Collection, found: _Found) -> bool:
-    """Whether a stage was done that the built scene does not have."""
+def lacks_results(built: bpy.types.Collection, found: _Project) -> bool:
+    """Whether a stage has results that the built scene lacks."""
     done = {s for s, entry in (found.run or {}).get("stages", {}).items() if s in STAGE.values() and "not_done" not in entry}
     return bool(done - set(dict(built.get(KEYS_KEY, {})))) and OUT_KEY in built and str(found.out) == built[OUT_KEY]
 
 
 def _retarget(scene: bpy.types.Scene, rig: State) -> State:
-    if rig.word == "empty" or rig.word == "ready":
-        return State(word="empty", why="Comes after the rig.")
-    retarget = scene.tricap_retarget
-    if retarget.last or retarget.last_export:
-        word = "stale" if rig.word == "stale" else "done"
-        return State(word=word, why=retarget.last_export or "The character plays the motion.")
-    return State(word="ready", why="Put the motion onto your own character, or export it.")
+    if rig.status in (Status.EMPTY, Status.READY):
+        return State(status=Status.EMPTY, message="Build the rig first.")
+    props = scene.tricap_retarget
+    if props.last_export or props.last:
+        status = Status.STALE if rig.status == Status.STALE else Status.DONE
+        return State(status=status, message=props.last_export or "The character plays the motion.")
+    return State(status=Status.READY, message="Retarget the motion to your own character, or export it.")
 
 
 def joints_of(model: str) -> tuple[str, ...]:
-    """The joints of a body model that one is asked to click.
+    """The joints of a body model that the user is asked to click.
 
     Raises:
         InputError: there is no such model.
@@ -284,13 +318,13 @@ def joints_of(model: str) -> tuple[str, ...]:
     return known[model]
 
 
-def _keys(found: _Found) -> Mapping[str, str] | None:
+def _keys(found: _Project) -> Mapping[str, str] | None:
     if found.footage is None or found.take is None or found.out is None:
         return None
     return stage_keys(found.footage, settings_of(found.take.settings, {}, "The panel"), found.out)
 
 
-def _look_into_run(found: _Found) -> None:
+def _read_run(found: _Project) -> None:
     try:
         path = found.out / "run.json" if found.out is not None else None
         found.run = read_run(path) if path is not None and path.exists() else None
@@ -299,16 +333,17 @@ def _look_into_run(found: _Found) -> None:
 
 
 def _sequence(folder: Path, view: Any) -> ImageSequence:
-    """An opened view, kept as long as its folder or file does not change."""
+    """An opened view, cached until its folder or file changes."""
     where = (folder / (view.movie or view.images)) if view.movie else (folder / view.images).parent
     try:
         state = where.stat()
     except OSError as error:
-        raise InputError(f"The footage of view {view.name} is not at {where.resolve()} any more; move it back, or press {FIND}.") from error
+        message = f"The footage of view {view.name} is no longer at {where.resolve()}. Move it back, or press Find Footage."
+        raise FixableError(message, Fix.FIND_FOOTAGE) from error
     key = (str(where), view.images, view.movie, state.st_mtime_ns, state.st_size)
     opened = get_session().file.sequences
     if key not in opened:
-        if len(opened) > MOST_SEQUENCES:
+        if len(opened) > CACHED_SEQUENCES:
             opened.clear()
         opened[key] = open_sequence(folder, images=view.images, movie=view.movie, view=view.name)
     return opened[key]

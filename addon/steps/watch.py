@@ -1,5 +1,5 @@
-"""Keeping the steps' states up to date without work in draw(): looked at again once a second if something changed in the scene or on disk,
-at once when a job or an operator of ours ends, and when a file is loaded.
+"""Keeps the steps' states up to date, so that draw() computes nothing. They are computed again once a second if something changed in the
+scene or on disk, and at once when a job or one of our operators ends.
 """
 
 from collections.abc import Mapping
@@ -12,84 +12,86 @@ from ...core.foundation.errors import InputError
 from .. import folders, jobs, project
 from ..session import get_session
 from . import states
-from .states import STEPS, Look, State
+from .states import STEPS, State, Status, StepStates
 
 TICK_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class StepEnd:
-    """A step that failed or was stopped: the key of its input, whether it failed, and the sentence to show as long as the input stays."""
+    """How a step failed or was stopped; shown until its input (of this key) changes."""
 
     key: str
     failed: bool
-    why: str
+    message: str
 
 
 class OpenSteps(bpy.types.PropertyGroup):
-    """Which steps are unfolded in the panel; lives in the WindowManager: neither saved nor undone."""
+    """Which steps are unfolded in the panel; belongs to the WindowManager, so it is neither saved nor undone."""
 
     __annotations__ = {step: bpy.props.BoolProperty(name=title, default=step == "footage", options={"SKIP_SAVE"},
                                                     description=f"Show step {n}, {title}")
                        for n, (step, title) in enumerate(zip(STEPS, states.TITLES), 1)}  # fmt: skip
 
 
-def look(scene: bpy.types.Scene) -> Look:
-    """The states as they were found last; nothing is computed but the first time."""
-    return get_session().file.looks.get(scene.name_full) or refresh(scene)
+def current(scene: bpy.types.Scene) -> StepStates:
+    """The states as computed last; computed now only if they never were."""
+    return get_session().file.step_states.get(scene.name_full) or refresh(scene)
 
 
-def refresh(scene: bpy.types.Scene) -> Look:
-    """Look at everything now. The next step is unfolded when it becomes another one, and what is done is folded, but the last."""
+def refresh(scene: bpy.types.Scene) -> StepStates:
+    """Compute the states now. When another step becomes the next one, it is unfolded, and finished steps are folded, except the last."""
     file, name = get_session().file, scene.name_full
-    before, now = file.looks.get(name), _with_ends(scene, states.compute(scene))
-    file.looks[name], file.stamps[name], file.changed = now, _stamp(scene), False
+    before, now = file.step_states.get(name), _with_ends(scene, states.compute(scene))
+    file.step_states[name], file.stamps[name], file.changed = now, _stamp(scene), False
     if before is None or before.next != now.next:
         _unfold(before, now)
     return now
 
 
 def mark(*_: Any) -> None:
-    """Something changed; look again soon."""
+    """Something changed: compute the states at the next tick."""
     get_session().file.changed = True
 
 
 def state_of(context: bpy.types.Context, step: str) -> State:
-    """The state of a step to show: what was found, or that it is running."""
+    """The state of a step to show: that it is running, or as computed last."""
     job = context.window_manager.tricap
-    return State(word="running", why=job.left) if job.running and job.step == step else look(context.scene).states[step]
+    running = job.running and job.step == step
+    return State(status=Status.RUNNING, message=job.left) if running else current(context.scene).states[step]
 
 
-def _with_ends(scene: bpy.types.Scene, now: Look) -> Look:
-    """A step that failed with the input that it still has stays failed, and one that was stopped says what was kept."""
+def _with_ends(scene: bpy.types.Scene, now: StepStates) -> StepStates:
+    """With the steps that failed or were stopped, as long as their input is the same."""
     found, ends = dict(now.states), get_session().file.step_ends
     for (name, step), end in list(ends.items()):
         if name == scene.name_full and step in found:
-            same = end.key == _input(step, now)
-            if same and found[step].word in ("ready", "stale"):
-                found[step] = State(word="failed" if end.failed else found[step].word, why=end.why)
-            elif not same or found[step].word == "done":
+            same, status = end.key == _input_key(step, now), found[step].status
+            if same and status in (Status.READY, Status.STALE):
+                found[step] = State(status=Status.FAILED if end.failed else status, message=end.message)
+            elif not same or status == Status.DONE:
                 del ends[name, step]
-    return Look(states=found, keys=now.keys)
+    return StepStates(states=found, keys=now.keys)
 
 
-def _input(step: str, now: Look) -> str:
+def _input_key(step: str, now: StepStates) -> str:
     return now.keys.get(states.STAGE.get(step, ""), "")
 
 
-def _ended(context: bpy.types.Context, step: str, failed: str, stopped: str) -> None:
+def _job_ended(context: bpy.types.Context, step: str, failed: str, stopped: str) -> None:
     scene, ends = context.scene, get_session().file.step_ends
     ends.pop((scene.name_full, step), None)
     now = refresh(scene)
     if (failed or stopped) and step in STEPS:
-        ends[scene.name_full, step] = StepEnd(key=_input(step, now), failed=bool(failed), why=failed or stopped)
+        ends[scene.name_full, step] = StepEnd(key=_input_key(step, now), failed=bool(failed), message=failed or stopped)
         refresh(scene)
 
 
-def _unfold(before: Look | None, now: Look) -> None:
+def _unfold(before: StepStates | None, now: StepStates) -> None:
     shown: Mapping[str, Any] = bpy.context.window_manager.tricap_steps
-    if before is not None and before.next not in (None, STEPS[-1]) and now.states[before.next].word in ("done", "empty"):
-        setattr(shown, before.next, False)
+    if before is not None and before.next not in (None, STEPS[-1]):
+        if now.states[before.next].status in (Status.DONE, Status.EMPTY):
+            setattr(shown, before.next, False)
     if now.next:
         setattr(shown, now.next, True)
 
@@ -115,11 +117,9 @@ def _tick() -> float:
     context = bpy.context
     scene, runs = context.scene, context.window_manager.tricap.running
     if scene is not None:
-        file, name = get_session().file, scene.name_full
-        if (
-            (file.changed and not runs) or name not in file.looks or file.stamps.get(name) != _stamp(scene)
-        ):  # a run finishes step after step
-            before = file.looks.get(name)
+        file, before = get_session().file, get_session().file.step_states.get(scene.name_full)
+        changed = file.changed and not runs  # a run changes the files, step by step
+        if changed or before is None or file.stamps.get(scene.name_full) != _stamp(scene):
             if refresh(scene) != before:
                 jobs.redraw(context)
     return TICK_S
@@ -140,16 +140,16 @@ def register() -> None:
     for name in HANDLERS:
         getattr(bpy.app.handlers, name).append(_scene_changed)
     session = get_session()
-    session.on_job_end.append(_ended)
+    session.on_job_end.append(_job_ended)
     session.on_value_change.append(mark)
     bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
 
 
 def unregister() -> None:
-    """Watch no longer."""
+    """Stop watching."""
     bpy.app.timers.unregister(_tick)
     session = get_session()
-    session.on_job_end.remove(_ended)
+    session.on_job_end.remove(_job_ended)
     session.on_value_change.remove(mark)
     for name in HANDLERS:
         getattr(bpy.app.handlers, name).remove(_scene_changed)

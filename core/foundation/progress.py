@@ -17,6 +17,11 @@ class Monitor:
     def __init__(self, report: Callable[[str, float, float], None] | None = None) -> None:
         self._report = report
         self._cancel = threading.Event()
+        self.task = ""  # the name of what is computed now, for machines
+
+    def begin(self, task: str) -> None:
+        """Name the task, such as a stage of a run, to which the next steps belong."""
+        self.task = task
 
     def step(self, stage: str, done: float, total: float) -> None:
         """Say that `done` of `total` parts of `stage` are finished.

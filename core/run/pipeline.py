@@ -146,6 +146,7 @@ def all_stages(run: Run, monitor: Monitor) -> None:
     """Measure, track, fit and report, as `run` does, of an opened take."""
     check_body(run.footage, run.settings["fitting"])
     for stage in (measure, track, fit, report) if run.settings["fitting"].use_surface else (fit, report):
+        monitor.begin(stage.__name__)
         stage(run, monitor)
 
 

@@ -111,7 +111,7 @@ def reloaded(before: dict[str, list[str]], package: str) -> list[dict[str, objec
                 "added": counts(difference(traces(), before)),
                 "classes": registered_classes(),
                 "listeners": len(session.get_session().on_job_end),
-                "footage": states["footage"].word,
+                "footage": states["footage"].status,
             }
         )
     return found

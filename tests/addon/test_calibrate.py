@@ -62,7 +62,7 @@ def test_a_mistake_is_told_and_changes_nothing(blender, empty, tmp_path: Path) -
     with pytest.raises(RuntimeError, match="footage first"):
         empty.ops.tricap.calibrate()
     empty.context.scene.tricap_calibrate.floor = "0, forty"
-    with pytest.raises(RuntimeError, match="“0, forty” is no list of frames"):
+    with pytest.raises(RuntimeError, match="“0, forty” is not a list of frames"):
         empty.ops.tricap.calibrate(bar=str(tmp_path), length_m=0.5)
     assert not [o for o in empty.context.scene.objects if o.type == "CAMERA"]
 
@@ -234,7 +234,7 @@ def test_tracks_that_make_no_world_are_told(blender, empty, bar: Path, tmp_path:
     for clip in list(empty.data.movieclips)[:2]:
         clip.tracking.tracks["World X"].markers[0].mute = True
         clip.tracking.tracks["World X"].name = "else"
-    with pytest.raises(RuntimeError, match="“World X” is needed in the clips of two cameras at least; it is in 1"):
+    with pytest.raises(RuntimeError, match="“World X” must be in the clips of at least two cameras; it is in 1"):
         empty.ops.tricap.set_world()
 
 

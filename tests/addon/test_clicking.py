@@ -168,7 +168,7 @@ def test_all_done_and_another_frame(session: Any, scene: Any) -> None:
 def test_the_first_clicks_say_the_frame(blender: ModuleType, scene: Any) -> None:
     operators, clips = module("clicking.operators"), module("project").clips_of(scene)
     scene.frame_set(2)
-    operators.note_first_frame(scene, clips, 2)
+    operators.set_click_frame(scene, clips, 2)
     assert scene.tricap.seed_frame == 2
     assert blender.ops.tricap.click(name="elbow.R", view="C", x=430.3 / 2, y=100.1, frame=1) == {"FINISHED"}
     assert scene.tricap.seed_frame == 1
@@ -191,12 +191,12 @@ def test_surface_seeds_belong_to_the_frame_of_the_first_clicks(blender: ModuleTy
     session.skip()
     assert session.name == "seed 2" and module("project").table(scene)["seeds"]["surface"] == [{"L": [250, 200], "C": [250, 200]}]
     scene.frame_set(1)
-    with pytest.raises(module("jobs").InputError, match="belong to frame 0"):
+    with pytest.raises(module("jobs").InputError, match="Go back to frame 0"):
         operators.ClickSeeds.follow(SimpleNamespace(session=session), blender.context)
 
 
 @pytest.mark.parametrize(("wrong", "why"), [
-    ({"name": "elbow"}, "is no joint"), ({"name": "elbow.R", "view": "X"}, "no view “X”"),
+    ({"name": "elbow"}, "is not a joint"), ({"name": "elbow.R", "view": "X"}, "no view “X”"),
     ({"name": "elbow.R", "view": "C", "x": 1e4}, "outside the image")])  # fmt: skip
 def test_a_wrong_click_is_told(blender: ModuleType, scene: Any, wrong: dict[str, Any], why: str) -> None:
     with pytest.raises(RuntimeError, match=why):
@@ -207,7 +207,7 @@ def test_clicking_needs_footage_model_and_window(blender: ModuleType, scene: Any
     with pytest.raises(RuntimeError, match="needs Blender's window"):
         blender.ops.tricap.click_joints()
     scene.tricap.model = "none"
-    with pytest.raises(module("jobs").InputError, match="body model first"):
+    with pytest.raises(module("jobs").InputError, match="a body in step 3 first"):
         module("clicking.operators").model_joints(scene)
     scene.tricap.views.clear()
     with pytest.raises(module("jobs").InputError, match="footage first"):
@@ -240,7 +240,7 @@ def test_undo_takes_the_clicks_back(blender: ModuleType, scene: Any) -> None:
 
 def test_a_deleted_clip_is_told(blender: ModuleType, session: Any, scene: Any) -> None:
     blender.data.movieclips.remove(module("project").clips_of(scene)["L"])
-    assert not session.whole and session.view_of(None) is None
+    assert not session.has_all_clips and session.view_of(None) is None
     with pytest.raises(module("jobs").InputError, match="view L was deleted"):
         session.clicks()
 

@@ -112,12 +112,12 @@ def test_progress_is_drawn_a_few_times_a_second(jobs: ModuleType, monkeypatch: p
     monkeypatch.setattr(jobs, "redraw", lambda context: None)
     monkeypatch.setattr(jobs, "time", SimpleNamespace(monotonic=lambda: now[0]))
     watcher = jobs.JobOperator()
-    watcher.job = SimpleNamespace(monitor=SimpleNamespace(cancelled=False), stage_words="surface", fraction=0.0, left_words="")
+    watcher.job = SimpleNamespace(monitor=SimpleNamespace(cancelled=False), stage_text="surface", fraction=0.0, left_text="")
     for tick in range(40):  # four seconds
         watcher.job.fraction, now[0] = tick // 20 * 0.3 + tick % 20 / 100, 100.0 + jobs.TICK_S * tick
         watcher._show(None)
     assert 12 <= len(told) <= 17 and len(set(told)) == len(told)
-    watcher.job.monitor.cancelled, watcher.job.stage_words = True, "Stopping"
+    watcher.job.monitor.cancelled, watcher.job.stage_text = True, "Stopping"
     watcher._show(None)
     now[0] += 10
     watcher._show(None)
@@ -165,7 +165,7 @@ def test_wrong_input_is_one_sentence(jobs: ModuleType, blender: ModuleType, tmp_
         blender.ops.tricap.build_scene(out=str(tmp_path))
     with pytest.raises(RuntimeError, match="Choose the take first"):
         blender.ops.tricap.run()
-    with pytest.raises(RuntimeError, match="is no folder; choose the folder that holds take.toml"):
+    with pytest.raises(RuntimeError, match="is not a folder; choose the folder that contains take.toml"):
         blender.ops.tricap.run(take=str(tmp_path / "nowhere"))
     with pytest.raises(RuntimeError, match="relative to the Blender file, which was never saved"):
         blender.ops.tricap.build_scene(out="//results")
@@ -191,13 +191,13 @@ def test_a_bug_in_the_scene_is_told_too_and_the_panel_hears_of_the_end(
     blender.utils.register_class(BrokenEnd)
     session_of(jobs).on_job_end.append(listener)
     try:
-        with pytest.raises(RuntimeError, match="Tricap made a mistake .KeyError"):
+        with pytest.raises(RuntimeError, match="Internal error in Tricap .KeyError"):
             blender.ops.tricap.broken_end()
     finally:
         session_of(jobs).on_job_end.remove(listener)
         blender.utils.unregister_class(BrokenEnd)
     assert 'result["nothing"]' in caplog.text and [step for step, _ in heard] == ["surface"]
-    assert heard[0][1].startswith("Tricap made a mistake (KeyError")
+    assert heard[0][1].startswith("Internal error in Tricap (KeyError")
 
 
 def test_a_bug_is_told_with_its_traceback(jobs: ModuleType, blender: ModuleType, caplog: pytest.LogCaptureFixture) -> None:
@@ -210,7 +210,7 @@ def test_a_bug_is_told_with_its_traceback(jobs: ModuleType, blender: ModuleType,
 
     blender.utils.register_class(Broken)
     try:
-        with pytest.raises(RuntimeError, match="Tricap made a mistake .ZeroDivisionError"):
+        with pytest.raises(RuntimeError, match="Internal error in Tricap .ZeroDivisionError"):
             blender.ops.tricap.broken()
     finally:
         blender.utils.unregister_class(Broken)

@@ -136,7 +136,7 @@ def test_a_model_of_ones_own_tells_which_joints_to_click(project: ModuleType, bl
     project.open_take(blender.context.scene, take)
     assert blender.context.scene.tricap.model == "own"
     bodies = importlib.import_module("bl_ext.user_default.tricap.addon.steps.bodies")
-    assert [name for name, _ in bodies.seeds_of(blender.context)] == ["shoulder.R", "elbow.R", "wrist.R"]
+    assert [name for name, _ in bodies.clicked_views(blender.context)] == ["shoulder.R", "elbow.R", "wrist.R"]
 
 
 def test_no_body_is_read_and_written(project: ModuleType, blender: ModuleType, take: Path) -> None:
@@ -159,7 +159,7 @@ def test_somebody_elses_change_is_not_written_over(project: ModuleType, blender:
     scene = blender.context.scene
     project.open_take(scene, take)
     write_table(take, read_table(take) | {"fps": 100.0})
-    with pytest.raises(project.InputError, match="changed outside this file; press Reload Take"):
+    with pytest.raises(project.InputError, match="changed outside Blender. Reload Take"):
         project.write(scene)
     assert read_table(take)["fps"] == 100.0
     project.write(scene, overwrite=True)
@@ -183,7 +183,7 @@ def test_a_saved_file_knows_its_project_and_both_can_be_moved(project: ModuleTyp
     assert project.folder_of(scene) == tmp_path / "b" / "kick" and project.table(scene) == said
     assert project.clips_of(scene)["C"].size[:] == (192, 144)
     shutil.move(str(tmp_path / "b" / "kick"), tmp_path / "elsewhere")
-    with pytest.raises(project.InputError, match="is not there; move it back, or choose where it is now"):
+    with pytest.raises(project.InputError, match="does not exist. Move it back, or choose where it is now"):
         project.write(scene)
 
 
@@ -197,7 +197,7 @@ def test_where_a_new_project_lies(project: ModuleType, blender: ModuleType, tmp_
     assert (scene.tricap.take, scene.tricap.out) == ("//my shot é_tricap", "//my shot é_tricap/results")
     write_take(tmp_path / "other", small_rig())
     scene.tricap.take = str(tmp_path / "other")
-    with pytest.raises(project.InputError, match="holds a take already; press Open Take"):
+    with pytest.raises(project.InputError, match="already contains a take. Press Open Take"):
         project.make_folder(scene)
 
 

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -39,14 +40,14 @@ def states(blender: ModuleType) -> ModuleType:
 def words(states: ModuleType, blender: ModuleType) -> Words:
     """The states' words in a line, after a look."""
     watch = importlib.import_module(f"{NAME}.steps.watch")
-    return lambda: " ".join(watch.refresh(blender.context.scene).states[step].word for step in states.STEPS)
+    return lambda: " ".join(watch.refresh(blender.context.scene).states[step].status for step in states.STEPS)
 
 
 @pytest.fixture
 def why(states: ModuleType, blender: ModuleType) -> Callable[[str], str]:
     """The sentence of a step."""
     watch = importlib.import_module(f"{NAME}.steps.watch")
-    return lambda step: watch.refresh(blender.context.scene).states[step].why
+    return lambda step: watch.refresh(blender.context.scene).states[step].message
 
 
 def new_project(blender: ModuleType, sample: Path, folder: Path) -> Any:
@@ -81,12 +82,12 @@ def test_the_whole_way_from_footage_to_a_rig(blender: ModuleType, words: Words, 
     scene = new_project(blender, sample, tmp_path)
     assert [(v.name, v.images) for v in scene.tricap.views] == [("L", "L/*.png"), ("C", "C/*.png"), ("R", "R/*.png")]
     assert words() == "done ready ready empty empty empty empty empty"
-    assert why("footage") == "3 views, 3 frames of 512×384 pixels, 25 a second."
+    assert why("footage") == "3 views, 3 frames of 512×384 pixels, 25 fps."
     assert blender.ops.tricap.cameras_from_file(filepath=str(tmp_path / "film" / "rig.toml")) == {"FINISHED"}
     scene.tricap.model = "arm.R"
     assert words() == "done done ready ready empty empty empty empty"
     click(blender, read_table(sample)["seeds"]["joints"])
-    assert words() == "done done done ready empty empty empty empty" and why("seeds") == "All 3 joints are clicked."
+    assert words() == "done done done ready empty empty empty empty" and why("clicks") == "All 3 joints are clicked."
     scene.tricap.growing.spacing_px = 6
     assert blender.ops.tricap.measure() == {"FINISHED"}
     assert words() == "done done done done ready empty empty empty"
@@ -179,7 +180,7 @@ def test_a_surface_that_was_left_out_is_no_open_step(blender: ModuleType, done: 
         run["stages"][stage] = {"seconds": 0.0, "key": run["stages"][stage]["key"], "not_done": "fitting.use_surface is false"}
     path.write_text(json.dumps(run))
     shutil.rmtree(tmp_path / "out" / "clouds")
-    assert words().split()[3:6] == ["done", "done", "done"] and "Left out" in why("surface")
+    assert words().split()[3:6] == ["done", "done", "done"] and "Skipped" in why("surface")
 
 
 def test_doing_what_is_missing_does_nothing_twice(blender: ModuleType, done: Any, tmp_path: Path, words: Words) -> None:
@@ -202,10 +203,10 @@ def test_objects_and_clips_that_the_user_deleted_or_renamed(blender: ModuleType,
     scene.tricap.views[1].clip.name = "my film"
     assert words() == "done done done done done done done ready"
     blender.data.objects.remove(body)
-    assert words().split()[6] == "stale" and "not in the scene" in why("rig")
+    assert words().split()[6] == "stale" and "missing from the scene" in why("rig")
     assert blender.ops.tricap.build_scene() == {"FINISHED"} and words().split()[6] == "done"
     blender.data.movieclips.remove(scene.tricap.views[0].clip)
-    assert words().split()[0] == "failed" and "press Reload Footage" in why("footage")
+    assert words().split()[0] == "failed" and "Press Reload Footage" in why("footage")
     with pytest.raises(RuntimeError, match="clip of view L was deleted; press Reload Footage"):
         blender.ops.tricap.fit()
     assert blender.ops.tricap.reload_footage() == {"FINISHED"}
@@ -220,7 +221,7 @@ def test_a_saved_file_opens_with_its_states_and_undo_goes_back(blender: ModuleTy
     assert words() == "done done done done done done done ready"
     shutil.move(tmp_path / "take", tmp_path / "hidden")
     assert words().split()[0] == "failed"
-    with pytest.raises(RuntimeError, match="is not there; move it back, or choose where it is now"):
+    with pytest.raises(RuntimeError, match="does not exist. Move it back, or choose where it is now"):
         blender.ops.tricap.run()
 
 
@@ -243,7 +244,7 @@ def blank(folder: Path) -> None:
 
 
 WRONG = {
-    "another size": "was calibrated with pictures of 640×480 pixels, its footage has 512×384",
+    "another size": "was calibrated with images of 640×480 pixels, its footage has 512×384",
     "no camera for a view": "no camera “R”",
     "no rig at all": "Cannot read the rig",
     "damaged rig": "rig.toml",
@@ -284,7 +285,7 @@ def test_wrong_moves_with_footage(blender: ModuleType, words: Words, why: Any, s
     assert not blender.context.scene.tricap.views and not any((tmp_path / "x_tricap").iterdir()), "nothing half made"
     scene = new_project(blender, sample, tmp_path)
     scene.tricap.views[0].offset_frames = 2
-    assert words().split()[0] == "failed" and "press Use Common Frames" in why("footage")
+    assert words().split()[0] == "failed" and "Press Use Common Frames" in why("footage")
     assert blender.ops.tricap.common_frames() == {"FINISHED"}
     assert words().split()[0] == "done" and why("footage").startswith("3 views, 1 frames")
     scene.tricap.views[1].name = "L"
@@ -294,7 +295,7 @@ def test_wrong_moves_with_footage(blender: ModuleType, words: Words, why: Any, s
     assert blender.ops.tricap.remove_view() == {"FINISHED"} and blender.ops.tricap.move_view(up=True) == {"FINISHED"}
     assert [v.name for v in scene.tricap.views] == ["C", "L"]
     (tmp_path / "film" / "C").rename(tmp_path / "film" / "gone")
-    assert words().split()[0] == "failed" and "is not at" in why("footage")
+    assert words().split()[0] == "failed" and "is no longer at" in why("footage")
 
 
 def test_a_read_only_folder_is_told(blender: ModuleType, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,7 +312,7 @@ def test_a_click_that_contradicts_itself_is_told_at_its_step(blender: ModuleType
     scene = opened(blender, sample, tmp_path)
     marker = scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers[0]
     marker.co = (0.1, 0.1)
-    assert words().split()[2] == "failed" and "“wrist.R”" in why("seeds") and "click the same spot in every view" in why("seeds")
+    assert words().split()[2] == "failed" and "“wrist.R”" in why("clicks") and "click the same spot in every view" in why("clicks")
 
 
 @pytest.mark.slow
@@ -323,13 +324,13 @@ def test_clicks_are_intersected_once(
     importlib.import_module(f"{NAME}.session").get_session().file.click_problems.clear()
     monkeypatch.setattr(states, "clicked_depth", lambda footage, name, at: asked.append(name) or real(footage, name, at))
     for _ in range(2):
-        assert states.compute(scene).states["seeds"].word == "done" and sorted(asked) == ["elbow.R", "shoulder.R", "wrist.R"]
+        assert states.compute(scene).states["clicks"].status == "done" and sorted(asked) == ["elbow.R", "shoulder.R", "wrist.R"]
     os.utime(tmp_path / "take" / "rig.toml", ns=(1, 1))
-    assert states.compute(scene).states["seeds"].word == "done" and len(asked) == 6
+    assert states.compute(scene).states["clicks"].status == "done" and len(asked) == 6
     scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers[0].co = (0.1, 0.1)
     for _ in range(2):
-        found = states.compute(scene).states["seeds"]
-        assert found.word == "failed" and "wrist.R" in found.why and asked.count("wrist.R") == 3
+        found = states.compute(scene).states["clicks"]
+        assert found.status == "failed" and "wrist.R" in found.message and asked.count("wrist.R") == 3
 
 
 def test_swapped_views_are_told(blender: ModuleType, words: Words, why: Any, sample: Path, tmp_path: Path) -> None:
@@ -375,7 +376,7 @@ def test_the_panel_is_drawn_at_every_point(blender: ModuleType, states: ModuleTy
         assert "Next: 8 Retarget and Export" in " ".join(drawn.texts) and blender.context.scene.tricap_retarget.source.name == "Body"
         assert drawn.operators.count("tricap.open_views") == 3, "surface, tracks and body can be looked at over the footage"
     elif point == "empty":
-        assert " ".join(drawn.texts).count("Save this file first") == 1
+        assert " ".join(drawn.texts).count("Save the Blender file first") == 1
         assert drawn.operators[:2] == ["tricap.load_sample", "wm.save_mainfile"]
 
 
@@ -401,7 +402,7 @@ def test_the_untouched_cube_makes_room(blender: ModuleType) -> None:
         for name, value in change.items():
             setattr(cube, name, value)
         blender.context.view_layer.update()
-        aside._put_aside_cube(operator, blender.context)
+        aside._hide_default_cube(operator, blender.context)
         found = bool(cube.hide_get())
         blender.data.objects.remove(cube)
         return found
@@ -419,19 +420,19 @@ def test_changes_by_scripts_and_by_dragging_are_noticed(blender: ModuleType, wor
                lambda: os.utime(tmp_path / "take" / "rig.toml", (1, 1))]  # fmt: skip
     for change in changes:
         watch.refresh(scene)
-        known = watch.look(scene)
-        assert watch._tick() == watch.TICK_S and watch.look(scene) is known, "nothing changed: nothing is computed"
+        known = watch.current(scene)
+        assert watch._tick() == watch.TICK_S and watch.current(scene) is known, "nothing changed: nothing is computed"
         change()
         blender.context.view_layer.update()
         watch._tick()
-        assert watch.look(scene) is not known
+        assert watch.current(scene) is not known
 
 
 def test_the_rate_of_images_is_asked_for(blender: ModuleType, why: Any, sample: Path, tmp_path: Path) -> None:
     shutil.copytree(sample, tmp_path / "film")
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
     assert blender.ops.tricap.add_footage(directory=str(tmp_path / "film"), fps=120.0) == {"FINISHED"}
-    assert blender.context.scene.tricap.fps == 120.0 and why("footage").endswith("120 a second.")
+    assert blender.context.scene.tricap.fps == 120.0 and why("footage").endswith("120 fps.")
 
 
 def recorded_at_30(sample: Path, folder: Path) -> Path:
@@ -453,7 +454,7 @@ def test_a_take_brings_its_values_with_its_footage(
     scene, made = blender.context.scene, read_table(tmp_path / "shot_tricap")
     assert made == read_table(film) and scene.tricap.fps == 30.0 and scene.tricap.interlaced == "odd"
     assert [(view.name, view.offset_frames) for view in scene.tricap.views] == [("R", 1), ("C", 0), ("L", 0)]
-    assert words().startswith("done done done") and why("footage").endswith("30 a second.")
+    assert words().startswith("done done done") and why("footage").endswith("30 fps.")
     assert (tmp_path / "shot_tricap" / "rig.toml").read_bytes() == (film / "rig.toml").read_bytes()
     scene.tricap.views[0].offset_frames = 0
     assert blender.ops.tricap.keep_mine() == {"FINISHED"} and read_table(film)["views"][0]["offset_frames"] == 1, (
@@ -473,7 +474,7 @@ def test_moved_footage_is_found_again(blender: ModuleType, words: Words, why: An
     scene = new_project(blender, sample, tmp_path)
     assert blender.ops.tricap.click(name="elbow.R", view="L", x=100, y=100) == {"FINISHED"}
     (tmp_path / "film").rename(tmp_path / "other film")
-    assert words().startswith("failed") and why("footage").endswith("move it back, or press Find Footage.")
+    assert words().startswith("failed") and why("footage").endswith("Move it back, or press Find Footage.")
     assert str(tmp_path / "film" / "L") in why("footage"), "where it was, not the link in the project"
     with pytest.raises(RuntimeError, match="does not hold L, C, R"):
         blender.ops.tricap.find_footage(directory=str(tmp_path / "shot_tricap"))
@@ -491,20 +492,28 @@ def test_while_a_run_goes_on_its_finished_steps_are_seen(blender: ModuleType, wo
     known = watch.refresh(scene)
     watch.mark()
     watch._tick()
-    assert watch.look(scene) is known, "a run is not disturbed by what happens in the scene"
+    assert watch.current(scene) is known, "a run is not disturbed by what happens in the scene"
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "run.json").write_text("{}")
     watch._tick()
-    assert watch.look(scene) is not known
+    assert watch.current(scene) is not known
 
 
-def test_a_run_goes_through_the_steps_from_top_to_bottom(blender: ModuleType, states: ModuleType) -> None:
-    run = importlib.import_module(f"{NAME}.operators.run").Run
-    said = ("", "seeds", "surface", "tracks", "filters", "thin the clouds", "background", "fit the click frame", "fit frame after frame",
-            "adjust the sequence", "refine the complete model", "adjust the postures", "skin", "silhouettes", "report", "reading clouds",
-            "preparing the scene")  # fmt: skip
-    order = [states.STEPS.index(run.step_at(stage)) for stage in said]
-    assert order == sorted(order) and {states.STEPS[i] for i in order} == {"surface", "tracks", "body", "rig"}
+@pytest.mark.slow
+def test_a_run_goes_through_the_steps_from_top_to_bottom(
+    blender: ModuleType, states: ModuleType, sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs = importlib.import_module(f"{NAME}.jobs")
+    seen, plain = [], jobs.Job._note
+
+    def noting(self: Any, stage: str, done: float, total: float) -> None:
+        plain(self, stage, done, total)
+        seen.append(self.step)
+
+    monkeypatch.setattr(jobs.Job, "_note", noting)
+    opened(blender, sample, tmp_path)
+    assert blender.ops.tricap.run() == {"FINISHED"}
+    assert [step for step, _ in groupby(seen)] == ["surface", "tracks", "body", "rig"]
 
 
 def test_undo_and_redo_take_the_states_along(blender: ModuleType, words: Words, sample: Path, tmp_path: Path) -> None:
@@ -541,8 +550,10 @@ def test_the_check_is_kept_until_its_input_changes(blender: ModuleType, words: W
     said = scene.tricap.check_said.splitlines()
     words()
     assert said and said[0].split()[0] in " ".join(layout.draw(panel.TRICAP_PT_main, blender.context).texts)
+    assert "tricap.mend_offsets" not in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
     late = importlib.import_module(f"{NAME}.session").get_session().file.late_frames
     late[scene.tricap.check_key] = {"L": 0, "C": 0, "R": 1}
+    assert "tricap.mend_offsets" in type(layout)().draw(panel.TRICAP_PT_main, blender.context).operators
     assert blender.ops.tricap.mend_offsets() == {"FINISHED"}
     assert [view.offset_frames for view in scene.tricap.views] == [0, 0, -1]
     assert not blender.ops.tricap.mend_offsets.poll() or scene.tricap.check_key in late
@@ -586,13 +597,13 @@ def test_time_left(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None
     clock[0] += 20.0
     assert job.seconds_left == pytest.approx(8), "it does not grow while nothing is heard"
     clock[0] += 20.0
-    assert job.seconds_left is None and job.left_words == "", "nothing is told once it is over"
+    assert job.seconds_left is None and job.left_text == "", "nothing is told once it is over"
     job._note("tracks", 0, 20)
     assert job.seconds_left is None, "another stage, another pace"
     clock[0] += 5.0
     job._note("tracks", 0.04, 20)
     assert job.seconds_left is None, "how the first frame begins says nothing of the others"
-    assert [jobs.time_words(s) for s in (40.2, 100, 3600, 7260)] == ["40 s", "2 min", "60 min", "2 h 1 min"]
+    assert [jobs.time_text(s) for s in (40.2, 100, 3600, 7260)] == ["40 s", "2 min", "60 min", "2 h 1 min"]
 
 
 @pytest.mark.slow
@@ -613,13 +624,13 @@ def test_both_fields_are_shown_one_by_one(blender: ModuleType, why: Callable[[st
     project = importlib.import_module(f"{NAME}.project")
     before, folder = read_table(tmp_path / "take"), tmp_path / "take"
     scene.tricap.interlaced = "both"
-    assert "press Reload Footage" in why("footage")
-    with pytest.raises(project.InputError, match="press Reload Footage"):
+    assert "Press Reload Footage" in why("footage")
+    with pytest.raises(project.InputError, match="Press Reload Footage"):
         project.write(scene)
     assert read_table(folder) == before and blender.ops.tricap.reload_footage() == {"FINISHED"}
     clip = scene.tricap.views["C"].clip
     assert clip.frame_duration == 6 and tuple(clip.size) == (512, 384)
-    assert why("footage") == "3 views, 6 frames of 512×384 pixels, 50 a second."
+    assert why("footage") == "3 views, 6 frames of 512×384 pixels, 50 fps."
     said = read_table(folder)
     assert said["interlaced"] == "both" and said["seeds"]["joints"] == before["seeds"]["joints"] and said["fps"] == before["fps"]
     scene.tricap.views["C"].offset_frames = 1

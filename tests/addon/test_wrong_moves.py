@@ -50,7 +50,7 @@ def refused(act: Callable[[], object], *words: str) -> None:
     with pytest.raises(RuntimeError) as caught:
         act()
     said = str(caught.value).strip()
-    assert said.startswith("Error: ") and said.count("\n") == 0 and "Traceback" not in said and "Tricap made a mistake" not in said, said
+    assert said.startswith("Error: ") and said.count("\n") == 0 and "Traceback" not in said and "Internal error in Tricap" not in said, said
     assert all(word in said for word in words), said
 
 
