@@ -79,7 +79,7 @@ def clips_of(scene: bpy.types.Scene) -> dict[str, bpy.types.MovieClip]:
     """
     for view in scene.tricap.views:
         if view.clip is None:
-            raise InputError(f"The movie clip of view {view.name} was deleted; press Reload Footage.")
+            raise InputError(f"The movie clip of view {view.name} was deleted. Press Reload Footage.")
     return {view.name: view.clip for view in scene.tricap.views}
 
 

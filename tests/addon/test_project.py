@@ -214,5 +214,5 @@ def test_a_deleted_clip_is_told_and_a_wrong_take_changes_nothing(project: Module
             project.open_take(scene, take / "broken")
     assert project.folder_of(scene) == take
     blender.data.movieclips.remove(project.clips_of(scene)["C"])
-    with pytest.raises(project.InputError, match="clip of view C was deleted; press Reload Footage"):
+    with pytest.raises(project.InputError, match="clip of view C was deleted. Press Reload Footage"):
         project.table(scene)

@@ -207,7 +207,7 @@ def test_objects_and_clips_that_the_user_deleted_or_renamed(blender: ModuleType,
     assert blender.ops.tricap.build_scene() == {"FINISHED"} and words().split()[6] == "done"
     blender.data.movieclips.remove(scene.tricap.views[0].clip)
     assert words().split()[0] == "failed" and "Press Reload Footage" in why("footage")
-    with pytest.raises(RuntimeError, match="clip of view L was deleted; press Reload Footage"):
+    with pytest.raises(RuntimeError, match="clip of view L was deleted. Press Reload Footage"):
         blender.ops.tricap.fit()
     assert blender.ops.tricap.reload_footage() == {"FINISHED"}
     assert words() == "done done done done done done done ready"
