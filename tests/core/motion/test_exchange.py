@@ -280,7 +280,7 @@ def test_damaged_points_are_said(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=word):
             read_motion_source(tmp_path / name)
-    with pytest.raises(InputError, match="no motion"):
+    with pytest.raises(InputError, match="no file or folder"):
         read_motion_source(tmp_path / "nothing.bvh")
 
 
