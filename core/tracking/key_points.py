@@ -18,7 +18,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.intersection import forward_intersection
 from ..images.sampling import SplineImage
-from ..matching.least_squares import SearchImage, TemplatePoints, match_patches
+from ..matching.least_squares import match_patches
 from ..matching.patches import patch_offsets
 from .published_step import STEPS
 from .settings import KeyPointSettings, TrackStatus
