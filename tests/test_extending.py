@@ -11,7 +11,7 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.fitting.context import Conditions
+from tricap.core.fitting.context import FitContext
 from tricap.core.fitting.stages.sequence import FitInput, fit_sequence
 from tricap.core.fitting.state import ShapeParameters
 from tricap.core.foundation.errors import InputError
@@ -77,13 +77,13 @@ def test_the_field_function() -> None:
 
 
 def test_the_observation_moves_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Given to `Conditions.of_shape`, as the page says: the forearm comes out as long as the tape, and not as it was without."""
-    taped, of_shape = made("An observation for the fit")["TapedBone"], Conditions.of_shape
+    """Given to `FitContext.shape_observations`, as the page says: the forearm comes out as long as the tape, and not as it was without."""
+    taped, shape_observations = made("An observation for the fit")["TapedBone"], FitContext.shape_observations
     scene = make_scene(frames=1, seed=1, points=120)
     given = FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={0: scene.clicks}, click_frame=0, time_s=scene.time_s)
     free = fit_sequence(given).shape.lengths_m[1]
     tape = taped(bone=1, tape_m=1.08 * free, sigma_m=1e-4)
-    monkeypatch.setattr(Conditions, "of_shape", lambda self, lengths=None: [*of_shape(self, lengths), tape])
+    monkeypatch.setattr(FitContext, "shape_observations", lambda self, lengths=None: [*shape_observations(self, lengths), tape])
     assert abs(fit_sequence(given).shape.lengths_m[1] / free - 1.08) < 0.005
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..body.model_file import BodyModel
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
-from .inputs.background import EmptyViews
+from .inputs.background import BackgroundRegions
 from .inputs.clicks import Clicks
 from .inputs.cloud_points import CloudPoints
 from .inputs.keypoints import JointTracks
@@ -26,10 +26,10 @@ from .observations import (
     SurfacePoints,
     Symmetry,
 )
-from .observations.self_collision import LimbsApart
+from .observations.self_collision import CollisionPairs
 from .observations.shape_priors import proportions
 from .robust import robust_weights
-from .segmentation import HeldSegments, segment, soft_segment
+from .segmentation import SegmentationCache, segment, soft_segment
 from .settings import FitSettings
 from .solve.problem import Problem
 from .solve.time_priors import Acceleration
@@ -44,7 +44,7 @@ NO_SHAPE = np.zeros(0, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Conditions:
+class FitContext:
     """Model, settings and clicks of one fit."""
 
     cameras: tuple[Camera, ...]
@@ -61,18 +61,18 @@ class Conditions:
     places: Mapping[int, np.ndarray]  # (J, 3) of joints clicked in two views, NaN of others, by frame index
     tracks: JointTracks
     silhouettes: Silhouettes
-    empty: EmptyViews
-    limbs: LimbsApart
+    empty: BackgroundRegions
+    limbs: CollisionPairs
     monitor: Monitor = field(default_factory=Monitor)  # asked within the steps whether to stop
 
-    def stretch(self, frames: Sequence[int]) -> "Conditions":
+    def stretch(self, frames: Sequence[int]) -> "FitContext":
         """The same for some of the frames, which count from 0 then; only `click` stays the index in the recording."""
         parts = {name: getattr(self, name).stretch(frames) for name in ("tracks", "silhouettes", "empty")}
         clicked = {i: self.clicked[t] for i, t in enumerate(frames) if t in self.clicked}
         return replace(self, clicked=clicked, places={i: self.places[frames[i]] for i in clicked}, **parts)
 
-    def beliefs(self, state: BodyState) -> list[Observation]:
-        """What is known of any posture: limits, beliefs, and that limbs are no ghosts."""
+    def pose_observations(self, state: BodyState) -> list[Observation]:
+        """What is known of any posture: limits, priors, and that limbs are no ghosts."""
         return [*self.priors, *self.limbs.observe(state)]
 
     def joints(self, t: int) -> list[Observation]:
@@ -84,11 +84,11 @@ class Conditions:
         points: CloudPoints,
         state: BodyState,
         wide: np.ndarray | float = 1.0,
-        held: HeldSegments | None = None,
+        held: SegmentationCache | None = None,
     ) -> SurfacePoints:
         """The points near a body's surface, as observations of it; `wide` (B,) or for all multiplies the gate.
 
-        Points within one patch share the model's error: the weight of their common part is divided among them (`crowding`).
+        Points within one patch share the model's error: the weight of their common part is divided among them (`variance_inflation`).
         """
         s = self.settings
         find = partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * wide)
@@ -107,12 +107,12 @@ class Conditions:
             xyz_m=points.xyz_m[rows],
             bone=bone,
             sigma_m=np.sqrt(own + model),
-            crowding=(own + share * model) / (own + model) / part,
+            variance_inflation=(own + share * model) / (own + model) / part,
             form=s.residual,
         )
 
-    def seen_surface(
-        self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0, held: HeldSegments | None = None
+    def surface_observations(
+        self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0, held: SegmentationCache | None = None
     ) -> list[Observation]:
         """What the views show of the body's surface in frame index `t`: measured points, and outlines."""
         return [self.surface(points, state, wide, held), *self.silhouettes.observe(t, state, held, wide)]
@@ -138,7 +138,7 @@ class Conditions:
             self.stature_sigma / alike,
         )
 
-    def of_shape(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
+    def shape_observations(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
         """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the proportions is
         known (else infinite)."""
         mean, s = self.parameters.vector(), self.settings
@@ -170,7 +170,7 @@ class Conditions:
         return Problem(
             parameters=self.parameters,
             observe=observe,
-            of_shape=self.of_shape(),
+            shape_observations=self.shape_observations(),
             free_shape=shape,
             smoothness=smoothness,
             held=held,

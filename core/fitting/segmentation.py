@@ -47,7 +47,7 @@ def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: 
     return found, owner[found]
 
 
-class HeldSegments:
+class SegmentationCache:
     """Whose each point is, as long as the body has hardly moved since it was asked; points do not change sides for a millimetre."""
 
     def __init__(self) -> None:

@@ -35,7 +35,10 @@ class FitSettings:
     track_again: bool = knob(False, "Track once more with the fitted body, which says where and when lost points reappear.")
     track_sigma_m: float = knob(0.001, "How far a tracked point moves on its limb from frame to frame.", unit="m", low=0.0, high=0.05)
     shared_frames: float = knob(
-        1.0, "Over how many frames the model errs alike; beliefs of the shape weigh as much more (balls=one: all).", low=1.0, high=1e5
+        1.0,
+        "Over how many frames the model errs alike; priors of the shape weigh as much more (balls=one: all).",
+        low=1.0,
+        high=1e5,
     )
     use_contours: bool = knob(True, "Let the views' outlines (tricap contour) be touched by the body.")
     use_background: bool = knob(True, "Keep limbs out of pixels that show the still background (cameras and background must stand still).")

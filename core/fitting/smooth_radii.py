@@ -18,7 +18,7 @@ from ..body.skin.parts import body_parts
 from .state import ShapeParameters
 
 
-def evened(parameters: ShapeParameters, vector: np.ndarray, covariance: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+def smooth_radii(parameters: ShapeParameters, vector: np.ndarray, covariance: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """The shape vector (S,) and its covariance (S, S) after (2)."""
     radii, lengths = parameters.layout.group("radii"), parameters.layout.group("lengths")
     A = _second_differences(parameters.template)

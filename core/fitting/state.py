@@ -20,9 +20,9 @@ from ..body.skeleton import Layout, Skeleton, frames_and_axes
 from ..geometry.rotation import cross_matrix
 from .part_field import CROSS, Part, cross
 
-__all__ = ["CROSS", "FIRM", "BodyState", "ShapeParameters", "free_bones", "shape_vector"]
+__all__ = ["CROSS", "FIRM_PRIOR", "BodyState", "ShapeParameters", "free_bones", "shape_vector"]
 
-FIRM = float(np.radians(20.5))  # a DOF with a prior of a smaller sigma is believed firmly
+FIRM_PRIOR = float(np.radians(20.5))  # a DOF with a prior of a smaller sigma is believed firmly
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,7 +113,7 @@ def free_bones(parameters: "ShapeParameters") -> np.ndarray:
     """Whether each bone (B,) has balls and a posture that must be seen, because the model does not believe it firmly beforehand."""
     bones, found = parameters.skeleton.bones, np.zeros(parameters.n_lengths, dtype=bool)
     found[parameters.template.metaballs.bone_index] = True
-    return found & np.array([any(dof.prior_sigma > FIRM for dof in bone.dofs) for bone in bones])
+    return found & np.array([any(dof.prior_sigma > FIRM_PRIOR for dof in bone.dofs) for bone in bones])
 
 
 class ShapeParameters:

@@ -17,7 +17,7 @@ from ..checking.fit_check import check_fit
 from ..checking.take_check import causes_of_failure, doubts, with_cause
 from ..checking.timing import synchronised
 from ..fitting.inputs.fit_input import FitInput
-from ..fitting.inputs.no_surface import can_do_without, empty_views, known_silhouettes
+from ..fitting.inputs.no_surface import can_fit_without_surface, background_regions, known_silhouettes
 from ..fitting.inputs.take_inputs import check_body, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_sequence
@@ -174,7 +174,7 @@ def _measure_frames(run: Run, summaries: list[FrameSummary], monitor: Monitor) -
 
 def _no_surface(run: Run, error: NothingMeasured, monitor: Monitor) -> None:
     """Go on with outlines and keypoints where there are some; otherwise the error, with its cause if that is certain."""
-    if can_do_without(run.footage, run.results):
+    if can_fit_without_surface(run.footage, run.results):
         run.warn(f"{error} The body rests on outlines and keypoints.")
         return run.do_without_surface("nothing could be measured")
     cause = next(iter(causes_of_failure(run.footage, monitor)), None)
@@ -223,7 +223,7 @@ def _no_body(run: Run, missing: str, began: float) -> None:
 def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, Any]]:
     """Fit the body and write it, track once more with its help, and compare silhouettes; gives the figures of the tracks, too."""
     fitting = run.settings["fitting"]
-    background = empty_views(run.footage, run.results, run.clouds, fitting, monitor)
+    background = background_regions(run.footage, run.results, run.clouds, fitting, monitor)
     given = fit_input(run.footage, run.clouds, run.trajectories, run.results, background)
     run.body = body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
     _write_body(run, body, monitor)

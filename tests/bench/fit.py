@@ -28,7 +28,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.motion import BodyFit
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
-from tricap.core.fitting.context import Conditions
+from tricap.core.fitting.context import FitContext
 from tricap.core.fitting.inputs.cloud_points import thinned
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
@@ -143,12 +143,12 @@ def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
         for name, X in joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()
     }
     given = FitInput(rig=cameras, model="full", clouds=[seen], clicks={0: clicks}, time_s=np.zeros(1))
-    fit: Conditions = sequence.conditions(given, settings)
+    fit: FitContext = sequence.conditions(given, settings)
     vector = fit.parameters.vector()
     start = motion[0] + random.normal(0, 0.05, motion.shape[1])
     there = fit.parameters.state(motion[0], vector)
     surface = fit.surface(points, there)
-    surface = replace(surface, kind="", sigma_m=surface.sigma_m * np.sqrt(surface.crowding), crowding=1.0).scaled(there)
+    surface = replace(surface, kind="", sigma_m=surface.sigma_m * np.sqrt(surface.variance_inflation), variance_inflation=1.0).scaled(there)
     held = [surface, *fit.priors]
 
     def residual(x: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ def ablation(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
     rows: list[tuple[str, tuple[str, ...], FitSettings]] = [
         ("points", (), base),
         (
-            "points, wide beliefs of the shape",
+            "points, wide priors of the shape",
             (),
             replace(base, length_sigma=1.0, proportion_sigma=1.0, radius_sigma=1.0, roundness_sigma=1.0),
         ),
@@ -245,7 +245,7 @@ def of_muscles(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
 
 
 def _surface_mm(scene: limb_scene.Scene, fit: BodyFit) -> np.ndarray:
-    """Distances of true points of the seen surface from the fitted one, in the first frame: the field over its gradient."""
+    """DistanceMap of true points of the seen surface from the fitted one, in the first frame: the field over its gradient."""
     random, motion = np.random.default_rng(9), scene.motion[0]
     bone = random.integers(0, len(scene.shape.lengths_m), 800)
     X, normal = limb_scene.surface(scene.shape, motion, random.uniform(0.1, 0.9, 800), random.uniform(0, 2 * np.pi, 800), bone)

@@ -26,17 +26,17 @@ from ...images.background import Background, known_background, still_background
 from ...surface.cloud import PointCloud
 from ...take.sources import read_picture
 from ...take.take import Footage, Seeds
-from ..observations import EmptySpace
-from ..observations.background import Distances
+from ..observations import BackgroundExclusion
+from ..observations.background import DistanceMap
 from ..settings import FitSettings
 from ..state import ShapeParameters, free_bones
-from .fit_input import EmptyView, FitInput, Packed
+from .fit_input import BackgroundDistances, FitInput, Packed
 
 ALONG = (0.2, 0.5, 0.8, 1.0)  # where on a bone's axis
 MIDDLE, BENT = 0.5, 3.0  # where on a hand's, and how many of the outline's sigmas it may be wrong
 
 
-class EmptyViews:
+class BackgroundRegions:
     """The views' empty parts in all frames."""
 
     def __init__(self, given: FitInput, parameters: ShapeParameters, settings: FitSettings) -> None:
@@ -53,22 +53,22 @@ class EmptyViews:
         self._given = given.empty if settings.use_background else ()
         self._rig, self._frames = given.rig, given.frames
 
-    def stretch(self, frames: Sequence[int]) -> "EmptyViews":
+    def stretch(self, frames: Sequence[int]) -> "BackgroundRegions":
         """Those of some of the frames."""
         part = copy(self)
         part._frames = [self._frames[t] for t in frames]
         return part
 
-    def observe(self, t: int) -> list[EmptySpace]:
+    def observe(self, t: int) -> list[BackgroundExclusion]:
         """What is empty in frame index `t`; nothing where that is not known."""
         views = [
-            Distances(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
+            DistanceMap(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
             for v in self._given
             if (d := v.of_frame(self._frames[t])) is not None
         ]
         if not views:
             return []
-        return [EmptySpace(views=views, head=self._head, tail=self._tail, fraction=self._fraction, sigma_px=self._sigma_px)]
+        return [BackgroundExclusion(views=views, head=self._head, tail=self._tail, fraction=self._fraction, sigma_px=self._sigma_px)]
 
 
 SAMPLES = 11  # frames for the background
@@ -78,7 +78,7 @@ STILL = 0.25  # of a limb's line shows the background, if the limb stands still
 LIMB_M = 0.06  # nothing is empty so near to a measured point or a clicked limb
 
 
-def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor) -> list[EmptyView]:
+def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor) -> list[BackgroundDistances]:
     """The empty parts of the views in the frames of the clouds; without those of which nothing tells the background.
 
     Raises:
@@ -101,7 +101,8 @@ def find_empty(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor)
             squares = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # endless where all is empty
             distances[k].append((np.minimum(squares, 255 * UNIT_PX / STEP_PX) * (STEP_PX / UNIT_PX)).astype(np.uint8))
     return [
-        EmptyView(view=footage.take.views[k].name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX) for k, d in distances.items()
+        BackgroundDistances(view=footage.take.views[k].name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
+        for k, d in distances.items()
     ]
 
 

@@ -113,10 +113,10 @@ class Packed(Sequence[np.ndarray]):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class EmptyView:
+class BackgroundDistances:
     """How far every place of a view is from the nearest pixel that may show the person: 0 inside the person's outline.
 
-    Node (j, i) is the middle of a square of `step_px` × `step_px` pixels. Distances are stored in steps of `unit_px`.
+    Node (j, i) is the middle of a square of `step_px` × `step_px` pixels. DistanceMap are stored in steps of `unit_px`.
     """
 
     view: str
@@ -147,7 +147,7 @@ class FitInput:
     trajectories: Trajectories | None = None
     contours: Sequence[Outlines] = ()
     keypoints: Sequence[JointPlaces] = ()
-    empty: Sequence[EmptyView] = ()
+    empty: Sequence[BackgroundDistances] = ()
     locked: Sequence[str] = ()  # degrees of freedom that are held at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # rad, by degree of freedom
     frames: Sequence[int] = ()  # the take's numbers (T); without them they are read from the clouds

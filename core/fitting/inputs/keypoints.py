@@ -50,7 +50,11 @@ class JointTracks:
             else:
                 found.append(
                     Keypoints(
-                        joint=joint[rows], xyz_m=table.place[rows], sigma_m=table.sigma[rows], kind="keypoints", crowding=self._crowding
+                        joint=joint[rows],
+                        xyz_m=table.place[rows],
+                        sigma_m=table.sigma[rows],
+                        kind="keypoints",
+                        variance_inflation=self._crowding,
                     )
                 )
         if cameras:
@@ -61,7 +65,7 @@ class JointTracks:
                     xy_px=np.concatenate(xy),
                     sigma_px=np.concatenate(sigma),
                     kind="keypoints",
-                    crowding=self._crowding,
+                    variance_inflation=self._crowding,
                 )
             )
         return found

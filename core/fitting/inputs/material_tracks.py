@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..observations import MaterialSteps
-from ..segmentation import HeldSegments, segment
+from ..segmentation import SegmentationCache, segment
 from ..settings import FitSettings
 from ..state import BodyState
 from .cloud_points import CloudPoints
@@ -41,7 +41,7 @@ class MaterialTracks:
         self._xyz = [xyz[where[f]] if f in where else np.full(xyz.shape[1:], np.nan) for f in frames]
         self._sigma = [sigma[where[f]] if f in where else np.full(xyz.shape[1], np.nan) for f in frames]
         self._surface, self._settings = surface, settings
-        self._held = HeldSegments()
+        self._held = SegmentationCache()
         self._pairs = [self._pair(t) for t in range(len(frames) - 1)]
 
     def stretch(self, frames: Sequence[int]) -> "MaterialTracks":
@@ -70,12 +70,12 @@ class MaterialTracks:
             to_m=self._xyz[t + 1][rows[keep]],
             bone=found[0][keep],
             sigma_m=np.sqrt(own + skin),
-            crowding=np.repeat((own + share * skin) / (own + skin), 3),
+            variance_inflation=np.repeat((own + share * skin) / (own + skin), 3),
         )
 
     def forget(self) -> None:
         """Ask anew whose each point is: what comes next shall not depend on what was asked before."""
-        self._held = HeldSegments()
+        self._held = SegmentationCache()
 
     def _limbs(self, t: int, rows: np.ndarray, sigma: np.ndarray, state: BodyState) -> np.ndarray:
         """The bone of each point in one frame, −1 for nobody's."""

@@ -12,13 +12,13 @@ from ...surface.cloud import PointCloud
 from ...take.take import Footage
 from ...tracking.contour import ContourTable, Polygons
 from ..settings import FitSettings
-from .background import STEP_PX, UNIT_PX, find_empty, still_backgrounds
-from .fit_input import EmptyView, Packed
+from .background import STEP_PX, UNIT_PX, find_background, still_backgrounds
+from .fit_input import BackgroundDistances, Packed
 
 LEAST_CORNERS = 3
 
 
-def can_do_without(footage: Footage, results: Results) -> bool:
+def can_fit_without_surface(footage: Footage, results: Results) -> bool:
     """Whether outlines (`tricap contour`) or keypoints can stand for measured points."""
     return bool(footage.take.keypoints) or any(results.path("contours", f"{v.name}.csv").is_file() for v in footage.take.views)
 
@@ -74,9 +74,9 @@ def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     return mask.astype(bool)
 
 
-def empty_views(
+def background_regions(
     footage: Footage, results: Results, clouds: Sequence[PointCloud], settings: FitSettings, monitor: Monitor
-) -> list[EmptyView]:
+) -> list[BackgroundDistances]:
     """Where the views show no part of the person: outside the outline, and in views without one where the still background is seen.
 
     Raises:
@@ -86,16 +86,16 @@ def empty_views(
     if not settings.use_background:
         return []
     outlines = outline_polygons(footage, results) if settings.use_contours else {}
-    others = find_empty(footage, clouds, monitor) if len(outlines) < len(footage.take.views) else []
-    return outside_outlines(footage, outlines) + [empty for empty in others if empty.view not in outlines]
+    others = find_background(footage, clouds, monitor) if len(outlines) < len(footage.take.views) else []
+    return background_outside_outlines(footage, outlines) + [empty for empty in others if empty.view not in outlines]
 
 
-def outside_outlines(footage: Footage, outlines: Mapping[str, Mapping[int, np.ndarray]]) -> list[EmptyView]:
+def background_outside_outlines(footage: Footage, outlines: Mapping[str, Mapping[int, np.ndarray]]) -> list[BackgroundDistances]:
     """Where the views show no part of the person: outside of the outline."""
     found = []
     for name, polygons in outlines.items():
         tables = Packed(_distances(filled(xy, footage.rig[name].size_px)) for xy in polygons.values())
-        found.append(EmptyView(view=name, frame=np.array(list(polygons)), distance=tables, step_px=STEP_PX, unit_px=UNIT_PX))
+        found.append(BackgroundDistances(view=name, frame=np.array(list(polygons)), distance=tables, step_px=STEP_PX, unit_px=UNIT_PX))
     return found
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...geometry.camera import Camera
 from ..observations import SilhouetteRays
-from ..segmentation import HeldSegments, from_bone
+from ..segmentation import SegmentationCache, from_bone
 from ..settings import FitSettings
 from ..state import BodyState
 from .fit_input import FitInput
@@ -52,7 +52,9 @@ class Silhouettes:
         part._frames, part._rays = [self._frames[t] for t in frames], {}
         return part
 
-    def observe(self, t: int, state: BodyState, held: HeldSegments | None = None, wide: np.ndarray | float = 1.0) -> list[SilhouetteRays]:
+    def observe(
+        self, t: int, state: BodyState, held: SegmentationCache | None = None, wide: np.ndarray | float = 1.0
+    ) -> list[SilhouetteRays]:
         """The rays of frame index `t` that touch a limb of the body near its state; `wide` (B,) or for all multiplies the gate."""
         if t not in self._rays:
             self._rays[t] = self._of_frame(t, state)
@@ -76,7 +78,7 @@ class Silhouettes:
             direction=rays.direction[rows],
             bone=bone,
             sigma_m=np.sqrt(own + model),
-            crowding=(own + share * model) / (own + model),
+            variance_inflation=(own + share * model) / (own + model),
         )
         return [found.scaled(state)]
 

@@ -23,7 +23,7 @@ from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import FitSettings
 from .clicks import enough, read_clicks
-from .fit_input import ClickedAt, EmptyView, FitInput, JointPlaces, Outline
+from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
 OURS = {
     "upper_arm": "shoulder",
@@ -42,7 +42,11 @@ LEAST_CONFIDENCE = 0.2
 
 
 def fit_input(
-    footage: Footage, clouds: Sequence[PointCloud], trajectories: Trajectories | None, results: Results, empty: Sequence[EmptyView] = ()
+    footage: Footage,
+    clouds: Sequence[PointCloud],
+    trajectories: Trajectories | None,
+    results: Results,
+    empty: Sequence[BackgroundDistances] = (),
 ) -> FitInput:
     """All that the fit can use of a run; clicks in other frames than the footage's are left out.
 

@@ -8,27 +8,27 @@ from typing import Protocol
 import numpy as np
 
 from ..state import Block, BodyState, FromBlocks
-from .background import EmptySpace
+from .background import BackgroundExclusion
 from .joints import ClickedJoints, FootOnFloor, Keypoints
 from .material_step import MaterialSteps, StepsFromFixed
-from .pose_priors import JointLimits, MotionPrior, ShapePrior
-from .self_collision import Apart
+from .pose_priors import JointLimits, PosePrior, ShapePrior
+from .self_collision import SelfCollision
 from .shape_priors import EqualRadii, Proportions, Symmetry
 from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
 
 __all__ = [
-    "Apart",
+    "SelfCollision",
     "Block",
     "ClickedJoints",
-    "EmptySpace",
+    "BackgroundExclusion",
     "EqualRadii",
     "FootOnFloor",
     "FromBlocks",
     "JointLimits",
     "Keypoints",
     "MaterialSteps",
-    "MotionPrior",
+    "PosePrior",
     "Observation",
     "Proportions",
     "ShapePrior",
@@ -47,7 +47,7 @@ class Observation(Protocol):
         """Empty, or the kind (problem.Scales) of residuals of which some may be gross errors, and are weighted down."""
 
     @property
-    def crowding(self) -> np.ndarray | float:
+    def variance_inflation(self) -> np.ndarray | float:
         """Divides the weights of robust observations: > 1 where neighbouring residuals share their errors."""
 
     def residual(self, state: BodyState) -> np.ndarray:

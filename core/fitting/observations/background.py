@@ -19,7 +19,7 @@ SMALL = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Distances:
+class DistanceMap:
     """d of (1) in one view, every `step_px` pixels: node (j, i) is at the pixel (first + i · step, first + j · step)."""
 
     camera: Camera
@@ -41,16 +41,16 @@ class Distances:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class EmptySpace(FromBlocks):
+class BackgroundExclusion(FromBlocks):
     """Points on the axes of bones, each a fraction of the way from joint `head` to joint `tail`, in all views of one frame."""
 
-    views: Sequence[Distances]
+    views: Sequence[DistanceMap]
     head: np.ndarray  # (P,) index in Skeleton.joint_names
     tail: np.ndarray  # (P,)
     fraction: np.ndarray  # (P,)
     sigma_px: np.ndarray  # (P,)
     kind: str = ""
-    crowding: np.ndarray | float = 1.0
+    variance_inflation: np.ndarray | float = 1.0
 
     @property
     def size(self) -> int:

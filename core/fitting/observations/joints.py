@@ -23,7 +23,7 @@ class ClickedJoints:
     xy_px: np.ndarray  # (K, 2) full-frame pixels
     sigma_px: np.ndarray | float  # (K,) or for all
     kind: str = ""
-    crowding: np.ndarray | float = 1.0
+    variance_inflation: np.ndarray | float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(2K,)"""
@@ -51,7 +51,7 @@ class Keypoints:
     xyz_m: np.ndarray  # (K, 3)
     sigma_m: np.ndarray  # (K,)
     kind: str = ""
-    crowding: np.ndarray | float = 1.0
+    variance_inflation: np.ndarray | float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(3K,)"""
@@ -74,7 +74,7 @@ class FootOnFloor:
     sigma_m: float
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(K,)"""

@@ -23,7 +23,7 @@ class MaterialSteps:
     to_m: np.ndarray  # (N, 3) world, in frame b
     bone: np.ndarray  # (N,)
     sigma_m: np.ndarray  # (N,) of one coordinate of the difference
-    crowding: np.ndarray | float = 1.0  # (3N,) as in SurfacePoints
+    variance_inflation: np.ndarray | float = 1.0  # (3N,) as in SurfacePoints
 
     def residual(self, a: BodyState, b: BodyState) -> np.ndarray:
         """(3N,)"""
@@ -61,9 +61,9 @@ class StepsFromFixed(FromBlocks):
     kind: str = "steps"
 
     @property
-    def crowding(self) -> np.ndarray | float:
+    def variance_inflation(self) -> np.ndarray | float:
         """As in the steps."""
-        return self.steps.crowding
+        return self.steps.variance_inflation
 
     @property
     def size(self) -> int:

@@ -1,4 +1,4 @@
-"""Parameters believed to lie near a value: (θ − mean) / σ. Used for the prediction 2θ_i − θ_{i−1}, for weak beliefs about twist, and
+"""Parameters believed to lie near a value: (θ − mean) / σ. Used for the prediction 2θ_i − θ_{i−1}, for weak priors about twist, and
 for radii (in logarithms, so that σ is relative).
 
 Joint limits as soft one-sided observations: r = max(0, θ − θ_max) / σ and r = max(0, θ_min − θ) / σ, σ about 2°.
@@ -13,13 +13,13 @@ from ..state import Block, BodyState, FromBlocks, shape_vector
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MotionPrior(FromBlocks):
+class PosePrior(FromBlocks):
     """Mean and sigma of every DOF (D,), rad or metres; an infinite sigma believes nothing."""
 
     mean: np.ndarray
     sigma: np.ndarray
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(D,)"""
@@ -43,7 +43,7 @@ class ShapePrior:
     mean: np.ndarray
     sigma: np.ndarray
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(S,)"""
@@ -65,7 +65,7 @@ class JointLimits(FromBlocks):
     high: np.ndarray
     sigma: float
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(D,)"""

@@ -19,7 +19,7 @@ from ..state import Block, BodyState, FromBlocks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Apart(FromBlocks):
+class SelfCollision(FromBlocks):
     """N places on limbs, each beside another bone's part."""
 
     bone: np.ndarray  # (N,) of the limb
@@ -29,9 +29,9 @@ class Apart(FromBlocks):
     sigma_m: float
     slope: np.ndarray | None = None  # (N,) |∇D| at the state of `scaled`, 1/m
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
-    def scaled(self, state: BodyState) -> "Apart":
+    def scaled(self, state: BodyState) -> "SelfCollision":
         """The same places with |∇D| of this state."""
         X, slope = self._places(state), np.empty(len(self.bone))
         for c in np.unique(self.other).tolist():
@@ -102,7 +102,7 @@ SIGMA_M = 0.01
 NEAR_M = 0.03
 
 
-class LimbsApart:
+class CollisionPairs:
     """The pairs of bones of one skeleton whose parts neither meet at a joint nor have a part between them that meets both."""
 
     def __init__(self, skeleton: Skeleton, bone_index: np.ndarray) -> None:
@@ -112,7 +112,7 @@ class LimbsApart:
         pairs = [(b, int(c)) for b in limbs for c in fleshy if not meet[b, c]]
         self._limb, self._other = (np.array(column, dtype=np.intp) for column in (zip(*pairs) if pairs else ((), ())))
 
-    def observe(self, state: BodyState) -> list[Apart]:
+    def observe(self, state: BodyState) -> list[SelfCollision]:
         """The places that are near another part in this state."""
         bone, other = np.repeat(self._limb, len(FRACTIONS)), np.repeat(self._other, len(FRACTIONS))
         if not len(bone):
@@ -126,7 +126,7 @@ class LimbsApart:
         near = np.flatnonzero(away < radius[bone].min(axis=1) + radius[other].max(axis=1) + NEAR_M)
         if not len(near):
             return []
-        found = Apart(
+        found = SelfCollision(
             bone=bone[near], fraction=fraction[near], other=other[near], radius_m=SOFT * radius[bone[near]].min(axis=1), sigma_m=SIGMA_M
         )
         return [found.scaled(state)]

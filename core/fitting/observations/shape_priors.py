@@ -44,7 +44,7 @@ class Proportions:
     mean: np.ndarray
     covariance: np.ndarray
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(B,) W (ln L − mean), with WᵀW the inverse of the covariance."""
@@ -70,7 +70,7 @@ class EqualRadii:
     sigma: float
     log_ratio: np.ndarray | float = 0.0  # (M,) the model's ln l_x − ln l_z
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(M,)"""
@@ -94,7 +94,7 @@ class Symmetry:
     right: np.ndarray  # (K,)
     sigma: np.ndarray  # (K,)
     kind: str = ""
-    crowding: float = 1.0
+    variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(K,)"""

@@ -26,7 +26,7 @@ class SilhouetteRays(FromBlocks):
     direction: np.ndarray  # (N, 3) unit vectors
     bone: np.ndarray  # (N,)
     sigma_m: np.ndarray  # (N,) Z/f · σ_px
-    crowding: np.ndarray | float = 1.0
+    variance_inflation: np.ndarray | float = 1.0
     held: SurfacePoints | None = None  # the touching points with their weights, at the state of `scaled`
     along_m: np.ndarray | None = None  # (N,) where they lie on their rays: at other states they are looked for from there
     kind: str = "contours"

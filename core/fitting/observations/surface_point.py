@@ -41,7 +41,7 @@ class SurfacePoints(FromBlocks):
     xyz_m: np.ndarray  # (N, 3) world
     bone: np.ndarray  # (N,) index of the bone
     sigma_m: np.ndarray  # (N,) of one residual, along the normal
-    crowding: np.ndarray | float = 1.0  # (N,) how many times less a point tells than if its error were its own
+    variance_inflation: np.ndarray | float = 1.0  # (N,) how many times less a point tells than if its error were its own
     form: str = "metric"  # or "paper"
     parts: tuple[_Scaled, ...] | None = None
     kind: str = "points"

@@ -59,8 +59,8 @@ class Problem:
     parameters: ShapeParameters
     observe: Callable[[int, BodyState], list[Observation]]
     observe_step: Callable[[int, BodyState, BodyState], MaterialSteps | None] | None = None
-    of_shape: Sequence[Observation] = ()
-    of_shape_weight: float = 1.0
+    shape_observations: Sequence[Observation] = ()
+    shape_weight: float = 1.0
     free_shape: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     smoothness: Smoothness | None = None
     held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))  # DOFs that keep their values
@@ -75,9 +75,9 @@ class Problem:
         place[self.free_shape] = np.arange(len(self.free_shape))
         return place
 
-    def weights(self, residuals: np.ndarray, scale: float, crowding: np.ndarray | float, largest: float = np.inf) -> np.ndarray:
+    def weights(self, residuals: np.ndarray, scale: float, variance_inflation: np.ndarray | float, largest: float = np.inf) -> np.ndarray:
         """Weights of robust observations in (1); against other kinds they do not count for less than with the `largest` scale."""
-        return robust_weights(residuals / scale, self.robust, self.robust_width) / (min(scale, largest) ** 2 * crowding)
+        return robust_weights(residuals / scale, self.robust, self.robust_width) / (min(scale, largest) ** 2 * variance_inflation)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -113,8 +113,8 @@ def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: 
     for t in range(T - 1):
         problem.monitor.check()
         _add_step(problem, lin, t, states[t], states[t + 1], scales.steps, factor.steps)
-    for o in problem.of_shape if len(problem.free_shape) else ():
-        r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, D + problem.free_shape], problem.of_shape_weight
+    for o in problem.shape_observations if len(problem.free_shape) else ():
+        r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, D + problem.free_shape], problem.shape_weight
         lin.equations.corner += w * J.T @ J
         lin.equations.h -= w * J.T @ r
         lin.cost += w * float(r @ r)
@@ -135,7 +135,7 @@ def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarr
             total += float(np.sum(w * o.residual(state) ** 2))
     total += sum(float(np.sum(step[1] * step[0].residual(a, b) ** 2)) for a, b, step in zip(states, states[1:], lin.steps) if step)
     if len(problem.free_shape):
-        total += problem.of_shape_weight * sum(float(np.sum(o.residual(states[0]) ** 2)) for o in problem.of_shape)
+        total += problem.shape_weight * sum(float(np.sum(o.residual(states[0]) ** 2)) for o in problem.shape_observations)
     return total + (problem.smoothness.cost(motion) if problem.smoothness is not None else 0.0)
 
 
@@ -181,7 +181,7 @@ def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scal
         w: np.ndarray | float = 1.0
         if o.kind:
             lin.residuals.setdefault(o.kind, []).append(r)
-            w = problem.weights(r, scales.of(o.kind), o.crowding, LARGEST_SCALE.get(o.kind, np.inf)) / factor.of(o.kind)
+            w = problem.weights(r, scales.of(o.kind), o.variance_inflation, LARGEST_SCALE.get(o.kind, np.inf)) / factor.of(o.kind)
         frame.append((o, w))
         lin.cost += float(np.sum(w * r * r))
         for rows, columns, J in blocks_of(o, state, len(free) > 0):
@@ -205,7 +205,7 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
         return
     e, D = lin.equations, a.n_motion
     r = step.residual(a, b)
-    w = problem.weights(r, scale, step.crowding) / factor
+    w = problem.weights(r, scale, step.variance_inflation) / factor
     lin.steps.append((step, w))
     lin.residuals.setdefault("steps", []).append(r)
     lin.cost += float(np.sum(w * r * r))

@@ -77,7 +77,7 @@ def typical_acceleration(motion: np.ndarray, known: np.ndarray, time_s: np.ndarr
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class HandedOver:
+class MarginalPrior:
     """(1) of the first two frames of a stretch, or of the last two."""
 
     equations: NormalEquations  # of two frames, in the order of time
@@ -109,11 +109,11 @@ class HandedOver:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Tied:
+class Coupling:
     """Accelerations within a stretch, and what the frames beside it say."""
 
     acceleration: Acceleration
-    beside: HandedOver | None
+    beside: MarginalPrior | None
 
     def cost(self, motion: np.ndarray) -> float:
         """Sum of squares at a motion (T, D)."""
@@ -126,17 +126,17 @@ class Tied:
             self.beside.add_to(equations, motion)
 
 
-def hand_over(
+def marginal_prior(
     problem: Problem,
     solution: Solution,
     own: range,
-    beside: HandedOver | None,
+    beside: MarginalPrior | None,
     time_s: np.ndarray,
     sigma: np.ndarray,
     *,
     ahead: bool,
     understated: Scales | None = None,
-) -> HandedOver:
+) -> MarginalPrior:
     """What the `own` frames of an adjusted stretch, and those `beside` it, say of the two frames ahead of them or before them.
 
     `time_s` (T,) are the times of the stretch's frames, `sigma` (D,) those of accelerations, `understated` as in `linearise`.
@@ -150,11 +150,13 @@ def hand_over(
     def step(t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
         return observe_step(t + first, a, b) if observe_step and (t + first in own or t + first + 1 in own) else None
 
-    tied = Tied(acceleration=Acceleration(time_s=time_s[frames], sigma=sigma), beside=beside)
-    part = replace(problem, smoothness=tied, of_shape=(), observe=observe, observe_step=step)
+    tied = Coupling(acceleration=Acceleration(time_s=time_s[frames], sigma=sigma), beside=beside)
+    part = replace(problem, smoothness=tied, shape_observations=(), observe=observe, observe_step=step)
     e = linearise(part, solution.motion[frames], solution.vector, solution.scales, understated).equations
     left = eliminated(e, len(own)) if ahead else reversed_in_time(eliminated(reversed_in_time(e), len(own)))
-    return HandedOver(equations=_definite(left), motion=solution.motion[frames][-2:] if ahead else solution.motion[frames][:2], first=ahead)
+    return MarginalPrior(
+        equations=_definite(left), motion=solution.motion[frames][-2:] if ahead else solution.motion[frames][:2], first=ahead
+    )
 
 
 def _definite(e: NormalEquations) -> NormalEquations:

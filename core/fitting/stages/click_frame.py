@@ -8,7 +8,7 @@ from scipy.stats import qmc
 
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
-from ..context import Conditions
+from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..observations import Observation
 from ..observations.shape_priors import clicked_chains
@@ -16,8 +16,8 @@ from ..segmentation import crop
 from ..solve.problem import linearise
 from ..solve.solver import FURTHEST, Solution, solve
 from ..state import BodyState
-from .hidden_limbs import found_again
-from .inverse_kinematics import inverse_kinematics, other_postures
+from .hidden_limbs import reacquired_poses
+from .inverse_kinematics import inverse_kinematics, other_poses
 
 REACH_M = 0.20  # points further than this from the clicked limb's surface are not looked at
 WIDE = 1.5  # the gate, as long as the radii are the model's
@@ -30,7 +30,7 @@ STAGE = "fit the click frame"
 DEPTH_SHIFT_M = 0.04  # clicks from a short base are least certain along the view
 
 
-def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> Solution:
+def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> Solution:
     """Motion (1, D) and shape: the best supported of several starts about the clicked posture.
 
     Raises:
@@ -42,7 +42,7 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     starts = _starts(fit, points, clicked.motion[0], clicked.vector, monitor)
     parts = [monitor.part(STAGE, i, len(starts) + 1) for i in range(len(starts) + 1)]
     for part, motion in zip(parts, starts):
-        solution = fit_posture_and_shape(fit, points, motion, clicked.vector, part)
+        solution = fit_pose_and_shape(fit, points, motion, clicked.vector, part)
         score = fit.score(fit.click, points, solution.motion[0], solution.vector)
         if score > best_score:
             best, best_score = solution, score
@@ -60,22 +60,22 @@ def fit_click_frame(fit: Conditions, points: CloudPoints, monitor: Monitor) -> S
     return _with_lost_limbs(fit, points, best, best_score, parts[-1])
 
 
-def _with_lost_limbs(fit: Conditions, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> Solution:
+def _with_lost_limbs(fit: FitContext, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> Solution:
     """The solution, or one from where a limb without points explains points that nothing else does.
 
     Clicks from a short base leave a limb's depth open: bent towards the cameras and away from them look alike.
     """
-    found = found_again(fit, points, best.motion[0], best.vector, _try(monitor, 0))
+    found = reacquired_poses(fit, points, best.motion[0], best.vector, _try(monitor, 0))
     for i, start in enumerate(found):
-        solution = fit_posture_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
+        solution = fit_pose_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
         score = fit.score(fit.click, points, solution.motion[0], solution.vector)
         if score > best_score + fit.settings.min_points / 4:
             best, best_score = solution, score
     return best
 
 
-def fit_posture_and_shape(
-    fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
+def fit_pose_and_shape(
+    fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
 ) -> Solution:
     """From a motion (D,) and shape (S,) to the points and outlines.
 
@@ -109,7 +109,7 @@ def _plausible(solution: Solution) -> bool:
     return max(solution.scales.points, solution.scales.contours) < SUSPICIOUS
 
 
-def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
+def _around(fit: FitContext, motion: np.ndarray) -> np.ndarray:
     """The posture (D,) and others evenly around it (K, D), always the same ones, within the joints' limits; what is held stays."""
     skeleton = fit.model.skeleton
     spread = np.full(len(motion), AROUND_RAD)
@@ -121,7 +121,7 @@ def _around(fit: Conditions, motion: np.ndarray) -> np.ndarray:
     return np.concatenate([motion[None], within])
 
 
-def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> Solution:
+def _to_surface(fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> Solution:
     """First the posture, then posture and shape, together or in turns as published: each holds the other."""
     near = crop(points, fit.parameters.state(motion, vector), REACH_M)
     ways = 2 if fit.settings.method == "joint" else 2 * ALTERNATIONS
@@ -140,7 +140,7 @@ def _to_surface(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector
     return solution
 
 
-def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+def clicked_lengths(fit: FitContext, points: CloudPoints, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     """ln of the bone lengths (B,) and their sigmas, as the click frame knows them; infinite for bones that are not between clicks."""
     near = crop(points, fit.parameters.state(solution.motion[0], solution.vector), REACH_M)
     problem = fit.problem(_observe(fit, near, 1.0), "shape")
@@ -150,8 +150,8 @@ def clicked_lengths(fit: Conditions, points: CloudPoints, solution: Solution) ->
     return solution.vector[lengths], np.where(between, np.sqrt(np.diag(covariance)[lengths]), np.inf)
 
 
-def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> list[np.ndarray]:
-    others = other_postures(fit.parameters, fit.clicks, motion)
+def _starts(fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> list[np.ndarray]:
+    others = other_poses(fit.parameters, fit.clicks, motion)
     if len(others) > MOST_OTHERS:
         support = []
         for other in others:
@@ -167,5 +167,9 @@ def _starts(fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np
     return starts
 
 
-def _observe(fit: Conditions, points: CloudPoints, wide: float) -> Callable[[int, BodyState], list[Observation]]:
-    return lambda t, state: [*fit.seen_surface(fit.click, points, state, wide), *fit.joints(fit.click), *fit.beliefs(state)]
+def _observe(fit: FitContext, points: CloudPoints, wide: float) -> Callable[[int, BodyState], list[Observation]]:
+    return lambda t, state: [
+        *fit.surface_observations(fit.click, points, state, wide),
+        *fit.joints(fit.click),
+        *fit.pose_observations(state),
+    ]

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from ...foundation.progress import Monitor
-from ..context import Conditions
+from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..segmentation import from_bone, segment
 from ..state import BodyState, free_bones
@@ -20,7 +20,7 @@ ROUNDS = ((400, 150.0, 0.03, 4), (60, 25.0, 0.02, 2), (60, 10.0, 0.015, 1))  # p
 BEYOND_M = 0.05  # points so far beyond a limb's reach, or so near to another part or bone, are none of its
 
 
-def lost_limbs(fit: Conditions, counts: np.ndarray) -> list[np.ndarray]:
+def lost_limbs(fit: FitContext, counts: np.ndarray) -> list[np.ndarray]:
     """The limbs, or the lower parts of limbs, (bones of each, from the body outwards) whose bones all have too few points.
 
     `counts` (B,) of a posture. A part that belongs to a larger one is not named for itself.
@@ -30,8 +30,8 @@ def lost_limbs(fit: Conditions, counts: np.ndarray) -> list[np.ndarray]:
     return [outer[b] for b in lost if int(fit.model.skeleton.parents[b]) not in lost]
 
 
-def found_again(
-    fit: Conditions, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
+def reacquired_poses(
+    fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
 ) -> list[np.ndarray]:
     """Postures (D,) in which limbs explain points that nothing else does; none where there are too few such points.
 
@@ -60,7 +60,7 @@ def found_again(
 
 
 def _found(
-    fit: Conditions, points: CloudPoints, rows: np.ndarray, limb: np.ndarray, now: np.ndarray, vector: np.ndarray, monitor: Monitor
+    fit: FitContext, points: CloudPoints, rows: np.ndarray, limb: np.ndarray, now: np.ndarray, vector: np.ndarray, monitor: Monitor
 ) -> np.ndarray | None:
     """The posture (D,) in which a limb explains most of these points; None if it explains too few."""
     kept = now[None]
@@ -72,14 +72,14 @@ def _found(
     return kept[0] if support.max() > fit.settings.min_points / 4 else None
 
 
-def _limbs(fit: Conditions) -> dict[int, np.ndarray]:
+def _limbs(fit: FitContext) -> dict[int, np.ndarray]:
     """Limbs and the lower parts of limbs: the first bone of each, and all that must be seen, from the body outwards."""
     skeleton, free = fit.model.skeleton, free_bones(fit.parameters)
     first = [int(b) for b in np.flatnonzero(free) if skeleton.parents[b] >= 0 and _limb(fit, int(b))]
     return {b: np.array([c for c in np.flatnonzero(free) if b in _line(skeleton.parents, int(c))]) for b in first}
 
 
-def _limb(fit: Conditions, bone: int) -> bool:
+def _limb(fit: FitContext, bone: int) -> bool:
     return fit.model.skeleton.bones[bone].name.endswith((".L", ".R"))
 
 
@@ -90,7 +90,7 @@ def _line(parents: np.ndarray, bone: int) -> list[int]:
     return line
 
 
-def _unexplained(fit: Conditions, points: CloudPoints, state: BodyState, limb: np.ndarray) -> np.ndarray:
+def _unexplained(fit: FitContext, points: CloudPoints, state: BodyState, limb: np.ndarray) -> np.ndarray:
     """Rows of the points within a limb's reach that are near no other part of the body, nor near a hand, foot or other bone's axis."""
     reach = float(state.lengths_m[limb].sum()) + BEYOND_M
     near = np.linalg.norm(points.xyz_m - state.head_m[limb[0]], axis=1) < reach
@@ -107,7 +107,7 @@ def _unexplained(fit: Conditions, points: CloudPoints, state: BodyState, limb: n
     return np.flatnonzero(near)
 
 
-def _astray(fit: Conditions, points: CloudPoints, state: BodyState, limb: np.ndarray) -> np.ndarray:
+def _astray(fit: FitContext, points: CloudPoints, state: BodyState, limb: np.ndarray) -> np.ndarray:
     """Rows of the points that neither a limb nor anything else explains."""
     rows = _unexplained(fit, points, state, limb)
     for b in limb:
@@ -115,7 +115,7 @@ def _astray(fit: Conditions, points: CloudPoints, state: BodyState, limb: np.nda
     return rows
 
 
-def _postures(fit: Conditions, motion: np.ndarray, limb: np.ndarray, count: int, spread: float) -> np.ndarray:
+def _postures(fit: FitContext, motion: np.ndarray, limb: np.ndarray, count: int, spread: float) -> np.ndarray:
     """Postures (count, D) of one limb, evenly within `spread` [rad] of a posture and the joints' limits; the rest of the body as it is.
 
     A free bone that is not lost turns about itself too: its points hardly tell by how much, and it carries the limb around.
@@ -136,7 +136,7 @@ def _even(dimensions: int, count: int) -> np.ndarray:
     return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))
 
 
-def _explained(fit: Conditions, points: CloudPoints, rows: np.ndarray, state: BodyState, limb: np.ndarray, width_m: float) -> float:
+def _explained(fit: FitContext, points: CloudPoints, rows: np.ndarray, state: BodyState, limb: np.ndarray, width_m: float) -> float:
     """How many of the points a limb explains: the sum of their weights."""
     best = np.zeros(len(rows))
     for b in limb:

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from ...body.skeleton import Skeleton, joint_positions
 from ..inputs.clicks import Clicks
-from ..observations import JointLimits, MotionPrior, Observation, Proportions
+from ..observations import JointLimits, Observation, PosePrior, Proportions
 from ..observations.shape_priors import STATURE_SIGMA
 from ..solve.solver import Problem, Solution, solve
-from ..state import FIRM, ShapeParameters
+from ..state import FIRM_PRIOR, ShapeParameters
 
 GRID_STEP = np.radians(25.0)
 FREE_SPAN = np.pi  # search range of a DOF without limits
@@ -27,16 +27,16 @@ CLICKED_STATURE_SIGMA = 0.02  # some sixteen lengths of about 8 % each
 
 
 def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], lengths: Proportions) -> Solution:
-    """Motion (1, D) and shape vector at the click frame. `priors`: limits and beliefs about the DOFs.
+    """Motion (1, D) and shape vector at the click frame. `priors`: limits and priors about the DOFs.
 
     Bone lengths are free within what is believed of them, radii are not.
     """
     vector = parameters.vector()
-    start = coarse_posture(parameters, clicks)
+    start = coarse_pose(parameters, clicks)
     problem = Problem(
         parameters=parameters,
         observe=lambda t, state: [*clicks.observations, *priors],
-        of_shape=[lengths],
+        shape_observations=[lengths],
         free_shape=parameters.layout.group("lengths"),
         held=parameters.skeleton.locked,
     )
@@ -72,7 +72,7 @@ def trunk_joints(skeleton: Skeleton) -> list[str]:
     return list(dict.fromkeys(j for bone, s in zip(skeleton.bones, stiff) if s for j in (bone.head_joint, bone.tail_joint)))
 
 
-def coarse_posture(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
+def coarse_pose(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
     """A motion vector (D,) near the located joints: the trunk turned as a whole, then for limb after limb the best on a grid of the DOFs
     that move its tail."""
     skeleton, lengths = parameters.skeleton, parameters.template.lengths_m
@@ -87,7 +87,7 @@ def coarse_posture(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
     return _towards(skeleton, lengths, clicks.xyz_m, motion, trunk if turned else [], known)
 
 
-def posture_as_clicked(parameters: ShapeParameters, xyz_m: np.ndarray, motion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def pose_as_clicked(parameters: ShapeParameters, xyz_m: np.ndarray, motion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """The posture (D,) in which limbs lead to where their joints (J, 3) were clicked, NaN those that were not; the rest as in `motion`
     (D,) of the shape `vector`."""
     skeleton = parameters.skeleton
@@ -142,7 +142,7 @@ def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, plac
         motion[skeleton.layout[dof.name]] = np.clip(angles[dof.axis], *dof.limits)
 
 
-def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarray) -> list[np.ndarray]:
+def other_poses(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarray) -> list[np.ndarray]:
     """Further starts for bones whose tail nobody clicked: a coarse grid of the DOFs that move it, the others as in `motion` (D,).
 
     Bones whose posture the model believes firmly have none.
@@ -152,7 +152,7 @@ def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarr
     turned = sum(clicks.located[skeleton.joint_names.index(j)] for j in trunk) >= 3
     for b, bone in enumerate(skeleton.bones):
         dofs = _movers(skeleton, b)
-        believed = all(dof.prior_sigma <= FIRM for dof in bone.dofs)
+        believed = all(dof.prior_sigma <= FIRM_PRIOR for dof in bone.dofs)
         if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or believed or (turned and bone.tail_joint in trunk):
             continue
         for values in product(*(_values(skeleton, d)[1::2] for d in dofs)):
@@ -163,7 +163,7 @@ def other_postures(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarr
 
 
 def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> list[Observation]:
-    """Soft limits, and the model's beliefs about DOFs; where it has none, a sigma of 180° or 10 m keeps the equations regular."""
+    """Soft limits, and the model's priors about DOFs; where it has none, a sigma of 180° or 10 m keeps the equations regular."""
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
     mean, sigma = np.array([(dof.prior_mean, dof.prior_sigma) for dof in skeleton.dofs]).T
     base = skeleton.layout.group("base")
@@ -171,18 +171,19 @@ def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> l
     mean[free] = np.clip(0.0, low, high)[free]
     sigma[free] = np.pi
     mean[base], sigma[base] = about_m, 10.0
-    return [JointLimits(low=low, high=high, sigma=limit_sigma), MotionPrior(mean=mean, sigma=sigma)]
+    return [JointLimits(low=low, high=high, sigma=limit_sigma), PosePrior(mean=mean, sigma=sigma)]
 
 
-def lasting(priors: list[Observation], time_s: np.ndarray) -> list[Observation]:
-    """The beliefs of one frame for every frame of a sequence: a posture lasts, so frames closer than `LASTS_S` share one belief.
+def shared_over_time(priors: list[Observation], time_s: np.ndarray) -> list[Observation]:
+    """The priors of one frame for every frame of a sequence: a posture lasts, so frames closer than `LASTS_S` share one belief.
 
-    Not so firm beliefs: they stand for what is hardly measured, and are up against the model's error, which is the same in all frames.
+    Not so firm priors: they stand for what is hardly measured, and are up against the model's error, which is the same in all frames.
     """
     step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else LASTS_S
     frames = min(max(1.0, LASTS_S / step), float(len(time_s)))
     return [
-        replace(p, sigma=np.where(p.sigma <= FIRM, p.sigma, p.sigma * np.sqrt(frames))) if isinstance(p, MotionPrior) else p for p in priors
+        replace(p, sigma=np.where(p.sigma <= FIRM_PRIOR, p.sigma, p.sigma * np.sqrt(frames))) if isinstance(p, PosePrior) else p
+        for p in priors
     ]
 
 

@@ -12,16 +12,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..context import Conditions
+from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.material_tracks import MaterialTracks
 from ..inputs.standing_feet import StandingFeet
 from ..segmentation import crop
 from ..solve.block_band import NormalEquations
 from ..solve.solver import Solution
-from ..solve.time_priors import HandedOver
+from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
-from .pose_tracking import Kept
+from .pose_tracking import Checkpoints
 
 AT_ONCE = 300  # frames: a whole body with 4,000 points a frame takes 2 MB each while it is adjusted
 BLOCKS = 3  # of those from which the shape is found
@@ -33,13 +33,13 @@ REACH_M = 0.10  # of the points that are kept for the adjustment of the sequence
 class Recording:
     """What the adjustment over T frames is made from, all of a recording or a stretch of it."""
 
-    fit: Conditions
+    fit: FitContext
     frames: Sequence[int]  # T, the take's numbers
     points: Sequence[CloudPoints]  # T
     time_s: np.ndarray  # (T,)
     sigma: np.ndarray  # (D,) of accelerations
     tracks: MaterialTracks | None
-    lengths: tuple[np.ndarray, np.ndarray]  # see Conditions.of_shape
+    lengths: tuple[np.ndarray, np.ndarray]  # see FitContext.shape_observations
     feet: StandingFeet | None
 
     def stretch(self, frames: Sequence[int], motion: np.ndarray, vector: np.ndarray) -> "Recording":
@@ -60,7 +60,7 @@ class Recording:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Looked:
+class FrameResults:
     """What is told of n adjusted frames."""
 
     values: np.ndarray  # (n, D)
@@ -73,15 +73,15 @@ class Looked:
     outline_m: np.ndarray  # (K,)
 
 
-def joined(parts: list[Looked]) -> Looked:
+def joined(parts: list[FrameResults]) -> FrameResults:
     """One after the other. The list is emptied, so that little is held twice."""
-    ends = {name: np.cumsum([0, *(len(getattr(p, name)) for p in parts)]) for name in Looked.__dataclass_fields__}
+    ends = {name: np.cumsum([0, *(len(getattr(p, name)) for p in parts)]) for name in FrameResults.__dataclass_fields__}
     whole = {name: np.empty((end[-1], *getattr(parts[0], name).shape[1:]), getattr(parts[0], name).dtype) for name, end in ends.items()}
     for i in range(len(parts)):
         part = parts.pop(0)
         for name, end in ends.items():
             whole[name][end[i] : end[i + 1]] = getattr(part, name)
-    return Looked(**whole)
+    return FrameResults(**whole)
 
 
 def near(points: CloudPoints, state: BodyState) -> CloudPoints:
@@ -126,7 +126,7 @@ WAYS = {1: "ahead", -1: "back"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ended:
+class Convergence:
     """How an adjustment ended."""
 
     iterations: int
@@ -137,59 +137,61 @@ class Ended:
         return {"ended": np.array([self.iterations, self.converged], dtype=np.int64)}
 
     @staticmethod
-    def of(solution: Solution) -> "Ended":
+    def of(solution: Solution) -> "Convergence":
         """That of a solution."""
-        return Ended(iterations=solution.iterations, converged=solution.converged)
+        return Convergence(iterations=solution.iterations, converged=solution.converged)
 
     @staticmethod
-    def loaded(kept: Mapping[str, np.ndarray]) -> "Ended":
+    def loaded(kept: Mapping[str, np.ndarray]) -> "Convergence":
         """What was kept."""
-        return Ended(iterations=int(kept["ended"][0]), converged=bool(kept["ended"][1]))
+        return Convergence(iterations=int(kept["ended"][0]), converged=bool(kept["ended"][1]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FoundShape:
+class ShapeResult:
     """The shape of a recording in stretches."""
 
     simplified: np.ndarray  # (S',) of the simplified body, from which the complete model is made
     vector: np.ndarray  # (S,)
     covariance: np.ndarray  # (S, S)
-    ended: Ended
+    ended: Convergence
 
-    def save(self, kept: Kept | None) -> None:
+    def save(self, kept: Checkpoints | None) -> None:
         """Keep it."""
         if kept is not None:
             kept.save("shape", {"simplified": self.simplified, "vector": self.vector, "covariance": self.covariance, **self.ended.arrays()})
 
     @staticmethod
-    def loaded(kept: Kept | None) -> "FoundShape | None":
+    def loaded(kept: Checkpoints | None) -> "ShapeResult | None":
         """What was kept, if anything was."""
         found = kept.load("shape") if kept is not None else None
         if found is None:
             return None
-        return FoundShape(simplified=found["simplified"], vector=found["vector"], covariance=found["covariance"], ended=Ended.loaded(found))
+        return ShapeResult(
+            simplified=found["simplified"], vector=found["vector"], covariance=found["covariance"], ended=Convergence.loaded(found)
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Behind:
+class MarginalPriors:
     """What the frames behind hand over: to the adjustment, and to covariances, where understated variances are made honest."""
 
-    known: HandedOver | None
-    honest: HandedOver | None
+    known: MarginalPrior | None
+    honest: MarginalPrior | None
 
 
-NOTHING_BEHIND = Behind(known=None, honest=None)
+NOTHING_BEHIND = MarginalPriors(known=None, honest=None)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Stretch:
+class StretchResult:
     """An adjusted stretch: what is told of its own frames, and what it hands over ahead (1) and back (−1)."""
 
-    looked: Looked
-    ended: Ended
-    behind: Mapping[int, Behind]
+    looked: FrameResults
+    ended: Convergence
+    behind: Mapping[int, MarginalPriors]
 
-    def save(self, kept: Kept | None, own: range, around: range) -> None:
+    def save(self, kept: Checkpoints | None, own: range, around: range) -> None:
         """Keep it under its own frames, with those that took part."""
         if kept is None:
             return
@@ -201,25 +203,25 @@ class Stretch:
         kept.save(_name(own), arrays)
 
     @staticmethod
-    def loaded(kept: Kept | None, own: range, around: range) -> "Stretch | None":
+    def loaded(kept: Checkpoints | None, own: range, around: range) -> "StretchResult | None":
         """What was kept of these frames with the same margins, if anything was."""
         found = kept.load(_name(own)) if kept is not None else None
         if found is None or found["around"].tolist() != [around.start, around.stop]:
             return None
         behind = {
-            way: Behind(known=_handed_over(found, f"{word}.known", way), honest=_handed_over(found, f"{word}.honest", way))
+            way: MarginalPriors(known=_handed_over(found, f"{word}.known", way), honest=_handed_over(found, f"{word}.honest", way))
             for way, word in WAYS.items()
             if f"{word}.known.motion" in found
         }
-        return Stretch(looked=_value(Looked, "looked", found), ended=Ended.loaded(found), behind=behind)
+        return StretchResult(looked=_value(FrameResults, "looked", found), ended=Convergence.loaded(found), behind=behind)
 
 
 def _name(own: range) -> str:
     return f"frames_{own.start}_{own.stop - 1}"
 
 
-def _handed_over(kept: Mapping[str, np.ndarray], name: str, way: int) -> HandedOver:
-    return HandedOver(equations=_value(NormalEquations, name, kept), motion=kept[f"{name}.motion"], first=way > 0)
+def _handed_over(kept: Mapping[str, np.ndarray], name: str, way: int) -> MarginalPrior:
+    return MarginalPrior(equations=_value(NormalEquations, name, kept), motion=kept[f"{name}.motion"], first=way > 0)
 
 
 def _table(name: str, value: Any) -> dict[str, np.ndarray]:

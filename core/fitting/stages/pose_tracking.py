@@ -16,20 +16,20 @@ from typing import Protocol
 import numpy as np
 
 from ...foundation.progress import Monitor
-from ..context import Conditions
+from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.material_tracks import MaterialTracks
-from ..observations import MotionPrior, Observation, StepsFromFixed
-from ..segmentation import HeldSegments, crop
+from ..observations import Observation, PosePrior, StepsFromFixed
+from ..segmentation import SegmentationCache, crop
 from ..solve.solver import Solution, solve
 from ..state import BodyState, free_bones
-from .hidden_limbs import found_again
-from .inverse_kinematics import lasting, posture_as_clicked
+from .hidden_limbs import reacquired_poses
+from .inverse_kinematics import pose_as_clicked, shared_over_time
 
-KEEP_EVERY = 25  # frames: some seconds of work
+CHECKPOINT_EVERY = 25  # frames: some seconds of work
 
 
-class Kept(Protocol):
+class Checkpoints(Protocol):
     """Where a fit keeps its work, each part by its name, under a key of all that it depends on."""
 
     def load(self, name: str) -> Mapping[str, np.ndarray] | None:
@@ -40,7 +40,7 @@ class Kept(Protocol):
 
 
 @dataclass(kw_only=True)
-class Way:
+class PoseTrackingState:
     """What is known of T frames with D degrees of freedom and B bones, when `done` of them are done."""
 
     motion: np.ndarray  # (T, D)
@@ -62,13 +62,13 @@ class Way:
             "done": np.array([self.done]),
         }
 
-    def goes_on(self, kept: Mapping[str, np.ndarray] | None) -> "Way":
+    def goes_on(self, kept: Mapping[str, np.ndarray] | None) -> "PoseTrackingState":
         """What was kept, if it is of these frames, else this."""
         mine, other = ({n: a.shape for n, a in table.items() if n != "seen"} for table in (self.arrays(), kept or {}))
         if kept is None or mine != other:
             return self
         support = float(kept["support"][0])
-        return Way(
+        return PoseTrackingState(
             motion=kept["motion"].copy(),
             known=kept["known"].copy(),
             unseen=kept["unseen"].copy(),
@@ -88,20 +88,20 @@ WIDENING, WIDEST = 0.25, 4.0  # of the gate of a limb that is not seen: per fram
 
 
 def follow(
-    fit: Conditions,
+    fit: FitContext,
     points: Sequence[CloudPoints],
     time_s: np.ndarray,
     first: Solution,
     tracks: MaterialTracks | None,
     monitor: Monitor,
-    kept: Kept | None = None,
+    kept: Checkpoints | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motion (T, D) of all frames, and where each DOF (T, D) was seen."""
-    fit, T = replace(fit, priors=lasting(fit.priors, time_s)), len(points)  # the frame before has said them already
+    fit, T = replace(fit, priors=shared_over_time(fit.priors, time_s)), len(points)  # the frame before has said them already
     motion = np.full((T, first.motion.shape[1]), np.nan)
     motion[fit.click] = first.motion[0]
     at_click = _unseen(fit, fit.click, points[fit.click], first.motion[0], first.vector, np.zeros(len(fit.model.skeleton.bones)))
-    way = Way(motion=motion, known=np.ones(motion.shape, dtype=bool), unseen=at_click, seen=[fit.click])
+    way = PoseTrackingState(motion=motion, known=np.ones(motion.shape, dtype=bool), unseen=at_click, seen=[fit.click])
     way = way.goes_on(kept.load("way") if kept else None)
     ahead, back = [(t, 1) for t in range(fit.click + 1, T)], [(t, -1) for t in range(fit.click - 1, -1, -1)]
     for t, direction in [*ahead, *back][way.done - 1 :]:
@@ -111,7 +111,7 @@ def follow(
             way.support, way.seen, way.unseen = None, [fit.click], at_click
         _step(fit, way, t, direction, points, time_s, first, tracks, part)
         way.done += 1
-        if kept is not None and way.done % KEEP_EVERY == 0:
+        if kept is not None and way.done % CHECKPOINT_EVERY == 0:
             kept.save("way", way.arrays())
     if tracks is not None:
         tracks.forget()  # a fit that went on from a checkpoint knows less of them
@@ -119,8 +119,8 @@ def follow(
 
 
 def _step(
-    fit: Conditions,
-    way: Way,
+    fit: FitContext,
+    way: PoseTrackingState,
     t: int,
     direction: int,
     all_points: Sequence[CloudPoints],
@@ -148,7 +148,7 @@ def _step(
 
 
 def _mend(
-    fit: Conditions, way: Way, clicked: int, direction: int, points: Sequence[CloudPoints], first: Solution, monitor: Monitor
+    fit: FitContext, way: PoseTrackingState, clicked: int, direction: int, points: Sequence[CloudPoints], first: Solution, monitor: Monitor
 ) -> None:
     """From a clicked frame back over those before it, as long as what comes from there is better than what was found."""
     motion, wide = way.motion, np.ones(len(fit.model.skeleton.bones))
@@ -163,7 +163,7 @@ def _mend(
         motion[t] = posture
 
 
-def _reach(fit: Conditions, state: BodyState) -> np.ndarray:
+def _reach(fit: FitContext, state: BodyState) -> np.ndarray:
     """How far from each bone (B,) points are looked at: about a limb, as far as what hangs on it may have swung."""
     hanging = state.skeleton.ancestors.T @ state.lengths_m
     return np.where(free_bones(fit.parameters) & (state.skeleton.parents >= 0), np.maximum(hanging, REACH_M), REACH_M)
@@ -174,13 +174,13 @@ def _some(points: CloudPoints) -> CloudPoints:
     return points.take(np.arange(0, len(points.xyz_m), 1 + (len(points.xyz_m) - 1) // MOST_POINTS)) if len(points.xyz_m) else points
 
 
-def _unseen(fit: Conditions, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, before: np.ndarray) -> np.ndarray:
+def _unseen(fit: FitContext, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, before: np.ndarray) -> np.ndarray:
     """For how many frames each bone (B,) was not seen well enough; 0 for those whose posture the model believes firmly."""
     few = fit.evidence(t, points, fit.parameters.state(motion, vector)) < fit.settings.min_points / 2
     return np.where(few & free_bones(fit.parameters), before + 1, 0)
 
 
-def _slowing(fit: Conditions, unseen: np.ndarray) -> np.ndarray:
+def _slowing(fit: FitContext, unseen: np.ndarray) -> np.ndarray:
     """Factor (D,) of the predicted change of every DOF: less than 1 where none of the bones that it moves is seen."""
     moved, free = fit.model.skeleton.moved_by, free_bones(fit.parameters)
     seen = ((unseen == 0) & free)[:, None] & moved
@@ -209,7 +209,7 @@ def _from_neighbour(tracks: MaterialTracks | None, t: int, before: BodyState, di
 
 
 def _next_posture(
-    fit: Conditions,
+    fit: FitContext,
     i: int,
     points: CloudPoints,
     moved: list[StepsFromFixed],
@@ -226,16 +226,16 @@ def _next_posture(
     best, best_support, best_score = predictions[0], -1.0, -np.inf
 
     def adjusted(start: np.ndarray) -> tuple[np.ndarray, float, float]:
-        prior, held = MotionPrior(mean=start, sigma=sigma), HeldSegments()
+        prior, held = PosePrior(mean=start, sigma=sigma), SegmentationCache()
 
-        def observe(t: int, state: BodyState, prior: MotionPrior = prior, held: HeldSegments = held) -> list[Observation]:
+        def observe(t: int, state: BodyState, prior: PosePrior = prior, held: SegmentationCache = held) -> list[Observation]:
             return [
-                *fit.seen_surface(i, points, state, wide, held),
+                *fit.surface_observations(i, points, state, wide, held),
                 *fit.joints(i),
                 *fit.empty.observe(i),
                 *moved,
                 prior,
-                *fit.beliefs(state),
+                *fit.pose_observations(state),
             ]
 
         solution = solve(fit.problem(observe), start[None], first.vector, steps=s.frame_steps, scales=first.scales, monitor=monitor)
@@ -249,10 +249,10 @@ def _next_posture(
         if last_support is None or best_support > LOST_SUPPORT * last_support:
             break
     if i in fit.places:
-        posture, support, score = adjusted(posture_as_clicked(fit.parameters, fit.places[i], best, first.vector))
+        posture, support, score = adjusted(pose_as_clicked(fit.parameters, fit.places[i], best, first.vector))
         if score > best_score:
             best, best_support, best_score = posture, support, score
-    for start in found_again(fit, points, best, first.vector, monitor):
+    for start in reacquired_poses(fit, points, best, first.vector, monitor):
         posture, support, score = adjusted(start)
         if score > best_score + s.min_points / 4:
             best, best_support, best_score = posture, support, score

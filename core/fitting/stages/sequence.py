@@ -29,8 +29,8 @@ from ...body.motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotio
 from ...body.shape import default_shape, one_ball_shape, scaled_shape
 from ...foundation.arrays import LazySequence
 from ...foundation.progress import Monitor
-from ..context import NO_SHAPE, Conditions
-from ..inputs.background import EmptyViews
+from ..context import NO_SHAPE, FitContext
+from ..inputs.background import BackgroundRegions
 from ..inputs.clicks import enough, read_clicks
 from ..inputs.cloud_points import CloudPoints, thinned
 from ..inputs.fit_input import FitInput
@@ -39,19 +39,32 @@ from ..inputs.material_tracks import MaterialTracks
 from ..inputs.silhouettes import Silhouettes
 from ..inputs.standing_feet import StandingFeet
 from ..observations import Observation
-from ..observations.self_collision import LimbsApart
+from ..observations.self_collision import CollisionPairs
 from ..robust import robust_scale
-from ..segmentation import HeldSegments
+from ..segmentation import SegmentationCache
 from ..settings import FitSettings
-from ..smooth_radii import evened
+from ..smooth_radii import smooth_radii
 from ..solve.problem import Problem, Scales, linearise, variance_factors
 from ..solve.solver import Solution, solve
-from ..solve.time_priors import Acceleration, HandedOver, Tied, hand_over, typical_acceleration
+from ..solve.time_priors import Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
 from ..state import BodyState, ShapeParameters, free_bones
 from .click_frame import clicked_lengths, fit_click_frame
-from .inverse_kinematics import clicked_stature, dof_priors, lasting
-from .long_sequence import AT_ONCE, NOTHING_BEHIND, Behind, Ended, FoundShape, Looked, Recording, Stretch, joined, near, outwards, sample
-from .pose_tracking import Kept, follow
+from .inverse_kinematics import clicked_stature, dof_priors, shared_over_time
+from .long_sequence import (
+    AT_ONCE,
+    NOTHING_BEHIND,
+    Convergence,
+    FrameResults,
+    MarginalPriors,
+    Recording,
+    ShapeResult,
+    StretchResult,
+    joined,
+    near,
+    outwards,
+    sample,
+)
+from .pose_tracking import Checkpoints, follow
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
 
@@ -62,7 +75,9 @@ MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that 
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
-def fit_sequence(given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None, kept: Kept | None = None) -> BodyFit:
+def fit_sequence(
+    given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None, kept: Checkpoints | None = None
+) -> BodyFit:
     """Shape and motion of the person. Frames without points are bridged and say so in their status. Time is linear in frames.
 
     With `kept`, the work frame after frame is kept there from time to time, and so is each stretch that is done; both are gone on with.
@@ -115,7 +130,7 @@ def _at_once(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: 
     monitor.step(SIGMAS, 1, 3)
     covariance = _covariance(problem, solution, factors)
     monitor.step(SIGMAS, 2, 3)
-    return _result(part, _looked(part, solution, covariance, frames), solution.vector, covariance[2], [Ended.of(solution)])
+    return _result(part, _looked(part, solution, covariance, frames), solution.vector, covariance[2], [Convergence.of(solution)])
 
 
 def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> tuple[Recording, Problem, list[Solution]]:
@@ -123,7 +138,7 @@ def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: 
     steps = part.fit.settings.sequence_steps
     problem = _whole_sequence(part)
     solution = solve(problem, motion, vector, steps=steps, monitor=monitor, stage="adjust the sequence")
-    solutions = [_begun_anew(part.fit, part.points, part.time_s, solution, problem, monitor)]
+    solutions = [_restarted(part.fit, part.points, part.time_s, solution, problem, monitor)]
     if part.fit.settings.balls == "complete":
         part = replace(part, fit=_completed(part.fit, solutions[0].vector))
         problem = _whole_sequence(part)
@@ -141,13 +156,13 @@ def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: 
     return part, problem, solutions
 
 
-def _in_stretches(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor, kept: Kept | None) -> BodyFit:
+def _in_stretches(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor, kept: Checkpoints | None) -> BodyFit:
     """As `_at_once`, with memory for `AT_ONCE` frames and two margins only.
 
     First the shape, from blocks of frames all over the recording: since a body differs from its model in every frame alike, more would not
     tell more of it. Then, with that shape held, the postures. Their covariances count what is not known of the shape.
     """
-    found = FoundShape.loaded(kept)
+    found = ShapeResult.loaded(kept)
     if found is None:
         found = _shape_of_blocks(every, motion, vector, monitor)
         found.save(kept)
@@ -157,21 +172,23 @@ def _in_stretches(every: Recording, motion: np.ndarray, vector: np.ndarray, moni
     return _result(every, looked, found.vector, found.covariance, [found.ended, *ends])
 
 
-def _shape_of_blocks(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> FoundShape:
+def _shape_of_blocks(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> ShapeResult:
     """The shape from some blocks of a motion (T, D)."""
     frames = sample(len(motion), every.fit.click)
     part, problem, solutions = _adjusted(every.stretch(frames, motion, vector), motion[frames], vector, monitor)
     last = solutions[-1]
     covariance = _covariance(problem, last, _factors(part, problem, last))[2]
-    return FoundShape(simplified=solutions[0].vector, vector=last.vector, covariance=covariance, ended=Ended.of(last))
+    return ShapeResult(simplified=solutions[0].vector, vector=last.vector, covariance=covariance, ended=Convergence.of(last))
 
 
-def _postures(every: Recording, motion: np.ndarray, shape: FoundShape, monitor: Monitor, kept: Kept | None) -> tuple[Looked, list[Ended]]:
+def _postures(
+    every: Recording, motion: np.ndarray, shape: ShapeResult, monitor: Monitor, kept: Checkpoints | None
+) -> tuple[FrameResults, list[Convergence]]:
     """The postures from a motion (T, D), with the shape held, stretch after stretch from the click frame on."""
-    done, ends = dict[int, Looked](), list[Ended]()
-    behind, plan = dict[int, Behind](), outwards(len(motion), every.fit.click)
+    done, ends = dict[int, FrameResults](), list[Convergence]()
+    behind, plan = dict[int, MarginalPriors](), outwards(len(motion), every.fit.click)
     for k, (own, around, direction) in enumerate(plan):
-        stretch = Stretch.loaded(kept, own, around)
+        stretch = StretchResult.loaded(kept, own, around)
         if stretch is None:
             told = monitor.part("adjust the postures", k, len(plan))
             stretch = _stretch(every, (own, around, direction), motion, shape, behind.get(direction, NOTHING_BEHIND), told)
@@ -183,24 +200,24 @@ def _postures(every: Recording, motion: np.ndarray, shape: FoundShape, monitor: 
 
 
 def _stretch(
-    every: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: FoundShape, behind: Behind, monitor: Monitor
-) -> Stretch:
+    every: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: ShapeResult, behind: MarginalPriors, monitor: Monitor
+) -> StretchResult:
     """One of `outwards`, from a motion (T, D) of all frames, with what the stretches behind handed over."""
     own, around, direction = place
     part = every.stretch(around, motion, shape.vector)
     problem = _whole_sequence(part, behind.known)
     held = replace(problem, free_shape=NO_SHAPE)
     solution = solve(held, motion[around], shape.vector, steps=part.fit.settings.sequence_steps, monitor=monitor)
-    solution = _begun_anew(part.fit, part.points, part.time_s, solution, held, monitor)
+    solution = _restarted(part.fit, part.points, part.time_s, solution, held, monitor)
     local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, held, solution)
     covariance = _covariance(_whole_sequence(part, behind.honest), solution, factors, shape.covariance)
-    told = partial(hand_over, problem, solution, local, time_s=part.time_s, sigma=part.sigma)
+    told = partial(marginal_prior, problem, solution, local, time_s=part.time_s, sigma=part.sigma)
     ways = [way for way in ({1, -1} if direction == 0 else {direction}) if (own.stop < len(motion) if way > 0 else own.start > 0)]
-    return Stretch(
+    return StretchResult(
         looked=_looked(part, solution, covariance, local),
-        ended=Ended.of(solution),
+        ended=Convergence.of(solution),
         behind={
-            way: Behind(
+            way: MarginalPriors(
                 known=told(beside=behind.known, ahead=way > 0), honest=told(beside=behind.honest, ahead=way > 0, understated=factors)
             )
             for way in ways
@@ -208,7 +225,7 @@ def _stretch(
     )
 
 
-def _standing(fit: Conditions, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
+def _standing(fit: FitContext, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> StandingFeet | None:
     """Which feet stand in a motion (T, D), if that is asked for."""
     if not fit.settings.floor:
         return None
@@ -216,13 +233,13 @@ def _standing(fit: Conditions, motion: np.ndarray, vector: np.ndarray, time_s: n
     return StandingFeet(joints, fit.model.skeleton.joint_names, time_s)
 
 
-def _completed(fit: Conditions, vector: np.ndarray) -> Conditions:
+def _completed(fit: FitContext, vector: np.ndarray) -> FitContext:
     """The same conditions for the complete model of the body that was found (S,)."""
     shape = complete_shape(fit.parameters.shape(vector, np.full(len(vector), np.nan)))
     return replace(fit, parameters=ShapeParameters(shape, fit.settings.weights), settings=replace(fit.settings, radius_sigma=MUSCLE_SIGMA))
 
 
-def conditions(given: FitInput, settings: FitSettings) -> Conditions:
+def conditions(given: FitInput, settings: FitSettings) -> FitContext:
     """What stays the same throughout the fit.
 
     Raises:
@@ -243,7 +260,7 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
     stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
     shape = scaled_shape(shape, stature)
     parameters = ShapeParameters(shape, settings.weights)
-    return Conditions(
+    return FitContext(
         cameras=given.rig.cameras,
         model=model,
         parameters=parameters,
@@ -258,8 +275,8 @@ def conditions(given: FitInput, settings: FitSettings) -> Conditions:
         frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
         located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
         silhouettes=Silhouettes(given, model.surface, settings),
-        empty=EmptyViews(given, parameters, settings),
-        limbs=LimbsApart(model.skeleton, shape.metaballs.bone_index),
+        empty=BackgroundRegions(given, parameters, settings),
+        limbs=CollisionPairs(model.skeleton, shape.metaballs.bone_index),
     )
 
 
@@ -268,7 +285,7 @@ def _best_known(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
     return max(places, key=lambda t: int(np.isfinite(places[t]).sum())) if places else tracks.best_frame()
 
 
-def _loosest(fit: Conditions) -> np.ndarray:
+def _loosest(fit: FitContext) -> np.ndarray:
     """The largest sigma (D,) of accelerations."""
     s, skeleton = fit.settings, fit.model.skeleton
     sigma = np.full(len(skeleton.dofs), np.radians(s.acceleration_deg_s2))
@@ -276,16 +293,16 @@ def _loosest(fit: Conditions) -> np.ndarray:
     return sigma
 
 
-def _whole_sequence(every: Recording, beside: HandedOver | None = None) -> Problem:
+def _whole_sequence(every: Recording, beside: MarginalPrior | None = None) -> Problem:
     """The adjustment of postures and shape, with what frames beside these say."""
     fit, points, feet = every.fit, every.points, every.feet
-    priors = lasting(fit.priors, every.time_s)
+    priors = shared_over_time(fit.priors, every.time_s)
 
-    held = HeldSegments()
+    held = SegmentationCache()
 
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [
-            *fit.seen_surface(t, points[t], state, held=held),
+            *fit.surface_observations(t, points[t], state, held=held),
             *fit.joints(t),
             *fit.empty.observe(t),
             *priors,
@@ -295,11 +312,11 @@ def _whole_sequence(every: Recording, beside: HandedOver | None = None) -> Probl
 
     problem = fit.problem(observe, "shape", Acceleration(time_s=every.time_s, sigma=every.sigma))
     if beside is not None:
-        problem = replace(problem, smoothness=Tied(acceleration=Acceleration(time_s=every.time_s, sigma=every.sigma), beside=beside))
+        problem = replace(problem, smoothness=Coupling(acceleration=Acceleration(time_s=every.time_s, sigma=every.sigma), beside=beside))
     return replace(
         problem,
-        of_shape=fit.of_shape(every.lengths),
-        of_shape_weight=_shared_weight(points, fit.settings),
+        shape_observations=fit.shape_observations(every.lengths),
+        shape_weight=_shared_weight(points, fit.settings),
         observe_step=None if every.tracks is None else every.tracks.steps,
     )
 
@@ -314,12 +331,12 @@ def _shared_weight(points: Sequence[CloudPoints], settings: FitSettings) -> floa
     return (own + frames * model) / (own + model)
 
 
-def _begun_anew(
-    fit: Conditions, points: Sequence[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem, monitor: Monitor
+def _restarted(
+    fit: FitContext, points: Sequence[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem, monitor: Monitor
 ) -> Solution:
     """The solution, or that from where frames with suspicious residuals stand between the others, if it explains more of those frames."""
     sigma0 = np.array([_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
-    strange = np.flatnonzero(_strange(sigma0))
+    strange = np.flatnonzero(_outlying(sigma0))
     good = np.setdiff1d(np.flatnonzero(np.isfinite(sigma0)), strange)
     if not len(strange) or not len(good) or not fit.settings.sequence_steps:
         return solution
@@ -341,20 +358,20 @@ def _begun_anew(
     return again if more > 0 else solution
 
 
-def _sigma0(fit: Conditions, t: int, points: CloudPoints, solution: Solution) -> float:
+def _sigma0(fit: FitContext, t: int, points: CloudPoints, solution: Solution) -> float:
     """The robust scale of a frame's points, without points that of its outlines; NaN without either."""
     state = fit.parameters.state(solution.motion[t], solution.vector)
-    residuals = [r for o in fit.seen_surface(t, points, state) if len(r := o.residual(state))]
+    residuals = [r for o in fit.surface_observations(t, points, state) if len(r := o.residual(state))]
     return robust_scale(residuals[0]) if residuals else np.nan
 
 
-def _strange(sigma0: np.ndarray) -> np.ndarray:
+def _outlying(sigma0: np.ndarray) -> np.ndarray:
     """Which frames (T,) have suspicious residuals."""
     usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
     return np.asarray(np.nan_to_num(sigma0) > SUSPICIOUS * usual)
 
 
-def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, np.ndarray, np.ndarray], frames: range) -> Looked:
+def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, np.ndarray, np.ndarray], frames: range) -> FrameResults:
     """What is told of some of the frames that were adjusted."""
     fit, points, (pose, mixed, shape) = part.fit, part.points, covariance
     skeleton = fit.model.skeleton
@@ -371,7 +388,7 @@ def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, n
         counts[0, i] = np.bincount(fit.surface(points[t], state).bone, minlength=B)
         counts[1, i] = fit.evidence(t, points[t], state)
         outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
-    return Looked(
+    return FrameResults(
         values=solution.motion[frames],
         covariance=pose[frames],
         joints_m=joints,
@@ -383,10 +400,10 @@ def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, n
     )
 
 
-def _result(every: Recording, looked: Looked, vector: np.ndarray, covariance: np.ndarray, ends: Sequence[Ended]) -> BodyFit:
+def _result(every: Recording, looked: FrameResults, vector: np.ndarray, covariance: np.ndarray, ends: Sequence[Convergence]) -> BodyFit:
     """The body of all frames, with the shape vector (S,) of a covariance (S, S), and how the adjustments ended."""
     fit, skeleton = every.fit, every.fit.model.skeleton
-    vector, covariance = evened(fit.parameters, vector, covariance, fit.settings.evenness_sigma)
+    vector, covariance = smooth_radii(fit.parameters, vector, covariance, fit.settings.evenness_sigma)
     motion = BodyMotion(
         frames=np.array(every.frames),
         time_s=every.time_s,
@@ -437,9 +454,9 @@ def _wider(settings: FitSettings, own_m: float) -> float:
     return max(1.0, (own + far * model) / (own + near * model))
 
 
-def _statuses(fit: Conditions, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
+def _statuses(fit: FitContext, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
     enough = counts[:, free_bones(fit.parameters)] >= fit.settings.min_points
     total = counts.sum(axis=1)
     few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))
-    strange = few | _strange(sigma0)
+    strange = few | _outlying(sigma0)
     return tuple(BRIDGED if not e.any() else SUSPECT if s else PARTIAL if not e.all() else FITTED for e, s in zip(enough, strange))

@@ -10,7 +10,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.fitting.inputs.fit_input import FitInput
-from tricap.core.fitting.observations import MotionPrior
+from tricap.core.fitting.observations import PosePrior
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Problem
 from tricap.core.fitting.solve.solver import _next_damping, solve
@@ -150,7 +150,7 @@ def test_only_a_finite_minimum_is_called_converged(mean: float, known: float, co
     D = len(parameters.skeleton.dofs)
     sigma = np.full(D, 1.0)
     sigma[-1] = 1.0 if known else np.inf  # nothing is known of one angle: no damping makes the equations regular
-    problem = Problem(parameters=parameters, observe=lambda t, state: [MotionPrior(mean=np.full(D, mean), sigma=sigma)])
+    problem = Problem(parameters=parameters, observe=lambda t, state: [PosePrior(mean=np.full(D, mean), sigma=sigma)])
     solution = solve(problem, np.zeros((1, D)), parameters.vector(), steps=20)
     assert solution.converged is converged
     if converged:

@@ -11,12 +11,12 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skin.contour_skin import limb_skin
 from tricap.core.fitting.inputs import fit_input
-from tricap.core.fitting.inputs.background import EmptyViews
-from tricap.core.fitting.inputs.fit_input import EmptyView, FitInput, JointPlaces, Packed
+from tricap.core.fitting.inputs.background import BackgroundRegions
+from tricap.core.fitting.inputs.fit_input import BackgroundDistances, FitInput, JointPlaces, Packed
 from tricap.core.fitting.inputs.silhouettes import Silhouettes
 from tricap.core.fitting.inputs.standing_feet import StandingFeet
-from tricap.core.fitting.observations import MotionPrior
-from tricap.core.fitting.observations.self_collision import LimbsApart
+from tricap.core.fitting.observations import PosePrior
+from tricap.core.fitting.observations.self_collision import CollisionPairs
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Problem
 from tricap.core.fitting.solve.solver import solve
@@ -37,7 +37,7 @@ def _given(scene, **changes) -> FitInput:
     return FitInput(**{**values, **changes})
 
 
-def _empty(scene, step_px: int = 4) -> list[EmptyView]:
+def _empty(scene, step_px: int = 4) -> list[BackgroundDistances]:
     """How far every place is from the true outline."""
     found = []
     for camera in scene.rig.cameras:
@@ -48,7 +48,9 @@ def _empty(scene, step_px: int = 4) -> list[EmptyView]:
             outside = (raster.image(np.ones(len(raster.sample)), 0.0) == 0).astype(np.uint8)
             far = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_5)[step_px // 2 :: step_px, step_px // 2 :: step_px]
             tables.append(np.minimum(2 * far, 255).astype(np.uint8))
-        found.append(EmptyView(view=camera.name, frame=np.arange(len(tables)), distance=Packed(tables), step_px=step_px, unit_px=0.5))
+        found.append(
+            BackgroundDistances(view=camera.name, frame=np.arange(len(tables)), distance=Packed(tables), step_px=step_px, unit_px=0.5)
+        )
     return found
 
 
@@ -75,11 +77,11 @@ def test_a_limb_without_points_keeps_out_of_the_background(make_scene) -> None:
 
 def test_of_a_hand_the_middle_alone_keeps_out_of_the_background_and_less_exactly() -> None:
     parameters, far = ShapeParameters(default_shape(read_model("full"))), np.full((200, 250), 80, np.uint8)
-    empty = [EmptyView(view="C", frame=np.arange(1), distance=Packed([far]), step_px=4, unit_px=0.5)]
+    empty = [BackgroundDistances(view="C", frame=np.arange(1), distance=Packed([far]), step_px=4, unit_px=0.5)]
     given = FitInput(
         rig=limb_scene.front_rig(), model="full", clouds=[SimpleNamespace(frame=0)], clicks={}, time_s=np.zeros(1), empty=empty
     )
-    seen = EmptyViews(given, parameters, FitSettings(empty_sigma_px=4.0)).observe(0)[0]
+    seen = BackgroundRegions(given, parameters, FitSettings(empty_sigma_px=4.0)).observe(0)[0]
     joints = np.array(parameters.skeleton.joint_names)
     hands = seen.sigma_px > 4.0
     assert sorted(joints[seen.head[hands]]) == ["wrist.L", "wrist.R"]
@@ -157,7 +159,7 @@ def test_keypoints_begin_the_fit_and_carry_it_without_clicks(make_scene, space) 
 def test_a_hidden_arm_stays_outside_of_the_trunk() -> None:
     model = read_model("full")
     shape, names = default_shape(model), [bone.name for bone in model.skeleton.bones]
-    parameters, limbs = ShapeParameters(shape), LimbsApart(model.skeleton, shape.metaballs.bone_index)
+    parameters, limbs = ShapeParameters(shape), CollisionPairs(model.skeleton, shape.metaballs.bone_index)
     motion = np.zeros(len(model.skeleton.dofs))
     assert limbs.observe(parameters.state(motion, parameters.vector())) == []  # nothing touches anything at rest
     layout = model.skeleton.layout
@@ -166,7 +168,7 @@ def test_a_hidden_arm_stays_outside_of_the_trunk() -> None:
     inside = parameters.state(motion, parameters.vector())
     found = limbs.observe(inside)[0]
     assert {names[b] for b in found.bone[found.residual(inside) > 1]} <= {"forearm.R", "hand.R"}
-    prior = MotionPrior(mean=motion, sigma=np.full(len(motion), np.radians(20)))
+    prior = PosePrior(mean=motion, sigma=np.full(len(motion), np.radians(20)))
     problem = Problem(parameters=parameters, observe=lambda t, state: [prior, *limbs.observe(state)])
     freed = parameters.state(solve(problem, motion[None], parameters.vector(), steps=20).motion[0], parameters.vector())
     before, after = (max(np.max(o.residual(state), initial=0.0) for o in limbs.observe(state)) for state in (inside, freed))
@@ -261,11 +263,13 @@ def test_views_from_around_are_witnesses_of_their_own(outlined) -> None:
         around.append(replace(camera, R_cam_world=camera.R_cam_world @ about_z))
     parameters = ShapeParameters(scene.shape)
     state = parameters.state(scene.motion[0], parameters.vector())
-    crowding = []
+    variance_inflation = []
     for cameras in (row, tuple(around)):
         given = _given(scene, rig=Rig(cameras=cameras), contours=contours)
-        crowding.append(max(np.max(o.crowding) for o in Silhouettes(given, read_model("arm.R").surface, FitSettings()).observe(0, state)))
-    assert crowding[0] > 2 * crowding[1] > 2
+        variance_inflation.append(
+            max(np.max(o.variance_inflation) for o in Silhouettes(given, read_model("arm.R").surface, FitSettings()).observe(0, state))
+        )
+    assert variance_inflation[0] > 2 * variance_inflation[1] > 2
 
 
 def test_outlines_past_its_end_hold_an_ellipsoid_and_are_the_hands_where_a_forearm_has_more_balls(outlined) -> None:

@@ -12,7 +12,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
 from tricap.core.body.skin.contour_skin import limb_skin
-from tricap.core.fitting.inputs.no_surface import filled, outline_polygons, outside_outlines
+from tricap.core.fitting.inputs.no_surface import background_outside_outlines, filled, outline_polygons
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.raster import rasterize
 from tricap.core.motion.formats.markers import Markers
@@ -92,7 +92,7 @@ def test_what_lies_outside_an_outline_is_empty(tmp_path: Path) -> None:
     job = take_run.Results(tmp_path / "out")
     polygons = outline_polygons(footage, job)
     assert set(polygons) == {"L", "C", "R"} and set(polygons["C"]) == {0, 1, 2}
-    empty = next(e for e in outside_outlines(footage, polygons) if e.view == "C")
+    empty = next(e for e in background_outside_outlines(footage, polygons) if e.view == "C")
     inside = filled(polygons["C"][1], footage.rig["C"].size_px)
     skin = limb_skin(SHAPE, MOTION[1])
     raster = rasterize(footage.rig["C"], skin.vertices_m, skin.triangles)

@@ -6,23 +6,23 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.fitting.observations import (
-    Apart,
+    BackgroundExclusion,
     ClickedJoints,
-    EmptySpace,
     EqualRadii,
     FootOnFloor,
     JointLimits,
     Keypoints,
     MaterialSteps,
-    MotionPrior,
+    PosePrior,
     Proportions,
+    SelfCollision,
     ShapePrior,
     SilhouetteRays,
     StepsFromFixed,
     SurfacePoints,
     Symmetry,
 )
-from tricap.core.fitting.observations.background import Distances
+from tricap.core.fitting.observations.background import DistanceMap
 from tricap.core.fitting.solve.block_band import NormalEquations
 from tricap.core.fitting.solve.time_priors import Acceleration
 from tricap.core.fitting.state import ShapeParameters
@@ -61,23 +61,23 @@ def _cases(parameters: ShapeParameters, state, rng):
         SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma, form="paper").scaled(state),
         ClickedJoints(cameras=(camera,) * joints, joint=np.arange(joints), xy_px=rng.normal(400, 50, (joints, 2)), sigma_px=5.0),
         JointLimits(low=np.full(dofs, -0.2), high=np.full(dofs, 0.2), sigma=0.03),
-        MotionPrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
+        PosePrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
         ShapePrior(mean=shape, sigma=np.full(len(shape), 0.2)),
         EqualRadii(sigma=0.1, log_ratio=0.3),
         Proportions(mean=shape[: len(root)], covariance=root @ root.T + 0.01 * np.eye(len(root))),
         FootOnFloor(joint=np.arange(joints), height_m=rng.normal(0, 0.1, joints), floor_m=0.1, sigma_m=0.02),
         Keypoints(joint=np.arange(joints), xyz_m=rng.normal(0, 1, (joints, 3)), sigma_m=rng.uniform(0.005, 0.02, joints)),
-        _apart(state, rng),
+        _collisions(state, rng),
         _empty(camera, joints, rng),
         _rays(state, near, bone, sigma, rng),
         Symmetry(left=np.array([0, 3]), right=np.array([1, 4]), sigma=np.array([0.015, 0.03])),
     ]
 
 
-def _apart(state, rng):
+def _collisions(state, rng):
     """Places on the last bone that are less than a large radius away from the bone before it."""
     last = len(state.lengths_m) - 1
-    return Apart(
+    return SelfCollision(
         bone=np.full(6, last),
         fraction=rng.uniform(0.1, 0.6, 6),
         other=np.full(6, state.skeleton.parents[last]),
@@ -86,11 +86,11 @@ def _apart(state, rng):
     ).scaled(state)
 
 
-def _empty(camera: Camera, joints: int, rng) -> EmptySpace:
-    """Distances that rise evenly to the right and downwards: without the kinks between the nodes of a real table."""
+def _empty(camera: Camera, joints: int, rng) -> BackgroundExclusion:
+    """DistanceMap that rise evenly to the right and downwards: without the kinks between the nodes of a real table."""
     rise = 0.05 * np.arange(201)[None, :] + 0.03 * np.arange(151)[:, None]
-    view = Distances(camera=camera, values_px=rise, step_px=4.0, first_px=0.0)
-    return EmptySpace(
+    view = DistanceMap(camera=camera, values_px=rise, step_px=4.0, first_px=0.0)
+    return BackgroundExclusion(
         views=[view, view],
         head=np.arange(joints),
         tail=(np.arange(joints) + 1) % joints,

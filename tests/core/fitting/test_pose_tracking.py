@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tricap.core.fitting.solve.time_priors import HandedOver
+from tricap.core.fitting.solve.time_priors import MarginalPrior
 from tricap.core.fitting.stages import long_sequence, pose_tracking, sequence
 from tricap.core.fitting.stages.sequence import FitInput, FitSettings, fit_sequence
 from tricap.core.foundation.progress import Cancelled, Monitor
@@ -39,7 +39,7 @@ def arrays(fit: object) -> dict[str, bytes]:
 
 @pytest.fixture
 def given(make_scene, monkeypatch: pytest.MonkeyPatch) -> FitInput:
-    monkeypatch.setattr(pose_tracking, "KEEP_EVERY", 2)
+    monkeypatch.setattr(pose_tracking, "CHECKPOINT_EVERY", 2)
     scene = make_scene(frames=FRAMES, click=CLICK)
     return FitInput(
         rig=scene.rig,
@@ -125,7 +125,7 @@ def test_what_stretches_handed_over_is_let_go(make_scene, monkeypatch: pytest.Mo
 
     def counted(*given: object) -> object:
         gc.collect()
-        held.append(sum(isinstance(thing, HandedOver) for thing in gc.get_objects()))
+        held.append(sum(isinstance(thing, MarginalPrior) for thing in gc.get_objects()))
         return adjusted(*given)
 
     monkeypatch.setattr(sequence, "_stretch", counted)

@@ -8,7 +8,7 @@ import pytest
 from tricap.core.body.metaballs import field, field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, one_ball_shape
-from tricap.core.fitting.segmentation import HeldSegments, from_bone
+from tricap.core.fitting.segmentation import SegmentationCache, from_bone
 from tricap.core.fitting.state import ShapeParameters
 
 
@@ -32,7 +32,7 @@ def test_points_of_the_surface_are_no_distance_from_it(name: str, balls: str) ->
 
 def test_held_segments_are_found_anew_when_the_body_grows() -> None:
     parameters = ShapeParameters(default_shape(read_model("arm.R")))
-    motion, held, asked = np.zeros(8), HeldSegments(), []
+    motion, held, asked = np.zeros(8), SegmentationCache(), []
 
     def get(grown: float) -> None:
         vector = parameters.vector()

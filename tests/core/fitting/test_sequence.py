@@ -14,9 +14,9 @@ from tricap.core.fitting.solve import problem, solver
 from tricap.core.fitting.solve.problem import Scales
 from tricap.core.fitting.solve.solver import Solution, solve
 from tricap.core.fitting.stages import click_frame, hidden_limbs
-from tricap.core.fitting.stages.click_frame import fit_posture_and_shape
+from tricap.core.fitting.stages.click_frame import fit_pose_and_shape
 from tricap.core.fitting.stages.inverse_kinematics import inverse_kinematics
-from tricap.core.fitting.stages.sequence import FitInput, FitSettings, _begun_anew, conditions, fit_sequence
+from tricap.core.fitting.stages.sequence import FitInput, FitSettings, _restarted, conditions, fit_sequence
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 
@@ -90,7 +90,7 @@ def test_sigmas_are_honest(make_scene) -> None:
         clicks = {j: {v: xy + rng.normal(0, 5.0, 2) for v, xy in views.items()} for j, views in scene.clicks.items()}
         fit = _fit(scene, joints=clicks)
         z_joints.append((fit.motion.joints_m - scene.joints_m) / fit.motion.joint_sigma_m[..., None])
-        sure = [0, 1, 2, 3, 4, 6]  # the twists are held by beliefs, which are not drawn at random here
+        sure = [0, 1, 2, 3, 4, 6]  # the twists are held by priors, which are not drawn at random here
         z_dofs.append(((fit.motion.values - scene.motion) / fit.motion.sigma)[:, sure])
     assert 0.8 < np.sqrt(np.mean(np.square(z_joints))) < 1.25  # 1.13
     assert 0.8 < np.sqrt(np.mean(np.square(z_dofs))) < 1.25  # 1.09
@@ -106,7 +106,7 @@ def test_starts_thirty_degrees_off_all_converge(make_scene) -> None:
     for _ in range(200):
         start = clicked.motion[0].copy()
         start[3:] += np.radians(rng.uniform(-30, 30, 5))
-        solution = fit_posture_and_shape(fit, points, start, clicked.vector)
+        solution = fit_pose_and_shape(fit, points, start, clicked.vector)
         X = fit.parameters.state(solution.motion[0], solution.vector).joint_jacobian[0]
         good += np.linalg.norm(X - scene.joints_m[0], axis=1).max() < 0.012
     assert good == 200
@@ -310,7 +310,7 @@ def test_a_start_behind_the_limb_begins_anew_around_the_clicks(make_scene) -> No
     assert len(np.unique(np.round(around, 6), axis=0)) == len(around) == click_frame.OTHERS_AROUND + 1
     assert np.abs(around[:, 3:] - clicked.motion[0, 3:]).max() <= click_frame.AROUND_RAD + 1e-9
     wrong = clicked.motion[0] + np.array([0, 0.2, 0, 1.0, -0.9, -1.1, 0.9, -0.7])  # alone this ends 66 mm off, with 3.6 times the residuals
-    solution = fit_posture_and_shape(fit, points, wrong, clicked.vector)
+    solution = fit_pose_and_shape(fit, points, wrong, clicked.vector)
     X = fit.parameters.state(solution.motion[0], solution.vector).joint_jacobian[0]
     assert np.linalg.norm(X - scene.joints_m[0], axis=1).max() < 0.012
 
@@ -320,15 +320,15 @@ def test_a_frame_that_went_wrong_begins_anew_between_its_neighbours(make_scene) 
     fit = conditions(_given(scene), UNKNOWN)
     points = [thinned(c, UNKNOWN.voxel_m) for c in scene.clouds]
     vector = fit.parameters.vector(scene.shape)
-    problem = fit.problem(lambda t, state: [*fit.seen_surface(t, points[t], state), *fit.beliefs(state)])
+    problem = fit.problem(lambda t, state: [*fit.surface_observations(t, points[t], state), *fit.pose_observations(state)])
     lost = scene.motion.copy()
     lost[3, 1] += 0.03  # behind the limb's surface
     lost[3, 3:5] += 0.2
     solution = Solution(motion=lost, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
-    again = _begun_anew(fit, points, scene.time_s, solution, problem, Monitor())
+    again = _restarted(fit, points, scene.time_s, solution, problem, Monitor())
     assert np.degrees(np.abs(again.motion[3, 3:5] - scene.motion[3, 3:5])).max() < 3.0
     good = Solution(motion=scene.motion, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
-    assert _begun_anew(fit, points, scene.time_s, good, problem, Monitor()) is good
+    assert _restarted(fit, points, scene.time_s, good, problem, Monitor()) is good
 
 
 def _empty(frame: int) -> SimpleNamespace:

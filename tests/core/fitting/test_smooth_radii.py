@@ -5,7 +5,7 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.fitting.smooth_radii import evened
+from tricap.core.fitting.smooth_radii import smooth_radii
 from tricap.core.fitting.state import ShapeParameters
 
 SIGMA = 0.4
@@ -29,7 +29,7 @@ def with_a_ring(parameters: ShapeParameters) -> tuple[np.ndarray, np.ndarray]:
 def test_a_ring_is_evened_out_as_far_as_it_was_not_measured(parameters: ShapeParameters) -> None:
     vector, rows = with_a_ring(parameters)
     for sigma, low, high in ((0.005, 0.99, 1.0), (1.0, 0.0, 0.3)):
-        found, covariance = evened(parameters, vector, sigma**2 * np.eye(len(vector)), SIGMA)
+        found, covariance = smooth_radii(parameters, vector, sigma**2 * np.eye(len(vector)), SIGMA)
         left = (found - parameters.vector())[rows] / np.log(1.5)
         assert (left >= low).all() and (left <= high).all()
         assert np.linalg.eigvalsh(covariance).min() > 0 and (np.diag(covariance) <= sigma**2 * (1 + 1e-9)).all()
@@ -38,13 +38,13 @@ def test_a_ring_is_evened_out_as_far_as_it_was_not_measured(parameters: ShapePar
 def test_a_body_thicker_all_along_or_towards_its_ends_stays_as_it_is(parameters: ShapeParameters) -> None:
     vector = parameters.vector()
     vector[parameters.layout.group("radii")] += np.log(1.3)
-    found, _ = evened(parameters, vector, np.eye(len(vector)), SIGMA)
+    found, _ = smooth_radii(parameters, vector, np.eye(len(vector)), SIGMA)
     np.testing.assert_allclose(found, vector, atol=1e-12)
 
 
 def test_lengths_stay_even_where_they_are_seen_with_the_radii(parameters: ShapeParameters) -> None:
     vector, rows = with_a_ring(parameters)
     J = np.random.default_rng(3).normal(size=(2 * len(vector), len(vector)))
-    found, _ = evened(parameters, vector, np.linalg.inv(J.T @ J), SIGMA)
+    found, _ = smooth_radii(parameters, vector, np.linalg.inv(J.T @ J), SIGMA)
     lengths = parameters.layout.group("lengths")
     assert np.array_equal(found[lengths], vector[lengths]) and not np.allclose(found[rows], vector[rows])

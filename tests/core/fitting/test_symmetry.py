@@ -7,7 +7,7 @@ import numpy as np
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.fitting.context import Conditions
+from tricap.core.fitting.context import FitContext
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.observations import Symmetry
 from tricap.core.fitting.settings import FitSettings
@@ -26,8 +26,8 @@ def clicked_person(right_shin: float) -> FitInput:
     return FitInput(rig=rig, model="full", clouds=[cloud], time_s=np.zeros(1), clicks={0: clicks})
 
 
-def symmetry(fit: Conditions) -> Symmetry:
-    (found,) = (x for x in fit.of_shape() if isinstance(x, Symmetry))
+def symmetry(fit: FitContext) -> Symmetry:
+    (found,) = (x for x in fit.shape_observations() if isinstance(x, Symmetry))
     return found
 
 
