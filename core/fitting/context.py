@@ -1,4 +1,4 @@
-"""What stays the same throughout one fit: the model, the clicks, what is believed beforehand, and how points become observations."""
+"""What stays the same throughout one fit: model, settings, clicks and priors, and how points become observations."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,7 +12,7 @@ from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from .inputs.background import BackgroundRegions
 from .inputs.clicks import Clicks
-from .inputs.cloud_points import CloudPoints
+from .inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints
 from .inputs.keypoints import JointTracks
 from .inputs.silhouettes import Silhouettes
 from .observations import (
@@ -31,15 +31,16 @@ from .observations.shape_priors import proportions
 from .robust import robust_weights
 from .segmentation import SegmentationCache, segment, soft_segment
 from .settings import FitSettings
-from .solve.problem import Problem
-from .solve.time_priors import Acceleration
+from .solve.problem import Problem, Smoothness
 from .state import BodyState, ShapeParameters
 
-SUPPORT_SIGMA_M = 0.005  # width of the weight by which postures are compared
-FLESH_UNLIKE = 2.0  # the sigma of radii on the left against the right over that of lengths
-WEIGHT_SIGMA = 0.3  # of ln w: an isolated ball's weight and radius are seen as one, r = l √(½ ln 2w)
-POINTS_OF_RAY = 3  # a limb of 25 cm shows some 300 points (of one voxel each), and 40 rays a view
-MOST_OFF = 3.0  # sigmas of a click, or beyond a limit, that count
+SUPPORT_SIGMA_M, SUPPORT_WIDTH = 0.005, 3.0  # of the weights by which poses are compared
+FLESH_ASYMMETRY = 2.0  # the sigma of radii on the left against the right over that of lengths
+WEIGHT_SIGMA = 0.3  # of ln w: of an isolated ball only r = l √(½ ln 2w) is observable, not its weight and radius apart
+POINTS_OF_RAY = 3  # a limb of 25 cm has some 300 points (one a voxel), and 40 rays a view
+LARGEST_RESIDUAL = 3.0  # sigmas of a click, or beyond a limit, that count in a score
+FEW = 0.5  # of `min_points`: a bone with fewer has lost its points
+LEAST_GAIN = 0.25  # of `min_points`: a pose from another start replaces the first one if it explains so many points more; less is noise
 NO_SHAPE = np.zeros(0, dtype=np.intp)
 
 
@@ -53,94 +54,112 @@ class FitContext:
     settings: FitSettings
     clicks: Clicks
     click: int  # index of the frame where the fit begins
-    located: np.ndarray  # (J,) whether a joint has a place in space of its own, in any frame
+    located: np.ndarray  # (J,) whether a joint was located in space, in any frame
     stature_sigma: float  # relative, of a person about the parameters' template
-    frames: int  # for how many a belief of bone lengths counts
+    frames: int  # the prior of bone lengths counts as often
     priors: list[Observation]  # of every frame's motion
     clicked: Mapping[int, ClickedJoints]  # by frame index
     places: Mapping[int, np.ndarray]  # (J, 3) of joints clicked in two views, NaN of others, by frame index
     tracks: JointTracks
     silhouettes: Silhouettes
-    empty: BackgroundRegions
-    limbs: CollisionPairs
-    monitor: Monitor = field(default_factory=Monitor)  # asked within the steps whether to stop
+    background: BackgroundRegions
+    collisions: CollisionPairs
+    monitor: Monitor = field(default_factory=Monitor)  # checked for cancellation within the steps
 
     def stretch(self, frames: Sequence[int]) -> "FitContext":
-        """The same for some of the frames, which count from 0 then; only `click` stays the index in the recording."""
-        parts = {name: getattr(self, name).stretch(frames) for name in ("tracks", "silhouettes", "empty")}
+        """The same for some of the frames, whose indices then begin at 0; only `click` stays the index in the recording."""
+        parts = {name: getattr(self, name).stretch(frames) for name in ("tracks", "silhouettes", "background")}
         clicked = {i: self.clicked[t] for i, t in enumerate(frames) if t in self.clicked}
         return replace(self, clicked=clicked, places={i: self.places[frames[i]] for i in clicked}, **parts)
 
     def pose_observations(self, state: BodyState) -> list[Observation]:
-        """What is known of any posture: limits, priors, and that limbs are no ghosts."""
-        return [*self.priors, *self.limbs.observe(state)]
+        """Observations of any pose: limits, priors, and no self-collision."""
+        return [*self.priors, *self.collisions.observe(state)]
 
     def joints(self, t: int) -> list[Observation]:
-        """What is known of the joints in frame index `t`: clicks and keypoints."""
+        """Observations of the joints in frame index `t`: clicks and keypoints."""
         return [*([self.clicked[t]] if t in self.clicked else []), *self.tracks.observe(t)]
 
     def surface(
         self,
         points: CloudPoints,
         state: BodyState,
-        wide: np.ndarray | float = 1.0,
-        held: SegmentationCache | None = None,
+        gate_scale: np.ndarray | float = 1.0,
+        cache: SegmentationCache | None = None,
     ) -> SurfacePoints:
-        """The points near a body's surface, as observations of it; `wide` (B,) or for all multiplies the gate.
+        """The points near a body's surface, as observations of it; `gate_scale` (B,) or for all multiplies the gate.
 
         Points within one patch share the model's error: the weight of their common part is divided among them (`variance_inflation`).
         """
         s = self.settings
-        find = partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * wide)
-        if held is None:
-            return self._observed(points, *find()).scaled(state)
-        owners = held.get(points.frame, state, find)
-        made = (held.made(points.frame, owners) or self._observed(points, *owners)).scaled(state)
-        held.keep(points.frame, owners, made)
-        return cast(SurfacePoints, made)
+        find = partial(_hard if s.segmentation == "hard" else soft_segment, points, state, self.model.surface, s.gate_m * gate_scale)
+        if cache is None:
+            return self._observed(points, state, *find())
+        owners = cache.get(points.frame, state, find)
+        earlier = cast(SurfacePoints | None, cache.derived(points.frame, owners))
+        observed = earlier.reweighted(state) if earlier is not None else self._observed(points, state, *owners)
+        cache.keep(points.frame, owners, observed)
+        return observed
 
-    def _observed(self, points: CloudPoints, rows: np.ndarray, bone: np.ndarray, part: np.ndarray) -> SurfacePoints:
+    def _observed(self, points: CloudPoints, state: BodyState, rows: np.ndarray, bone: np.ndarray, share: np.ndarray) -> SurfacePoints:
+        """Some points (rows), each with its bone and the share of it that is this bone's."""
         s = self.settings
-        own, model = points.sigma_m[rows] ** 2 + 1e-12, s.model_sigma_m**2
-        share = max(1.0, (s.model_patch_m / s.voxel_m) ** 2)
-        return SurfacePoints(
+        own, model = points.sigma_m[rows] ** 2 + VARIANCE_FLOOR_M2, s.model_sigma_m**2
+        in_patch = max(1.0, (s.model_patch_m / s.voxel_m) ** 2)  # points that share the model's error
+        return SurfacePoints.about(
+            state,
             xyz_m=points.xyz_m[rows],
             bone=bone,
             sigma_m=np.sqrt(own + model),
-            variance_inflation=(own + share * model) / (own + model) / part,
+            variance_inflation=(own + in_patch * model) / (own + model) / share,
             form=s.residual,
         )
 
     def surface_observations(
-        self, t: int, points: CloudPoints, state: BodyState, wide: np.ndarray | float = 1.0, held: SegmentationCache | None = None
+        self,
+        t: int,
+        points: CloudPoints,
+        state: BodyState,
+        gate_scale: np.ndarray | float = 1.0,
+        cache: SegmentationCache | None = None,
     ) -> list[Observation]:
-        """What the views show of the body's surface in frame index `t`: measured points, and outlines."""
-        return [self.surface(points, state, wide, held), *self.silhouettes.observe(t, state, held, wide)]
+        """Observations of the body's surface in frame index `t`: measured points and outlines."""
+        return [self.surface(points, state, gate_scale, cache), *self.silhouettes.observe(t, state, cache, gate_scale)]
 
     def evidence(self, t: int, points: CloudPoints, state: BodyState) -> np.ndarray:
-        """How many points each bone (B,) has, and what stands for points: rays of outlines, and a keypoint at its end, which is enough."""
+        """The points of each bone (B,), rays of outlines counted as points; a keypoint at its end counts as enough."""
         b, ends = len(state.lengths_m), [self.model.skeleton.joint_names.index(bone.tail_joint) for bone in self.model.skeleton.bones]
         counts = np.bincount(segment(points, state, self.model.surface, self.settings.gate_m)[1], minlength=b)
         for rays in self.silhouettes.observe(t, state):
             counts += POINTS_OF_RAY * np.bincount(rays.bone, minlength=b)
         return np.asarray(counts + np.where(np.isin(ends, self.tracks.joints(t)), self.settings.min_points, 0))
 
+    @property
+    def few_points(self) -> float:
+        """A bone with fewer points has lost them."""
+        return FEW * self.settings.min_points
+
+    @property
+    def least_gain(self) -> float:
+        """By how many points a pose must be better supported to replace another."""
+        return LEAST_GAIN * self.settings.min_points
+
     @cached_property
     def proportions(self) -> Proportions:
-        """What is believed of the bone lengths, against the error that the model has in all frames alike."""
-        s, alike = self.settings, np.sqrt(self.frames)
+        """The prior of the bone lengths. It counts once for every frame: the model's error is the same in all of them."""
+        s, root = self.settings, np.sqrt(self.frames)
         return proportions(
             self.model,
             self.parameters.template.lengths_m,
             self.located,
             s.length_sigma,
-            s.proportion_sigma / alike,
-            self.stature_sigma / alike,
+            s.proportion_sigma / root,
+            self.stature_sigma / root,
         )
 
     def shape_observations(self, lengths: tuple[np.ndarray, np.ndarray] | None = None) -> list[Observation]:
-        """What is believed about the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where more than the proportions is
-        known (else infinite)."""
+        """The priors of the shape; `lengths`: ln of the bone lengths (B,) and their sigmas, where there is more than the proportions
+        (else infinite)."""
         mean, s = self.parameters.vector(), self.settings
         sigma = np.full(len(mean), s.radius_sigma)
         sigma[self.parameters.layout.group("weights")] = WEIGHT_SIGMA
@@ -153,44 +172,46 @@ class FitContext:
             EqualRadii(sigma=s.roundness_sigma, log_ratio=np.log(radii[:, 0] / radii[:, 2])),
         ]
         left, right = self.parameters.pairs()
-        unlike = np.where(left < self.parameters.n_lengths, 1.0 / np.sqrt(self.frames), FLESH_UNLIKE)
-        return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma * unlike)] if len(left) else found
+        asymmetry = np.where(np.isin(left, of_lengths), 1.0 / np.sqrt(self.frames), FLESH_ASYMMETRY)
+        return [*found, Symmetry(left=left, right=right, sigma=s.symmetry_sigma * asymmetry)] if len(left) else found
 
     def problem(
         self,
         observe: Callable[[int, BodyState], list[Observation]],
         free: str | None = None,
-        smoothness: Acceleration | None = None,
+        smoothness: Smoothness | None = None,
         *,
-        hold_motion: bool = False,
+        fix_pose: bool = False,
     ) -> Problem:
-        """An adjustment in which the shape parameters of the set `free` may change, and the motion unless it is held."""
+        """An adjustment of the shape parameters in the group `free`, and of the pose unless it is fixed."""
         shape = self.parameters.layout.group(free) if free else NO_SHAPE
-        held = np.arange(len(self.model.skeleton.dofs)) if hold_motion else self.model.skeleton.locked
+        fixed = np.arange(len(self.model.skeleton.dofs)) if fix_pose else self.model.skeleton.locked
         return Problem(
             parameters=self.parameters,
             observe=observe,
             shape_observations=self.shape_observations(),
             free_shape=shape,
             smoothness=smoothness,
-            held=held,
+            fixed=fixed,
             robust=self.settings.robust,
             robust_width=self.settings.robust_width,
             monitor=self.monitor,
         )
 
     def support(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
-        """How many points and rays of frame index `t` a body explains: the sum of their weights at a fixed width."""
+        """How many points and rays of frame index `t` a body explains: the sum of their robust weights for a width of `SUPPORT_SIGMA_M`."""
         state = self.parameters.state(motion, vector)
         found: list[SurfacePoints | SilhouetteRays] = [self.surface(points, state), *self.silhouettes.observe(t, state)]
-        return sum(float(robust_weights(o.residual(state) * o.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", 3.0).sum()) for o in found)
+        return sum(
+            float(robust_weights(o.residual(state) * o.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", SUPPORT_WIDTH).sum()) for o in found
+        )
 
     def score(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
-        """The `support`, less what joints known in frame index t and the DOFs' limits are off by: half the squares of it, in sigmas."""
+        """The `support`, less half the squared residuals of joints in frame index t and of the DOFs' limits (capped)."""
         state = self.parameters.state(motion, vector)
         limits = [prior for prior in self.priors if isinstance(prior, JointLimits)]
-        off = np.concatenate([o.residual(state) for o in (*self.joints(t), *limits)])
-        return self.support(t, points, motion, vector) - 0.5 * float(np.minimum(off**2, MOST_OFF**2).sum())
+        residuals = np.concatenate([o.residual(state) for o in (*self.joints(t), *limits)])
+        return self.support(t, points, motion, vector) - 0.5 * float(np.minimum(residuals**2, LARGEST_RESIDUAL**2).sum())
 
 
 def _hard(
@@ -199,6 +220,6 @@ def _hard(
     surface: np.ndarray,
     gate_m: np.ndarray | float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `soft_segment`: every point is wholly one limb's."""
+    """As `soft_segment`, with every point wholly one limb's."""
     rows, bone = segment(points, state, surface, gate_m)
     return rows, bone, np.ones(len(rows))

@@ -3,12 +3,16 @@
 import numpy as np
 
 MAD_TO_SIGMA = 1.4826
-SMALLEST_SCALE = 0.05
+SMALLEST_SCALE = 0.05  # of unit-weight residuals: perfect data must not make infinite weights
+ENOUGH_FOR_SCALE = 5  # residuals for a median
+ENOUGH = 20  # residuals for a variance factor
+LEAST_SLOPE = 0.05  # of E[ψ']: mostly outliers, and the factor would be unbounded
+FACTOR_RANGE = (0.5, 10.0)
 
 
 def robust_scale(residuals: np.ndarray, fallback: float = 1.0) -> float:
     """Standard deviation of the good residuals from the median of their absolute values."""
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), SMALLEST_SCALE) if len(residuals) > 4 else fallback
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), SMALLEST_SCALE) if len(residuals) >= ENOUGH_FOR_SCALE else fallback
 
 
 def robust_weights(x: np.ndarray, kind: str, width: float) -> np.ndarray:
@@ -17,8 +21,8 @@ def robust_weights(x: np.ndarray, kind: str, width: float) -> np.ndarray:
 
 
 def variance_factor(x: np.ndarray, kind: str, width: float) -> float:
-    """By how much the inverse of the weighted normal equations understates the covariance: E[ψ²] E[w] / E[ψ']² (Huber 1981, §7.6)."""
-    if len(x) < 20:
+    """Factor from the inverse of the weighted normal equations to the covariance: E[ψ²] E[w] / E[ψ']² (Huber 1981, §7.6)."""
+    if len(x) < ENOUGH:
         return 1.0
     w = robust_weights(x, kind, width)
     slope: np.ndarray
@@ -27,5 +31,5 @@ def variance_factor(x: np.ndarray, kind: str, width: float) -> float:
         slope = (1 - 3 * u) / (1 + u) ** 3
     else:
         slope = (np.abs(x) < width).astype(float)
-    least = max(float(np.mean(slope)), 0.05)
-    return float(np.clip(np.mean((w * x) ** 2) * np.mean(w) / least**2, 0.5, 10.0))
+    mean_slope = max(float(np.mean(slope)), LEAST_SLOPE)
+    return float(np.clip(np.mean((w * x) ** 2) * np.mean(w) / mean_slope**2, *FACTOR_RANGE))

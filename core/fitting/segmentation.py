@@ -1,19 +1,22 @@
-"""Which limb does a measured point belong to? (D'Apuzzo et al. 1999, §3.3: the closest limb in the posture so far.)
+"""Which limb does a measured point belong to? (D'Apuzzo et al. 1999, §3.3: the closest limb in the pose so far.)
 
-Closest is the limb with the smallest distance from the bone's segment, minus the limb's radius there (`body.bone_profile`; a fat trunk must
-not swallow the points of a thin arm). A point is nobody's when it is further from that surface than a gate, when it lies along the bone
-where the surface is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the hand), or
-when its normal points into the limb.
+    distance = |X − bone's segment| − radius of the limb in the direction of X                            (1)
+
+The closest limb has the smallest distance from its surface (`body.bone_profile`), not from its axis: a fat trunk must not swallow the
+points of a thin arm. A point belongs to no limb when it is further from that surface than a gate, when it lies along the bone where the
+surface is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the hand), or when its
+normal points into the limb.
 
 Points that may belong to several limbs, to each in part (Horaud, Niskanen, Dewaele & Boyer 2009, IEEE TPAMI 31(1), §4).
 
     α_ij = π_ij N(d_ij; σ) max(0, n_i·n_j) / (Σ_k π_ik N(d_ik; σ) max(0, n_i·n_k) + π_0 / (2 gate))               (1)
-    π_j = mean of α_ij over i ,   π_0 = what is left ,   σ² = Σ α d² / Σ α , within 3 and 30 mm                 (2)
+    π_j = mean of α_ij over i ,   π_0 = 1 − Σ_j π_j ,   σ² = Σ α d² / Σ α , within 3 and 30 mm                  (2)
 
 d_ij is the distance of point i from the surface of limb j, n are their normals, and the last term of (1) is the class of outliers, even
 within the gate. Few of a body's limbs are near a point: π_ij is π_j among those that are, together 1 − π_0. A few rounds of (1) and (2)
-begin at σ = 30 mm; as the body comes to its points σ falls with their distances, so a far start is undecided, and a good fit decides as
-sharply as the hard segmentation. What a limb gets where the surface is another part's (`segmentation`) is nobody's.
+begin at σ = 30 mm; as the body approaches its points σ falls with their distances, so a far start remains undecided, and a good fit decides
+as sharply as the hard segmentation. The part of a point that goes to a limb where the surface is another part's (`segmentation`) is
+dropped.
 """
 
 from collections.abc import Callable, Hashable
@@ -24,21 +27,21 @@ import numpy as np
 from .inputs.cloud_points import CloudPoints
 from .state import CROSS, BodyState
 
-HARDLY_M = 0.004
+HYSTERESIS_M = 0.004  # motion of the body within which points keep their limbs
 FACING = 0.6  # least cosine between a point's normal and the limb's
 
 
 def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the points that belong to a limb (K,) and the limb's bone (K,).
 
-    `surface` (B, 2): fractions of each bone between which a surface is its own; `gate_m` (B,) or for all:
-    farthest distance from the limb's surface.
+    `surface` (B, 2): the fractions of each bone between which a surface is its own; `gate_m` (B,) or for all: the largest distance from the
+    limb's surface.
     """
     n, gate = len(points.xyz_m), np.broadcast_to(gate_m, (len(state.lengths_m),))
     nearest, owner = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
     own = np.zeros(n, dtype=bool)
     for b, rows in candidates(points.xyz_m, state, gate):
-        gap, along, facing = from_bone(points.xyz_m[rows], points.normals[rows], state, b)
+        gap, along, facing = facing_bone(points.xyz_m[rows], points.normals[rows], state, b)
         closer = gap < nearest[rows]
         rows = rows[closer]
         nearest[rows], owner[rows] = gap[closer], b
@@ -48,32 +51,32 @@ def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: 
 
 
 class SegmentationCache:
-    """Whose each point is, as long as the body has hardly moved since it was asked; points do not change sides for a millimetre."""
+    """The limb of each point, as long as the body has hardly moved: points do not change limbs for a millimetre."""
 
     def __init__(self) -> None:
-        self._held: dict[Hashable, tuple[np.ndarray, Any]] = {}
-        self._made: dict[Hashable, tuple[Any, Any]] = {}
+        self._found: dict[Hashable, tuple[np.ndarray, Any]] = {}
+        self._derived: dict[Hashable, tuple[Any, Any]] = {}
 
     def get(self, key: Hashable, state: BodyState, find: Callable[[], Any]) -> Any:
-        """What was found for `key` when the body was where it is now, within `HARDLY_M`; else what `find` finds now."""
+        """The segmentation for `key` of a body within `HYSTERESIS_M` of the present one; without one that of `find`."""
         tails = state.head_m + state.lengths_m[:, None] * state.R[:, :, 1]
         now = np.concatenate([state.head_m.ravel(), tails.ravel(), *(profile.radii_m.ravel() for profile in state.profiles.values())])
-        if key not in self._held or np.abs(self._held[key][0] - now).max() > HARDLY_M:
-            self._held[key] = (now, find())
-        return self._held[key][1]
+        if key not in self._found or np.abs(self._found[key][0] - now).max() > HYSTERESIS_M:
+            self._found[key] = (now, find())
+        return self._found[key][1]
 
-    def made(self, key: Hashable, found: Any) -> Any:
-        """What was kept for `key` as made of just this `found`; None if that has changed."""
-        known = self._made.get(key)
-        return known[1] if known is not None and known[0] is found else None
+    def derived(self, key: Hashable, found: Any) -> Any:
+        """What was stored for `key` with this very segmentation; None if there is none."""
+        last = self._derived.get(key)
+        return last[1] if last is not None and last[0] is found else None
 
-    def keep(self, key: Hashable, found: Any, made: Any) -> None:
-        """Keep what was made of what was found."""
-        self._made[key] = found, made
+    def keep(self, key: Hashable, found: Any, derived: Any) -> None:
+        """Store what was derived from a segmentation."""
+        self._derived[key] = found, derived
 
 
 def crop(points: CloudPoints, state: BodyState, reach_m: np.ndarray | float) -> CloudPoints:
-    """The points within `reach_m` (of each bone (B,), or of all) of the bones: what a fit near this posture can ever need."""
+    """The points within `reach_m` (of each bone (B,), or of all) of the bones: all that a fit near this pose can ever need."""
     near, reach = np.zeros(len(points.xyz_m), dtype=bool), np.broadcast_to(reach_m, (len(state.lengths_m),))
     for b, rows in candidates(points.xyz_m, state, reach):
         near[rows] |= _gap(points.xyz_m[rows], state, b)[0] < reach[b]
@@ -81,7 +84,7 @@ def crop(points: CloudPoints, state: BodyState, reach_m: np.ndarray | float) -> 
 
 
 def candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """For each bone with balls the points (K,) in a sphere that holds all within its `reach_m` (B,) of its surface."""
+    """For each bone with balls the points (K,) in a sphere that encloses all places within its `reach_m` (B,) of its surface."""
     bones = np.unique(state.balls.bone_index)
     widest = np.array([state.profiles[b].radii_m.max() for b in bones.tolist()])
     half = state.lengths_m[bones] / 2
@@ -93,14 +96,14 @@ def candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> list
     return [(int(b), np.flatnonzero(column)) for b, column in zip(bones, near.T)]
 
 
-def from_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def facing_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance from the limb's surface (N,) [m], fraction along the bone (N,), and whether the normal points outwards (N,)."""
-    gap, along, cosine = beside_bone(xyz_m, normals, state, bone)
+    gap, along, cosine = bone_distance(xyz_m, normals, state, bone)
     return gap, along, cosine >= FACING
 
 
-def beside_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `from_bone`, with the cosine (N,) between the normal and the limb's; 1 where the normal is unknown."""
+def bone_distance(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `facing_bone`, with the cosine (N,) between the normal and the limb's; 1 where the normal is unknown."""
     gap, along, outward = _gap(xyz_m, state, bone)
     normal = (normals @ state.R[bone])[:, CROSS]
     size = np.sqrt(np.einsum("ni,ni->n", normal, normal) * np.einsum("ni,ni->n", outward, outward))
@@ -109,7 +112,7 @@ def beside_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: 
 
 
 def _gap(xyz_m: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance from the limb's surface (N,) [m], fraction along the bone (N,), and the direction of its normal across the bone (N, 2)."""
+    """Distance (1) from the limb's surface (N,), fraction along the bone (N,), and the direction of its normal across the bone (N, 2)."""
     local = (xyz_m - state.head_m[bone]) @ state.R[bone]
     length = state.lengths_m[bone]
     along, across = local[:, 1] / length, local[:, CROSS]
@@ -122,15 +125,15 @@ def _gap(xyz_m: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np
 
 
 WIDEST_M, NARROWEST_M = 0.030, 0.003
-ROUNDS = 6
+ROUNDS = 6  # of (1) and (2)
 OUTLIERS = (0.05, 0.5)  # π_0 at the start, and at most
-LEAST_SHARE = 0.05  # what a point gives to a limb; less is not worth its equation
+LEAST_SHARE = 0.05  # of a point for a limb; a smaller one is not worth its equation
 
 
 def soft_segment(
     points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the points (K,), a limb's bone (K,), and which share of the point is the limb's (K,). A row may come several times.
+    """Rows of the points (K,), a limb's bone (K,), and the limb's share of the point (K,). A row may occur several times.
 
     Arguments as in `segmentation.segment`.
     """
@@ -138,7 +141,7 @@ def soft_segment(
     found = candidates(points.xyz_m, state, gate)
     gap, likely, own = (np.zeros((len(points.xyz_m), len(found))) for _ in range(3))
     for j, (b, rows) in enumerate(found):
-        d, along, cosine = beside_bone(points.xyz_m[rows], points.normals[rows], state, b)
+        d, along, cosine = bone_distance(points.xyz_m[rows], points.normals[rows], state, b)
         gap[rows, j], likely[rows, j] = d, np.maximum(cosine, 0.0) * (np.abs(d) < gate[b])
         own[rows, j] = (along >= surface[b, 0]) & (along <= surface[b, 1])
     share = responsibilities(gap, likely, float(gate.mean()))
@@ -158,7 +161,7 @@ def responsibilities(gap_m: np.ndarray, likely: np.ndarray, gate_m: float) -> np
         total = float(share.sum())
         if total < 1e-9:
             break
-        mixture = share.sum(axis=0) / max(int(near.any(axis=1).sum()), 1)  # what is beyond every gate is no outlier of the body
+        mixture = share.sum(axis=0) / max(int(near.any(axis=1).sum()), 1)  # points beyond every gate do not count as outliers
         outliers = float(np.clip(1 - mixture.sum(), *OUTLIERS))
         sigma = float(np.clip(np.sqrt((share * gap_m**2).sum() / total), NARROWEST_M, WIDEST_M))  # (2)
     return share

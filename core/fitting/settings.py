@@ -22,31 +22,35 @@ class FitSettings:
     )
     segmentation: str = knob("hard", "A point belongs to its nearest limb, or in parts to several.", choices=("hard", "soft"))
     weights: bool = knob(False, "The balls' weights are parameters of the fit too: edges can be sharper or rounder.")
-    robust: str = knob("geman-mcclure", "How gross points lose their weight.", choices=("geman-mcclure", "huber"))
+    robust: str = knob("geman-mcclure", "Robust weights of outliers.", choices=("geman-mcclure", "huber"))
     robust_width: float = knob(3.0, "Residual, in robust standard deviations, at which a point loses half its pull.", low=1.0, high=20.0)
     voxel_m: float = knob(0.008, "Points are averaged in voxels of this size.", unit="m", low=0.001, high=0.1)
-    model_sigma_m: float = knob(0.004, "What a real body differs from its metaballs.", unit="m", low=0.0, high=0.05)
+    model_sigma_m: float = knob(0.004, "Standard deviation of a real body from its metaballs.", unit="m", low=0.0, high=0.05)
     model_patch_m: float = knob(0.06, "Points within a patch of this size share the model's error.", unit="m", low=0.0, high=0.5)
     use_surface: bool = knob(
         True,
-        "Let measured points attract the body; without them the fit rests on outlines and keypoints alone, and nothing is measured for it.",
+        "Fit the body to measured points; without them it is fitted to outlines and keypoints alone, and no surface is measured.",
     )
-    use_trajectories: bool = knob(True, "Let tracked points hold their places in the limbs: twist, sliding, centres of the joints.")
-    track_again: bool = knob(False, "Track once more with the fitted body, which says where and when lost points reappear.")
+    use_trajectories: bool = knob(
+        True, "Tracked points stay at their places in the limbs: they determine twist, sliding, centres of the joints."
+    )
+    track_again: bool = knob(False, "Track once more with the fitted body, which predicts where and when lost points reappear.")
     track_sigma_m: float = knob(0.001, "How far a tracked point moves on its limb from frame to frame.", unit="m", low=0.0, high=0.05)
     shared_frames: float = knob(
         1.0,
-        "Over how many frames the model errs alike; priors of the shape weigh as much more (balls=one: all).",
+        "Frames over which the model's error is the same; the prior of the shape weighs as much more (balls=one: all).",
         low=1.0,
         high=1e5,
     )
-    use_contours: bool = knob(True, "Let the views' outlines (tricap contour) be touched by the body.")
+    use_contours: bool = knob(True, "Fit the body to the views' outlines (tricap contour).")
     use_background: bool = knob(True, "Keep limbs out of pixels that show the still background (cameras and background must stand still).")
-    empty_sigma_px: float = knob(4.0, "How exactly the person's outline is known from the background.", unit="px", low=0.5, high=50.0)
-    gate_m: float = knob(0.035, "A point further than this from a limb's surface is not the limb's.", unit="m", low=0.005, high=0.3)
-    outline_gate_m: float = knob(0.10, "A ray of an outline further than this from every limb touches none.", unit="m", low=0.005, high=1.0)
-    floor: bool = knob(False, "A foot that stands keeps the height that feet have when they stand (world: Z up, a level floor).")
-    click_sigma_px: float = knob(5.0, "How exactly joints are clicked.", unit="px", low=0.1, high=100.0)
+    background_sigma_px: float = knob(
+        4.0, "Sigma of the person's outline against the background.", unit="px", low=0.5, high=50.0, was=("empty_sigma_px",)
+    )
+    gate_m: float = knob(0.035, "A point further than this from a limb's surface does not belong to it.", unit="m", low=0.005, high=0.3)
+    outline_gate_m: float = knob(0.10, "A ray of an outline further than this from every limb is ignored.", unit="m", low=0.005, high=1.0)
+    floor: bool = knob(False, "A standing foot has the height that feet have when they stand (world: Z up, a level floor).")
+    click_sigma_px: float = knob(5.0, "Sigma of a clicked joint.", unit="px", low=0.1, high=100.0)
     length_sigma: float = knob(
         0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.", low=0.001, high=1.0
     )
@@ -57,8 +61,8 @@ class FitSettings:
     roundness_sigma: float = knob(0.10, "Relative sigma of the difference of a ball's two cross radii.", low=0.001, high=1.0)
     evenness_sigma: float = knob(
         0.4,
-        "Relative sigma of how much thicker than those beside it a ball is, about the model: rings that "
-        "nothing proves are evened out after the fit.",
+        "Relative sigma of a ball's thickness against its neighbours', about the model: after the fit, rings that no measurement supports "
+        "are smoothed.",
         low=0.001,
         high=100.0,
     )
@@ -69,7 +73,7 @@ class FitSettings:
         low=0.001,
         high=1.0,
     )
-    limit_sigma_deg: float = knob(2.0, "How softly joint limits hold.", unit="deg", low=0.1, high=30.0)
+    limit_sigma_deg: float = knob(2.0, "Sigma of joint limits: how far a joint may exceed them.", unit="deg", low=0.1, high=30.0)
     prediction_sigma_deg: float = knob(15.0, "Sigma of an angle predicted from the frames before.", unit="deg", low=0.5, high=90.0)
     prediction_sigma_m: float = knob(0.03, "Sigma of a position predicted from the frames before.", unit="m", low=0.001, high=1.0)
     acceleration_deg_s2: float = knob(
@@ -78,4 +82,4 @@ class FitSettings:
     acceleration_m_s2: float = knob(5.0, "Typical acceleration of the base, for the adjustment over time.", unit="m/s²", low=0.01, high=1e4)
     frame_steps: int = knob(6, "Most steps of the adjustment of one frame.", low=1, high=100)
     sequence_steps: int = knob(30, "Most steps of the adjustment over the whole sequence.", low=0, high=200)
-    min_points: int = knob(25, "A bone with fewer points in a frame counts as not seen.", low=1, high=10000)
+    min_points: int = knob(25, "A bone with fewer points in a frame counts as not observed.", low=1, high=10000)

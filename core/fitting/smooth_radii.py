@@ -1,13 +1,13 @@
-"""After the fit: balls that took turns in explaining what was seen share it again, or the surface would have rings.
+"""Post-fit smoothing: radius is redistributed among neighbouring, strongly correlated balls, or the surface would have rings.
 
 A person is thicker or thinner than the model over longer stretches than a ball. For x, ln l of the cross radii, with K their covariance
-where the lengths are held, x_0 the model's, and balls that follow each other along a part of the body,
+given the lengths, x_0 the model's, and balls that follow each other along a part of the body,
 
     A (x − x_0) = 0 ± σ ,   A: x_i−1 − 2 x_i + x_i+1 of three such balls                                    (1)
     x' = x − G A (x − x_0) ,   K' = K − G A K ,   G = K Aᵀ (A K Aᵀ + σ²)⁻¹                                  (2)
 
-What was measured well stays. So do postures and lengths in any case: as an equation of the fit itself, (1) took the joints of a turning
-person 3 mm farther from the truth, since thickness there makes up for what joints are off.
+Precisely measured radii hardly change; poses and lengths do not change at all: as an equation of the fit itself, (1) took the joints of a
+turning person 3 mm farther from the truth, since thickness there compensates errors of the joints.
 """
 
 import numpy as np
@@ -27,12 +27,12 @@ def smooth_radii(parameters: ShapeParameters, vector: np.ndarray, covariance: np
     G = K @ A.T @ np.linalg.inv(A @ K @ A.T + sigma**2 * np.eye(len(A)))
     found, spread = vector.copy(), covariance.copy()
     found[radii] -= G @ (A @ (vector - parameters.vector())[radii])  # (2)
-    spread[np.ix_(radii, radii)] -= G @ A @ K
+    spread[np.ix_(radii, radii)] -= G @ A @ K  # (2)
     return found, spread
 
 
 def _second_differences(shape: BodyShape) -> np.ndarray:
-    """A (2 P, 2 M) of (1): for P threes of the M balls, of l_x and of l_z; none where muscles lie side by side."""
+    """A (2 P, 2 M) of (1): for P triples of the M balls, of l_x and of l_z; none where muscles lie side by side."""
     balls = shape.metaballs
     if not set(np.bincount(balls.bone_index).tolist()) <= {0, SIMPLE}:
         return np.zeros((0, 2 * len(balls.weight)))
@@ -43,9 +43,9 @@ def _second_differences(shape: BodyShape) -> np.ndarray:
         if b in part.bones
     ]
     line = sorted(places)
-    threes = [[m for *_, m in line[i : i + 3]] for i in range(len(line) - 2) if line[i][0] == line[i + 2][0]]
-    A = np.zeros((len(threes), 2, len(balls.weight), 2))
-    for k, three in enumerate(threes):
+    triples = [[m for *_, m in line[i : i + 3]] for i in range(len(line) - 2) if line[i][0] == line[i + 2][0]]
+    A = np.zeros((len(triples), 2, len(balls.weight), 2))
+    for k, triple in enumerate(triples):
         for axis in (0, 1):
-            A[k, axis, three, axis] = 1.0, -2.0, 1.0
-    return A.reshape(2 * len(threes), 2 * len(balls.weight))
+            A[k, axis, triple, axis] = 1.0, -2.0, 1.0
+    return A.reshape(2 * len(triples), 2 * len(balls.weight))

@@ -17,7 +17,7 @@ from ..checking.fit_check import check_fit
 from ..checking.take_check import causes_of_failure, doubts, with_cause
 from ..checking.timing import synchronised
 from ..fitting.inputs.fit_input import FitInput
-from ..fitting.inputs.no_surface import can_fit_without_surface, background_regions, known_silhouettes
+from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, known_silhouettes
 from ..fitting.inputs.take_inputs import check_body, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_sequence

@@ -58,7 +58,7 @@ def test_no_code_of_a_project_runs(blender: ModuleType, small_run: SmallRun, ran
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     for folder in (small_run.take, small_run.out):
         with_code(folder, ran)
-    for name in ("surface/0003", "tracks/0003", "fit/way"):
+    for name in ("surface/0003", "tracks/0003", "fit/pose_tracking"):
         pickled(small_run.out / "cache" / f"{name}.npz", ran)
     monkeypatch.chdir(small_run.take)
     scene = blender.context.scene

@@ -32,6 +32,7 @@ from tricap.core.fitting.context import FitContext
 from tricap.core.fitting.inputs.cloud_points import thinned
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.solve.problem import Estimate
 from tricap.core.fitting.solve.solver import FURTHEST, solve
 from tricap.core.fitting.stages import sequence
 from tricap.core.geometry.camera import Camera
@@ -97,7 +98,7 @@ def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion[0])
     clicks = {name: {c.name: c.project(X) + random.uniform(-3, 3, 2) for c in cameras.cameras} for name, X in joints.items()}
     spent: dict[str, float] = {}
-    real = {name: getattr(sequence, name) for name in ("follow", "solve", "fit_click_frame", "_covariance")}
+    real = {name: getattr(sequence, name) for name in ("track_poses", "solve", "fit_click_frame", "_covariance")}
 
     def timed(name: str):
         def call(*args, **kwargs):
@@ -121,7 +122,7 @@ def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
         "frames": frames,
         "points_a_frame": float(np.mean([len(c.xyz_m) for c in clouds])),
         "click_frame_s": spent["fit_click_frame"],
-        "frame_to_frame_ms_a_frame": 1e3 * spent["follow"] / max(frames - 1, 1),
+        "frame_to_frame_ms_a_frame": 1e3 * spent["track_poses"] / max(frames - 1, 1),
         "sequence_ms_a_frame": 1e3 * spent["solve"] / frames,
         "covariance_ms_a_frame": 1e3 * spent["_covariance"] / frames,
         "iterations": fit.iterations,
@@ -143,12 +144,14 @@ def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
         for name, X in joint_positions(shape.skeleton, shape.lengths_m, motion[0]).items()
     }
     given = FitInput(rig=cameras, model="full", clouds=[seen], clicks={0: clicks}, time_s=np.zeros(1))
-    fit: FitContext = sequence.conditions(given, settings)
+    fit: FitContext = sequence.fit_context(given, settings)
     vector = fit.parameters.vector()
     start = motion[0] + random.normal(0, 0.05, motion.shape[1])
     there = fit.parameters.state(motion[0], vector)
     surface = fit.surface(points, there)
-    surface = replace(surface, kind="", sigma_m=surface.sigma_m * np.sqrt(surface.variance_inflation), variance_inflation=1.0).scaled(there)
+    surface = replace(surface, kind="", sigma_m=surface.sigma_m * np.sqrt(surface.variance_inflation), variance_inflation=1.0).reweighted(
+        there
+    )
     held = [surface, *fit.priors]
 
     def residual(x: np.ndarray) -> np.ndarray:
@@ -170,7 +173,7 @@ def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
 
     problem = fit.problem(lambda t, state: held)
     ways: dict[str, Callable[[int], np.ndarray]] = {
-        "ours": lambda most: solve(problem, start[None], vector, steps=most, furthest=FURTHEST).motion[0],
+        "ours": lambda most: solve(problem, Estimate(motion=start[None], vector=vector), steps=most, furthest=FURTHEST).motion[0],
         "scipy_jacobian": lambda most: least_squares(residual, start, jacobian, xtol=1e-4, ftol=1e-4, max_nfev=most).x,
         "scipy_2point": lambda most: least_squares(residual, start, xtol=1e-4, ftol=1e-4, max_nfev=most).x,
     }
@@ -245,7 +248,7 @@ def of_muscles(seeds: int = 4, frames: int = 8) -> list[dict[str, object]]:
 
 
 def _surface_mm(scene: limb_scene.Scene, fit: BodyFit) -> np.ndarray:
-    """DistanceMap of true points of the seen surface from the fitted one, in the first frame: the field over its gradient."""
+    """Distances of true points of the seen surface from the fitted one, in the first frame: the field over its gradient."""
     random, motion = np.random.default_rng(9), scene.motion[0]
     bone = random.integers(0, len(scene.shape.lengths_m), 800)
     X, normal = limb_scene.surface(scene.shape, motion, random.uniform(0.1, 0.9, 800), random.uniform(0, 2 * np.pi, 800), bone)

@@ -1,7 +1,7 @@
-"""Where the views show the background, frame by frame, as observations of a body: no limb is there.
+"""Background regions of the views, frame by frame, as observations of a body: no limb is there.
 
-Only limbs whose posture must be seen; and of a hand, which the model believes to be straight, the middle, less exactly: the tip of one that
-is bent would pull its forearm.
+Only of limbs whose pose must be observed; and, with a larger sigma, of the middle of a hand, whose prior is a straight wrist: the tip of a
+bent one would pull its forearm.
 
 Where the views show the still background and so no part of the person, for the fit.
 
@@ -32,25 +32,25 @@ from ..settings import FitSettings
 from ..state import ShapeParameters, free_bones
 from .fit_input import BackgroundDistances, FitInput, Packed
 
-ALONG = (0.2, 0.5, 0.8, 1.0)  # where on a bone's axis
-MIDDLE, BENT = 0.5, 3.0  # where on a hand's, and how many of the outline's sigmas it may be wrong
+FRACTIONS = (0.2, 0.5, 0.8, 1.0)  # of a bone's axis, where its places are
+HAND_FRACTION, HAND_SIGMA = 0.5, 3.0  # of a hand's axis; its sigma over that of the outline
 
 
 class BackgroundRegions:
-    """The views' empty parts in all frames."""
+    """The background regions of all views in all frames."""
 
     def __init__(self, given: FitInput, parameters: ShapeParameters, settings: FitSettings) -> None:
         skeleton = parameters.skeleton
         names = {joint: i for i, joint in enumerate(skeleton.joint_names)}
         free = free_bones(parameters)
         ends = ~free & free[skeleton.parents] & ~np.isin(np.arange(len(free)), skeleton.parents)
-        places = [(bone, along, 1.0) for bone, seen in zip(skeleton.bones, free) if seen for along in ALONG]
-        places += [(bone, MIDDLE, BENT) for bone, last in zip(skeleton.bones, ends) if last and bone.dofs]
+        places = [(bone, along, 1.0) for bone, observed in zip(skeleton.bones, free) if observed for along in FRACTIONS]
+        places += [(bone, HAND_FRACTION, HAND_SIGMA) for bone, last in zip(skeleton.bones, ends) if last and bone.dofs]
         self._head = np.array([names[bone.head_joint] for bone, _, _ in places], dtype=np.intp)
         self._tail = np.array([names[bone.tail_joint] for bone, _, _ in places], dtype=np.intp)
         self._fraction = np.array([along for _, along, _ in places])
-        self._sigma_px = settings.empty_sigma_px * np.array([wider for _, _, wider in places])
-        self._given = given.empty if settings.use_background else ()
+        self._sigma_px = settings.background_sigma_px * np.array([wider for _, _, wider in places])
+        self._given = given.background if settings.use_background else ()
         self._rig, self._frames = given.rig, given.frames
 
     def stretch(self, frames: Sequence[int]) -> "BackgroundRegions":
@@ -60,7 +60,7 @@ class BackgroundRegions:
         return part
 
     def observe(self, t: int) -> list[BackgroundExclusion]:
-        """What is empty in frame index `t`; nothing where that is not known."""
+        """The observations of frame index `t`; none where no background is known."""
         views = [
             DistanceMap(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
             for v in self._given

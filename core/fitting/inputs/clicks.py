@@ -1,4 +1,4 @@
-"""Clicked joints: which there are, where they lie in space, and whether the views agree."""
+"""Clicked joints: their observations, their places in space, and whether the views agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,21 +17,21 @@ STEPS = 10
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Clicks:
-    """What is known of the joints where the fit begins, and their places in space."""
+    """The observations of the joints where the fit begins, and their places in space."""
 
     observations: tuple[Observation, ...]
-    xyz_m: np.ndarray  # (J, 3) NaN: not known in two views
+    xyz_m: np.ndarray  # (J, 3) NaN: not in two views
 
     @property
     def located(self) -> np.ndarray:
-        """Which joints (J,) have a place in space."""
+        """Which joints (J,) are located in space."""
         return np.isfinite(self.xyz_m).all(axis=1)
 
 
 def read_clicks(rig: Rig, joint_names: Sequence[str], joints: ClickedAt, sigma_px: float) -> tuple[ClickedJoints, np.ndarray]:
     """Clicks of the model's joints in one frame, and the joints' places (J, 3) by forward intersection, NaN without two views.
 
-    `joints[name][view] = (x, y)` in full-frame pixels. Joints of other limbs are passed over.
+    `joints[name][view] = (x, y)` in full-frame pixels. Joints that the model does not have are ignored.
 
     Raises:
         InputError: the views contradict each other, or the rig has no such view.
@@ -55,11 +55,11 @@ def read_clicks(rig: Rig, joint_names: Sequence[str], joints: ClickedAt, sigma_p
     return found, places
 
 
-def enough(xyz_m: np.ndarray, joint_names: Sequence[str], observations: Sequence[Observation]) -> Clicks:
-    """What the fit begins with, when two of the joints (J, 3) have places.
+def initial_clicks(xyz_m: np.ndarray, joint_names: Sequence[str], observations: Sequence[Observation]) -> Clicks:
+    """The joints of the frame in which the fit begins; at least two (J, 3) must be located.
 
     Raises:
-        InputError: they have not.
+        InputError: fewer are.
     """
     located = [name for name, place in zip(joint_names, xyz_m) if np.isfinite(place).all()]
     if len(located) < 2:

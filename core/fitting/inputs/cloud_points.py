@@ -1,9 +1,13 @@
-"""What the fit takes from a cloud: finite points, thinned to one per voxel, with a sigma along the surface normal."""
+"""A cloud as the fit uses it: finite points, thinned to one per voxel, with a sigma along the surface normal."""
 
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+
+VARIANCE_FLOOR_M2 = 1e-12  # of points, rays and steps whose sigma is 0
+LEAST_AGREEMENT = 0.3  # length of a voxel's mean normal; of a shorter one the direction is unknown
+HALF = 0.5  # between the length of a normal, 1, and that of an unknown one, 0
 
 
 class Cloud(Protocol):
@@ -59,11 +63,11 @@ def thinned(cloud: Cloud, voxel_m: float) -> CloudPoints:
         np.stack([np.bincount(which, column) for column in table.T], axis=1) / count[:, None] for table in (xyz, normals, sigma[:, None])
     ]
     length = np.linalg.norm(mean[1], axis=1, keepdims=True)
-    normals = mean[1] / np.where(length > 0.3, length, np.inf)
+    normals = mean[1] / np.where(length > LEAST_AGREEMENT, length, np.inf)
     return CloudPoints(frame=int(cloud.frame), xyz_m=mean[0], normals=normals, sigma_m=mean[2][:, 0])
 
 
 def _sigma_along(normals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     along = np.einsum("ni,nij,nj->n", normals, covariance, normals)
     mean = np.trace(covariance, axis1=1, axis2=2) / 3
-    return np.sqrt(np.maximum(np.where(np.linalg.norm(normals, axis=1) > 0.5, along, mean), 0.0))
+    return np.sqrt(np.maximum(np.where(np.linalg.norm(normals, axis=1) > HALF, along, mean), 0.0))

@@ -1,4 +1,4 @@
-"""What a fit is made from, in one value: clouds, trajectories, contours, clicks, keypoints, and what the user knows about the joints."""
+"""The input of a fit in one value: clouds, trajectories, contours, clicks, keypoints, and what the user specifies about the joints."""
 
 import tempfile
 import zlib
@@ -14,7 +14,7 @@ from ...geometry.rig import Rig
 from .cloud_points import Cloud
 from .material_tracks import Trajectories
 
-IN_MEMORY = 1 << 24  # bytes of packed images; more are kept in a file
+IN_MEMORY = 1 << 24  # bytes of packed images; more go to a temporary file
 ClickedAt = Mapping[str, Mapping[str, Sequence[float]]]  # joint -> view -> (x, y) full-frame pixels
 
 
@@ -34,7 +34,7 @@ class Outlines(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ViewContours:
-    """Outlines that are held in memory: V vertices of all frames."""
+    """Outlines in memory: V vertices of all frames."""
 
     view: str
     frame: np.ndarray  # (V,) the take's frame numbers
@@ -56,7 +56,7 @@ class ViewContours:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class JointPlaces:
-    """K places of joints that another system found: in the pixels of a view (K, 2), or in space (K, 3) [m] where `view` is empty."""
+    """K places of joints from another system: in the pixels of a view (K, 2), or in space (K, 3) [m] where `view` is empty."""
 
     view: str
     frame: np.ndarray  # (K,) the take's frame numbers
@@ -74,7 +74,7 @@ class JointPlaces:
 
 
 class Packed(Sequence[np.ndarray]):
-    """Small images (h, w) uint8 of one size, compressed: they are mostly flat. Those of a long recording lie in a temporary file."""
+    """Small images (h, w) uint8 of one size, compressed: they are mostly flat. Those of a long recording are in a temporary file."""
 
     def __init__(self, images: Iterable[np.ndarray] = ()) -> None:
         self._file: IO[bytes] = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY)
@@ -84,10 +84,10 @@ class Packed(Sequence[np.ndarray]):
             self.append(image)
 
     def append(self, image: np.ndarray) -> None:
-        """One more.
+        """Append an image.
 
         Raises:
-            InputError: there is no room for it.
+            InputError: the disk is full.
         """
         self._size = image.shape
         try:
@@ -114,7 +114,7 @@ class Packed(Sequence[np.ndarray]):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BackgroundDistances:
-    """How far every place of a view is from the nearest pixel that may show the person: 0 inside the person's outline.
+    """The distance of every place of a view from the nearest pixel that may show the person: 0 inside the person's outline.
 
     Node (j, i) is the middle of a square of `step_px` × `step_px` pixels. DistanceMap are stored in steps of `unit_px`.
     """
@@ -129,28 +129,28 @@ class BackgroundDistances:
         object.__setattr__(self, "frame", frozen(self.frame, (len(self.distance),), np.int64, "frame"))
 
     def of_frame(self, frame: int) -> np.ndarray | None:
-        """(h, w) of one frame; None if it is not known."""
+        """(h, w) of one frame; None if there is none."""
         at = np.flatnonzero(self.frame == frame)
         return self.distance[at[0]] if len(at) else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FitInput:
-    """A recording as the fit takes it: `clouds` in the order of time, `time_s` (T,) their times, clicks by frame number."""
+    """A recording: `clouds` in the order of time, `time_s` (T,) their times, clicks by frame number."""
 
     rig: Rig
     model: str
     clouds: Sequence[Cloud]
     time_s: np.ndarray
     clicks: Mapping[int, ClickedAt] = field(default_factory=dict)
-    click_frame: int | None = None  # where the fit begins; None: where most joints are known
+    click_frame: int | None = None  # where the fit begins; None: where most joints are located
     trajectories: Trajectories | None = None
     contours: Sequence[Outlines] = ()
     keypoints: Sequence[JointPlaces] = ()
-    empty: Sequence[BackgroundDistances] = ()
-    locked: Sequence[str] = ()  # degrees of freedom that are held at their rest value
+    background: Sequence[BackgroundDistances] = ()
+    locked: Sequence[str] = ()  # degrees of freedom that stay at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # rad, by degree of freedom
-    frames: Sequence[int] = ()  # the take's numbers (T); without them they are read from the clouds
+    frames: Sequence[int] = ()  # the take's numbers (T); without them those of the clouds
 
     def __post_init__(self) -> None:
         times = np.asarray(self.time_s, dtype=np.float64)

@@ -1,7 +1,7 @@
-"""Keypoints that another system found, frame by frame, as observations of the model's joints.
+"""Keypoints from another system, frame by frame, as observations of the model's joints.
 
-A detector's errors last: keypoints of the frames within `LASTS_S` weigh together as one. What a detector calls a hip is not the centre of
-the hip: the sigmas say so, and gross errors lose their weight.
+A detector's errors are correlated over time: keypoints of the frames within `CORRELATION_S` weigh together as one. A detector's hip is not
+the centre of the hip: the sigmas include that, and outliers lose their weight.
 """
 
 from collections.abc import Sequence
@@ -14,17 +14,17 @@ from ..observations import ClickedJoints, Keypoints, Observation
 from .clicks import intersection
 from .fit_input import FitInput, JointPlaces
 
-LASTS_S = 0.2
+CORRELATION_S = 0.2  # of a detector's errors
 
 
 class JointTracks:
-    """The keypoints of all frames. Joints that the model does not have are passed over."""
+    """The keypoints of all frames. Joints that the model does not have are ignored."""
 
     def __init__(self, given: FitInput, joint_names: Sequence[str]) -> None:
         self._names = list(joint_names)
         self._frames, self._rig = given.frames, given.rig
-        step = float(np.median(np.diff(given.time_s))) if len(given.time_s) > 1 else LASTS_S
-        self._crowding = max(1.0, LASTS_S / step)
+        step = float(np.median(np.diff(given.time_s))) if len(given.time_s) > 1 else CORRELATION_S
+        self._inflation = max(1.0, CORRELATION_S / step)
         self._tables = [
             (table, np.array([self._names.index(j) if j in self._names else -1 for j in table.joint], dtype=np.intp))
             for table in given.keypoints
@@ -37,7 +37,7 @@ class JointTracks:
         return part
 
     def observe(self, t: int) -> list[Observation]:
-        """What is known of the joints in frame index `t`."""
+        """Observations of the joints in frame index `t`."""
         found: list[Observation] = []
         cameras: list[Camera] = []
         index, xy, sigma = [], [], []
@@ -54,7 +54,7 @@ class JointTracks:
                         xyz_m=table.place[rows],
                         sigma_m=table.sigma[rows],
                         kind="keypoints",
-                        variance_inflation=self._crowding,
+                        variance_inflation=self._inflation,
                     )
                 )
         if cameras:
@@ -65,22 +65,22 @@ class JointTracks:
                     xy_px=np.concatenate(xy),
                     sigma_px=np.concatenate(sigma),
                     kind="keypoints",
-                    variance_inflation=self._crowding,
+                    variance_inflation=self._inflation,
                 )
             )
         return found
 
     def located(self, t: int) -> np.ndarray:
-        """Where the joints are (J, 3) in frame index `t`: from keypoints in space, or from two views; NaN where unknown."""
+        """The places of the joints (J, 3) in frame index `t`: from keypoints in space, or from two views; NaN without either."""
         places = np.full((len(self._names), 3), np.nan)
-        seen: dict[int, list[tuple[Camera, np.ndarray]]] = {}
+        in_views: dict[int, list[tuple[Camera, np.ndarray]]] = {}
         for table, joint, rows in self._rows(t):
             if not table.view:
                 places[joint[rows]] = table.place[rows]
                 continue
             for j, xy in zip(joint[rows].tolist(), table.place[rows]):
-                seen.setdefault(j, []).append((self._rig[table.view], xy))
-        for j, views in seen.items():
+                in_views.setdefault(j, []).append((self._rig[table.view], xy))
+        for j, views in in_views.items():
             if len(views) > 1 and not np.isfinite(places[j]).all():
                 places[j] = intersection([camera for camera, _ in views], np.array([xy for _, xy in views]))
         return places

@@ -1,4 +1,4 @@
-"""Trajectories as the fit sees them: for each pair of successive frames the points that were seen in both, thinned, on their limbs."""
+"""Trajectories as observations: for each pair of successive frames the points tracked in both, thinned, each on its limb."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -11,9 +11,10 @@ from ..observations import MaterialSteps
 from ..segmentation import SegmentationCache, segment
 from ..settings import FitSettings
 from ..state import BodyState
-from .cloud_points import CloudPoints
+from .cloud_points import VARIANCE_FLOOR_M2, CloudPoints
 
-SPACING_M = 0.012  # one tracked point in a cube of this size is enough
+SPACING_M = 0.012  # of the cubes with one tracked point each
+UNKNOWN_SIGMA_M = 0.002  # of a step, where the trajectories have none
 
 
 class Trajectories(Protocol):
@@ -25,7 +26,7 @@ class Trajectories(Protocol):
 
     @property
     def xyz_m(self) -> np.ndarray:
-        """(T, N, 3) world; NaN: not seen."""
+        """(T, N, 3) world; NaN: not measured."""
 
     @property
     def sigma_m(self) -> np.ndarray:
@@ -41,11 +42,11 @@ class MaterialTracks:
         self._xyz = [xyz[where[f]] if f in where else np.full(xyz.shape[1:], np.nan) for f in frames]
         self._sigma = [sigma[where[f]] if f in where else np.full(xyz.shape[1], np.nan) for f in frames]
         self._surface, self._settings = surface, settings
-        self._held = SegmentationCache()
+        self._cache = SegmentationCache()
         self._pairs = [self._pair(t) for t in range(len(frames) - 1)]
 
     def stretch(self, frames: Sequence[int]) -> "MaterialTracks":
-        """Those of some of the frames; whose each point is is asked anew."""
+        """Those of some of the frames; their points are assigned to limbs anew."""
         part, none = copy(self), (np.zeros(0, dtype=np.intp), np.zeros(0))
         part._xyz, part._sigma = [self._xyz[t] for t in frames], [self._sigma[t] for t in frames]
         part._pairs = [self._pairs[a] if b == a + 1 else none for a, b in zip(frames, frames[1:])]
@@ -53,32 +54,32 @@ class MaterialTracks:
         return part
 
     def steps(self, t: int, a: BodyState | None, b: BodyState | None) -> MaterialSteps | None:
-        """What the points say that are on the same limb in frame t (body `a`) and t + 1 (body `b`; None: not yet known)."""
+        """The observations of the points on the same limb in frame t (body `a`) and t + 1 (body `b`); None: not yet known."""
         rows, sigma = self._pairs[t]
         found = [
-            self._held.get((t, i), state, partial(self._limbs, i, rows, sigma, state))
+            self._cache.get((t, i), state, partial(self._limbs, i, rows, sigma, state))
             for i, state in ((t, a), (t + 1, b))
             if state is not None
         ]
         keep = np.flatnonzero((found[0] >= 0) & (found[0] == found[-1]))
         if not len(keep):
             return None
-        own, skin = sigma[keep] ** 2 + 1e-12, self._settings.track_sigma_m**2
-        share = max(1.0, (self._settings.model_patch_m / SPACING_M) ** 2)
+        own, skin = sigma[keep] ** 2 + VARIANCE_FLOOR_M2, self._settings.track_sigma_m**2
+        in_patch = max(1.0, (self._settings.model_patch_m / SPACING_M) ** 2)
         return MaterialSteps(
             from_m=self._xyz[t][rows[keep]],
             to_m=self._xyz[t + 1][rows[keep]],
             bone=found[0][keep],
             sigma_m=np.sqrt(own + skin),
-            variance_inflation=np.repeat((own + share * skin) / (own + skin), 3),
+            variance_inflation=np.repeat((own + in_patch * skin) / (own + skin), 3),
         )
 
     def forget(self) -> None:
-        """Ask anew whose each point is: what comes next shall not depend on what was asked before."""
-        self._held = SegmentationCache()
+        """Assign points to limbs anew: what follows must not depend on what was computed before."""
+        self._cache = SegmentationCache()
 
     def _limbs(self, t: int, rows: np.ndarray, sigma: np.ndarray, state: BodyState) -> np.ndarray:
-        """The bone of each point in one frame, −1 for nobody's."""
+        """The bone of each point in one frame, −1 for none."""
         points = CloudPoints(frame=t, xyz_m=self._xyz[t][rows], normals=np.zeros((len(rows), 3)), sigma_m=sigma)
         mine, bone = segment(points, state, self._surface, self._settings.gate_m)
         limbs = np.full(len(rows), -1)
@@ -86,9 +87,9 @@ class MaterialTracks:
         return limbs
 
     def _pair(self, t: int) -> tuple[np.ndarray, np.ndarray]:
-        """Points seen in frames t and t + 1, the first in each cell, and the sigma of their steps."""
-        seen = np.flatnonzero(np.isfinite(self._xyz[t]).all(axis=1) & np.isfinite(self._xyz[t + 1]).all(axis=1))
-        cells = np.floor(self._xyz[t][seen] / SPACING_M).astype(np.int64)
+        """Points tracked in frames t and t + 1, the first in each cell, and the sigma of their steps."""
+        tracked = np.flatnonzero(np.isfinite(self._xyz[t]).all(axis=1) & np.isfinite(self._xyz[t + 1]).all(axis=1))
+        cells = np.floor(self._xyz[t][tracked] / SPACING_M).astype(np.int64)
         first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-        rows = seen[first]
-        return rows, np.nan_to_num(np.hypot(self._sigma[t][rows], self._sigma[t + 1][rows]), nan=0.002)
+        rows = tracked[first]
+        return rows, np.nan_to_num(np.hypot(self._sigma[t][rows], self._sigma[t + 1][rows]), nan=UNKNOWN_SIGMA_M)

@@ -1,5 +1,5 @@
-"""When a foot stands, for the fit: its ankle, or the ball of it, is slow and low. While it stands the joint keeps the height that it has
-whenever it stands, on either foot. World: Z up, and the floor is level; where it lies is found from the motion.
+"""Standing feet, as observations: an ankle, or the ball of a foot, that is slow and low. While it stands the joint has the height that it
+has whenever it stands, on either foot. World: Z up, and the floor is level; its height comes from the motion.
 """
 
 from collections.abc import Sequence
@@ -9,11 +9,11 @@ import numpy as np
 
 from ..observations import FootOnFloor
 
-SLOW_M_S = 0.25  # as in retargeting: a foot slower than this comes to stand
+SLOW_M_S = 0.25  # as in retargeting: a slower foot stands
 LOW_M = 0.05  # above the lowest place of the joint
-LOWEST_PERCENTILE = 3.0
-SPAN_S = 0.1  # speeds are taken over this time, so that noise does not count
-SIGMA_M = 0.01
+LOWEST_PERCENTILE = 3.0  # of a joint's heights: its lowest place, but for outliers
+SPAN_S = 0.1  # speeds are taken over this time, which averages their noise
+SIGMA_M = 0.01  # of the height
 KINDS = ("ankle", "toe")
 
 

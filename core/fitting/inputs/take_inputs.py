@@ -22,7 +22,7 @@ from ...take.take import JOINTS, Footage, Seeds, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import FitSettings
-from .clicks import enough, read_clicks
+from .clicks import initial_clicks, read_clicks
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
 OURS = {
@@ -46,7 +46,7 @@ def fit_input(
     clouds: Sequence[PointCloud],
     trajectories: Trajectories | None,
     results: Results,
-    empty: Sequence[BackgroundDistances] = (),
+    background: Sequence[BackgroundDistances] = (),
 ) -> FitInput:
     """All that the fit can use of a run; clicks in other frames than the footage's are left out.
 
@@ -65,7 +65,7 @@ def fit_input(
         trajectories=trajectories,  # type: ignore[arg-type]
         contours=read_contours(results, [v.name for v in take.views]),
         keypoints=[read_source(footage, source) for source in take.keypoints],
-        empty=empty,
+        background=background,
         locked=take.locked,
         limits={name: (radians(low), radians(high)) for name, (low, high) in take.limits.items()},
     )
@@ -90,7 +90,7 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
     places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
     if not take.keypoints:
         best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
-        enough(places.get(take.seeds.frame, places[best]), names, [])
+        initial_clicks(places.get(take.seeds.frame, places[best]), names, [])
 
 
 def missing_for_fit(footage: Footage) -> str:

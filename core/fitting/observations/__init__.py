@@ -1,6 +1,6 @@
-"""Observations: one error term, one small file. Each gives residuals of unit weight and their analytic Jacobian.
+"""Observations: one error term, one small file. Each has residuals of unit weight and their analytic Jacobian.
 
-Most look at one frame; `MaterialSteps` ties two.
+Most observe one frame; `MaterialSteps` ties two.
 """
 
 from typing import Protocol
@@ -44,14 +44,14 @@ class Observation(Protocol):
 
     @property
     def kind(self) -> str:
-        """Empty, or the kind (problem.Scales) of residuals of which some may be gross errors, and are weighted down."""
+        """The kind (problem.Scales) of residuals that may contain outliers and get robust weights; empty: not robust."""
 
     @property
     def variance_inflation(self) -> np.ndarray | float:
-        """Divides the weights of robust observations: > 1 where neighbouring residuals share their errors."""
+        """Divides the weights of robust observations: > 1 where neighbouring residuals have correlated errors."""
 
     def residual(self, state: BodyState) -> np.ndarray:
         """Residuals (n,), divided by their sigmas."""
 
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
-        """Derivative (n, D + S) of the residuals to motion and shape; (n, D) without shape."""
+        """Derivative (n, D + S) of the residuals with respect to pose and shape; (n, D) without shape."""

@@ -1,10 +1,10 @@
-"""A limb is not where the views show the background: the axis of a bone projects into the person's outline.
+"""A limb does not lie where a view shows the background: the axis of a bone projects into the person's outline.
 
     r = √(2 (√(1 + u²) − 1)) ,   u = d(x) / σ                                                         (1)
 
 d is the distance of an axis point's image x from the nearest pixel that may show the person, 0 inside. The cost r²/2 grows with u², and
 with |u| far outside (pseudo-Huber, Charbonnier et al. 1994), so that a wrong outline does not tear a limb off. Visual hulls (Laurentini
-1994) say the same of the whole body; the axis alone says it without knowing how thick the limb is.
+1994) constrain the whole body in the same way; the axis alone needs no thickness of the limb.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from ...geometry.camera import Camera
 from ..state import Block, BodyState, FromBlocks
 
-SMALL = 1e-9
+SMALLEST = 1e-9  # of r: at 0 its derivative is the limit, 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,7 +28,7 @@ class DistanceMap:
     first_px: float
 
     def sampled(self, xy_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """d (N,) and its gradient (N, 2) at pixels (N, 2), bilinear; 0 outside the image, which tells nothing."""
+        """d (N,) and its gradient (N, 2) at pixels (N, 2), bilinear; 0 outside the image, where nothing is known."""
         h, w = self.values_px.shape
         at = (xy_px - self.first_px) / self.step_px
         inside = (at >= 0).all(axis=1) & (at[:, 0] < w - 1) & (at[:, 1] < h - 1)
@@ -60,7 +60,7 @@ class BackgroundExclusion(FromBlocks):
     def residual(self, state: BodyState) -> np.ndarray:
         """(views · P,)  (1)"""
         xyz = self._mix(state.joints_m, np.arange(len(self.head)))
-        return np.concatenate([_bent(view.sampled(view.camera.project(xyz))[0] / self.sigma_px)[0] for view in self.views])
+        return np.concatenate([_pseudo_huber(view.sampled(view.camera.project(xyz))[0] / self.sigma_px)[0] for view in self.views])
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
         """One block for each view in which a point is outside: most are inside, where the derivative is zero."""
@@ -71,8 +71,8 @@ class BackgroundExclusion(FromBlocks):
             if not len(out):
                 continue
             dX = state.joint_jacobian[1]
-            dxyz = self._mix(dX[:, :, : dX.shape[2] if shape else state.n_motion], out)
-            across = (_bent(d[out] / self.sigma_px[out])[1] / self.sigma_px[out])[:, None] * gradient[out]
+            dxyz = self._mix(dX[:, :, : state.layout.size(shape)], out)
+            across = (_pseudo_huber(d[out] / self.sigma_px[out])[1] / self.sigma_px[out])[:, None] * gradient[out]
             in_image = view.camera.project_with_jacobian(xyz[out])[1]
             yield k * len(self.head) + out, np.arange(dxyz.shape[2]), np.einsum("pa,pai,pik->pk", across, in_image, dxyz, optimize=True)
 
@@ -81,8 +81,8 @@ class BackgroundExclusion(FromBlocks):
         return np.asarray((1 - f) * of_joints[self.head[which]] + f * of_joints[self.tail[which]])
 
 
-def _bent(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pseudo_huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """r of (1) and dr/du."""
     root = np.sqrt(1 + u * u)
     r = u * np.sqrt(2 / (root + 1))  # √(2 (√(1 + u²) − 1)) without cancellation
-    return r, np.where(r > SMALL, u / (root * np.maximum(r, SMALL)), 1.0)
+    return r, np.where(r > SMALLEST, u / (root * np.maximum(r, SMALLEST)), 1.0)

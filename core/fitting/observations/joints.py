@@ -1,9 +1,16 @@
-"""Joints clicked in the views, or found in them by another system: projection(joint) = click + ε, σ about 5 px (the papers'
-initialisation).
+"""Joints clicked in the views, or detected in them by another system:
 
-Imported keypoints in space: position of a joint = keypoint ± σ, each coordinate. (In images a keypoint is a clicked joint.)
+    (projection(joint) − click) / σ = ε ,    σ about 5 px                                                 (1)
 
-A standing foot neither sinks into the floor nor hovers: the height of its joints above the floor = a given height ± σ (optional).
+(D'Apuzzo et al. 1999, §3.3: the initialisation.)
+
+Imported keypoints K in space, for each coordinate of a joint X (a keypoint in an image is a `ClickedJoints`):
+
+(X − K) / σ = ε                                                                                       (1)
+
+A standing foot neither sinks into the floor nor hovers (optional): its joints X have given heights h above the floor,
+
+(up · X − floor − h) / σ = ε                                                                          (1)
 """
 
 from dataclasses import dataclass
@@ -16,7 +23,7 @@ from ..state import BodyState
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClickedJoints:
-    """K clicks, each of one joint in one camera."""
+    """K clicks, each of one joint in one camera.  (1)"""
 
     cameras: tuple[Camera, ...]  # K
     joint: np.ndarray  # (K,) index in Skeleton.joint_names
@@ -34,7 +41,7 @@ class ClickedJoints:
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(2K, D + S) or (2K, D)"""
         X, dX = state.joint_jacobian
-        n = dX.shape[2] if shape else state.n_motion
+        n = state.layout.size(shape)
         rows = [camera.project_with_jacobian(X[j])[1] @ dX[j, :, :n] / s for camera, j, s in zip(self.cameras, self.joint, self._sigmas)]
         return np.concatenate(rows) if rows else np.zeros((0, n))
 
@@ -45,7 +52,7 @@ class ClickedJoints:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Keypoints:
-    """K joints seen in space by another system (TRC, C3D, CSV)."""
+    """K joints located in space by another system (TRC, C3D, CSV).  (1)"""
 
     joint: np.ndarray  # (K,) index in Skeleton.joint_names
     xyz_m: np.ndarray  # (K, 3)
@@ -61,12 +68,12 @@ class Keypoints:
         """(3K, D + S) or (3K, D)"""
         J = state.joint_jacobian[1][self.joint] / self.sigma_m[:, None, None]
         J = J.reshape(-1, J.shape[2])
-        return J if shape else J[:, : state.n_motion]
+        return J[:, : state.layout.size(shape)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FootOnFloor:
-    """K joints at known heights above a plane. `up` is the plane's unit normal, `floor_m` its height along `up`."""
+    """K joints at given heights above a plane. `up` is the plane's unit normal, `floor_m` its height along `up`.  (1)"""
 
     joint: np.ndarray  # (K,) index in Skeleton.joint_names
     height_m: np.ndarray  # (K,) of the joint's centre above the floor when the foot stands
@@ -84,4 +91,4 @@ class FootOnFloor:
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(K, D + S) or (K, D)"""
         J = np.einsum("i,kic->kc", np.array(self.up), state.joint_jacobian[1][self.joint]) / self.sigma_m
-        return J if shape else J[:, : state.n_motion]
+        return J[:, : state.layout.size(shape)]

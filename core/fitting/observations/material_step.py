@@ -1,9 +1,11 @@
-"""Tracked points stay where they are in their limb from one frame to the next: p(t+1) − p(t) = ε with p = Rᵀ(X − head) in the bone's axes.
+"""Tracked points stay at the same place of their limb from one frame to the next:
 
-They show what a surface of revolution cannot: twist, and sliding along the bone; and, over time, where the joints are, because a joint
-is the point that moves with both its limbs. Differences of successive frames leave no nuisance unknowns and keep the normal equations in
-their band; as long as the same points are seen the errors telescope, so little is lost against places common to all frames. The sigma
-is 1–10 mm (skin slides).
+    (p(t+1) − p(t)) / σ = ε ,    p = Rᵀ (X − head)    in the bone's axes                                  (1)
+
+They constrain what a surface of revolution cannot: twist, and sliding along the bone; and, over time, the places of the joints, because a
+joint is the point that moves with both its limbs. Differences of successive frames introduce no nuisance unknowns and leave the normal
+equations in their band. While the same points are tracked the errors telescope, so little is lost against places common to all frames.
+The sigma is 1–10 mm (skin slides).
 """
 
 from collections.abc import Iterator
@@ -11,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..part_field import cross
+from ...geometry.rotation import cross
 from ..state import Block, BodyState, FromBlocks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaterialSteps:
-    """N points seen in two frames, a and b."""
+    """N points tracked from frame a to frame b.  (1)"""
 
     from_m: np.ndarray  # (N, 3) world, in frame a
     to_m: np.ndarray  # (N, 3) world, in frame b
@@ -31,8 +33,7 @@ class MaterialSteps:
         return (difference / self.sigma_m[:, None]).ravel()
 
     def blocks(self, a: BodyState, b: BodyState, shape: bool = True) -> Iterator[Block]:
-        """Derivatives, limb by limb, to the motion of frame a, of frame b, and (columns from 2 D on) to the shape that both share."""
-        D = a.n_motion
+        """Derivatives, limb by limb; the columns are those of two frames (`ParameterLayout`)."""
         for limb in np.unique(self.bone).tolist():
             own = np.flatnonzero(self.bone == limb)
             dofs, lengths = a.parts[limb].chain
@@ -40,12 +41,12 @@ class MaterialSteps:
             d = len(dofs)
             parts = [at_a[..., :d], at_b[..., :d], *([at_a[..., d:] + at_b[..., d:]] if shape else [])]
             J = np.concatenate(parts, axis=2) / self.sigma_m[own, None, None]
-            columns = np.concatenate([dofs, D + dofs, *([2 * D + lengths] if shape else [])])
+            columns = a.layout.two_frames(dofs, lengths, shape)
             yield (3 * own[:, None] + np.arange(3)).ravel(), columns, J.reshape(3 * len(own), -1)
 
     def jacobian(self, a: BodyState, b: BodyState) -> np.ndarray:
-        """(3N, D + D + S): derivatives to the motion of frame a, of frame b, and to the shape that both share."""
-        J = np.zeros((3 * len(self.bone), 2 * a.n_motion + a.n_shape))
+        """(3N, D + D + S): derivatives with respect to the poses in frames a and b, and to the shape that both share."""
+        J = np.zeros((3 * len(self.bone), a.layout.n_pose + a.layout.size()))
         for rows, columns, block in self.blocks(a, b):
             J[rows[:, None], columns] = block
         return J
@@ -53,16 +54,16 @@ class MaterialSteps:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepsFromFixed(FromBlocks):
-    """The same observations for one body `b`, while the other frame's body is held."""
+    """The same observations for one body, while the pose of the other frame's is fixed."""
 
     steps: MaterialSteps
     other: BodyState
-    backwards: bool = False  # the held body is frame b, the observed one frame a
+    backwards: bool = False  # the fixed body is that of frame b, the observed one that of frame a
     kind: str = "steps"
 
     @property
     def variance_inflation(self) -> np.ndarray | float:
-        """As in the steps."""
+        """That of the steps."""
         return self.steps.variance_inflation
 
     @property
@@ -75,12 +76,10 @@ class StepsFromFixed(FromBlocks):
         return self.steps.residual(state, self.other) if self.backwards else self.steps.residual(self.other, state)
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
-        """Derivatives, limb by limb; to the shape, which both bodies have."""
-        D, first = state.n_motion, 0 if self.backwards else state.n_motion
+        """Derivatives, limb by limb; the shape moves both bodies."""
         for rows, columns, J in self.steps.blocks(*((state, self.other) if self.backwards else (self.other, state)), shape):
-            mine = ((columns >= first) & (columns < first + D)) | (columns >= 2 * D)
-            own = columns[mine]
-            yield rows, np.where(own < 2 * D, own - first, own - D), J[:, mine]
+            own, columns = state.layout.one_of_two(columns, second=not self.backwards)
+            yield rows, columns, J[:, own]
 
 
 def _local(state: BodyState, bone: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
@@ -88,7 +87,7 @@ def _local(state: BodyState, bone: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
 
 
 def _derivative(state: BodyState, bone: int, xyz_m: np.ndarray) -> np.ndarray:
-    """Of the local points of one bone, to the DOFs and lengths of its chain (N, 3, d + l)."""
+    """Derivative (N, 3, d + l) of points in one bone's axes with respect to the DOFs and lengths of its chain."""
     sk = state.skeleton
     dofs, lengths = state.parts[bone].chain
     turns = cross(state.axes[dofs], xyz_m[:, None] - state.head_m[sk.dof_bone[dofs]])

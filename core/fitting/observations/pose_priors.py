@@ -1,7 +1,13 @@
-"""Parameters believed to lie near a value: (θ − mean) / σ. Used for the prediction 2θ_i − θ_{i−1}, for weak priors about twist, and
-for radii (in logarithms, so that σ is relative).
+"""Gaussian priors of parameters:
 
-Joint limits as soft one-sided observations: r = max(0, θ − θ_max) / σ and r = max(0, θ_min − θ) / σ, σ about 2°.
+    (θ − mean) / σ = ε                                                                                    (1)
+
+For the prediction 2θ_i − θ_{i−1}, for DOFs that observations hardly constrain (twist), and for radii (in logarithms, so that σ is
+relative).
+
+Joint limits as soft one-sided observations:
+
+max(0, θ − θ_max) / σ = ε ,    min(0, θ − θ_min) / σ = ε ,    σ about 2°                              (1)
 """
 
 from collections.abc import Iterator
@@ -14,7 +20,7 @@ from ..state import Block, BodyState, FromBlocks, shape_vector
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosePrior(FromBlocks):
-    """Mean and sigma of every DOF (D,), rad or metres; an infinite sigma believes nothing."""
+    """Mean and sigma of every DOF (D,), rad or metres; with an infinite sigma there is no prior.  (1)"""
 
     mean: np.ndarray
     sigma: np.ndarray
@@ -26,8 +32,8 @@ class PosePrior(FromBlocks):
         return (state.motion - self.mean) / self.sigma
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
-        """Diagonal, to the motion."""
-        every = np.arange(state.n_motion)
+        """Diagonal, with respect to the pose."""
+        every = np.arange(state.layout.n_pose)
         yield every, every, np.diag(1 / np.broadcast_to(self.sigma, state.motion.shape))
 
     @property
@@ -38,7 +44,7 @@ class PosePrior(FromBlocks):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapePrior:
-    """Mean and sigma of the shape vector (S,), logarithms of lengths and cross radii; an infinite sigma believes nothing."""
+    """Mean and sigma of the shape vector (S,), logarithms of lengths and cross radii; with an infinite sigma there is no prior.  (1)"""
 
     mean: np.ndarray
     sigma: np.ndarray
@@ -51,15 +57,15 @@ class ShapePrior:
 
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(S, D + S); zeros (S, D) without shape"""
-        J = np.zeros((state.n_shape, state.n_motion + (state.n_shape if shape else 0)))
+        J = state.layout.empty_jacobian(state.layout.n_shape, shape)
         if shape:
-            J[:, state.n_motion :] = np.diag(1 / self.sigma)
+            J[:, state.layout.columns("shape")] = np.diag(1 / self.sigma)
         return J
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointLimits(FromBlocks):
-    """Lowest and highest value of every DOF (D,); infinite: free."""
+    """Lowest and highest value of every DOF (D,); infinite: free.  (1)"""
 
     low: np.ndarray
     high: np.ndarray
@@ -72,7 +78,7 @@ class JointLimits(FromBlocks):
         return (np.maximum(state.motion - self.high, 0.0) + np.minimum(state.motion - self.low, 0.0)) / self.sigma
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
-        """Diagonal, for the DOFs that are beyond a limit."""
+        """Diagonal, for the DOFs beyond a limit."""
         beyond = np.flatnonzero((state.motion > self.high) | (state.motion < self.low))
         yield beyond, beyond, np.eye(len(beyond)) / self.sigma
 

@@ -1,15 +1,15 @@
-"""Limbs do not go through each other or the trunk: a place on a limb's axis keeps the limb's radius away from another part's surface.
+"""No self-collision: a place on a limb's axis stays the limb's radius away from another part's surface.
 
     r = max(0, ρ − D(F(X)) / |∇D|) / σ ,    D = √(−½ ln F) − √(½ ln 2)                                     (1)
 
-X lies at a fraction of a bone, F is the field of the other part, |∇D| and the radius ρ are those of the state of `scaled`. What is hidden
-behind the trunk is measured by nothing; that it is not inside the trunk is known all the same.
+X lies at a fraction of a bone, F is the field of the other part; |∇D| and the radius ρ are constants, evaluated at a reference state. A
+limb that the trunk occludes is measured by nothing; this at least keeps it out of the trunk.
 
-Which places of which limbs are near which other parts of the body, and are to stay outside of them (observations.apart).
+Places on limbs that are near other parts of the body, and have to stay outside of them (`observations.SelfCollision`).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,29 +17,34 @@ from ...body.skeleton import Skeleton
 from ..part_field import PartField
 from ..state import Block, BodyState, FromBlocks
 
+LEAST_SLOPE = 0.3  # of |∇D|, in units of 1 / (mean l of the part): on a limb's axis it vanishes
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SelfCollision(FromBlocks):
-    """N places on limbs, each beside another bone's part."""
+    """N places on limbs, each with the part of another bone to stay out of.  (1)"""
 
     bone: np.ndarray  # (N,) of the limb
     fraction: np.ndarray  # (N,) of the bone's length
     other: np.ndarray  # (N,) bone of the other part
     radius_m: np.ndarray  # (N,) of the limb there
     sigma_m: float
-    slope: np.ndarray | None = None  # (N,) |∇D| at the state of `scaled`, 1/m
+    slope: np.ndarray  # (N,) |∇D| at the reference state, 1/m
     kind: str = ""
     variance_inflation: float = 1.0
 
-    def scaled(self, state: BodyState) -> "SelfCollision":
-        """The same places with |∇D| of this state."""
-        X, slope = self._places(state), np.empty(len(self.bone))
-        for c in np.unique(self.other).tolist():
-            rows = np.flatnonzero(self.other == c)
-            field = PartField(state.parts[c], state, X[rows])
+    @staticmethod
+    def about(
+        reference: BodyState, *, bone: np.ndarray, fraction: np.ndarray, other: np.ndarray, radius_m: np.ndarray, sigma_m: float
+    ) -> "SelfCollision":
+        """The observations of places, with |∇D| of a reference state."""
+        X, slope = _places(reference, bone, fraction), np.empty(len(bone))
+        for c in np.unique(other).tolist():
+            rows = np.flatnonzero(other == c)
+            field = PartField(reference.parts[c], reference, X[rows])
             steep = np.linalg.norm(field.gradient, axis=1) * np.abs(field.distance[1])
-            slope[rows] = np.maximum(steep, 0.3 / state.balls.radii_m[field.part.balls].mean())
-        return replace(self, slope=slope)
+            slope[rows] = np.maximum(steep, LEAST_SLOPE / reference.balls.radii_m[field.part.balls].mean())
+        return SelfCollision(bone=bone, fraction=fraction, other=other, radius_m=radius_m, sigma_m=sigma_m, slope=slope)
 
     @property
     def size(self) -> int:
@@ -48,47 +53,37 @@ class SelfCollision(FromBlocks):
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(N,)"""
-        X, missing = self._places(state), np.empty(len(self.bone))
+        X, missing = _places(state, self.bone, self.fraction), np.empty(len(self.bone))
         for c in np.unique(self.other).tolist():
             rows = np.flatnonzero(self.other == c)
-            missing[rows] = self.radius_m[rows] - PartField(state.parts[c], state, X[rows]).distance[0] / self._slope[rows]
+            missing[rows] = self.radius_m[rows] - PartField(state.parts[c], state, X[rows]).distance[0] / self.slope[rows]
         return np.maximum(missing, 0.0) / self.sigma_m
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
-        """Derivatives, place by place that is too near; the radii of the limbs are held."""
+        """Derivatives, place by place, of those that are too near; the radii of the limbs are constants."""
         near = np.flatnonzero(self.residual(state) > 0)
-        X = self._places(state)
+        X, at = _places(state, self.bone, self.fraction), state.layout
         for row in near.tolist():
             part = state.parts[int(self.other[row])]
             field = PartField(part, state, X[row : row + 1])
             own, J = part.columns(shape), field.jacobian(shape)[0]
             dofs, lengths = state.parts[int(self.bone[row])].chain
             moved, stretched = self._derivative(state, row, X[row])
-            full = np.zeros(state.n_motion + (state.n_shape if shape else 0))
+            full = np.zeros(at.size(shape))
             full[own] = J
             full[dofs] += field.gradient[0] @ moved
             if shape:
-                full[state.n_motion + lengths] += field.gradient[0] @ stretched
-                full[state.n_motion + self.bone[row]] += field.gradient[0] @ self._along(state, row)
+                full[at.lengths(lengths)] += field.gradient[0] @ stretched
+                full[at.lengths(self.bone[row])] += field.gradient[0] @ self._along(state, row)
             columns = np.flatnonzero(full)
-            yield np.array([row]), columns, (-field.distance[1][0] / self._slope[row] / self.sigma_m * full[columns])[None]
-
-    @property
-    def _slope(self) -> np.ndarray:
-        if self.slope is None:
-            raise ValueError("limbs apart need `scaled(state)` first")
-        return self.slope
-
-    def _places(self, state: BodyState) -> np.ndarray:
-        along = self.fraction * state.lengths_m[self.bone]
-        return np.asarray(state.head_m[self.bone] + along[:, None] * state.R[self.bone][:, :, 1])
+            yield np.array([row]), columns, (-field.distance[1][0] / self.slope[row] / self.sigma_m * full[columns])[None]
 
     def _along(self, state: BodyState, row: int) -> np.ndarray:
         b = int(self.bone[row])
         return np.asarray(self.fraction[row] * state.lengths_m[b] * state.R[b][:, 1])
 
     def _derivative(self, state: BodyState, row: int, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of the place to the DOFs (3, d) and to ln of the lengths before it (3, l)."""
+        """Derivatives of the place with respect to the DOFs (3, d) and to ln of the lengths before it (3, l)."""
         skeleton = state.skeleton
         dofs, lengths = state.parts[int(self.bone[row])].chain
         turns = np.cross(state.axes[dofs], X - state.head_m[skeleton.dof_bone[dofs]])
@@ -96,10 +91,16 @@ class SelfCollision(FromBlocks):
         return turns.T, (state.lengths_m[lengths, None] * state.R[lengths, :, 1]).T
 
 
-FRACTIONS = (0.65, 1.0)  # of a limb's bone: nearer its head it grows out of the others
-SOFT = 0.8  # flesh gives way: of the limb's radius
+def _places(state: BodyState, bone: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """X of (1): places (N, 3) at fractions (N,) of bones (N,)."""
+    along = fraction * state.lengths_m[bone]
+    return np.asarray(state.head_m[bone] + along[:, None] * state.R[bone][:, :, 1])
+
+
+FRACTIONS = (0.65, 1.0)  # of a limb's bone: nearer its head it joins the others
+SOFTNESS = 0.8  # of the limb's radius: flesh is compressed
 SIGMA_M = 0.01
-NEAR_M = 0.03
+NEAR_M = 0.03  # between the surfaces, for an observation
 
 
 class CollisionPairs:
@@ -126,10 +127,15 @@ class CollisionPairs:
         near = np.flatnonzero(away < radius[bone].min(axis=1) + radius[other].max(axis=1) + NEAR_M)
         if not len(near):
             return []
-        found = SelfCollision(
-            bone=bone[near], fraction=fraction[near], other=other[near], radius_m=SOFT * radius[bone[near]].min(axis=1), sigma_m=SIGMA_M
+        found = SelfCollision.about(
+            state,
+            bone=bone[near],
+            fraction=fraction[near],
+            other=other[near],
+            radius_m=SOFTNESS * radius[bone[near]].min(axis=1),
+            sigma_m=SIGMA_M,
         )
-        return [found.scaled(state)]
+        return [found]
 
 
 def _radii(state: BodyState) -> np.ndarray:

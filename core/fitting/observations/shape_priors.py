@@ -1,29 +1,35 @@
-"""What is believed of the bone lengths together, as a person's proportions: ln L ~ N(mean, covariance).  (`bone_lengths`)
+"""Joint prior of the bone lengths, a person's proportions (`bone_lengths`): with WᵀW the inverse of the covariance,
 
-Limbs are nearly round, trunks as flat as the model's: ln l_x − ln l_z = ln of the model's ratio + ε for every ball, σ about 10 %.
+W (ln L − mean) = ε                                                                                   (1)
 
-Points seen from one side cannot tell depth from thickness.
+Limbs are nearly round, trunks as flat as the model's. For every ball, with the model's cross radii l_x⁰ and l_z⁰,
 
-Both sides of a body are alike: the logarithms of a length or radius on the left and on the right differ by 0 ± sigma.
+    (ln l_x − ln l_z − ln (l_x⁰ / l_z⁰)) / σ = ε ,    σ about 10 %                                         (1)
 
-People's bones do by 1 to 2 % at most (Auerbach & Ruff 2006, J. Hum. Evol. 50: 203-218), their flesh by more.
+Points from one side of a limb determine its depth and its thickness only together.
 
-What is believed of the bone lengths before anything but clicks is looked at.
+Both sides of a body are alike: for a length or radius p on the left and on the right,
+
+    (ln p_L − ln p_R) / σ = ε                                                                             (1)
+
+People's bones differ by 1 to 2 % at most (Auerbach & Ruff 2006, J. Hum. Evol. 50: 203-218), their flesh by more.
+
+The prior of the bone lengths.
 
     ln L_b = ln L_b,model + g + c_k + d_b + j_b ,   g ~ N(0, σ_g²) ,   c_k ~ N(0, σ_k²) ,   d_b ~ N(0, σ_d²)                (1)
     σ_k² = σ_c⁴ / (σ_c² + (e / L_k)²)                                                                                  (2)
 
-g is the person's size: all bones share it. d_b is what one bone is longer or shorter than in other people of that size, a few per cent.
-c_k belongs to a chain k of bones whose two ends were clicked: there the length is what was clicked (a joint is where the operator, or a
-detector, sees it, not where the anatomist does), so it is free by σ_c, as far as two clicks that are off by e tell a length L_k (2); a
-neck is too short for them. Inside a chain (collarbones; pelvis, spine and chest), and where nobody clicked at all (head, hands), bones
-keep the model's proportions: clouds and outlines show no joints there, and what a body differs from its balls (a cap, fingers, loose
-clothes) it differs in all frames alike. However many they are, frames do not outvote σ_d nor σ_g, which count as often as they do: else
-what nobody clicked grows together with all the rest, for chains that were clicked follow by c_k.
+g is the person's size, common to all bones. d_b is the deviation of one bone from those of other people of that size, a few per cent. c_k
+belongs to a chain k of bones whose two ends were clicked: there the length is the clicked one (an operator or a detector places a joint
+elsewhere than an anatomist), so it is free by σ_c, as far as two clicks with an error e determine a length L_k (2); a neck is too short for
+that. Inside a chain (collarbones; pelvis, spine and chest), and where nothing was clicked (head, hands), bones have the model's
+proportions: clouds and outlines show no joints there, and the model's error (a cap, fingers, loose clothes) is the same in all frames.
+However many they are, frames must not outvote σ_d and σ_g, which count once for each of them: otherwise unclicked bones grow with the
+others, while clicked chains adapt by c_k.
 
-j_b ~ N(0, model.length_sigma²) is for a joint that has no place of its own that people agree on, clicked or not. A neck's base is taken
-anywhere between the breastbone and the vertebrae in the middle of the neck, 25 mm up or down. A neck that keeps its proportions above such
-a click lifts the skull off the head that was measured; one with j_b is as long as the head's surface says.
+j_b ~ N(0, model.length_sigma²) is for a joint without an agreed place, clicked or not. A neck's base is placed anywhere between the
+breastbone and the vertebrae in the middle of the neck, 25 mm up or down. A neck of fixed proportions above such a click lifts the skull off
+the measured head; with j_b its length follows from the head's surface.
 """
 
 from collections.abc import Sequence
@@ -47,15 +53,14 @@ class Proportions:
     variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
-        """(B,) W (ln L − mean), with WᵀW the inverse of the covariance."""
+        """(B,)  (1)"""
         return np.asarray(self._root @ (np.log(state.lengths_m) - self.mean))
 
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(B, D + S); zeros (B, D) without shape"""
-        b = len(self.mean)
-        J = np.zeros((b, state.n_motion + (state.n_shape if shape else 0)))
+        J = state.layout.empty_jacobian(len(self.mean), shape)
         if shape:
-            J[:, state.n_motion : state.n_motion + b] = self._root
+            J[:, state.layout.columns("lengths")] = self._root
         return J
 
     @cached_property
@@ -65,7 +70,7 @@ class Proportions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EqualRadii:
-    """One observation for each of the M balls."""
+    """One observation (1) for each of the M balls."""
 
     sigma: float
     log_ratio: np.ndarray | float = 0.0  # (M,) the model's ln l_x − ln l_z
@@ -79,16 +84,16 @@ class EqualRadii:
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(M, D + S); zeros (M, D) without shape"""
         m = len(state.balls.weight)
-        J = np.zeros((m, state.n_motion + (state.n_shape if shape else 0)))
+        J = state.layout.empty_jacobian(m, shape)
         if shape:
-            rows, first = np.arange(m), state.n_motion + len(state.lengths_m) + 2 * np.arange(m)
-            J[rows, first], J[rows, first + 1] = 1 / self.sigma, -1 / self.sigma
+            rows, (x, z) = np.arange(m), state.layout.radii(np.arange(m)).T
+            J[rows, x], J[rows, z] = 1 / self.sigma, -1 / self.sigma
         return J
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Symmetry:
-    """K pairs of shape parameters."""
+    """K pairs of shape parameters.  (1)"""
 
     left: np.ndarray  # (K,) indices in the shape vector
     right: np.ndarray  # (K,)
@@ -103,15 +108,15 @@ class Symmetry:
 
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
         """(K, D + S); zeros (K, D) without shape"""
-        J = np.zeros((len(self.left), state.n_motion + (state.n_shape if shape else 0)))
+        J = state.layout.empty_jacobian(len(self.left), shape)
         if shape:
-            rows = np.arange(len(self.left))
-            J[rows, state.n_motion + self.left], J[rows, state.n_motion + self.right] = 1 / self.sigma, -1 / self.sigma
+            rows, at = np.arange(len(self.left)), state.layout
+            J[rows, at.shape_columns(self.left)], J[rows, at.shape_columns(self.right)] = 1 / self.sigma, -1 / self.sigma
         return J
 
 
 STATURE_SIGMA = 0.07  # relative, of a person about the model
-CLICKS_OFF_M = 0.02  # of both ends of a length together
+CLICK_ERROR_M = 0.02  # e of (2), of both ends of a length together
 
 
 def proportions(
@@ -122,18 +127,18 @@ def proportions(
     own_sigma: float,
     stature_sigma: float = STATURE_SIGMA,
 ) -> Proportions:
-    """(1) about the lengths (B,) of a model, when some joints (J,) have places: σ_c, σ_d and σ_g. Lengths that are known fix the size."""
+    """(1) about the lengths (B,) of a model, with joints (J,) that were located: σ_c, σ_d and σ_g. Given lengths fix the size."""
     stature = min(stature_sigma, clicked_sigma)
     of_joints = np.minimum(model.length_sigma, 2 * clicked_sigma)
-    covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(own_sigma**2 + of_joints**2)
+    covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(own_sigma**2 + of_joints**2)  # (1)
     for chain in clicked_chains(model.skeleton, located):
-        of_clicks = (CLICKS_OFF_M / lengths_m[chain].sum()) ** 2
+        of_clicks = (CLICK_ERROR_M / lengths_m[chain].sum()) ** 2
         covariance[np.ix_(chain, chain)] += clicked_sigma**4 / (clicked_sigma**2 + of_clicks)  # (2)
     return Proportions(mean=np.log(lengths_m), covariance=covariance)
 
 
 def clicked_chains(skeleton: Skeleton, located: np.ndarray) -> list[list[int]]:
-    """The bones that have joints with places (J,) on both sides, those together that follow each other without such a joint or a fork."""
+    """The bones with `located` joints (J,) on both sides; those in a row without such a joint or a fork between them are one chain."""
     joint = {name: i for i, name in enumerate(skeleton.joint_names)}
     ends = [(joint[bone.head_joint], joint[bone.tail_joint]) for bone in skeleton.bones]
     chains = [[b] for b in range(len(ends)) if _clicked_on_both_sides(ends, b, located)]

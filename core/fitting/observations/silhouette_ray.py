@@ -1,57 +1,69 @@
-"""Silhouettes: the ray through a point of the contour touches the body's surface (Plänkers & Fua 2003; SCIENCE: D'Apuzzo et al. 1999, §4).
+"""Silhouettes: the ray through a point of the contour touches the body's surface (Plänkers & Fua 2003; D'Apuzzo et al. 1999, §4).
 
     t* = argmax_t F(o + t u) ,   √(−½ ln F(o + t* u)) − √(½ ln 2) = ε                                    (1)
 
-Because ∂F/∂t = 0 at t*, derivatives of F(o + t* u) need none of t* (envelope theorem): they are those of a surface point held there.
+Because ∂F/∂t = 0 at t*, derivatives of F(o + t* u) need none of t* (envelope theorem): they are those of a surface point fixed there.
 t* starts at the best of the closest approaches to the single balls, t = −(M o)·(M u)/|M u|² with M = diag(1/l) Rᵀ.
-A ray belongs to one bone's part, whose field is meant. The sigma is that of the contour in the image, carried to the ray's depth.
+A ray belongs to one bone's part, whose field is F. The sigma is that of the contour in the image, carried to the ray's depth.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..state import Block, BodyState, FromBlocks
 from .surface_point import SurfacePoints
 
-MEAN_STEPS, NEWTON_STEPS, LONGEST_M = 10, 5, 0.01
+MEAN_STEPS, NEWTON_STEPS = 10, 5  # iterations for t* from the closest approach: fixed point, then Newton
+LONGEST_M = 0.01  # of a Newton step: where ln F is hardly curved it would be far too long
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SilhouetteRays(FromBlocks):
-    """N rays through contour points, each tangent to one bone's part."""
+    """N rays through contour points, each tangent to one bone's part, with weights from a reference state (`SilhouetteRays.about`)."""
 
     origin_m: np.ndarray  # (N, 3) camera centres
     direction: np.ndarray  # (N, 3) unit vectors
     bone: np.ndarray  # (N,)
     sigma_m: np.ndarray  # (N,) Z/f · σ_px
-    variance_inflation: np.ndarray | float = 1.0
-    held: SurfacePoints | None = None  # the touching points with their weights, at the state of `scaled`
-    along_m: np.ndarray | None = None  # (N,) where they lie on their rays: at other states they are looked for from there
+    variance_inflation: np.ndarray | float
+    tangent: SurfacePoints  # the points of contact at the reference state, with their weights
+    along_m: np.ndarray  # (N,) their places on the rays, from which t* is iterated at other states
     kind: str = "contours"
 
-    def scaled(self, state: BodyState) -> "SilhouetteRays":
-        """The same rays with weights for this state."""
-        X = replace(self, along_m=None).touching(state)
-        along = np.einsum("ni,ni->n", X - self.origin_m, self.direction)
-        return replace(self, held=SurfacePoints(xyz_m=X, bone=self.bone, sigma_m=self.sigma_m).scaled(state), along_m=along)
+    @staticmethod
+    def about(
+        reference: BodyState,
+        *,
+        origin_m: np.ndarray,
+        direction: np.ndarray,
+        bone: np.ndarray,
+        sigma_m: np.ndarray,
+        variance_inflation: np.ndarray | float = 1.0,
+    ) -> "SilhouetteRays":
+        """The observations of rays, with weights from a reference state."""
+        X = _contacts(reference, origin_m, direction, bone)
+        return SilhouetteRays(
+            origin_m=origin_m,
+            direction=direction,
+            bone=bone,
+            sigma_m=sigma_m,
+            variance_inflation=variance_inflation,
+            tangent=SurfacePoints.about(reference, xyz_m=X, bone=bone, sigma_m=sigma_m),
+            along_m=np.einsum("ni,ni->n", X - origin_m, direction),
+        )
 
-    def touching(self, state: BodyState) -> np.ndarray:
+    def contacts(self, state: BodyState) -> np.ndarray:
         """The points (N, 3) where the field along each ray is largest.  (1)"""
-        X = np.empty_like(self.origin_m)
-        for b in np.unique(self.bone):
-            rows = np.flatnonzero(self.bone == b)
-            start = None if self.along_m is None else self.along_m[rows]
-            X[rows] = _largest_field(state, int(b), self.origin_m[rows], self.direction[rows], start)
-        return X
+        return _contacts(state, self.origin_m, self.direction, self.bone, self.along_m)
 
     def residual(self, state: BodyState) -> np.ndarray:
         """(N,)"""
         return self._points(state).residual(state)
 
     def blocks(self, state: BodyState, shape: bool = True) -> Iterator[Block]:
-        """Derivatives at fixed t*, part by part."""
+        """Derivatives at constant t*, part by part."""
         yield from self._points(state).blocks(state, shape)
 
     @property
@@ -60,13 +72,22 @@ class SilhouetteRays(FromBlocks):
         return len(self.bone)
 
     def _points(self, state: BodyState) -> SurfacePoints:
-        if self.held is None:
-            raise ValueError("silhouette rays need `scaled(state)` first")
-        return self.held.at(self.touching(state))
+        return self.tangent.moved(self.contacts(state))
+
+
+def _contacts(
+    state: BodyState, origin_m: np.ndarray, direction: np.ndarray, bone: np.ndarray, start: np.ndarray | None = None
+) -> np.ndarray:
+    """The points (N, 3) of (1); `start` (N,) where t* is iterated from, else from the closest approaches to the balls."""
+    X = np.empty_like(origin_m)
+    for b in np.unique(bone):
+        rows = np.flatnonzero(bone == b)
+        X[rows] = _largest_field(state, int(b), origin_m[rows], direction[rows], None if start is None else start[rows])
+    return X
 
 
 def _largest_field(state: BodyState, bone: int, origin: np.ndarray, direction: np.ndarray, start: np.ndarray | None) -> np.ndarray:
-    """Along a ray the field is Σ w exp(−2 (a t² + 2 b t + c)): its shares p_i give t = −Σ p b / Σ p a, then Newton's steps on ln F."""
+    """Along a ray the field is Σ w exp(−2 (a t² + 2 b t + c)): the balls' shares p give t = −Σ p b / Σ p a; then Newton on ln F."""
     part, balls = state.parts[bone], state.balls
     own, of = part.balls, balls.bone_index[part.balls]
     centre = state.head_m[of] + np.einsum("mij,mj->mi", state.R[of], balls.centre[own] * state.lengths_m[of, None])

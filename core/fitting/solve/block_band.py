@@ -3,8 +3,8 @@
     | A   B | |x|   |g|      A: block band, D×D blocks, coupled to the next two frames
     | Bᵀ  C | |s| = |h|
 
-Cholesky of the band, Schur complement for the shape, and the blocks of the inverse that covariances need.
-Cost and memory grow linearly with the number of frames.
+Cholesky of the band, Schur complement for the shape, and the blocks of the inverse for covariances. Cost and memory grow linearly with
+the number of frames.
 """
 
 from dataclasses import dataclass
@@ -38,24 +38,24 @@ class NormalEquations:
             h=np.zeros(S),
         )
 
-    def hold(self, motion: np.ndarray) -> None:
+    def fix(self, dofs: np.ndarray) -> None:
         """Take some of the D unknowns (K,) out of every frame: they keep their values. Their variance in the inverse is 1."""
-        if not len(motion):
+        if not len(dofs):
             return
         for blocks in (self.diagonal, self.next1, self.next2):
-            blocks[:, motion, :] = 0.0
-            blocks[:, :, motion] = 0.0
-        self.diagonal[:, motion, motion] = 1.0
-        self.border[:, motion] = 0.0
-        self.g[:, motion] = 0.0
+            blocks[:, dofs, :] = 0.0
+            blocks[:, :, dofs] = 0.0
+        self.diagonal[:, dofs, dofs] = 1.0
+        self.border[:, dofs] = 0.0
+        self.g[:, dofs] = 0.0
 
-    def solve(self, damping: float = 0.0, held_back: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """x (T, D) and s (S,), with the diagonal multiplied by 1 + damping (Marquardt), and more by as much as frames are `held_back` (T,).
+    def solve(self, damping: float = 0.0, absolute: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """x (T, D) and s (S,), with the diagonal multiplied by 1 + damping (Marquardt), plus an `absolute` damping (T,) (Levenberg).
 
         Raises:
             numpy.linalg.LinAlgError: the equations are not positive definite.
         """
-        factor = Factor(self, damping, held_back)
+        factor = Factor(self, damping, absolute)
         rhs = factor.solve(np.concatenate([self.g[..., None], self.border], axis=2))
         free, V = rhs[..., 0], rhs[..., 1:]
         schur = self.corner + damping * np.diag(np.diag(self.corner)) - np.einsum("tds,tdr->sr", self.border, V)
@@ -65,7 +65,7 @@ class NormalEquations:
     def covariance(self, shape: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Blocks of the inverse: pose (T, D, D), pose with shape (T, D, S), shape (S, S).
 
-        With a covariance of the `shape` from elsewhere, what the poses are for it.
+        With the covariance (S, S) of a `shape` that was estimated elsewhere, the other blocks follow from it.
         """
         V = Factor(self, 0.0).solve(self.border)
         if shape is None:
@@ -89,12 +89,12 @@ def reversed_in_time(equations: NormalEquations) -> NormalEquations:
 
 
 def eliminated(equations: NormalEquations, frames: int) -> NormalEquations:
-    """What is left of the equations when the first `frames` are eliminated; `frames` is at most T − 2."""
+    """The reduced equations after elimination of the first `frames`, at most T − 2 (Schur complement)."""
     e = equations
     A, C, border, g = e.diagonal.copy(), e.next1.copy(), e.border.copy(), e.g.copy()
     corner, h, D = e.corner.copy(), e.h.copy(), e.g.shape[1]
     for t in range(frames):
-        below = np.concatenate([C[t], e.next2[t]])  # what couples frames t + 1 and t + 2 (rows) with t
+        below = np.concatenate([C[t], e.next2[t]])  # couples frames t + 1 and t + 2 (rows) with t
         K = np.linalg.solve(A[t], np.concatenate([below.T, border[t], g[t][:, None]], axis=1))
         ahead, shape, free = K[:, : 2 * D], K[:, 2 * D : -1], K[:, -1]
         less = below @ ahead
@@ -113,11 +113,11 @@ def eliminated(equations: NormalEquations, frames: int) -> NormalEquations:
 class Factor:
     """Cholesky factor of the band: inverses of the diagonal blocks, and the two blocks below each."""
 
-    def __init__(self, equations: NormalEquations, damping: float, held_back: np.ndarray | None = None) -> None:
+    def __init__(self, equations: NormalEquations, damping: float, absolute: np.ndarray | None = None) -> None:
         e, T = equations, len(equations.diagonal)
         self.inverse, self.below1, self.below2 = np.empty_like(e.diagonal), np.empty_like(e.next1), np.empty_like(e.next2)
         for t in range(T):
-            A = e.diagonal[t] + np.diag(damping * np.diag(e.diagonal[t]) + (0.0 if held_back is None else held_back[t]))
+            A = e.diagonal[t] + np.diag(damping * np.diag(e.diagonal[t]) + (0.0 if absolute is None else absolute[t]))
             if t > 0:
                 A = A - self.below1[t - 1] @ self.below1[t - 1].T
             if t > 1:
@@ -150,8 +150,8 @@ class Factor:
 def inverse_blocks(equations: NormalEquations) -> np.ndarray:
     """The diagonal blocks (T, D, D) of A⁻¹, by elimination from both ends: Z_k = (S_k + U_k − A_k)⁻¹ for block-tridiagonal A.
 
-    S_k is what is left of A_k when all before it is eliminated, U_k when all after it is. Two frames make one block. (The recursion over
-    the factor's columns, Takahashi 1973, needs half the work but loses all digits in long gaps without points.)
+    S_k is the Schur complement of A_k after elimination of all before it, U_k of all after it. Two frames make one block. (The recursion
+    over the factor's columns, Takahashi 1973, needs half the work but loses all digits in long gaps without points.)
     """
     A, C, D = *_pairs(equations), equations.g.shape[1]
     S, U = A.copy(), A.copy()
@@ -165,7 +165,7 @@ def inverse_blocks(equations: NormalEquations) -> np.ndarray:
 
 
 def _pairs(equations: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
-    """The band as blocks of two frames: diagonal (K, 2D, 2D) and what couples block k + 1 (rows) with k (K−1, 2D, 2D)."""
+    """The band as blocks of two frames: diagonal (K, 2D, 2D) and the coupling of block k + 1 (rows) with k (K−1, 2D, 2D)."""
     e, (T, D) = equations, equations.g.shape
     K = (T + 1) // 2
     A, C = np.zeros((K, 2 * D, 2 * D)), np.zeros((K - 1, 2 * D, 2 * D))

@@ -1,10 +1,10 @@
-"""What is adjusted: observations of frames, of pairs of frames, of the shape and of smoothness, and their normal equations.
+"""The adjustment: observations of frames, of pairs of frames, of the shape and of smoothness, and their normal equations.
 
     Σ_t Σ_i w_i (r_i(θ_t, s) / σ0)² + Σ_t Σ_i w_i (r_i(θ_t, θ_{t+1}, s) / σ1)² + Σ_j r_j(s)² + Σ_t |θ̈_t / σ_a|²  →  min          (1)
 
 r are residuals of unit weight (D'Apuzzo et al. 1999, Eqs. 9–12). Measured points and tracked points carry robust weights w and scales
-σ0, σ1 that are estimated from them, and so do contours and keypoints. Which limb a point belongs to is decided anew at every
-linearisation. Holding the shape while the pose is solved is choosing an empty set of free shape parameters.
+σ0, σ1 that are estimated from them, and so do contours and keypoints. Points are assigned to limbs anew at every linearisation. Solving
+the pose with a fixed shape means an empty set of free shape parameters.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ from ..robust import robust_scale, robust_weights, variance_factor
 from ..state import BodyState, ShapeParameters
 from .block_band import NormalEquations
 
-LARGEST_SCALE = {"contours": 1.0}  # a body too thin all around would take that for the outlines' noise, and stay so: outlines are few
+LARGEST_SCALE = {"contours": 1.0}  # outlines are few: a body too thin all around would pass for their noise, and stay thin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,13 +37,13 @@ class Scales:
         return float(getattr(self, kind))
 
     def renewed(self, residuals: Mapping[str, list[np.ndarray]]) -> "Scales":
-        """With the scales of these residuals; what has none keeps its own."""
+        """With the scales of these residuals; kinds without residuals keep theirs."""
         found = {kind: robust_scale(np.concatenate(r), self.of(kind)) for kind, r in residuals.items() if r}
         return replace(self, **found)
 
 
 class Smoothness(Protocol):
-    """What ties the frames of a motion (T, D) as a sum of squares that is quadratic in it."""
+    """What couples the frames of a motion (T, D): a sum of squares that is quadratic in it."""
 
     def cost(self, motion: np.ndarray) -> float:
         """The sum of squares."""
@@ -53,8 +53,17 @@ class Smoothness(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Estimate:
+    """A motion (T, D) and a shape vector (S,), with the scales of the residuals there (scales.points is sigma0)."""
+
+    motion: np.ndarray
+    vector: np.ndarray
+    scales: Scales = field(default_factory=Scales)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Problem:
-    """An adjustment. `observe(t, state)` gives frame t's observations, `observe_step(t, a, b)` those from frame t to t + 1."""
+    """An adjustment. `observe(t, state)` returns frame t's observations, `observe_step(t, a, b)` those from frame t to t + 1."""
 
     parameters: ShapeParameters
     observe: Callable[[int, BodyState], list[Observation]]
@@ -63,26 +72,26 @@ class Problem:
     shape_weight: float = 1.0
     free_shape: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     smoothness: Smoothness | None = None
-    held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))  # DOFs that keep their values
+    fixed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.intp))  # DOFs that keep their values
     robust: str = "geman-mcclure"
     robust_width: float = 3.0
-    monitor: Monitor = field(default_factory=Monitor)  # asked at every frame whether to stop
+    monitor: Monitor = field(default_factory=Monitor)  # checked for cancellation at every frame
 
     @cached_property
-    def place_of_shape(self) -> np.ndarray:
-        """(S,) where each shape parameter stands among the free ones; −1: it is held."""
+    def free_position(self) -> np.ndarray:
+        """(S,) the position of each shape parameter among the free ones; −1: it is fixed."""
         place = np.full(len(self.parameters.layout), -1)
         place[self.free_shape] = np.arange(len(self.free_shape))
         return place
 
     def weights(self, residuals: np.ndarray, scale: float, variance_inflation: np.ndarray | float, largest: float = np.inf) -> np.ndarray:
-        """Weights of robust observations in (1); against other kinds they do not count for less than with the `largest` scale."""
+        """Weights of robust observations in (1); relative to other kinds not less than with the `largest` scale."""
         return robust_weights(residuals / scale, self.robust, self.robust_width) / (min(scale, largest) ** 2 * variance_inflation)
 
 
 @dataclass(eq=False, kw_only=True)
 class Linearised:
-    """Observations with the weights that they have at one motion and shape; the cost and the normal equations there."""
+    """Observations with their weights at one motion and shape; the cost and the normal equations there."""
 
     observations: list[list[tuple[Observation, np.ndarray | float]]]
     steps: list[tuple[MaterialSteps, np.ndarray] | None]
@@ -95,33 +104,33 @@ class Linearised:
         return before.renewed(self.residuals)
 
 
-def linearise(problem: Problem, motion: np.ndarray, vector: np.ndarray, scales: Scales, understated: Scales | None = None) -> Linearised:
-    """Weights, cost and normal equations at a motion (T, D) and shape vector (S,).
+def linearise(problem: Problem, at: Estimate, factors: Scales | None = None) -> Linearised:
+    """Weights, cost and normal equations at a motion and shape vector.
 
-    `understated`: factors by which the variances of points and steps are understated (`variance_factors`); for covariances only.
+    `factors`: variance factors of the kinds of observations (`variance_factors`), for covariances only.
 
     Raises:
         Cancelled: the user asked to stop.
     """
-    factor = understated or Scales()
-    T, D = motion.shape
+    factors, layout = factors or Scales(), problem.parameters.layout
+    T, D = at.motion.shape
     lin = Linearised(observations=[], steps=[], equations=NormalEquations.empty(T, D, len(problem.free_shape)))
-    states = problem.parameters.states(motion, vector)
+    states = problem.parameters.states(at.motion, at.vector)
     for t, state in enumerate(states):
         problem.monitor.check()
-        _add_frame(problem, lin, t, state, scales, factor)
+        _add_frame(problem, lin, t, state, at.scales, factors)
     for t in range(T - 1):
         problem.monitor.check()
-        _add_step(problem, lin, t, states[t], states[t + 1], scales.steps, factor.steps)
+        _add_step(problem, lin, t, states[t], states[t + 1], at.scales.steps, factors.steps)
     for o in problem.shape_observations if len(problem.free_shape) else ():
-        r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, D + problem.free_shape], problem.shape_weight
+        r, J, w = o.residual(states[0]), o.jacobian(states[0])[:, layout.shape_columns(problem.free_shape)], problem.shape_weight
         lin.equations.corner += w * J.T @ J
         lin.equations.h -= w * J.T @ r
         lin.cost += w * float(r @ r)
     if problem.smoothness is not None:
-        problem.smoothness.add_to(lin.equations, motion)
-        lin.cost += problem.smoothness.cost(motion)
-    lin.equations.hold(problem.held)
+        problem.smoothness.add_to(lin.equations, at.motion)
+        lin.cost += problem.smoothness.cost(at.motion)
+    lin.equations.fix(problem.fixed)
     return lin
 
 
@@ -140,7 +149,7 @@ def cost(problem: Problem, lin: Linearised, motion: np.ndarray, vector: np.ndarr
 
 
 def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scales:
-    """By how much the weights understate variances (`robust.variance_factor`)."""
+    """The variance factors of the kinds (`robust.variance_factor`)."""
     return Scales(
         **{
             kind: variance_factor(np.concatenate(r) / scales.of(kind), problem.robust, problem.robust_width)
@@ -151,9 +160,9 @@ def variance_factors(problem: Problem, lin: Linearised, scales: Scales) -> Scale
     )
 
 
-def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, before: Scales) -> Scales:
+def first_scales(problem: Problem, start: Estimate) -> Scales:
     """The scales of the residuals before the first step."""
-    states, residuals = problem.parameters.states(motion, vector), dict[str, list[np.ndarray]]()
+    states, residuals = problem.parameters.states(start.motion, start.vector), dict[str, list[np.ndarray]]()
     for t, state in enumerate(states):
         problem.monitor.check()
         for o in problem.observe(t, state):
@@ -163,11 +172,11 @@ def first_scales(problem: Problem, motion: np.ndarray, vector: np.ndarray, befor
         step = problem.observe_step(t, a, b) if problem.observe_step is not None else None
         if step is not None:
             residuals.setdefault("steps", []).append(step.residual(a, b))
-    return before.renewed(residuals)
+    return start.scales.renewed(residuals)
 
 
 def blocks_of(observation: Observation, state: BodyState, shape: bool) -> Iterable[Block]:
-    """The Jacobian in blocks; one that is not sparse is one block."""
+    """The Jacobian in blocks; a dense one is one block."""
     if isinstance(observation, FromBlocks):
         return observation.blocks(state, shape)
     J = observation.jacobian(state, shape)
@@ -175,7 +184,7 @@ def blocks_of(observation: Observation, state: BodyState, shape: bool) -> Iterab
 
 
 def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scales: Scales, factor: Scales) -> None:
-    e, free, D, frame = lin.equations, problem.free_shape, state.n_motion, []
+    e, free, frame = lin.equations, problem.free_shape, []
     for o in problem.observe(t, state):
         r = o.residual(state)
         w: np.ndarray | float = 1.0
@@ -185,10 +194,9 @@ def _add_frame(problem: Problem, lin: Linearised, t: int, state: BodyState, scal
         frame.append((o, w))
         lin.cost += float(np.sum(w * r * r))
         for rows, columns, J in blocks_of(o, state, len(free) > 0):
-            weighted, columns, J = _free_columns(problem, D, w, rows, columns, J)
+            d, s, J = _free_columns(problem, 1, columns, J)
+            weighted, n = _weighted(J, w, rows), len(d)
             H, g = weighted @ J, weighted @ r[rows]
-            n = int(np.searchsorted(columns, D))  # its DOFs
-            d, s = columns[:n], columns[n:] - D
             e.diagonal[t][d[:, None], d] += H[:n, :n]
             e.g[t][d] -= g[:n]
             if len(s):
@@ -203,17 +211,15 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
     if step is None:
         lin.steps.append(None)
         return
-    e, D = lin.equations, a.n_motion
-    r = step.residual(a, b)
+    e, r = lin.equations, step.residual(a, b)
     w = problem.weights(r, scale, step.variance_inflation) / factor
     lin.steps.append((step, w))
     lin.residuals.setdefault("steps", []).append(r)
     lin.cost += float(np.sum(w * r * r))
     for rows, columns, J in step.blocks(a, b, len(problem.free_shape) > 0):
-        weighted, columns, J = _free_columns(problem, 2 * D, w, rows, columns, J)
-        H, g = weighted @ J, weighted @ r[rows]
-        n = int(np.searchsorted(columns, D))  # its DOFs
-        d, s = columns[:n], columns[2 * n :] - 2 * D
+        both, s, J = _free_columns(problem, 2, columns, J)
+        weighted, n = _weighted(J, w, rows), len(both) // 2
+        H, g, d = weighted @ J, weighted @ r[rows], both[:n]
         A, B, S = slice(0, n), slice(n, 2 * n), slice(2 * n, None)
         dd, ds = (d[:, None], d), (d[:, None], s)
         e.diagonal[t][dd] += H[A, A]
@@ -227,12 +233,16 @@ def _add_step(problem: Problem, lin: Linearised, t: int, a: BodyState, b: BodySt
         e.h[s] -= g[S]
 
 
-def _free_columns(
-    problem: Problem, motion: int, w: np.ndarray | float, rows: np.ndarray, columns: np.ndarray, J: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted transpose (c, n), columns (c,) and J (n, c) of a block without the shape parameters that are held."""
-    if len(columns) and columns[-1] >= motion and len(problem.free_shape) < len(problem.place_of_shape):
-        place = np.where(columns < motion, columns, motion + problem.place_of_shape[np.maximum(columns - motion, 0)])
-        keep = place >= np.where(columns < motion, 0, motion)
-        columns, J = place[keep], J[:, keep]
-    return J.T * (w if np.ndim(w) == 0 else np.asarray(w)[rows]), columns, J
+def _free_columns(problem: Problem, frames: int, columns: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pose columns (p,), positions (s,) among the free shape parameters, and J (n, p + s) of a block, without fixed shape parameters."""
+    pose, shape = problem.parameters.layout.split(columns, frames)
+    if len(shape) and len(problem.free_shape) < len(problem.free_position):
+        position = problem.free_position[shape]
+        keep = np.concatenate([np.ones(len(pose), dtype=bool), position >= 0])
+        shape, J = position[position >= 0], J[:, keep]
+    return pose, shape, J
+
+
+def _weighted(J: np.ndarray, w: np.ndarray | float, rows: np.ndarray) -> np.ndarray:
+    """JᵀW (c, n) of some rows (n,)."""
+    return np.asarray(J.T * (w if np.ndim(w) == 0 else np.asarray(w)[rows]))

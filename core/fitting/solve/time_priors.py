@@ -1,15 +1,17 @@
 """Weak smoothness over time: every DOF's acceleration is zero within a sigma.
 
-a_t = 2/(h1 + h2) · ((θ_{t+1} − θ_t)/h2 − (θ_t − θ_{t−1})/h1) = 0 ± σ ,   h1, h2: the times between the three frames
+a_t = 2/(h1 + h2) · ((θ_{t+1} − θ_t)/h2 − (θ_t − θ_{t−1})/h1) = 0 ± σ ,   h1, h2: the times between the three frames           (1)
 
-What the frames on one side say of the next two, handed over from one stretch of a recording to the next.
+Marginal prior: what all frames on one side of a stretch contribute to its first two, or last two, frames.
 
-Frames i on that side are eliminated from their normal equations (Schur complement); accelerations and tracked points reach two frames far:
+The frames i on that side are eliminated from their normal equations (Schur complement); accelerations and tracked points couple frames that
+are at most two apart, so what is left concerns the poses x of two frames b,
 
-    Λ = A_bb − A_bi A_ii⁻¹ A_ib ,   g = g_b − A_bi A_ii⁻¹ g_i        (x − x₀)ᵀ Λ (x − x₀) − 2 gᵀ (x − x₀)                          (1)
+    Λ = A_bb − A_bi A_ii⁻¹ A_ib ,   g = g_b − A_bi A_ii⁻¹ g_i                                                                     (1)
+    (x − x₀)ᵀ Λ (x − x₀) − 2 gᵀ (x − x₀)  →  min                                                                                  (2)
 
-of the postures x of two frames, with x₀ where it was linearised. Nothing is lost of what is linear: a twist that only tracked points tell
-is known over any number of stretches.
+with x₀ where the equations were linearised. Nothing linear is lost: a twist that only tracked points constrain stays determined over any
+number of stretches.
 """
 
 from dataclasses import dataclass, replace
@@ -19,11 +21,11 @@ import numpy as np
 from ..observations import MaterialSteps, Observation
 from ..state import BodyState
 from .block_band import NormalEquations, eliminated, reversed_in_time
-from .problem import Problem, Scales, linearise
-from .solver import Solution
+from .problem import Estimate, Problem, Scales, linearise
 
-SPAN_S = 0.1  # accelerations of a start are taken over this time, so that its noise does not count
-LEAST = 0.1  # of the loosest sigma: however steady a motion was where it was seen
+SPAN_S = 0.1  # accelerations of a first motion are taken over this time, which averages its noise
+LEAST = 0.1  # of the loosest sigma: however steady the observed motion
+ENOUGH = 3  # second differences of a DOF, for a sigma of its own
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,7 +36,7 @@ class Acceleration:
     sigma: np.ndarray  # (D,) rad/s², m/s²
 
     def coefficients(self) -> np.ndarray:
-        """(T−2, 3) of θ_{t−1}, θ_t, θ_{t+1}."""
+        """(T−2, 3) of θ_{t−1}, θ_t, θ_{t+1} in (1)."""
         h = np.diff(self.time_s)
         h1, h2 = h[:-1], h[1:]
         return (2 / (h1 + h2))[:, None] * np.stack([1 / h1, -1 / h1 - 1 / h2, 1 / h2], axis=1)
@@ -60,25 +62,28 @@ class Acceleration:
             equations.next2[t] += np.diag(c[2] * c[0] * weight)
 
 
-def typical_acceleration(motion: np.ndarray, known: np.ndarray, time_s: np.ndarray, loosest: np.ndarray) -> np.ndarray:
-    """Sigma (D,) of the accelerations of a motion (T, D), from where it is `known` (T, D); between `LEAST` times and once the `loosest`.
+def typical_acceleration(motion: np.ndarray, observed: np.ndarray, time_s: np.ndarray, loosest: np.ndarray) -> np.ndarray:
+    """Sigma (D,) of the accelerations of a motion (T, D) where it is `observed` (T, D), between `LEAST` times the `loosest` and that.
 
-    A hidden limb goes on as that limb moves where it is seen. The root mean square of second differences over `SPAN_S`.
+    An occluded limb is taken to move as that limb does where it is visible. The root mean square of second differences over `SPAN_S`.
     """
     step = max(1, round(SPAN_S / float(np.median(np.diff(time_s))))) if len(time_s) > 1 else 1
     if len(motion) < 2 * step + 3:
         return loosest
     h = (time_s[2 * step :] - time_s[: -2 * step]) / 2
     a = (motion[2 * step :] - 2 * motion[step:-step] + motion[: -2 * step]) / h[:, None] ** 2
-    good = known[2 * step :] & known[step:-step] & known[: -2 * step]
+    good = observed[2 * step :] & observed[step:-step] & observed[: -2 * step]
     count = good.sum(axis=0)
     rms = np.sqrt((np.where(good, a, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1))
-    return np.where(count >= 3, np.clip(rms, LEAST * loosest, loosest), loosest)
+    return np.where(count >= ENOUGH, np.clip(rms, LEAST * loosest, loosest), loosest)
+
+
+SMALLEST_DIAGONAL = 1e-12  # of Λ, before its rows are scaled
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MarginalPrior:
-    """(1) of the first two frames of a stretch, or of the last two."""
+    """(2) of the first two frames of a stretch, or of the last two."""
 
     equations: NormalEquations  # of two frames, in the order of time
     motion: np.ndarray  # (2, D) x₀
@@ -88,7 +93,7 @@ class MarginalPrior:
         return slice(0, 2) if self.first else slice(frames - 2, frames)
 
     def cost(self, motion: np.ndarray) -> float:
-        """(1) at a motion (T, D), with the least that it can be added: it is not negative."""
+        """(2) at a motion (T, D), plus the constant that makes its minimum 0."""
         information, g = self._dense()
         step = (motion[self._rows(len(motion))] - self.motion).ravel()
         return float(step @ information @ step - 2 * g @ step + g @ np.linalg.lstsq(information, g, rcond=None)[0])
@@ -104,42 +109,35 @@ class MarginalPrior:
             equations.border[rows] += self.equations.border
 
     def _dense(self) -> tuple[np.ndarray, np.ndarray]:
+        """Λ (2D, 2D) and g (2D,)."""
         e = self.equations
         return np.block([[e.diagonal[0], e.next1[0].T], [e.next1[0], e.diagonal[1]]]), e.g.ravel()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Coupling:
-    """Accelerations within a stretch, and what the frames beside it say."""
+    """The coupling of the frames of a stretch: accelerations, and the marginal prior from the frames on one side."""
 
     acceleration: Acceleration
-    beside: MarginalPrior | None
+    prior: MarginalPrior | None
 
     def cost(self, motion: np.ndarray) -> float:
         """Sum of squares at a motion (T, D)."""
-        return self.acceleration.cost(motion) + (self.beside.cost(motion) if self.beside is not None else 0.0)
+        return self.acceleration.cost(motion) + (self.prior.cost(motion) if self.prior is not None else 0.0)
 
     def add_to(self, equations: NormalEquations, motion: np.ndarray) -> None:
         """Add the normal equations."""
         self.acceleration.add_to(equations, motion)
-        if self.beside is not None:
-            self.beside.add_to(equations, motion)
+        if self.prior is not None:
+            self.prior.add_to(equations, motion)
 
 
 def marginal_prior(
-    problem: Problem,
-    solution: Solution,
-    own: range,
-    beside: MarginalPrior | None,
-    time_s: np.ndarray,
-    sigma: np.ndarray,
-    *,
-    ahead: bool,
-    understated: Scales | None = None,
+    problem: Problem, at: Estimate, own: range, coupling: Coupling, *, ahead: bool, factors: Scales | None = None
 ) -> MarginalPrior:
-    """What the `own` frames of an adjusted stretch, and those `beside` it, say of the two frames ahead of them or before them.
+    """The prior on the two frames after the `own` frames of an adjusted stretch (`ahead`), or on the two before them.
 
-    `time_s` (T,) are the times of the stretch's frames, `sigma` (D,) those of accelerations, `understated` as in `linearise`.
+    `coupling` of all frames of the stretch, with the prior that the stretch itself was given; `factors` as in `linearise`.
     """
     frames = slice(own.start, own.stop + 2) if ahead else slice(own.start - 2, own.stop)
     first, observe_step = frames.start, problem.observe_step
@@ -150,20 +148,19 @@ def marginal_prior(
     def step(t: int, a: BodyState, b: BodyState) -> MaterialSteps | None:
         return observe_step(t + first, a, b) if observe_step and (t + first in own or t + first + 1 in own) else None
 
-    tied = Coupling(acceleration=Acceleration(time_s=time_s[frames], sigma=sigma), beside=beside)
-    part = replace(problem, smoothness=tied, shape_observations=(), observe=observe, observe_step=step)
-    e = linearise(part, solution.motion[frames], solution.vector, solution.scales, understated).equations
-    left = eliminated(e, len(own)) if ahead else reversed_in_time(eliminated(reversed_in_time(e), len(own)))
-    return MarginalPrior(
-        equations=_definite(left), motion=solution.motion[frames][-2:] if ahead else solution.motion[frames][:2], first=ahead
-    )
+    smoothness = replace(coupling, acceleration=replace(coupling.acceleration, time_s=coupling.acceleration.time_s[frames]))
+    part = replace(problem, smoothness=smoothness, shape_observations=(), observe=observe, observe_step=step)
+    e = linearise(part, Estimate(motion=at.motion[frames], vector=at.vector, scales=at.scales), factors).equations
+    left = eliminated(e, len(own)) if ahead else reversed_in_time(eliminated(reversed_in_time(e), len(own)))  # (1)
+    motion = at.motion[frames]
+    return MarginalPrior(equations=_semidefinite(left), motion=motion[-2:] if ahead else motion[:2], first=ahead)
 
 
-def _definite(e: NormalEquations) -> NormalEquations:
-    """Equations of two frames without the negative eigenvalues that rounding leaves of directions of which nothing is known."""
+def _semidefinite(e: NormalEquations) -> NormalEquations:
+    """Equations of two frames without the negative eigenvalues that rounding leaves in directions that nothing constrains."""
     D = e.g.shape[1]
     A = np.block([[e.diagonal[0], e.next1[0].T], [e.next1[0], e.diagonal[1]]])
-    scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-12))
+    scale = 1 / np.sqrt(np.maximum(np.diag(A), SMALLEST_DIAGONAL))
     values, vectors = np.linalg.eigh((A + A.T) / 2 * scale * scale[:, None])
     A = (vectors * np.maximum(values, 0.0)) @ vectors.T / scale / scale[:, None]
     return replace(e, diagonal=np.stack([A[:D, :D], A[D:, D:]]), next1=A[None, D:, :D])

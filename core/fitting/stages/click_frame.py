@@ -1,4 +1,4 @@
-"""The first body: posture and shape at the frame in which the joints were clicked (D'Apuzzo et al. 1999, §3.3)."""
+"""The first body: pose and shape at the click frame (D'Apuzzo et al. 1999, §3.3)."""
 
 from collections.abc import Callable
 from itertools import chain
@@ -13,25 +13,25 @@ from ..inputs.cloud_points import CloudPoints
 from ..observations import Observation
 from ..observations.shape_priors import clicked_chains
 from ..segmentation import crop
-from ..solve.problem import linearise
+from ..solve.problem import Estimate, linearise
 from ..solve.solver import FURTHEST, Solution, solve
 from ..state import BodyState
 from .hidden_limbs import reacquired_poses
 from .inverse_kinematics import inverse_kinematics, other_poses
 
-REACH_M = 0.20  # points further than this from the clicked limb's surface are not looked at
-WIDE = 1.5  # the gate, as long as the radii are the model's
+REACH_M = 0.20  # of the points that take part, from the surface of the clicked pose
+FIRST_GATE = 1.5  # gate_scale as long as the radii are the model's
 POSE_STEPS, STEPS = 15, 25
-SUSPICIOUS = 3.0  # sigma0 of a posture behind the limb or beside it
+LARGEST_SIGMA0 = 3.0  # of a plausible pose; in front of the limb or past it, sigma0 is larger
 ALTERNATIONS, ALTERNATION_STEPS = 8, 5
-OTHERS_AROUND, AROUND_RAD, AROUND_M = 6, float(np.radians(20.0)), 0.05  # of new starts: six found the true arm in all of 20 trials
-MOST_OTHERS = 12  # of the starts for limbs that nobody clicked, those that explain most points
+OTHERS_AROUND, AROUND_RAD, AROUND_M = 6, float(np.radians(20.0)), 0.05  # of new starts: six led to the true arm in all of 20 trials
+MOST_OTHERS = 12  # starts for limbs without clicks: those that explain most points
 STAGE = "fit the click frame"
-DEPTH_SHIFT_M = 0.04  # clicks from a short base are least certain along the view
+DEPTH_SHIFT_M = 0.04  # of two more starts: with a short base, clicks are least precise along the view
 
 
 def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> Solution:
-    """Motion (1, D) and shape: the best supported of several starts about the clicked posture.
+    """Pose (1, D) and shape: the best supported of several starts about the clicked pose.
 
     Raises:
         InputError: neither measured points nor outlines lie near the clicked joints, and there are no keypoints.
@@ -51,7 +51,7 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
         if not fit.settings.use_surface:
             raise InputError(
                 f"Frame {points.frame} has no outlines near the clicked joints, and without a measured surface "
-                "(fitting.use_surface=false) the body rests on them; give outlines with `tricap contour`."
+                "(fitting.use_surface=false) the body needs them; find outlines with `tricap contour`."
             )
         raise InputError(
             f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
@@ -61,15 +61,15 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
 
 
 def _with_lost_limbs(fit: FitContext, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> Solution:
-    """The solution, or one from where a limb without points explains points that nothing else does.
+    """The solution, or a better one from a start where a limb without points explains points that no other part does.
 
-    Clicks from a short base leave a limb's depth open: bent towards the cameras and away from them look alike.
+    With a short base, clicks hardly determine a limb's depth: bent towards the cameras it looks as bent away from them.
     """
     found = reacquired_poses(fit, points, best.motion[0], best.vector, _try(monitor, 0))
     for i, start in enumerate(found):
         solution = fit_pose_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
         score = fit.score(fit.click, points, solution.motion[0], solution.vector)
-        if score > best_score + fit.settings.min_points / 4:
+        if score > best_score + fit.least_gain:
             best, best_score = solution, score
     return best
 
@@ -77,9 +77,9 @@ def _with_lost_limbs(fit: FitContext, points: CloudPoints, best: Solution, best_
 def fit_pose_and_shape(
     fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor | None = None
 ) -> Solution:
-    """From a motion (D,) and shape (S,) to the points and outlines.
+    """Adjust a pose (D,) and shape (S,) to the points and outlines.
 
-    When the residuals stay suspiciously large, again from the posture of the clicks and from others around it; the best supported is kept.
+    When the residuals stay too large, also from the clicked pose and from others around it; the best supported wins.
 
     Raises:
         Cancelled: the user asked to stop.
@@ -101,50 +101,49 @@ def fit_pose_and_shape(
 
 
 def _try(monitor: Monitor, number: int) -> Monitor:
-    """The monitor of one of several tries, of which nobody knows how many it will take: each counts for half of what is left."""
+    """The monitor of one of an unknown number of tries: each counts for half of what remains."""
     return monitor.part(STAGE, 2 ** (number + 1) - 2, 2 ** (number + 1))
 
 
 def _plausible(solution: Solution) -> bool:
-    return max(solution.scales.points, solution.scales.contours) < SUSPICIOUS
+    return max(solution.scales.points, solution.scales.contours) < LARGEST_SIGMA0
 
 
 def _around(fit: FitContext, motion: np.ndarray) -> np.ndarray:
-    """The posture (D,) and others evenly around it (K, D), always the same ones, within the joints' limits; what is held stays."""
+    """The pose (D,) and others evenly around it (K, D) within the joints' limits, the same in every run; fixed DOFs stay."""
     skeleton = fit.model.skeleton
     spread = np.full(len(motion), AROUND_RAD)
     spread[skeleton.layout.group("base")] = AROUND_M
     spread[skeleton.locked] = 0.0
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
-    moved = motion + spread * (2 * qmc.Halton(len(motion), scramble=False).random(OTHERS_AROUND + 1)[1:] - 1)  # its first is a corner
+    moved = motion + spread * (2 * qmc.Halton(len(motion), scramble=False).random(OTHERS_AROUND + 1)[1:] - 1)  # the first point is a corner
     within = np.where(spread > 0, np.clip(moved, np.minimum(low, motion), np.maximum(high, motion)), motion)
     return np.concatenate([motion[None], within])
 
 
 def _to_surface(fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> Solution:
-    """First the posture, then posture and shape, together or in turns as published: each holds the other."""
+    """First the pose, then pose and shape: together, or alternating as published, each with the other fixed."""
     near = crop(points, fit.parameters.state(motion, vector), REACH_M)
-    ways = 2 if fit.settings.method == "joint" else 2 * ALTERNATIONS
-    parts = iter([monitor.part(STAGE, i, 1 + ways) for i in range(1 + ways)])
-    begun = fit.problem(_observe(fit, near, WIDE))
-    solution = solve(begun, motion[None], vector, steps=POSE_STEPS, furthest=FURTHEST, monitor=next(parts))
+    rounds = 2 if fit.settings.method == "joint" else 2 * ALTERNATIONS
+    parts = iter([monitor.part(STAGE, i, 1 + rounds) for i in range(1 + rounds)])
+    pose_only, start = fit.problem(_observe(fit, near, FIRST_GATE)), Estimate(motion=motion[None], vector=vector)
+    solution = solve(pose_only, start, steps=POSE_STEPS, furthest=FURTHEST, monitor=next(parts))
     if fit.settings.method == "joint":
-        for wide, part in zip((WIDE, 1.0), parts):
-            problem = fit.problem(_observe(fit, near, wide), "shape")
-            solution = solve(problem, solution.motion, solution.vector, steps=STEPS, scales=solution.scales, monitor=part)
+        for gate_scale, part in zip((FIRST_GATE, 1.0), parts):
+            solution = solve(fit.problem(_observe(fit, near, gate_scale), "shape"), solution, steps=STEPS, monitor=part)
         return solution
     for _ in range(ALTERNATIONS):
         for free, part in zip(("shape", None), parts):
-            problem = fit.problem(_observe(fit, near, 1.0), free, hold_motion=free is not None)
-            solution = solve(problem, solution.motion, solution.vector, steps=ALTERNATION_STEPS, scales=solution.scales, monitor=part)
+            problem = fit.problem(_observe(fit, near, 1.0), free, fix_pose=free is not None)
+            solution = solve(problem, solution, steps=ALTERNATION_STEPS, monitor=part)
     return solution
 
 
 def clicked_lengths(fit: FitContext, points: CloudPoints, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
-    """ln of the bone lengths (B,) and their sigmas, as the click frame knows them; infinite for bones that are not between clicks."""
+    """ln of the bone lengths (B,) and their sigmas from the click frame; infinite for bones that are not between clicks."""
     near = crop(points, fit.parameters.state(solution.motion[0], solution.vector), REACH_M)
     problem = fit.problem(_observe(fit, near, 1.0), "shape")
-    covariance = linearise(problem, solution.motion, solution.vector, solution.scales).equations.covariance()[2]
+    covariance = linearise(problem, solution).equations.covariance()[2]
     lengths = fit.parameters.layout.group("lengths")
     between = np.isin(lengths, list(chain.from_iterable(clicked_chains(fit.model.skeleton, fit.located))))
     return solution.vector[lengths], np.where(between, np.sqrt(np.diag(covariance)[lengths]), np.inf)
@@ -167,9 +166,9 @@ def _starts(fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np
     return starts
 
 
-def _observe(fit: FitContext, points: CloudPoints, wide: float) -> Callable[[int, BodyState], list[Observation]]:
+def _observe(fit: FitContext, points: CloudPoints, gate_scale: float) -> Callable[[int, BodyState], list[Observation]]:
     return lambda t, state: [
-        *fit.surface_observations(fit.click, points, state, wide),
+        *fit.surface_observations(fit.click, points, state, gate_scale),
         *fit.joints(fit.click),
         *fit.pose_observations(state),
     ]

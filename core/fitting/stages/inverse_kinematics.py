@@ -1,5 +1,5 @@
-"""From clicked joints to a posture and bone lengths: the trunk as a rigid body, a coarse search outwards along the limbs, then least
-squares in the images.
+"""From clicked joints to a pose and bone lengths: the trunk as a rigid body, a coarse search outwards along the limbs, then least squares
+in the images.
 """
 
 from dataclasses import replace
@@ -12,24 +12,28 @@ from ...body.skeleton import Skeleton, joint_positions
 from ..inputs.clicks import Clicks
 from ..observations import JointLimits, Observation, PosePrior, Proportions
 from ..observations.shape_priors import STATURE_SIGMA
-from ..solve.solver import Problem, Solution, solve
+from ..solve.problem import Estimate, Problem
+from ..solve.solver import Solution, solve
 from ..state import FIRM_PRIOR, ShapeParameters
 
-GRID_STEP = np.radians(25.0)
+GRID_STEP = np.radians(25.0)  # of the coarse search
 FREE_SPAN = np.pi  # search range of a DOF without limits
 STEPS = 40
-LITTLE = np.radians(65.0)  # what bends less belongs to the trunk
-LASTS_S = 0.5
-ENOUGH_BONES = 4
+BASE_SIGMA_M = 10.0
+STIFF = np.radians(65.0)  # a joint that bends less belongs to the trunk
+LEAST_TRUNK_JOINTS = 3  # for the rotation of the trunk
+SMALL_ANGLES = 1e-3  # the weight of angles in the coarse search: of poses that fit alike, the one nearest to rest
+CORRELATION_S = 0.5  # poses closer in time are about the same
+ENOUGH_BONES = 4  # between clicks, for a stature
 OWN_SIGMA = 0.10  # of a clicked bone about its person's proportions
 ANYONES_SIGMA = 0.15  # of a person, a child or a giant, about the model
 CLICKED_STATURE_SIGMA = 0.02  # some sixteen lengths of about 8 % each
 
 
 def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation], lengths: Proportions) -> Solution:
-    """Motion (1, D) and shape vector at the click frame. `priors`: limits and priors about the DOFs.
+    """Pose (1, D) and shape vector at the click frame. `priors`: limits and priors of the DOFs.
 
-    Bone lengths are free within what is believed of them, radii are not.
+    Bone lengths are free within their prior, radii are fixed.
     """
     vector = parameters.vector()
     start = coarse_pose(parameters, clicks)
@@ -38,18 +42,18 @@ def inverse_kinematics(parameters: ShapeParameters, clicks: Clicks, priors: list
         observe=lambda t, state: [*clicks.observations, *priors],
         shape_observations=[lengths],
         free_shape=parameters.layout.group("lengths"),
-        held=parameters.skeleton.locked,
+        fixed=parameters.skeleton.locked,
     )
-    return solve(problem, start[None], vector, steps=STEPS)
+    return solve(problem, Estimate(motion=start[None], vector=vector), steps=STEPS)
 
 
 def clicked_stature(parameters: ShapeParameters, clicks: Clicks, priors: list[Observation]) -> tuple[float, float]:
     """The person's stature over that of the parameters' template, and its relative sigma.
 
-    It is that of the lengths and the posture that explain the clicks together. Clicks from a short base scatter along the view by many
-    centimetres, which makes the distance between any two of them longer than it is; a posture takes that up.
+    It is that of the lengths that explain the clicks together with a pose. With a short base, clicks scatter along the view by many
+    centimetres, which makes the distance between any two of them longer than it is; the pose absorbs that.
 
-    Few bones say less about a stature than their own clicks say about them: then 1.
+    With few clicked bones the stature is less precise than their own lengths: then 1.
     """
     skeleton, place = parameters.skeleton, dict(zip(parameters.skeleton.joint_names, clicks.xyz_m))
     clicked = [bone for bone in skeleton.bones if np.isfinite([place[bone.head_joint], place[bone.tail_joint]]).all()]
@@ -62,9 +66,9 @@ def clicked_stature(parameters: ShapeParameters, clicks: Clicks, priors: list[Ob
 
 
 def trunk_joints(skeleton: Skeleton) -> list[str]:
-    """The joints that keep their places in the trunk: those of the first bone and of the bones on it that turn by little."""
+    """The joints of the trunk: those of the first bone and of the bones on it that hardly bend."""
     stiff = [
-        not b or max((abs(limit) for dof in bone.dofs for limit in dof.limits), default=0.0) <= LITTLE
+        not b or max((abs(limit) for dof in bone.dofs for limit in dof.limits), default=0.0) <= STIFF
         for b, bone in enumerate(skeleton.bones)
     ]
     for b, p in enumerate(skeleton.parents):
@@ -73,13 +77,13 @@ def trunk_joints(skeleton: Skeleton) -> list[str]:
 
 
 def coarse_pose(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
-    """A motion vector (D,) near the located joints: the trunk turned as a whole, then for limb after limb the best on a grid of the DOFs
-    that move its tail."""
+    """A pose (D,) near the located joints: the trunk rotated as a whole, then for limb after limb the best on a grid of the DOFs that move
+    its tail."""
     skeleton, lengths = parameters.skeleton, parameters.template.lengths_m
     motion = np.array([np.clip(0.0, *dof.limits) for dof in skeleton.dofs])
     names, trunk = list(skeleton.joint_names), trunk_joints(skeleton)
     placed = [names.index(j) for j in trunk if clicks.located[names.index(j)]]
-    turned = len(placed) >= 3
+    turned = len(placed) >= LEAST_TRUNK_JOINTS
     if turned:
         _turn_trunk(skeleton, lengths, clicks.xyz_m, placed, motion)
     known = placed if turned else np.flatnonzero(clicks.located)[:1].tolist()
@@ -88,8 +92,8 @@ def coarse_pose(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
 
 
 def pose_as_clicked(parameters: ShapeParameters, xyz_m: np.ndarray, motion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """The posture (D,) in which limbs lead to where their joints (J, 3) were clicked, NaN those that were not; the rest as in `motion`
-    (D,) of the shape `vector`."""
+    """The pose (D,) in which limbs lead to where their joints (J, 3; NaN: not located) were clicked; else as in the pose `motion` (D,) of a
+    shape `vector`."""
     skeleton = parameters.skeleton
     return _towards(skeleton, parameters.state(motion, vector).lengths_m, xyz_m, motion, trunk_joints(skeleton), [])
 
@@ -100,9 +104,9 @@ def _towards(
     xyz_m: np.ndarray,
     motion: np.ndarray,
     trunk: list[str],
-    known: list[int],
+    placed: list[int],
 ) -> np.ndarray:
-    """Limb after limb the best on a grid of the DOFs that move its tail towards its place (J, 3); the base brings the joints `known` to
+    """Limb after limb the best on a grid of the DOFs that move its tail towards its place (J, 3); the base brings the joints `placed` to
     theirs."""
     names, located = list(skeleton.joint_names), np.isfinite(xyz_m).all(axis=1)
     for b, bone in enumerate(skeleton.bones):
@@ -117,20 +121,20 @@ def _towards(
         head = places[bone.head_joint]
         wanted = target - (xyz_m[names.index(bone.head_joint)] if located[names.index(bone.head_joint)] else head)
         angle = _angle(places[bone.tail_joint] - head, wanted)
-        motion = trial[np.argmin(angle + 1e-3 * np.abs(grid).sum(axis=1))]
-        if known:
-            _shift(skeleton, lengths, xyz_m, known, motion)
+        motion = trial[np.argmin(angle + SMALL_ANGLES * np.abs(grid).sum(axis=1))]
+        if placed:
+            _shift(skeleton, lengths, xyz_m, placed, motion)
     return motion
 
 
-def _shift(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, known: list[int], motion: np.ndarray) -> None:
-    """Bring the middle of the joints `known` to its place, by the base."""
+def _shift(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, placed: list[int], motion: np.ndarray) -> None:
+    """Bring the middle of the joints `placed` to its place, by the base."""
     places = np.stack(list(joint_positions(skeleton, lengths, motion).values()))
-    motion[skeleton.layout.group("base")] += (xyz_m[known] - places[known]).mean(axis=0)
+    motion[skeleton.layout.group("base")] += (xyz_m[placed] - places[placed]).mean(axis=0)
 
 
 def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, placed: list[int], motion: np.ndarray) -> None:
-    """Turn the first bone so that the trunk's joints fit best (Kabsch 1976)."""
+    """Rotate the first bone so that the trunk's joints fit best (Kabsch 1976)."""
     rest = np.stack(list(joint_positions(skeleton, lengths, np.zeros(len(motion))).values()))[placed]
     found = xyz_m[placed]
     U, _, Vt = np.linalg.svd((found - found.mean(axis=0)).T @ (rest - rest.mean(axis=0)))
@@ -143,17 +147,17 @@ def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, plac
 
 
 def other_poses(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarray) -> list[np.ndarray]:
-    """Further starts for bones whose tail nobody clicked: a coarse grid of the DOFs that move it, the others as in `motion` (D,).
+    """Further starts for bones whose tail was not clicked: a coarse grid of the DOFs that move it, the others as in `motion` (D,).
 
-    Bones whose posture the model believes firmly have none.
+    There are none for bones with a firm prior.
     """
     skeleton, starts = parameters.skeleton, []
     trunk = trunk_joints(skeleton)
-    turned = sum(clicks.located[skeleton.joint_names.index(j)] for j in trunk) >= 3
+    turned = sum(clicks.located[skeleton.joint_names.index(j)] for j in trunk) >= LEAST_TRUNK_JOINTS
     for b, bone in enumerate(skeleton.bones):
         dofs = _movers(skeleton, b)
-        believed = all(dof.prior_sigma <= FIRM_PRIOR for dof in bone.dofs)
-        if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or believed or (turned and bone.tail_joint in trunk):
+        firm = all(dof.prior_sigma <= FIRM_PRIOR for dof in bone.dofs)
+        if clicks.located[skeleton.joint_names.index(bone.tail_joint)] or firm or (turned and bone.tail_joint in trunk):
             continue
         for values in product(*(_values(skeleton, d)[1::2] for d in dofs)):
             start = motion.copy()
@@ -163,28 +167,30 @@ def other_poses(parameters: ShapeParameters, clicks: Clicks, motion: np.ndarray)
 
 
 def dof_priors(skeleton: Skeleton, limit_sigma: float, about_m: np.ndarray) -> list[Observation]:
-    """Soft limits, and the model's priors about DOFs; where it has none, a sigma of 180° or 10 m keeps the equations regular."""
+    """Soft limits, and the model's priors of the DOFs; where it has none, a sigma of 180° or `BASE_SIGMA_M` makes the equations regular."""
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
     mean, sigma = np.array([(dof.prior_mean, dof.prior_sigma) for dof in skeleton.dofs]).T
     base = skeleton.layout.group("base")
     free = ~np.isfinite(sigma)
     mean[free] = np.clip(0.0, low, high)[free]
     sigma[free] = np.pi
-    mean[base], sigma[base] = about_m, 10.0
+    mean[base], sigma[base] = about_m, BASE_SIGMA_M
     return [JointLimits(low=low, high=high, sigma=limit_sigma), PosePrior(mean=mean, sigma=sigma)]
 
 
 def shared_over_time(priors: list[Observation], time_s: np.ndarray) -> list[Observation]:
-    """The priors of one frame for every frame of a sequence: a posture lasts, so frames closer than `LASTS_S` share one belief.
+    """The priors of one frame for every frame of a sequence: poses within `CORRELATION_S` are correlated, so their frames share one prior.
 
-    Not so firm priors: they stand for what is hardly measured, and are up against the model's error, which is the same in all frames.
+    Not so firm priors: they concern what is hardly measured, and compete with the model's error, which is the same in all frames.
     """
-    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else LASTS_S
-    frames = min(max(1.0, LASTS_S / step), float(len(time_s)))
-    return [
-        replace(p, sigma=np.where(p.sigma <= FIRM_PRIOR, p.sigma, p.sigma * np.sqrt(frames))) if isinstance(p, PosePrior) else p
-        for p in priors
-    ]
+    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else CORRELATION_S
+    frames = min(max(1.0, CORRELATION_S / step), float(len(time_s)))
+    return [_inflated(p, frames) if isinstance(p, PosePrior) else p for p in priors]
+
+
+def _inflated(prior: PosePrior, frames: float) -> PosePrior:
+    """The prior of one of so many frames that share it; a firm one stays."""
+    return replace(prior, sigma=np.where(prior.sigma <= FIRM_PRIOR, prior.sigma, prior.sigma * np.sqrt(frames)))
 
 
 def _movers(skeleton: Skeleton, bone: int) -> np.ndarray:

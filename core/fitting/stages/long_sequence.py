@@ -1,9 +1,9 @@
-"""A recording in stretches: what is adjusted at once, so that the memory of a fit does not grow with the length of the clip.
+"""A recording in stretches: the frames that are adjusted at once, so that the memory of a fit does not grow with the length of the clip.
 
-Points are read when their stretch is adjusted and let go after it. The stretches follow each other from the click frame outwards. What is
-known of all frames behind is handed over (`handed_over`); of the frames ahead, `MARGIN` take part.
+Points are read when their stretch is adjusted, and released after it. The stretches follow each other from the click frame outwards. All
+frames of earlier stretches contribute a marginal prior (`handed_over`); of the frames ahead, `MARGIN` take part.
 
-What is finished of a fit in stretches, as arrays that are kept, so that a killed fit goes on with the next stretch.
+Checkpoints of a fit in stretches: an interrupted fit resumes with the next stretch.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,22 +16,26 @@ from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.material_tracks import MaterialTracks
 from ..inputs.standing_feet import StandingFeet
+from ..robust import robust_scale
 from ..segmentation import crop
 from ..solve.block_band import NormalEquations
+from ..solve.problem import Estimate
 from ..solve.solver import Solution
 from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
 from .pose_tracking import Checkpoints
 
 AT_ONCE = 300  # frames: a whole body with 4,000 points a frame takes 2 MB each while it is adjusted
-BLOCKS = 3  # of those from which the shape is found
+BLOCKS = 3  # of frames for the shape
 MARGIN = 50
-REACH_M = 0.10  # of the points that are kept for the adjustment of the sequence
+REACH_M = 0.10  # of the points that take part in the adjustment of the sequence
+SUSPICIOUS = 3.0  # times the usual sigma0
+Covariance = tuple[np.ndarray, np.ndarray, np.ndarray]  # blocks: pose (T, D, D), pose with shape (T, D, S), shape (S, S)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """What the adjustment over T frames is made from, all of a recording or a stretch of it."""
+    """The input of the adjustment over T frames: a whole recording or a stretch of it."""
 
     fit: FitContext
     frames: Sequence[int]  # T, the take's numbers
@@ -61,7 +65,7 @@ class Recording:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameResults:
-    """What is told of n adjusted frames."""
+    """The results of n adjusted frames."""
 
     values: np.ndarray  # (n, D)
     covariance: np.ndarray  # (n, D, D)
@@ -73,8 +77,50 @@ class FrameResults:
     outline_m: np.ndarray  # (K,)
 
 
+def frame_results(part: Recording, solution: Estimate, covariance: Covariance, frames: range) -> FrameResults:
+    """The results of some of the frames that were adjusted."""
+    fit, points, (pose, mixed, shape) = part.fit, part.points, covariance
+    skeleton = fit.model.skeleton
+    n, J, B = len(frames), len(skeleton.joint_names), len(skeleton.bones)
+    joints, joint_sigma = np.empty((n, J, 3)), np.empty((n, J))
+    sigma0 = np.array([frame_sigma0(fit, t, points[t], solution) for t in frames])
+    counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
+    for i, t in enumerate(frames):
+        fit.monitor.check()
+        state = fit.parameters.state(solution.motion[t], solution.vector)
+        joints[i], A = state.joint_jacobian
+        K = np.block([[pose[t], mixed[t]], [mixed[t].T, shape]])
+        joint_sigma[i] = np.sqrt(np.einsum("jia,ab,jib->j", A, K, A, optimize=True) / 3)
+        counts[0, i] = np.bincount(fit.surface(points[t], state).bone, minlength=B)
+        counts[1, i] = fit.evidence(t, points[t], state)
+        outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
+    return FrameResults(
+        values=solution.motion[frames],
+        covariance=pose[frames],
+        joints_m=joints,
+        joint_sigma_m=joint_sigma,
+        sigma0=sigma0,
+        points=counts[0],
+        evidence=counts[1],
+        outline_m=np.concatenate(outline),
+    )
+
+
+def frame_sigma0(fit: FitContext, t: int, points: CloudPoints, solution: Estimate) -> float:
+    """The robust scale of a frame's points, without points that of its outlines; NaN without either."""
+    state = fit.parameters.state(solution.motion[t], solution.vector)
+    residuals = [r for o in fit.surface_observations(t, points, state) if len(r := o.residual(state))]
+    return robust_scale(residuals[0]) if residuals else np.nan
+
+
+def outlying(sigma0: np.ndarray) -> np.ndarray:
+    """Which frames (T,) have suspiciously large residuals."""
+    usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
+    return np.asarray(np.nan_to_num(sigma0) > SUSPICIOUS * usual)
+
+
 def joined(parts: list[FrameResults]) -> FrameResults:
-    """One after the other. The list is emptied, so that little is held twice."""
+    """One after the other. The list is emptied meanwhile, so that little is in memory twice."""
     ends = {name: np.cumsum([0, *(len(getattr(p, name)) for p in parts)]) for name in FrameResults.__dataclass_fields__}
     whole = {name: np.empty((end[-1], *getattr(parts[0], name).shape[1:]), getattr(parts[0], name).dtype) for name, end in ends.items()}
     for i in range(len(parts)):
@@ -104,37 +150,37 @@ def spans(frames: int) -> list[range]:
 
 
 def outwards(frames: int, click: int) -> list[tuple[range, range, int]]:
-    """The stretches in the order in which they are adjusted: own frames, those with the margin, and the direction from the click frame.
+    """The stretches in the order of their adjustment: own frames, those with the margin, and the direction from the click frame.
 
-    The first has the click frame, margins on both sides, and direction 0.
+    The first contains the click frame; it has margins on both sides, and direction 0.
     """
     every = spans(frames)
     first = next(k for k, span in enumerate(every) if click in span)
 
-    def wide(span: range, before: int, after: int) -> range:
+    def extended(span: range, before: int, after: int) -> range:
         return range(max(0, span.start - before), min(frames, span.stop + after))
 
     return [
-        (every[first], wide(every[first], MARGIN, MARGIN), 0),
-        *((span, wide(span, 0, MARGIN), 1) for span in every[first + 1 :]),
-        *((span, wide(span, MARGIN, 0), -1) for span in every[:first][::-1]),
+        (every[first], extended(every[first], MARGIN, MARGIN), 0),
+        *((span, extended(span, 0, MARGIN), 1) for span in every[first + 1 :]),
+        *((span, extended(span, MARGIN, 0), -1) for span in every[:first][::-1]),
     ]
 
 
 A = TypeVar("A")
-WAYS = {1: "ahead", -1: "back"}
+DIRECTIONS = {1: "ahead", -1: "back"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convergence:
-    """How an adjustment ended."""
+    """Iterations of an adjustment, and whether it converged."""
 
     iterations: int
     converged: bool
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """As an array to be kept."""
-        return {"ended": np.array([self.iterations, self.converged], dtype=np.int64)}
+        """As an array, for a checkpoint."""
+        return {"convergence": np.array([self.iterations, self.converged], dtype=np.int64)}
 
     @staticmethod
     def of(solution: Solution) -> "Convergence":
@@ -142,9 +188,9 @@ class Convergence:
         return Convergence(iterations=solution.iterations, converged=solution.converged)
 
     @staticmethod
-    def loaded(kept: Mapping[str, np.ndarray]) -> "Convergence":
-        """What was kept."""
-        return Convergence(iterations=int(kept["ended"][0]), converged=bool(kept["ended"][1]))
+    def loaded(checkpoint: Mapping[str, np.ndarray]) -> "Convergence":
+        """From a checkpoint."""
+        return Convergence(iterations=int(checkpoint["convergence"][0]), converged=bool(checkpoint["convergence"][1]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -154,74 +200,81 @@ class ShapeResult:
     simplified: np.ndarray  # (S',) of the simplified body, from which the complete model is made
     vector: np.ndarray  # (S,)
     covariance: np.ndarray  # (S, S)
-    ended: Convergence
+    convergence: Convergence
 
-    def save(self, kept: Checkpoints | None) -> None:
-        """Keep it."""
-        if kept is not None:
-            kept.save("shape", {"simplified": self.simplified, "vector": self.vector, "covariance": self.covariance, **self.ended.arrays()})
+    def save(self, checkpoints: Checkpoints | None) -> None:
+        """Store it."""
+        if checkpoints is not None:
+            arrays = {"simplified": self.simplified, "vector": self.vector, "covariance": self.covariance}
+            checkpoints.save("shape_of_blocks", {**arrays, **self.convergence.arrays()})
 
     @staticmethod
-    def loaded(kept: Checkpoints | None) -> "ShapeResult | None":
-        """What was kept, if anything was."""
-        found = kept.load("shape") if kept is not None else None
+    def loaded(checkpoints: Checkpoints | None) -> "ShapeResult | None":
+        """From its checkpoint, if there is one."""
+        found = checkpoints.load("shape_of_blocks") if checkpoints is not None else None
         if found is None:
             return None
         return ShapeResult(
-            simplified=found["simplified"], vector=found["vector"], covariance=found["covariance"], ended=Convergence.loaded(found)
+            simplified=found["simplified"],
+            vector=found["vector"],
+            covariance=found["covariance"],
+            convergence=Convergence.loaded(found),
         )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MarginalPriors:
-    """What the frames behind hand over: to the adjustment, and to covariances, where understated variances are made honest."""
+    """The marginal prior of a stretch, once for its adjustment, once with calibrated variances (`variance_factors`) for its covariances."""
 
-    known: MarginalPrior | None
-    honest: MarginalPrior | None
+    adjustment: MarginalPrior | None
+    covariance: MarginalPrior | None
 
 
-NOTHING_BEHIND = MarginalPriors(known=None, honest=None)
+NO_PRIORS = MarginalPriors(adjustment=None, covariance=None)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StretchResult:
-    """An adjusted stretch: what is told of its own frames, and what it hands over ahead (1) and back (−1)."""
+    """An adjusted stretch: the results of its own frames, and the priors for the stretch ahead (1) and for the one before (−1)."""
 
-    looked: FrameResults
-    ended: Convergence
-    behind: Mapping[int, MarginalPriors]
+    results: FrameResults
+    convergence: Convergence
+    priors: Mapping[int, MarginalPriors]
 
-    def save(self, kept: Checkpoints | None, own: range, around: range) -> None:
-        """Keep it under its own frames, with those that took part."""
-        if kept is None:
+    def save(self, checkpoints: Checkpoints | None, own: range, around: range) -> None:
+        """Store it under its own frames, with those that took part."""
+        if checkpoints is None:
             return
-        arrays = {"around": np.array([around.start, around.stop]), **self.ended.arrays(), **_table("looked", self.looked)}
-        for way, behind in self.behind.items():
-            for name, handed in (("known", behind.known), ("honest", behind.honest)):
-                assert handed is not None
-                arrays |= {f"{WAYS[way]}.{name}.motion": handed.motion, **_table(f"{WAYS[way]}.{name}", handed.equations)}
-        kept.save(_name(own), arrays)
+        arrays = {"around": np.array([around.start, around.stop]), **self.convergence.arrays(), **_table("results", self.results)}
+        for direction, priors in self.priors.items():
+            for use, prior in (("adjustment", priors.adjustment), ("covariance", priors.covariance)):
+                assert prior is not None
+                name = f"{DIRECTIONS[direction]}.{use}"
+                arrays |= {f"{name}.motion": prior.motion, **_table(name, prior.equations)}
+        checkpoints.save(_name(own), arrays)
 
     @staticmethod
-    def loaded(kept: Checkpoints | None, own: range, around: range) -> "StretchResult | None":
-        """What was kept of these frames with the same margins, if anything was."""
-        found = kept.load(_name(own)) if kept is not None else None
+    def loaded(checkpoints: Checkpoints | None, own: range, around: range) -> "StretchResult | None":
+        """From its checkpoint, if there is one of these frames with the same margins."""
+        found = checkpoints.load(_name(own)) if checkpoints is not None else None
         if found is None or found["around"].tolist() != [around.start, around.stop]:
             return None
-        behind = {
-            way: MarginalPriors(known=_handed_over(found, f"{word}.known", way), honest=_handed_over(found, f"{word}.honest", way))
-            for way, word in WAYS.items()
-            if f"{word}.known.motion" in found
+        priors = {
+            direction: MarginalPriors(
+                adjustment=_prior(found, f"{word}.adjustment", direction), covariance=_prior(found, f"{word}.covariance", direction)
+            )
+            for direction, word in DIRECTIONS.items()
+            if f"{word}.adjustment.motion" in found
         }
-        return StretchResult(looked=_value(FrameResults, "looked", found), ended=Convergence.loaded(found), behind=behind)
+        return StretchResult(results=_value(FrameResults, "results", found), convergence=Convergence.loaded(found), priors=priors)
 
 
 def _name(own: range) -> str:
-    return f"frames_{own.start}_{own.stop - 1}"
+    return f"stretch_{own.start}_{own.stop - 1}"
 
 
-def _handed_over(kept: Mapping[str, np.ndarray], name: str, way: int) -> MarginalPrior:
-    return MarginalPrior(equations=_value(NormalEquations, name, kept), motion=kept[f"{name}.motion"], first=way > 0)
+def _prior(checkpoint: Mapping[str, np.ndarray], name: str, direction: int) -> MarginalPrior:
+    return MarginalPrior(equations=_value(NormalEquations, name, checkpoint), motion=checkpoint[f"{name}.motion"], first=direction > 0)
 
 
 def _table(name: str, value: Any) -> dict[str, np.ndarray]:
@@ -229,5 +282,5 @@ def _table(name: str, value: Any) -> dict[str, np.ndarray]:
     return {f"{name}.{field.name}": getattr(value, field.name) for field in fields(value)}
 
 
-def _value(kind: type[A], name: str, kept: Mapping[str, np.ndarray]) -> A:
-    return kind(**{field.name: kept[f"{name}.{field.name}"] for field in fields(kind)})  # type: ignore[arg-type]
+def _value(kind: type[A], name: str, checkpoint: Mapping[str, np.ndarray]) -> A:
+    return kind(**{field.name: checkpoint[f"{name}.{field.name}"] for field in fields(kind)})  # type: ignore[arg-type]

@@ -1,20 +1,20 @@
-"""Fit a body to a sequence (D'Apuzzo et al. 1999, §3.3): clicks → posture → shape and posture → frame after frame → the whole sequence.
+"""Fit a body to a sequence (D'Apuzzo et al. 1999, §3.3): clicks → pose → shape and pose → frame after frame → the whole sequence.
 
-1. The clicked joints give posture and bone lengths at the click frame (`inverse_kinematics`).
-2. At that frame the cloud gives posture and radii (`click_frame`).
-3. With that shape held, frame after frame forwards and backwards (`frame_to_frame`).
-4. One adjustment over the whole sequence: the shape once, a posture per frame, tied over time by tracked points and weak accelerations.
-   Frames whose residuals stay suspicious begin once more from between their neighbours.
-5. Where the complete model is asked for: it is made from that body (`body.complete`), and step 4 is done again with its radii.
+1. The clicked joints determine pose and bone lengths at the click frame (`inverse_kinematics`).
+2. At that frame the cloud determines pose and radii (`click_frame`).
+3. With that shape fixed, poses are tracked frame after frame, forwards and backwards (`frame_to_frame`).
+4. One adjustment over the whole sequence: one shape, a pose per frame, coupled over time by tracked points and weak accelerations. Frames
+   whose residuals stay suspicious restart once from between their neighbours.
+5. Where the complete model is asked for, it is made from that body (`body.complete`), and step 4 is repeated with its radii.
 
 A recording of more than `AT_ONCE` frames is adjusted stretch by stretch, so that memory does not grow with its length (`_in_stretches`).
 
 Points, outlines and keypoints are each enough alone.
 
-A body is not made of metaballs, and what it differs it may differ in every frame. `shared_frames` lets what is believed of the shape
-beforehand weigh as much against the points of so many frames as against those of one. By default it counts once: other postures tell of
-radii, and of the lengths between clicked joints. That bones are as long as other people's counts for all frames, for what nobody clicked is
-not seen in other postures either (`bone_lengths`). One ellipsoid a bone differs far from a body: there all of it counts for all frames.
+The metaball model has systematic error that may recur in every frame. `shared_frames` lets the prior of the shape weigh as much against the
+points of so many frames as against those of one. By default it counts once: other poses determine radii, and the lengths between clicked
+joints. The prior that bones are as long as other people's counts for all frames, for other poses do not show what was not clicked either
+(`bone_lengths`). A body of one ellipsoid a bone has far larger errors: there the whole prior counts for all frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,8 +31,8 @@ from ...foundation.arrays import LazySequence
 from ...foundation.progress import Monitor
 from ..context import NO_SHAPE, FitContext
 from ..inputs.background import BackgroundRegions
-from ..inputs.clicks import enough, read_clicks
-from ..inputs.cloud_points import CloudPoints, thinned
+from ..inputs.clicks import initial_clicks, read_clicks
+from ..inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints, thinned
 from ..inputs.fit_input import FitInput
 from ..inputs.keypoints import JointTracks
 from ..inputs.material_tracks import MaterialTracks
@@ -40,11 +40,10 @@ from ..inputs.silhouettes import Silhouettes
 from ..inputs.standing_feet import StandingFeet
 from ..observations import Observation
 from ..observations.self_collision import CollisionPairs
-from ..robust import robust_scale
 from ..segmentation import SegmentationCache
 from ..settings import FitSettings
 from ..smooth_radii import smooth_radii
-from ..solve.problem import Problem, Scales, linearise, variance_factors
+from ..solve.problem import Estimate, Problem, Scales, linearise, variance_factors
 from ..solve.solver import Solution, solve
 from ..solve.time_priors import Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
 from ..state import BodyState, ShapeParameters, free_bones
@@ -52,35 +51,39 @@ from .click_frame import clicked_lengths, fit_click_frame
 from .inverse_kinematics import clicked_stature, dof_priors, shared_over_time
 from .long_sequence import (
     AT_ONCE,
-    NOTHING_BEHIND,
+    NO_PRIORS,
     Convergence,
+    Covariance,
     FrameResults,
     MarginalPriors,
     Recording,
     ShapeResult,
     StretchResult,
+    frame_results,
+    frame_sigma0,
     joined,
     near,
+    outlying,
     outwards,
     sample,
 )
-from .pose_tracking import Checkpoints, follow
+from .pose_tracking import Checkpoints, PoseTracking, track_poses
 
 __all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
 
-SIGMAS = "sigmas of the fit"  # a stage, for people
-SUSPICIOUS = 3.0  # times the usual sigma0
-ERRORS_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
-MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that give the simplified body's surface
+ADJUST = "adjust the sequence"  # stages of the progress report
+SIGMAS = "sigmas of the fit"
+ERROR_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
+MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that have the simplified body's surface
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
 def fit_sequence(
-    given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None, kept: Checkpoints | None = None
+    given: FitInput, settings: FitSettings | None = None, monitor: Monitor | None = None, checkpoints: Checkpoints | None = None
 ) -> BodyFit:
-    """Shape and motion of the person. Frames without points are bridged and say so in their status. Time is linear in frames.
+    """Shape and motion of the person. Frames without points are bridged, and have that status. Time is linear in frames.
 
-    With `kept`, the work frame after frame is kept there from time to time, and so is each stretch that is done; both are gone on with.
+    With `checkpoints`, the state of pose tracking is stored from time to time, and each adjusted stretch; the fit resumes from them.
 
     Raises:
         InputError: the model or a degree of freedom is unknown, clicks are missing or contradict each other, or the limb has no points
@@ -88,7 +91,7 @@ def fit_sequence(
         Cancelled: the user asked to stop.
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
-    fit = replace(conditions(given, settings), monitor=monitor)
+    fit = replace(fit_context(given, settings), monitor=monitor)
     points: Sequence[CloudPoints] = LazySequence(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
     if len(points) <= AT_ONCE:
         points = _read(points, monitor)
@@ -96,21 +99,20 @@ def fit_sequence(
     tracks = None
     if given.trajectories is not None and settings.use_trajectories:
         tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
-    motion, known = follow(fit, points, given.time_s, first, tracks, monitor, kept)
-    sigma = typical_acceleration(motion, known, given.time_s, _loosest(fit))
-    every = Recording(
+    tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=tracks)
+    motion, observed = track_poses(tracking, monitor, checkpoints)
+    whole = Recording(
         fit=fit,
         frames=given.frames,
         points=points,
         time_s=given.time_s,
-        sigma=sigma,
+        sigma=typical_acceleration(motion, observed, given.time_s, _loosest(fit)),
         tracks=tracks,
         lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
         feet=_standing(fit, motion, first.vector, given.time_s),
     )
-    if len(points) <= AT_ONCE:
-        return _at_once(every, motion, first.vector, monitor)
-    return _in_stretches(every, motion, first.vector, monitor, kept)
+    start = Estimate(motion=motion, vector=first.vector)
+    return _at_once(whole, start, monitor) if len(points) <= AT_ONCE else _in_stretches(whole, start, monitor, checkpoints)
 
 
 def _read(points: Sequence[CloudPoints], monitor: Monitor) -> list[CloudPoints]:
@@ -121,106 +123,102 @@ def _read(points: Sequence[CloudPoints], monitor: Monitor) -> list[CloudPoints]:
     return read
 
 
-def _at_once(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> BodyFit:
-    """All frames in one adjustment, from a motion (T, D) and a shape vector (S,)."""
-    frames = range(len(motion))
-    part, problem, (*_, solution) = _adjusted(every.stretch(frames, motion, vector), motion, vector, monitor)
+def _at_once(whole: Recording, start: Estimate, monitor: Monitor) -> BodyFit:
+    """All frames in one adjustment."""
+    frames = range(len(start.motion))
+    part, problem, (*_, solution) = _adjusted(whole.stretch(frames, start.motion, start.vector), start, monitor)
     monitor.step(SIGMAS, 0, 3)
     factors = _factors(part, problem, solution)
     monitor.step(SIGMAS, 1, 3)
     covariance = _covariance(problem, solution, factors)
     monitor.step(SIGMAS, 2, 3)
-    return _result(part, _looked(part, solution, covariance, frames), solution.vector, covariance[2], [Convergence.of(solution)])
+    results = frame_results(part, solution, covariance, frames)
+    return _result(part, results, solution.vector, covariance[2], [Convergence.of(solution)])
 
 
-def _adjusted(part: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> tuple[Recording, Problem, list[Solution]]:
-    """Postures and shape together; where the complete model was asked for, a second solution, and the recording comes back with it."""
+def _adjusted(part: Recording, start: Estimate, monitor: Monitor) -> tuple[Recording, Problem, list[Solution]]:
+    """Poses and shape together. With the complete model there is a second solution, and the returned recording has that model."""
     steps = part.fit.settings.sequence_steps
     problem = _whole_sequence(part)
-    solution = solve(problem, motion, vector, steps=steps, monitor=monitor, stage="adjust the sequence")
-    solutions = [_restarted(part.fit, part.points, part.time_s, solution, problem, monitor)]
+    solution = solve(problem, start, steps=steps, monitor=monitor, stage=ADJUST)
+    solutions = [_restarted(part, solution, problem, monitor)]
     if part.fit.settings.balls == "complete":
         part = replace(part, fit=_completed(part.fit, solutions[0].vector))
         problem = _whole_sequence(part)
-        solutions.append(
-            solve(
-                problem,
-                solutions[0].motion,
-                part.fit.parameters.vector(),
-                steps=steps,
-                scales=solutions[0].scales,
-                monitor=monitor,
-                stage="refine the complete model",
-            )
-        )
+        again = replace(solutions[0], vector=part.fit.parameters.vector())
+        solutions.append(solve(problem, again, steps=steps, monitor=monitor, stage="refine the complete model"))
     return part, problem, solutions
 
 
-def _in_stretches(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor, kept: Checkpoints | None) -> BodyFit:
+def _in_stretches(whole: Recording, start: Estimate, monitor: Monitor, checkpoints: Checkpoints | None) -> BodyFit:
     """As `_at_once`, with memory for `AT_ONCE` frames and two margins only.
 
-    First the shape, from blocks of frames all over the recording: since a body differs from its model in every frame alike, more would not
-    tell more of it. Then, with that shape held, the postures. Their covariances count what is not known of the shape.
+    First the shape, from blocks of frames all over the recording: the model's error is the same in every frame, so more frames would not
+    determine it better. Then, with that shape fixed, the poses; their covariances include that of the shape.
     """
-    found = ShapeResult.loaded(kept)
-    if found is None:
-        found = _shape_of_blocks(every, motion, vector, monitor)
-        found.save(kept)
-    if every.fit.settings.balls == "complete":
-        every = replace(every, fit=_completed(every.fit, found.simplified))
-    looked, ends = _postures(every, motion, found, monitor, kept)
-    return _result(every, looked, found.vector, found.covariance, [found.ended, *ends])
+    shape = ShapeResult.loaded(checkpoints)
+    if shape is None:
+        shape = _shape_of_blocks(whole, start, monitor)
+        shape.save(checkpoints)
+    if whole.fit.settings.balls == "complete":
+        whole = replace(whole, fit=_completed(whole.fit, shape.simplified))
+    results, convergence = _poses(whole, start.motion, shape, monitor, checkpoints)
+    return _result(whole, results, shape.vector, shape.covariance, [shape.convergence, *convergence])
 
 
-def _shape_of_blocks(every: Recording, motion: np.ndarray, vector: np.ndarray, monitor: Monitor) -> ShapeResult:
-    """The shape from some blocks of a motion (T, D)."""
-    frames = sample(len(motion), every.fit.click)
-    part, problem, solutions = _adjusted(every.stretch(frames, motion, vector), motion[frames], vector, monitor)
+def _shape_of_blocks(whole: Recording, start: Estimate, monitor: Monitor) -> ShapeResult:
+    """The shape from some blocks of the frames."""
+    frames = sample(len(start.motion), whole.fit.click)
+    blocks = whole.stretch(frames, start.motion, start.vector)
+    part, problem, solutions = _adjusted(blocks, replace(start, motion=start.motion[frames]), monitor)
     last = solutions[-1]
     covariance = _covariance(problem, last, _factors(part, problem, last))[2]
-    return ShapeResult(simplified=solutions[0].vector, vector=last.vector, covariance=covariance, ended=Convergence.of(last))
+    return ShapeResult(simplified=solutions[0].vector, vector=last.vector, covariance=covariance, convergence=Convergence.of(last))
 
 
-def _postures(
-    every: Recording, motion: np.ndarray, shape: ShapeResult, monitor: Monitor, kept: Checkpoints | None
+def _poses(
+    whole: Recording, motion: np.ndarray, shape: ShapeResult, monitor: Monitor, checkpoints: Checkpoints | None
 ) -> tuple[FrameResults, list[Convergence]]:
-    """The postures from a motion (T, D), with the shape held, stretch after stretch from the click frame on."""
-    done, ends = dict[int, FrameResults](), list[Convergence]()
-    behind, plan = dict[int, MarginalPriors](), outwards(len(motion), every.fit.click)
+    """The poses from a motion (T, D), with the shape fixed, stretch after stretch from the click frame on."""
+    done, convergence = dict[int, FrameResults](), list[Convergence]()
+    priors, plan = dict[int, MarginalPriors](), outwards(len(motion), whole.fit.click)
     for k, (own, around, direction) in enumerate(plan):
-        stretch = StretchResult.loaded(kept, own, around)
+        stretch = StretchResult.loaded(checkpoints, own, around)
         if stretch is None:
-            told = monitor.part("adjust the postures", k, len(plan))
-            stretch = _stretch(every, (own, around, direction), motion, shape, behind.get(direction, NOTHING_BEHIND), told)
-            stretch.save(kept, own, around)
-        done[own.start] = stretch.looked  # and no longer what it handed over, which takes as much again
-        ends.append(stretch.ended)
-        behind.update(stretch.behind)
-    return joined([done.pop(start) for start in sorted(done)]), ends
+            part = monitor.part("adjust the poses", k, len(plan))
+            stretch = _stretch(whole, (own, around, direction), motion, shape, priors.get(direction, NO_PRIORS), part)
+            stretch.save(checkpoints, own, around)
+        done[own.start] = stretch.results  # without its priors, which take as much memory again
+        convergence.append(stretch.convergence)
+        priors.update(stretch.priors)
+    return joined([done.pop(start) for start in sorted(done)]), convergence
 
 
 def _stretch(
-    every: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: ShapeResult, behind: MarginalPriors, monitor: Monitor
+    whole: Recording, place: tuple[range, range, int], motion: np.ndarray, shape: ShapeResult, priors: MarginalPriors, monitor: Monitor
 ) -> StretchResult:
-    """One of `outwards`, from a motion (T, D) of all frames, with what the stretches behind handed over."""
+    """One of `outwards`, from a motion (T, D) of all frames, with the priors from the stretches before it."""
     own, around, direction = place
-    part = every.stretch(around, motion, shape.vector)
-    problem = _whole_sequence(part, behind.known)
-    held = replace(problem, free_shape=NO_SHAPE)
-    solution = solve(held, motion[around], shape.vector, steps=part.fit.settings.sequence_steps, monitor=monitor)
-    solution = _restarted(part.fit, part.points, part.time_s, solution, held, monitor)
-    local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, held, solution)
-    covariance = _covariance(_whole_sequence(part, behind.honest), solution, factors, shape.covariance)
-    told = partial(marginal_prior, problem, solution, local, time_s=part.time_s, sigma=part.sigma)
-    ways = [way for way in ({1, -1} if direction == 0 else {direction}) if (own.stop < len(motion) if way > 0 else own.start > 0)]
+    part = whole.stretch(around, motion, shape.vector)
+    problem = _whole_sequence(part, priors.adjustment)
+    pose_only = replace(problem, free_shape=NO_SHAPE)
+    start = Estimate(motion=motion[around], vector=shape.vector)
+    solution = solve(pose_only, start, steps=part.fit.settings.sequence_steps, monitor=monitor)
+    solution = _restarted(part, solution, pose_only, monitor)
+    local, factors = range(own.start - around.start, own.stop - around.start), _factors(part, pose_only, solution)
+    covariance = _covariance(_whole_sequence(part, priors.covariance), solution, factors, shape.covariance)
+    next_ones = [d for d in ({1, -1} if direction == 0 else {direction}) if (own.stop < len(motion) if d > 0 else own.start > 0)]
+
+    def prior(earlier: MarginalPrior | None, ahead: bool, factors: Scales | None = None) -> MarginalPrior:
+        coupling = Coupling(acceleration=Acceleration(time_s=part.time_s, sigma=part.sigma), prior=earlier)
+        return marginal_prior(problem, solution, local, coupling, ahead=ahead, factors=factors)
+
     return StretchResult(
-        looked=_looked(part, solution, covariance, local),
-        ended=Convergence.of(solution),
-        behind={
-            way: MarginalPriors(
-                known=told(beside=behind.known, ahead=way > 0), honest=told(beside=behind.honest, ahead=way > 0, understated=factors)
-            )
-            for way in ways
+        results=frame_results(part, solution, covariance, local),
+        convergence=Convergence.of(solution),
+        priors={
+            d: MarginalPriors(adjustment=prior(priors.adjustment, d > 0), covariance=prior(priors.covariance, d > 0, factors))
+            for d in next_ones
         },
     )
 
@@ -234,12 +232,12 @@ def _standing(fit: FitContext, motion: np.ndarray, vector: np.ndarray, time_s: n
 
 
 def _completed(fit: FitContext, vector: np.ndarray) -> FitContext:
-    """The same conditions for the complete model of the body that was found (S,)."""
+    """The same context for the complete model of a simplified body (S,)."""
     shape = complete_shape(fit.parameters.shape(vector, np.full(len(vector), np.nan)))
     return replace(fit, parameters=ShapeParameters(shape, fit.settings.weights), settings=replace(fit.settings, radius_sigma=MUSCLE_SIGMA))
 
 
-def conditions(given: FitInput, settings: FitSettings) -> FitContext:
+def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
     """What stays the same throughout the fit.
 
     Raises:
@@ -251,10 +249,10 @@ def conditions(given: FitInput, settings: FitSettings) -> FitContext:
     for frame, joints in given.clicks.items():
         clicked[frames.index(frame)], places[frames.index(frame)] = read_clicks(given.rig, names, joints, settings.click_sigma_px)
     wanted = given.click_frame if given.click_frame in given.clicks else None
-    begin = _best_known(places, tracks) if wanted is None else frames.index(wanted)
-    known = tracks.located(begin)
-    known = np.where(np.isfinite(places[begin]), places[begin], known) if begin in places else known
-    clicks = enough(known, names, [*([clicked[begin]] if begin in clicked else []), *tracks.observe(begin)])
+    begin = _best_located(places, tracks) if wanted is None else frames.index(wanted)
+    located = tracks.located(begin)
+    located = np.where(np.isfinite(places[begin]), places[begin], located) if begin in places else located
+    clicks = initial_clicks(located, names, [*([clicked[begin]] if begin in clicked else []), *tracks.observe(begin)])
     priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
     shape = one_ball_shape(default_shape(model)) if settings.balls == "one" else default_shape(model)
     stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
@@ -275,12 +273,12 @@ def conditions(given: FitInput, settings: FitSettings) -> FitContext:
         frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
         located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
         silhouettes=Silhouettes(given, model.surface, settings),
-        empty=BackgroundRegions(given, parameters, settings),
-        limbs=CollisionPairs(model.skeleton, shape.metaballs.bone_index),
+        background=BackgroundRegions(given, parameters, settings),
+        collisions=CollisionPairs(model.skeleton, shape.metaballs.bone_index),
     )
 
 
-def _best_known(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
+def _best_located(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
     """The frame index with most clicked joints; without clicks, the one with most keypoints."""
     return max(places, key=lambda t: int(np.isfinite(places[t]).sum())) if places else tracks.best_frame()
 
@@ -293,170 +291,114 @@ def _loosest(fit: FitContext) -> np.ndarray:
     return sigma
 
 
-def _whole_sequence(every: Recording, beside: MarginalPrior | None = None) -> Problem:
-    """The adjustment of postures and shape, with what frames beside these say."""
-    fit, points, feet = every.fit, every.points, every.feet
-    priors = shared_over_time(fit.priors, every.time_s)
-
-    held = SegmentationCache()
+def _whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Problem:
+    """The adjustment of poses and shape, with the marginal prior from the frames of earlier stretches."""
+    fit, points, feet = part.fit, part.points, part.feet
+    priors, cache = shared_over_time(fit.priors, part.time_s), SegmentationCache()
 
     def observe(t: int, state: BodyState) -> list[Observation]:
         return [
-            *fit.surface_observations(t, points[t], state, held=held),
+            *fit.surface_observations(t, points[t], state, cache=cache),
             *fit.joints(t),
-            *fit.empty.observe(t),
+            *fit.background.observe(t),
             *priors,
-            *fit.limbs.observe(state),
+            *fit.collisions.observe(state),
             *(feet.observe(t) if feet is not None else []),
         ]
 
-    problem = fit.problem(observe, "shape", Acceleration(time_s=every.time_s, sigma=every.sigma))
-    if beside is not None:
-        problem = replace(problem, smoothness=Coupling(acceleration=Acceleration(time_s=every.time_s, sigma=every.sigma), beside=beside))
+    coupling = Coupling(acceleration=Acceleration(time_s=part.time_s, sigma=part.sigma), prior=prior)
     return replace(
-        problem,
-        shape_observations=fit.shape_observations(every.lengths),
+        fit.problem(observe, "shape", coupling),
+        shape_observations=fit.shape_observations(part.lengths),
         shape_weight=_shared_weight(points, fit.settings),
-        observe_step=None if every.tracks is None else every.tracks.steps,
+        observe_step=None if part.tracks is None else part.tracks.steps,
     )
 
 
 def _shared_weight(points: Sequence[CloudPoints], settings: FitSettings) -> float:
-    """By how much T frames tell less of the shape than T times one frame: 1 for noise of the points alone, T for the model's error."""
+    """The weight of the shape's priors against T frames: 1 where the points' noise dominates, T where the model's error does."""
     sigmas = np.concatenate([p.sigma_m for p in points])
-    own = (float(np.median(sigmas)) if len(sigmas) else 0.0) ** 2 + 1e-12
+    own = (float(np.median(sigmas)) if len(sigmas) else 0.0) ** 2 + VARIANCE_FLOOR_M2
     model, frames = settings.model_sigma_m**2, float(len(points))
     if settings.balls != "one":
         frames = min(frames, settings.shared_frames)
     return (own + frames * model) / (own + model)
 
 
-def _restarted(
-    fit: FitContext, points: Sequence[CloudPoints], time_s: np.ndarray, solution: Solution, problem: Problem, monitor: Monitor
-) -> Solution:
-    """The solution, or that from where frames with suspicious residuals stand between the others, if it explains more of those frames."""
-    sigma0 = np.array([_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
-    strange = np.flatnonzero(_outlying(sigma0))
-    good = np.setdiff1d(np.flatnonzero(np.isfinite(sigma0)), strange)
-    if not len(strange) or not len(good) or not fit.settings.sequence_steps:
+def _restarted(part: Recording, solution: Solution, problem: Problem, monitor: Monitor) -> Solution:
+    """The solution, or a better one in which frames with suspicious residuals were started from between the others."""
+    fit, points, time_s = part.fit, part.points, part.time_s
+    sigma0 = np.array([frame_sigma0(fit, t, p, solution) for t, p in enumerate(points)])
+    bad = np.flatnonzero(outlying(sigma0))
+    good = np.setdiff1d(np.flatnonzero(np.isfinite(sigma0)), bad)
+    if not len(bad) or not len(good) or not fit.settings.sequence_steps:
         return solution
-    start = solution.motion.copy()
-    start[strange] = np.stack([np.interp(time_s[strange], time_s[good], column) for column in start[good].T], axis=1)
-    again = solve(
-        problem,
-        start,
-        solution.vector,
-        steps=fit.settings.sequence_steps,
-        scales=solution.scales,
-        monitor=monitor,
-        stage="adjust the sequence",
-    )
+    motion = solution.motion.copy()
+    motion[bad] = np.stack([np.interp(time_s[bad], time_s[good], column) for column in motion[good].T], axis=1)
+    again = solve(problem, replace(solution, motion=motion), steps=fit.settings.sequence_steps, monitor=monitor, stage=ADJUST)
     more = sum(
         fit.support(t, points[t], again.motion[t], again.vector) - fit.support(t, points[t], solution.motion[t], solution.vector)
-        for t in strange.tolist()
+        for t in bad.tolist()
     )
     return again if more > 0 else solution
 
 
-def _sigma0(fit: FitContext, t: int, points: CloudPoints, solution: Solution) -> float:
-    """The robust scale of a frame's points, without points that of its outlines; NaN without either."""
-    state = fit.parameters.state(solution.motion[t], solution.vector)
-    residuals = [r for o in fit.surface_observations(t, points, state) if len(r := o.residual(state))]
-    return robust_scale(residuals[0]) if residuals else np.nan
-
-
-def _outlying(sigma0: np.ndarray) -> np.ndarray:
-    """Which frames (T,) have suspicious residuals."""
-    usual = np.nanmedian(sigma0) if np.isfinite(sigma0).any() else 1.0
-    return np.asarray(np.nan_to_num(sigma0) > SUSPICIOUS * usual)
-
-
-def _looked(part: Recording, solution: Solution, covariance: tuple[np.ndarray, np.ndarray, np.ndarray], frames: range) -> FrameResults:
-    """What is told of some of the frames that were adjusted."""
-    fit, points, (pose, mixed, shape) = part.fit, part.points, covariance
-    skeleton = fit.model.skeleton
-    n, J, B = len(frames), len(skeleton.joint_names), len(skeleton.bones)
-    joints, joint_sigma = np.empty((n, J, 3)), np.empty((n, J))
-    sigma0 = np.array([_sigma0(fit, t, points[t], solution) for t in frames])
-    counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
-    for i, t in enumerate(frames):
-        fit.monitor.check()
-        state = fit.parameters.state(solution.motion[t], solution.vector)
-        joints[i], A = state.joint_jacobian
-        K = np.block([[pose[t], mixed[t]], [mixed[t].T, shape]])
-        joint_sigma[i] = np.sqrt(np.einsum("jia,ab,jib->j", A, K, A, optimize=True) / 3)
-        counts[0, i] = np.bincount(fit.surface(points[t], state).bone, minlength=B)
-        counts[1, i] = fit.evidence(t, points[t], state)
-        outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
-    return FrameResults(
-        values=solution.motion[frames],
-        covariance=pose[frames],
-        joints_m=joints,
-        joint_sigma_m=joint_sigma,
-        sigma0=sigma0,
-        points=counts[0],
-        evidence=counts[1],
-        outline_m=np.concatenate(outline),
-    )
-
-
-def _result(every: Recording, looked: FrameResults, vector: np.ndarray, covariance: np.ndarray, ends: Sequence[Convergence]) -> BodyFit:
-    """The body of all frames, with the shape vector (S,) of a covariance (S, S), and how the adjustments ended."""
-    fit, skeleton = every.fit, every.fit.model.skeleton
+def _result(
+    whole: Recording, results: FrameResults, vector: np.ndarray, covariance: np.ndarray, convergence: Sequence[Convergence]
+) -> BodyFit:
+    """The body of all frames, with the shape vector (S,) and its covariance (S, S)."""
+    fit, skeleton = whole.fit, whole.fit.model.skeleton
     vector, covariance = smooth_radii(fit.parameters, vector, covariance, fit.settings.evenness_sigma)
     motion = BodyMotion(
-        frames=np.array(every.frames),
-        time_s=every.time_s,
+        frames=np.array(whole.frames),
+        time_s=whole.time_s,
         dof_names=skeleton.dof_names,
-        values=looked.values,
-        covariance=looked.covariance,
+        values=results.values,
+        covariance=results.covariance,
         joint_names=skeleton.joint_names,
-        joints_m=looked.joints_m,
-        joint_sigma_m=looked.joint_sigma_m,
-        status=_statuses(fit, looked.evidence, looked.sigma0),
-        sigma0=looked.sigma0,
+        joints_m=results.joints_m,
+        joint_sigma_m=results.joint_sigma_m,
+        status=_statuses(fit, results.evidence, results.sigma0),
+        sigma0=results.sigma0,
     )
     return BodyFit(
         shape=fit.parameters.shape(vector, np.sqrt(np.diag(covariance))),
         motion=motion,
-        iterations=max(end.iterations for end in ends),
-        converged=all(end.converged for end in ends),
-        points=looked.points,
-        outline_m=looked.outline_m,
+        iterations=max(one.iterations for one in convergence),
+        converged=all(one.converged for one in convergence),
+        points=results.points,
+        outline_m=results.outline_m,
     )
 
 
-def _covariance(
-    problem: Problem, solution: Solution, understated: Scales, shape: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks of the covariance: pose (T, D, D), pose with shape (T, D, S), shape (S, S); the last may be given."""
-    lin = linearise(problem, solution.motion, solution.vector, solution.scales, understated)
-    pose, mixed, shape = lin.equations.covariance(shape)
-    pose[:, problem.held] = pose[:, :, problem.held] = mixed[:, problem.held] = 0.0
+def _covariance(problem: Problem, solution: Solution, factors: Scales, shape: np.ndarray | None = None) -> Covariance:
+    """Blocks of the covariance; that of the `shape` may be given."""
+    pose, mixed, shape = linearise(problem, solution, factors).equations.covariance(shape)
+    pose[:, problem.fixed] = pose[:, :, problem.fixed] = mixed[:, problem.fixed] = 0.0
     return pose, mixed, shape
 
 
 def _factors(part: Recording, problem: Problem, solution: Solution) -> Scales:
-    """By how much the variances of what was seen are understated."""
-    found = variance_factors(problem, linearise(problem, solution.motion, solution.vector, solution.scales), solution.scales)
+    """The variance factors of the observations."""
+    found = variance_factors(problem, linearise(problem, solution), solution.scales)
     own = [p.sigma_m for p in part.points if len(p.sigma_m)]
-    wider = _wider(part.fit.settings, float(np.median(np.concatenate(own))) if own else 0.0)
+    wider = _correlated(part.fit.settings, float(np.median(np.concatenate(own))) if own else 0.0)
     return replace(found, points=wider * found.points, contours=wider * found.contours, steps=wider * found.steps)
 
 
-def _wider(settings: FitSettings, own_m: float) -> float:
-    """By how much variances grow when the model's error is shared within `ERRORS_REACH_M`, and not only within the patches of the weights.
+def _correlated(settings: FitSettings, own_m: float) -> float:
+    """The variance factor of the model's error, which is shared within `ERROR_REACH_M`, and not only within the patches of the weights.
 
-    What a limb differs from its metaballs it differs along much of it, and the frames after show the same.
+    A limb differs from its metaballs along much of its length, and in the frames after it just so.
     """
-    own, model = own_m**2 + 1e-12, settings.model_sigma_m**2
-    near, far = (max(1.0, (reach / settings.voxel_m) ** 2) for reach in (settings.model_patch_m, ERRORS_REACH_M))
-    return max(1.0, (own + far * model) / (own + near * model))
+    own, model = own_m**2 + VARIANCE_FLOOR_M2, settings.model_sigma_m**2
+    patch, reach = (max(1.0, (size / settings.voxel_m) ** 2) for size in (settings.model_patch_m, ERROR_REACH_M))
+    return max(1.0, (own + reach * model) / (own + patch * model))
 
 
 def _statuses(fit: FitContext, counts: np.ndarray, sigma0: np.ndarray) -> tuple[str, ...]:
     enough = counts[:, free_bones(fit.parameters)] >= fit.settings.min_points
     total = counts.sum(axis=1)
     few = total < FEW_POINTS * max(float(np.median(total)), float(total[fit.click]))
-    strange = few | _outlying(sigma0)
-    return tuple(BRIDGED if not e.any() else SUSPECT if s else PARTIAL if not e.all() else FITTED for e, s in zip(enough, strange))
+    suspect = few | outlying(sigma0)
+    return tuple(BRIDGED if not e.any() else SUSPECT if s else PARTIAL if not e.all() else FITTED for e, s in zip(enough, suspect))

@@ -12,9 +12,9 @@ from tricap.core.body.skeleton import bone_frames, joint_positions
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.observations import PosePrior
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.solve.problem import Problem
+from tricap.core.fitting.solve.problem import Estimate, Problem
 from tricap.core.fitting.solve.solver import _next_damping, solve
-from tricap.core.fitting.stages.sequence import _statuses, conditions, fit_sequence
+from tricap.core.fitting.stages.sequence import _statuses, fit_context, fit_sequence
 from tricap.core.fitting.state import ShapeParameters, free_bones
 from tricap.core.foundation.errors import InputError
 
@@ -151,16 +151,16 @@ def test_only_a_finite_minimum_is_called_converged(mean: float, known: float, co
     sigma = np.full(D, 1.0)
     sigma[-1] = 1.0 if known else np.inf  # nothing is known of one angle: no damping makes the equations regular
     problem = Problem(parameters=parameters, observe=lambda t, state: [PosePrior(mean=np.full(D, mean), sigma=sigma)])
-    solution = solve(problem, np.zeros((1, D)), parameters.vector(), steps=20)
+    solution = solve(problem, Estimate(motion=np.zeros((1, D)), vector=parameters.vector()), steps=20)
     assert solution.converged is converged
     if converged:
-        again = solve(problem, solution.motion, solution.vector, steps=20)  # from the minimum no step goes down
+        again = solve(problem, Estimate(motion=solution.motion, vector=solution.vector), steps=20)  # from the minimum no step goes down
         assert again.converged and np.allclose(again.motion, mean)
 
 
 def test_a_partial_frame_can_be_suspect(make_scene) -> None:
     scene = make_scene(frames=4, seed=2)
-    fit = conditions(_given(scene), SETTINGS)
+    fit = fit_context(_given(scene), SETTINGS)
     counts = np.where(free_bones(fit.parameters), 200, 0) * np.ones((5, 1), dtype=int)
     counts[1, np.flatnonzero(free_bones(fit.parameters))[1]] = 0
     counts[3:] = counts[1]
@@ -169,8 +169,8 @@ def test_a_partial_frame_can_be_suspect(make_scene) -> None:
     assert _statuses(fit, counts, sigma0) == ("fitted", "partial", "fitted", "suspect", "bridged")
 
 
-def test_a_step_that_gains_less_than_foreseen_makes_the_next_one_shorter() -> None:
-    assert _next_damping(1e-3, gain=1.0, foreseen=10.0) == pytest.approx(1e-2)
-    assert _next_damping(1e-3, gain=4.0, foreseen=10.0) == pytest.approx(1e-3)
-    assert _next_damping(1e-3, gain=9.0, foreseen=10.0) == pytest.approx(1e-4)
-    assert _next_damping(1e-9, gain=9.0, foreseen=10.0) == pytest.approx(1e-9)
+def test_a_step_that_gains_less_than_predicted_makes_the_next_one_shorter() -> None:
+    assert _next_damping(1e-3, gain=1.0, predicted=10.0) == pytest.approx(1e-2)
+    assert _next_damping(1e-3, gain=4.0, predicted=10.0) == pytest.approx(1e-3)
+    assert _next_damping(1e-3, gain=9.0, predicted=10.0) == pytest.approx(1e-4)
+    assert _next_damping(1e-9, gain=9.0, predicted=10.0) == pytest.approx(1e-9)

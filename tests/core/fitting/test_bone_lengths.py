@@ -6,7 +6,7 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, scaled_shape
 from tricap.core.body.skeleton import joint_positions
-from tricap.core.fitting.inputs.clicks import enough, read_clicks
+from tricap.core.fitting.inputs.clicks import initial_clicks, read_clicks
 from tricap.core.fitting.inputs.silhouettes import Rays, touched
 from tricap.core.fitting.observations import Proportions
 from tricap.core.fitting.observations.shape_priors import clicked_chains, proportions
@@ -96,7 +96,11 @@ def test_an_outline_beyond_the_hand_is_the_fingers_and_one_over_the_crown_is_the
         X = state.head_m[b] + along * state.lengths_m[b] * state.R[b][:, 1] + 0.04 * state.R[b][:, 0]
         view = state.R[b][:, 2]
         rays = Rays(
-            origin_m=(X - 3 * view)[None], direction=view[None], outward=state.R[b][:, 0][None], angle=np.full(1, 1e-3), alike=np.ones(1)
+            origin_m=(X - 3 * view)[None],
+            direction=view[None],
+            outward=state.R[b][:, 0][None],
+            angle=np.full(1, 1e-3),
+            similar_views=np.ones(1),
         )
         return touched(rays, state, full.surface, 0.1)[1]
 
@@ -112,7 +116,7 @@ def test_clicks_that_scatter_along_the_view_do_not_lengthen_the_person(full, sma
     joints = joint_positions(full.skeleton, shape.lengths_m, motion)
     clicked = {name: {c.name: c.project(joints[name]) + rng.normal(0, 3, 2) for c in rig.cameras} for name in CLICKED}
     observed, places = read_clicks(rig, full.skeleton.joint_names, clicked, 5.0)
-    clicks = enough(places, full.skeleton.joint_names, [observed])
+    clicks = initial_clicks(places, full.skeleton.joint_names, [observed])
     found, sigma = clicked_stature(ShapeParameters(default_shape(full)), clicks, dof_priors(full.skeleton, 0.035, motion[:3]))
     assert abs(np.log(found / small)) < 2 * sigma
 

@@ -18,7 +18,7 @@ from tricap.core.fitting.inputs.standing_feet import StandingFeet
 from tricap.core.fitting.observations import PosePrior
 from tricap.core.fitting.observations.self_collision import CollisionPairs
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.solve.problem import Problem
+from tricap.core.fitting.solve.problem import Estimate, Problem
 from tricap.core.fitting.solve.solver import solve
 from tricap.core.fitting.stages.sequence import fit_sequence
 from tricap.core.fitting.state import ShapeParameters
@@ -70,7 +70,7 @@ def test_a_limb_without_points_keeps_out_of_the_background(make_scene) -> None:
         )
     errors = []
     for empty in ((), _empty(scene)):
-        fit = fit_sequence(_given(scene, clouds=clouds, empty=empty), SETTINGS)
+        fit = fit_sequence(_given(scene, clouds=clouds, background=empty), SETTINGS)
         errors.append(np.linalg.norm((fit.motion.joints_m - scene.joints_m)[last, wrist]))
     assert errors[1] < 0.5 * errors[0], errors
 
@@ -79,9 +79,9 @@ def test_of_a_hand_the_middle_alone_keeps_out_of_the_background_and_less_exactly
     parameters, far = ShapeParameters(default_shape(read_model("full"))), np.full((200, 250), 80, np.uint8)
     empty = [BackgroundDistances(view="C", frame=np.arange(1), distance=Packed([far]), step_px=4, unit_px=0.5)]
     given = FitInput(
-        rig=limb_scene.front_rig(), model="full", clouds=[SimpleNamespace(frame=0)], clicks={}, time_s=np.zeros(1), empty=empty
+        rig=limb_scene.front_rig(), model="full", clouds=[SimpleNamespace(frame=0)], clicks={}, time_s=np.zeros(1), background=empty
     )
-    seen = BackgroundRegions(given, parameters, FitSettings(empty_sigma_px=4.0)).observe(0)[0]
+    seen = BackgroundRegions(given, parameters, FitSettings(background_sigma_px=4.0)).observe(0)[0]
     joints = np.array(parameters.skeleton.joint_names)
     hands = seen.sigma_px > 4.0
     assert sorted(joints[seen.head[hands]]) == ["wrist.L", "wrist.R"]
@@ -170,7 +170,9 @@ def test_a_hidden_arm_stays_outside_of_the_trunk() -> None:
     assert {names[b] for b in found.bone[found.residual(inside) > 1]} <= {"forearm.R", "hand.R"}
     prior = PosePrior(mean=motion, sigma=np.full(len(motion), np.radians(20)))
     problem = Problem(parameters=parameters, observe=lambda t, state: [prior, *limbs.observe(state)])
-    freed = parameters.state(solve(problem, motion[None], parameters.vector(), steps=20).motion[0], parameters.vector())
+    freed = parameters.state(
+        solve(problem, Estimate(motion=motion[None], vector=parameters.vector()), steps=20).motion[0], parameters.vector()
+    )
     before, after = (max(np.max(o.residual(state), initial=0.0) for o in limbs.observe(state)) for state in (inside, freed))
     assert before > 3 and after < 1.0  # a centimetre
 
@@ -185,7 +187,7 @@ def test_outlines_and_clicks_alone_are_enough(make_scene, other_person) -> None:
     errors = np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2)
     assert set(fit.motion.status) == {"fitted"} and fit.converged and np.isfinite(fit.motion.sigma0).all()
     assert errors.mean() < 3e-3, errors.mean(axis=0)  # three persons: 0.5, 1.5, 0.8 mm
-    for use_surface, said in ((True, "no measured points"), (False, "no outlines.*give outlines with `tricap contour`")):
+    for use_surface, said in ((True, "no measured points"), (False, "no outlines.*find outlines with `tricap contour`")):
         with pytest.raises(InputError, match=said):
             fit_sequence(_given(scene, clouds=blind), replace(SETTINGS, use_surface=use_surface))
 

@@ -12,11 +12,12 @@ from tricap.core.fitting.inputs.cloud_points import CloudPoints
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.segmentation import crop, segment
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.solve.solver import Scales, Solution
+from tricap.core.fitting.solve.problem import Scales
+from tricap.core.fitting.solve.solver import Solution
 from tricap.core.fitting.stages.click_frame import _with_lost_limbs
 from tricap.core.fitting.stages.hidden_limbs import lost_limbs, reacquired_poses
 from tricap.core.fitting.stages.pose_tracking import REACH_M, _reach
-from tricap.core.fitting.stages.sequence import conditions
+from tricap.core.fitting.stages.sequence import fit_context
 from tricap.core.foundation.progress import Monitor
 
 from .limb_scene import front_rig, measured_cloud, surface
@@ -43,7 +44,7 @@ def standing():
     clicks = {name: {c.name: c.project(at) for c in rig.cameras} for name, at in joints.items()}
     clouds = [measured_cloud(shape, before, 0, np.random.default_rng(0), points=200, noise=0.001, gross=0.0)]
     given = FitInput(rig=rig, model="full", clouds=clouds, time_s=np.zeros(1), clicks={0: clicks})
-    return conditions(given, FitSettings()), shape, before
+    return fit_context(given, FitSettings()), shape, before
 
 
 def test_a_raised_arm_is_found(standing) -> None:

@@ -41,7 +41,7 @@ def _motion(parameters: ShapeParameters, rng: np.random.Generator) -> np.ndarray
 
 
 def _cases(parameters: ShapeParameters, state, rng):
-    n, dofs, joints = 40, state.n_motion, len(state.skeleton.joint_names)
+    n, dofs, joints = 40, state.layout.n_pose, len(state.skeleton.joint_names)
     bone = state.balls.bone_index[rng.integers(0, len(state.balls.weight), n)]
     along = rng.uniform(0.1, 0.9, n)
     local = np.stack([rng.normal(0, 0.05, n), along * state.lengths_m[bone], rng.normal(0, 0.05, n)], axis=1)
@@ -57,8 +57,8 @@ def _cases(parameters: ShapeParameters, state, rng):
     shape = parameters.vector()
     root = rng.normal(0, 0.1, (len(state.lengths_m),) * 2)
     return [
-        SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma).scaled(state),
-        SurfacePoints(xyz_m=near, bone=bone, sigma_m=sigma, form="paper").scaled(state),
+        SurfacePoints.about(state, xyz_m=near, bone=bone, sigma_m=sigma),
+        SurfacePoints.about(state, xyz_m=near, bone=bone, sigma_m=sigma, form="paper"),
         ClickedJoints(cameras=(camera,) * joints, joint=np.arange(joints), xy_px=rng.normal(400, 50, (joints, 2)), sigma_px=5.0),
         JointLimits(low=np.full(dofs, -0.2), high=np.full(dofs, 0.2), sigma=0.03),
         PosePrior(mean=np.zeros(dofs), sigma=rng.uniform(0.1, 1, dofs)),
@@ -77,13 +77,14 @@ def _cases(parameters: ShapeParameters, state, rng):
 def _collisions(state, rng):
     """Places on the last bone that are less than a large radius away from the bone before it."""
     last = len(state.lengths_m) - 1
-    return SelfCollision(
+    return SelfCollision.about(
+        state,
         bone=np.full(6, last),
         fraction=rng.uniform(0.1, 0.6, 6),
         other=np.full(6, state.skeleton.parents[last]),
         radius_m=rng.uniform(0.5, 1.0, 6),
         sigma_m=0.01,
-    ).scaled(state)
+    )
 
 
 def _empty(camera: Camera, joints: int, rng) -> BackgroundExclusion:
@@ -104,7 +105,7 @@ def _rays(state, near, bone, sigma, rng):
     origin = near + np.array([0.0, -3.0, 0.0]) + rng.normal(0, 0.2, near.shape)
     away = near + rng.normal(0, 0.01, near.shape) - origin
     direction = away / np.linalg.norm(away, axis=1, keepdims=True)
-    return SilhouetteRays(origin_m=origin, direction=direction, bone=bone, sigma_m=sigma).scaled(state)
+    return SilhouetteRays.about(state, origin_m=origin, direction=direction, bone=bone, sigma_m=sigma)
 
 
 @pytest.mark.parametrize("model", ["arm.R", "leg.L", "full"])
@@ -160,7 +161,7 @@ def test_jacobian_of_a_step_between_frames_equals_differences(model: str) -> Non
 @pytest.mark.parametrize("model", ["arm.R", "full"])
 @pytest.mark.parametrize("backwards", [False, True])
 def test_jacobian_of_a_step_from_a_fixed_frame_equals_differences(model: str, backwards: bool) -> None:
-    """The other frame's posture is fixed; its body is the same, so the shape moves both."""
+    """The other frame's pose is fixed; its body is the same, so the shape moves both."""
     rng = np.random.default_rng(4)
     parameters = _parameters(model)
     D, other = len(parameters.skeleton.dofs), _motion(parameters, rng)
@@ -223,7 +224,7 @@ def test_fields_are_let_go_after_their_derivatives_and_found_again() -> None:
     points = _cases(parameters, state, rng)[0]
     before, J = points.residual(state), points.jacobian(state)
     assert not points._last and np.array_equal(points.residual(state), before) and points._last
-    again = points.scaled(state)
+    again = points.reweighted(state)
     assert again._last and not points._last and np.array_equal(again.jacobian(state), J)
 
 

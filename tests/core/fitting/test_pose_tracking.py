@@ -89,7 +89,7 @@ class StoppedStretches(Monitor):
             self._begin("shape")
 
     def part(self, stage: str, index: int, total: int) -> Monitor:
-        if stage == "adjust the postures":
+        if stage == "adjust the poses":
             self._begin(f"{index + 1} of {total}")
         return Monitor()
 

@@ -8,7 +8,7 @@ import pytest
 from tricap.core.body.metaballs import field, field_and_derivatives
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, one_ball_shape
-from tricap.core.fitting.segmentation import SegmentationCache, from_bone
+from tricap.core.fitting.segmentation import SegmentationCache, facing_bone
 from tricap.core.fitting.state import ShapeParameters
 
 
@@ -19,14 +19,14 @@ def test_points_of_the_surface_are_no_distance_from_it(name: str, balls: str) ->
     parameters = ShapeParameters(shape if balls == "three" else one_ball_shape(shape))
     state = parameters.state(np.zeros(len(shape.skeleton.dofs)), parameters.vector())
     b = [bone.name for bone in shape.skeleton.bones].index(name)
-    counted, across = parameters.counted[b, state.balls.bone_index], np.linspace(0.0, 0.2, 2001)
+    counted, across = parameters.neighbours[b, state.balls.bone_index], np.linspace(0.0, 0.2, 2001)
     for f in (0.3, 0.5, 0.7):
         for side in (state.R[b][:, 0], state.R[b][:, 2]):
             ray = state.head_m[b] + f * state.lengths_m[b] * state.R[b][:, 1] + across[:, None] * side
             inside = field(state.balls, state.lengths_m, state.R, state.head_m, ray, counted) > 0.5
             X = ray[np.flatnonzero(inside)[-1:]]
             normal = -field_and_derivatives(state.balls, state.lengths_m, state.R, state.head_m, X, counted)[1]
-            gap, along, facing = from_bone(X, normal, state, b)
+            gap, along, facing = facing_bone(X, normal, state, b)
             assert abs(gap[0]) < 2e-3 and abs(along[0] - f) < 1e-9 and facing[0]  # it was 12 mm off at the neck
 
 

@@ -16,7 +16,7 @@ from tricap.core.fitting.solve.solver import Solution, solve
 from tricap.core.fitting.stages import click_frame, hidden_limbs
 from tricap.core.fitting.stages.click_frame import fit_pose_and_shape
 from tricap.core.fitting.stages.inverse_kinematics import inverse_kinematics
-from tricap.core.fitting.stages.sequence import FitInput, FitSettings, _restarted, conditions, fit_sequence
+from tricap.core.fitting.stages.sequence import FitInput, FitSettings, _restarted, fit_context, fit_sequence
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 
@@ -99,7 +99,7 @@ def test_sigmas_are_honest(make_scene) -> None:
 @pytest.mark.slow
 def test_starts_thirty_degrees_off_all_converge(make_scene) -> None:
     scene = make_scene(seed=1)
-    fit = conditions(_given(scene), KNOWN)
+    fit = fit_context(_given(scene), KNOWN)
     points = thinned(scene.clouds[0], KNOWN.voxel_m)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     rng, good = np.random.default_rng(0), 0
@@ -230,7 +230,7 @@ class _Heard(Monitor):
         super().__init__()
         self.told: list[tuple[str, float]] = []
         self.most, self.since = 0, 0
-        for module, name in ((solver, "linearise"), (hidden_limbs, "_postures")):
+        for module, name in ((solver, "linearise"), (hidden_limbs, "_poses")):
             monkeypatch.setattr(module, name, self._counted(getattr(module, name)))
 
     def _counted(self, work):
@@ -252,7 +252,7 @@ def test_every_step_of_the_click_frame_is_told_and_can_be_stopped(make_scene, mo
     """A whole body's click frame can take a minute: a word comes before every adjustment of it, and the bar never goes back."""
     scene = make_scene(frames=2, seed=1, points=80)
     monkeypatch.setattr(click_frame, "OTHERS_AROUND", 1)
-    monkeypatch.setattr(click_frame, "SUSPICIOUS", 0.0)  # all other starts are tried too
+    monkeypatch.setattr(click_frame, "LARGEST_SIGMA0", 0.0)  # all other starts are tried too
     monkeypatch.setattr(hidden_limbs, "lost_limbs", lambda fit, counts: [np.array([1])])
     monkeypatch.setattr(hidden_limbs, "_unexplained", lambda fit, points, state, limb: np.arange(40))
     monitor = _Heard(monkeypatch)
@@ -289,9 +289,9 @@ def test_paper_mode_fits_too(make_scene) -> None:
 def test_pose_and_shape_hold_each_other_when_they_alternate(make_scene, monkeypatch) -> None:
     scene, calls = make_scene(seed=10), []
 
-    def noted(problem, motion, vector, **options):
-        solution = solve(problem, motion, vector, **options)
-        calls.append((problem, not np.array_equal(solution.motion, motion), not np.array_equal(solution.vector, vector)))
+    def noted(problem, start, **options):
+        solution = solve(problem, start, **options)
+        calls.append((problem, not np.array_equal(solution.motion, start.motion), not np.array_equal(solution.vector, start.vector)))
         return solution
 
     monkeypatch.setattr(click_frame, "solve", noted)
@@ -302,7 +302,7 @@ def test_pose_and_shape_hold_each_other_when_they_alternate(make_scene, monkeypa
 
 def test_a_start_behind_the_limb_begins_anew_around_the_clicks(make_scene) -> None:
     scene = make_scene(seed=1, points=400)
-    fit = conditions(_given(scene), KNOWN)
+    fit = fit_context(_given(scene), KNOWN)
     points = thinned(scene.clouds[0], KNOWN.voxel_m)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     around = click_frame._around(fit, clicked.motion[0])
@@ -317,7 +317,7 @@ def test_a_start_behind_the_limb_begins_anew_around_the_clicks(make_scene) -> No
 
 def test_a_frame_that_went_wrong_begins_anew_between_its_neighbours(make_scene) -> None:
     scene = make_scene(frames=7, seed=4)
-    fit = conditions(_given(scene), UNKNOWN)
+    fit = fit_context(_given(scene), UNKNOWN)
     points = [thinned(c, UNKNOWN.voxel_m) for c in scene.clouds]
     vector = fit.parameters.vector(scene.shape)
     problem = fit.problem(lambda t, state: [*fit.surface_observations(t, points[t], state), *fit.pose_observations(state)])
@@ -325,10 +325,11 @@ def test_a_frame_that_went_wrong_begins_anew_between_its_neighbours(make_scene) 
     lost[3, 1] += 0.03  # behind the limb's surface
     lost[3, 3:5] += 0.2
     solution = Solution(motion=lost, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
-    again = _restarted(fit, points, scene.time_s, solution, problem, Monitor())
+    part = SimpleNamespace(fit=fit, points=points, time_s=scene.time_s)
+    again = _restarted(part, solution, problem, Monitor())
     assert np.degrees(np.abs(again.motion[3, 3:5] - scene.motion[3, 3:5])).max() < 3.0
     good = Solution(motion=scene.motion, vector=vector, cost=1.0, scales=Scales(), iterations=1, converged=True)
-    assert _restarted(fit, points, scene.time_s, good, problem, Monitor()) is good
+    assert _restarted(part, good, problem, Monitor()) is good
 
 
 def _empty(frame: int) -> SimpleNamespace:

@@ -11,7 +11,7 @@ from tricap.core.fitting.context import FitContext
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.observations import Symmetry
 from tricap.core.fitting.settings import FitSettings
-from tricap.core.fitting.stages.sequence import conditions, fit_sequence
+from tricap.core.fitting.stages.sequence import fit_context, fit_sequence
 
 from .limb_scene import front_rig, measured_cloud
 
@@ -32,7 +32,7 @@ def symmetry(fit: FitContext) -> Symmetry:
 
 
 def test_bones_are_more_alike_than_flesh_and_the_more_so_the_more_frames_share_an_error() -> None:
-    fit = conditions(clicked_person(1.0), FitSettings())
+    fit = fit_context(clicked_person(1.0), FitSettings())
     names = [fit.parameters.layout.names[i] for i in symmetry(fit).left]
     bones = np.array([name.startswith("length") for name in names])
     assert 0 < bones.sum() < len(bones)
