@@ -28,6 +28,8 @@ AXES = {
 }
 UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "inch": 0.0254}
 MOST_VALUES = 1 << 28  # 2 GB of float64
+LARGEST_BYTES = 1 << 30  # of a CSV file
+DEFAULT_FPS = 25.0  # of tables without times
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -108,10 +110,6 @@ def filled(markers: Markers) -> Markers:
     return Markers(
         names=tuple(markers.names[n] for n in keep), fps=markers.fps, frames=markers.frames, xyz_m=xyz, sigma_m=markers.sigma_m[:, keep]
     )
-
-
-LARGEST_BYTES = 1 << 30
-DEFAULT_FPS = 25.0
 
 
 def write_points_csv(path: Path, markers: Markers, *, axes: str = "Z up", unit: str = "m") -> None:

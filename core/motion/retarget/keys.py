@@ -1,8 +1,7 @@
-"""The same motion at another frame rate.
+"""Keyframes: resampling a motion at another frame rate, and key reduction.
 
-Fewer keys: of a motion keyed in every frame, those from which straight lines give the rest within a tolerance.
-
-Ramer (1972), Douglas and Peucker (1973), on all channels of a bone at once.
+Key reduction keeps those keys of a motion keyed in every frame from which linear interpolation gives the others within a tolerance: Ramer
+(1972), Douglas and Peucker (1973), on all channels of a bone at once.
 """
 
 from dataclasses import replace

@@ -1,9 +1,9 @@
-"""A person-like rest pose, for sources whose zero pose is not one.
+"""Poses: a person-like rest pose of the source, and the target's pose while its motion is computed.
 
 In some files the zero pose is arbitrary: every bone lies along its own axis. Rotations since that pose do not show how a part lies in the
 body. Any frame of the motion can serve as the rest pose instead; the best is one in which the person stands upright with straight limbs.
 
-Where the bones of a body are, whatever their parents in the rig: control rigs have parts that descend from nothing in the body.
+A target's bones are where the body has them, whatever their parents in the rig: control rigs have parts that descend from none of the body.
 """
 
 from collections.abc import Callable
