@@ -18,7 +18,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.intersection import forward_intersection
 from ..images.sampling import SplineImage
-from ..matching.least_squares import match_patches
+from ..matching.least_squares import SearchImage, TemplatePoints, match_patches
 from ..matching.patches import patch_offsets
 from .published_step import STEPS
 from .settings import KeyPointSettings, TrackStatus
@@ -222,8 +222,8 @@ def _first(grey: Sequence[np.ndarray], spline: Sequence[SplineImage], clicks: np
         induced = _induced_shapes(clicks, np.array(slope), view)
         for k in view.others:
             start = _search_warped(spline[view.reference], grey[k], clicks[:, view.reference], clicks[:, k], induced[:, k], view)
-            m = match_patches(spline[view.reference], clicks[:, view.reference], [spline[k]], [start], [induced[:, k]], view.matching,
-                              row_step=view.rows.step)[0]  # fmt: skip
+            template = TemplatePoints(image=spline[view.reference], xy=clicks[:, view.reference], row_step=view.rows.step)
+            m = match_patches(template, [SearchImage(image=spline[k], start=start, shape=induced[:, k])], view.matching)[0]
             better = m.ok & (m.correlation > best[:, k])
             xy[better, k], covariance[better, k], shape[better, k] = m.xy[better], m.covariance[better], m.shape[better]
             best[better, k], status[better, k] = m.correlation[better], TrackStatus.MEASURED
