@@ -1,7 +1,7 @@
 """What the add-on remembers while Blender runs: one `Session`, made when the add-on is registered and dropped when it is unregistered.
 
 What belongs to the open file is in `Session.file`, which begins anew when another file is loaded. No other module of the add-on has
-state of its own.
+state of its own. Every other module imports this one, so it imports none of them: their types are named in comments.
 """
 
 from collections.abc import Callable
@@ -13,14 +13,6 @@ import bpy
 if TYPE_CHECKING:
     from ..core.images.sequence import ImageSequence
     from ..core.take.writing import Table
-    from .clicking.draw import Drawing
-    from .clicking.finder import Finder
-    from .clicking.operators import ClickOperator
-    from .jobs import Job, JobEnded, JobOperator
-    from .overlay.layers import Inspection
-    from .overlay.results import RunResults
-    from .steps.states import StepStates
-    from .steps.watch import StepEnd
 
 TakePart = Callable[[bpy.types.Scene, "Table"], None]
 
@@ -30,7 +22,7 @@ class OpenResults:
     """The results that the overlays show, with the key of the files that they were read from; or why there are none."""
 
     key: tuple[Any, ...] | None = None
-    results: "RunResults | None" = None
+    results: Any = None  # overlay.results.RunResults
     problem: str = ""
 
 
@@ -39,16 +31,16 @@ class FileState:
     """What belongs to the open file."""
 
     changed: bool = True  # something changed in a scene since the states of its steps were computed
-    step_states: "dict[str, StepStates]" = field(default_factory=dict)  # by scene
+    step_states: dict[str, Any] = field(default_factory=dict)  # by scene: steps.states.StepStates
     stamps: dict[str, Any] = field(default_factory=dict)  # by scene: times and sizes of the files on which these states depend
-    step_ends: "dict[tuple[str, str], StepEnd]" = field(default_factory=dict)  # by scene and step: how it failed or was stopped
+    step_ends: dict[tuple[str, str], Any] = field(default_factory=dict)  # by scene and step: how it failed or was stopped (StepEnd)
     sequences: "dict[tuple[Any, ...], ImageSequence]" = field(default_factory=dict)  # the opened footage, by file
     joints: dict[str, tuple[str, ...]] = field(default_factory=dict)  # those to click, by body model
     click_problems: dict[tuple[Any, ...], str] = field(default_factory=dict)  # by joint, clicks and cameras; "" where there is none
     late_frames: dict[str, dict[str, int]] = field(default_factory=dict)  # by checked input: the delay of each view
     bar_counts: dict[str, tuple[int, int]] = field(default_factory=dict)  # by view: images searched, and images that show the whole bar
     open_results: OpenResults = field(default_factory=OpenResults)
-    inspection: "tuple[int, Inspection | None]" = (-1, None)  # the frame, and what is under the pointer in it
+    inspection: tuple[int, Any] = (-1, None)  # the frame, and what is under the pointer in it (overlay.layers.Inspection)
     region_corners: tuple[str, list[tuple[float, float]]] = ("", [])  # the view, and the corners clicked so far
 
 
@@ -57,17 +49,17 @@ class Session:
     """What the add-on remembers."""
 
     file: FileState = field(default_factory=FileState)
-    job: "Job | None" = None  # the one that computes on the worker thread
-    job_operator: "JobOperator | None" = None  # the modal operator that watches it
-    click_operator: "ClickOperator | None" = None  # the modal operator of the clicks
-    click_drawing: "Drawing | None" = None
-    finders: "list[Finder]" = field(default_factory=list)  # those whose threads run
+    job: Any = None  # the jobs.Job that computes on the worker thread
+    job_operator: Any = None  # the modal operator that watches it (jobs.JobOperator)
+    click_operator: Any = None  # the modal operator of the clicks (clicking.operators)
+    click_drawing: Any = None  # clicking.draw.Drawing
+    finders: list[Any] = field(default_factory=list)  # the clicking.finder.Finder whose threads run
     overlay_handle: Any = None  # Blender's handle of what draws the overlays
     cli_command: Any = None  # Blender's handle of `blender --command tricap`
     status_workspaces: set[str] = field(default_factory=set)  # those whose status bar shows our text
     take_digests: set[str] = field(default_factory=set)  # of every take.toml that was read or written
     property_groups: list[type] = field(default_factory=list)  # of the scene, in order of registration
-    on_job_end: "list[JobEnded]" = field(default_factory=list)
+    on_job_end: list[Callable[..., None]] = field(default_factory=list)  # jobs.JobEnded
     on_value_change: list[Callable[[], None]] = field(default_factory=list)  # a value of the panel was changed
     take_writers: list[TakePart] = field(default_factory=list)  # the scene's values into the table of take.toml
     take_readers: list[TakePart] = field(default_factory=list)  # and back
