@@ -244,7 +244,7 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
     if opened.frames:
         props.first_frame, props.last_frame = opened.frames[0], opened.frames[1] - 1
     _show_model(scene, saved.get("body", {}).get("model", ""))
-    props.seed_frame = opened.seeds.frame
+    props.seed_frame = opened.clicks.frame
     show_clicks(scene, saved, [view.name for view in opened.views])
     properties.show_settings(scene, opened.settings)
     for reader in get_session().take_readers:

@@ -9,7 +9,7 @@ import bpy
 from ...core.body.model_file import BodyModel, joint_depths_m, read_model
 from ...core.foundation.errors import InputError
 from ...core.run import take_run
-from ...core.take.take import JOINTS, Seeds, open_take
+from ...core.take.take import JOINTS, FrameClicks, open_take
 from .. import clicks, project, properties
 from ..overlay import canvas
 from ..panels import show_status
@@ -293,7 +293,7 @@ def make_finder(scene: bpy.types.Scene) -> tuple[Finder | None, str]:
     """The finder of proposals; None and the reason if cameras or images are missing."""
     try:
         take = project.take(scene)
-        footage = open_take(replace(take, seeds=Seeds(), keyframes=(), corrections=(), frames=None))
+        footage = open_take(replace(take, clicks=FrameClicks(), keyframes=(), corrections=(), frames=None))
         settings = take_run.settings_of(take.settings, properties.overrides(scene), "take.toml")["matching"]
     except InputError as error:
         return None, f"Epipolar lines and proposals are not available: {error}"

@@ -190,7 +190,7 @@ def _clicks(scene: bpy.types.Scene, found: _Project) -> State:
     if take.keypoints:
         return State(status=Status.DONE, message="The take has keypoints of another system; clicks are optional.")
     wanted = joints_of(take.body_model)
-    clicked = take.seeds.joints
+    clicked = take.clicks.joints
     if found.footage is not None:
         _check_clicks(found.footage)
     complete = [name for name in wanted if len(clicked.get(name, {})) >= 2]
@@ -215,7 +215,7 @@ def _check_clicks(footage: Footage) -> None:
     """
     take, rig = footage.take, footage.take.rig_path.stat()
     problems = get_session().file.click_problems
-    for name, at in take.seeds.joints.items():
+    for name, at in take.clicks.joints.items():
         clicks = tuple((view, *xy.tolist()) for view, xy in sorted(at.items()))
         key = (take.rig_path, rig.st_mtime_ns, rig.st_size, take.reference, name, clicks)
         if key not in problems:

@@ -285,7 +285,7 @@ def _exchanged(order: tuple[int, ...], a: int, b: int) -> tuple[int, ...]:
 def clicked_pairs(take: Take) -> list[PairMatches]:
     """The joints that were clicked in both of each two views, in all frames with clicks."""
     names = [v.name for v in take.views]
-    clicks = [at for seeds in (take.seeds, *take.keyframes) for at in seeds.joints.values()]
+    clicks = [at for frame in (take.clicks, *take.keyframes) for at in frame.joints.values()]
     pairs = []
     for i, j in combinations(range(len(names)), 2):
         both = [np.stack([at[names[i]], at[names[j]]]) for at in clicks if names[i] in at and names[j] in at]

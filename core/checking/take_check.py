@@ -24,7 +24,7 @@ from ..images.sampling import noise_sigma
 from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
-from ..take.take import Clicks, Footage, Take, open_take, read_take
+from ..take.take import Footage, Take, open_take, read_take
 from .findings import Checked, Finding, doubtful, wrong
 from .rig_check import ENOUGH, clicked_pairs, geometry_findings, rig_findings, rig_misses, same_views, share, stale_finding, unit_findings
 from .survey import frozen_view, picture_findings, rate_findings, survey
@@ -46,7 +46,7 @@ def joint_findings(take: Take) -> list[Finding]:
     if take.body_model is None or take.keypoints:
         return []
     joints = read_model(take.body_model).skeleton.joint_names
-    clicked = {name for seeds in (take.seeds, *take.keyframes) for name, at in seeds.joints.items() if len(at) > 1}
+    clicked = {name for frame in (take.clicks, *take.keyframes) for name, at in frame.joints.items() if len(at) > 1}
     advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
     if not clicked:
         sentence = f"No joint of the body “{take.body_model}” is clicked: there will be surface and tracks, but no body."
@@ -60,9 +60,8 @@ def joint_findings(take: Take) -> list[Finding]:
 
 def seed_findings(footage: Footage) -> list[Finding]:
     """Clicks without a place in space, far behind the others, or surface seeds on what never moves."""
-    seeds, found, depth = footage.take.seeds, [], dict[str, float]()
-    labelled: list[tuple[str, Clicks]] = [*seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(seeds.surface))]
-    for name, at in labelled:
+    clicks, found, depth = footage.take.clicks, [], dict[str, float]()
+    for name, at in clicks.named:
         try:
             depth[name] = clicked_depth(footage, name, at)
         except InputError as error:
@@ -83,13 +82,13 @@ def seed_findings(footage: Footage) -> list[Finding]:
 def _resting(footage: Footage) -> list[int]:
     """Surface seeds (their numbers from 0) around which the reference picture is the same in the frame furthest in time."""
     take, name = footage.take, footage.take.reference_view
-    frame = take.seeds.frame
-    clicked = [i for i, at in enumerate(take.seeds.surface) if name in at]
+    frame = take.clicks.frame
+    clicked = [i for i, at in enumerate(take.clicks.surface) if name in at]
     other = max(footage.frames, key=lambda f: abs(f - frame))
     if not clicked or other == frame:
         return []
     here, later = (take.rows_at(f).rows(footage.read(f)[take.reference]) for f in (frame, other))
-    xy = take.rows_at(frame).from_frame(np.array([take.seeds.surface[i][name] for i in clicked]))
+    xy = take.rows_at(frame).from_frame(np.array([take.clicks.surface[i][name] for i in clicked]))
     xy = np.clip(xy, 0, np.array(here.shape[::-1]) - 1)
     return [i for i, same in zip(clicked, unchanged(here, later, xy)) if same]
 
@@ -118,7 +117,7 @@ def bound_px(grey: np.ndarray, patch_px: int, row_step: int) -> np.ndarray:
 def texture_findings(footage: Footage, patch_px: int, max_sigma_px: float) -> tuple[list[Finding], dict[str, float]]:
     """Limbs between clicked joints, or what moves, with too little texture in the reference view; and the median bound [px] of each."""
     take, ref = footage.take, footage.take.reference
-    frame = take.seeds.frame if take.seeds.frame in footage.frames else footage.frames.start
+    frame = take.clicks.frame if take.clicks.frame in footage.frames else footage.frames.start
     grey = take.rows_at(frame).rows(footage.read(frame)[ref])
     bound = bound_px(grey, patch_px, take.rows_at(frame).step)
     view = take.views[ref].name
@@ -154,11 +153,11 @@ def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
     take = footage.take
     if take.body_model is None:
         return {}
-    clicked = {name: at[view] for name, at in take.seeds.joints.items() if view in at}
+    clicked = {name: at[view] for name, at in take.clicks.joints.items() if view in at}
     t = np.linspace(*ALONG, SAMPLES)[:, None]
     bones = read_model(take.body_model).skeleton.bones
     return {
-        b.name: take.rows_at(take.seeds.frame).from_frame(clicked[b.head_joint] * (1 - t) + clicked[b.tail_joint] * t)
+        b.name: take.rows_at(take.clicks.frame).from_frame(clicked[b.head_joint] * (1 - t) + clicked[b.tail_joint] * t)
         for b in bones
         if b.head_joint in clicked and b.tail_joint in clicked
     }

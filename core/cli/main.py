@@ -153,12 +153,12 @@ def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
     footage = open_take(read_take(args.take))
     settings = take_run.settings_of(footage.take.settings, overrides(args.set), str(args.take))
-    frame = footage.take.seeds.frame if footage.take.seeds.frame in footage.frames else footage.frames.start
+    frame = footage.take.clicks.frame if footage.take.clicks.frame in footage.frames else footage.frames.start
     where, seeds = first_seeds(footage, MeasureSettings.of(settings), frame, monitor)
     near, far = where.depth_range_m
     args.always_shown = [
         f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (depths from {where.method}), "
-        f"{len(footage.take.seeds.joints)} clicked joints, {len(where.planes)} planes of the room excluded."
+        f"{len(footage.take.clicks.joints)} clicked joints, {len(where.planes)} planes of the room excluded."
     ]
     return list(args.always_shown)
 

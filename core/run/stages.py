@@ -18,7 +18,7 @@ from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
 from ..surface import measure
-from ..take.take import NO_BODY, Footage, Seeds, Take, View
+from ..take.take import NO_BODY, Footage, FrameClicks, Take, View
 from ..tracking import track
 
 STAGES = ("measure", "track", "fit")
@@ -42,7 +42,7 @@ def _measure_input(footage: Footage) -> Any:
     rig = store.digest(take.rig_path)
     rows = take.interlaced, take.first_field
     person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v)) for v in take.views]
-    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.seeds), regions, person, measure.ALGORITHM
+    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.clicks), regions, person, measure.ALGORITHM
 
 
 def _person_files(take: Take, view: View) -> Any:
@@ -140,9 +140,8 @@ def _keypoints(take: Take) -> Any:
     return [(repr(s), [_stamp(path) for path in sorted(take.folder.glob(s.files))]) for s in take.keypoints]
 
 
-def _clicked(seeds: Seeds) -> Any:
-    clicks = [*seeds.joints.items(), *((f"surface {i}", at) for i, at in enumerate(seeds.surface))]
-    return seeds.frame, [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
+def _clicked(clicks: FrameClicks) -> Any:
+    return clicks.frame, clicks.table()
 
 
 def _corrections(take: Take) -> list[Any]:

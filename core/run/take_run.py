@@ -153,7 +153,7 @@ def open_run(
     footage = open_take(take)
     if frames is not None:
         footage = only_frames(footage, frames)
-    for name, at in take.seeds.joints.items():
+    for name, at in take.clicks.joints.items():
         clicked_depth(footage, name, at)
     if take.body_model is not None:
         read_model(take.body_model)

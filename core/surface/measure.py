@@ -127,13 +127,13 @@ def measure_frames(footage: Footage, settings: MeasureSettings, results: Results
         NothingMeasured: nothing of a person can be measured in the first frame.
     """
     take = footage.take
-    first = take.seeds.frame if take.seeds.frame in footage.frames else footage.frames.start
+    first = take.clicks.frame if take.clicks.frame in footage.frames else footage.frames.start
     order = [*range(first, footage.frames.stop), *range(first - 1, footage.frames.start - 1, -1)]
     base = store.digest(
         ALGORITHM,
         repr((settings.matching, settings.growing, settings.surface.of_measuring, settings.enhance)),
         take.rig_path,
-        repr((take.interlaced, take.first_field, take.reference_view, _seed_table(footage))),
+        repr((take.interlaced, take.first_field, take.reference_view, take.clicks.table())),
         repr([(v.name, v.offset_frames) for v in take.views]),
         repr(footage.delay_images) if any(footage.delay_images) else "",
     )
@@ -173,12 +173,6 @@ def _silhouette_digests(footage: Footage, frame: int) -> list[str]:
     """The content of the masks and backgrounds of a frame."""
     paths = (silhouette_file(footage, k, frame) for k in range(len(footage.take.views)))
     return [store.digest(path) for path in paths if path is not None and path.is_file()]
-
-
-def _seed_table(footage: Footage) -> list[tuple[str, list[tuple[str, list[float]]]]]:
-    seeds = footage.take.seeds
-    clicks = [*seeds.joints.items(), *((f"surface {i}", at) for i, at in enumerate(seeds.surface))]
-    return [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -276,19 +270,18 @@ def _first_foreground(now: _FrameViews, settings: MeasureSettings, monitor: Moni
         return Approximations(**{f.name: getattr(found, f.name)[~outside] for f in fields(Approximations)})
 
     planes, moving = _background_and_person(now, sweep(None))
-    clicks = [*take.seeds.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(take.seeds.surface))]
-    depth = np.array([clicked_depth(footage, name, at) for name, at in clicks])
-    if clicks and now.frame == take.seeds.frame:
+    depth = np.array([clicked_depth(footage, name, at) for name, at in take.clicks.named])
+    if len(depth) and now.frame == take.clicks.frame:
         where = fg.around_clicks(depth)
-    elif clicks:
-        where = fg.since_clicks(depth, frame_time_s(abs(now.frame - take.seeds.frame), take.fps), moving)
+    elif len(depth):
+        where = fg.since_clicks(depth, frame_time_s(abs(now.frame - take.clicks.frame), take.fps), moving)
     elif len(moving):
         where = fg.nearest_surface(moving)
     else:
         where = fg.Foreground(depth_range_m=ANY_DEPTH_M, method="everything")
     where = replace(where, planes=planes)
     seeds = sweep(where.depth_range_m)
-    if take.seeds.surface and now.frame == take.seeds.frame:
+    if take.clicks.surface and now.frame == take.clicks.frame:
         seeds = with_clicked(footage, now.views, seeds, settings.matching)
     return where, seeds
 

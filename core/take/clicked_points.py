@@ -54,7 +54,7 @@ def with_clicked(footage: Footage, views: Views, seeds: Approximations, matching
     Raises:
         InputError: see `clicked_point`.
     """
-    surface, base = footage.take.seeds.surface, views.base
+    surface, base = footage.take.clicks.surface, views.base
     points = [clicked_point(footage, f"surface seed {i + 1}", at) for i, at in enumerate(surface)]
     xyz = np.concatenate([p.xyz_m for p in points])
     K = np.concatenate([p.covariance_m2 for p in points])

@@ -77,12 +77,22 @@ class View:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Seeds:
+class FrameClicks:
     """What the user clicked, in full-frame pixels: surface points and joints, in one frame."""
 
     frame: int = 0
     surface: tuple[Clicks, ...] = ()
     joints: Mapping[str, Clicks] = field(default_factory=dict)
+
+    @property
+    def named(self) -> list[tuple[str, Clicks]]:
+        """All clicks and their names in messages: joints, then surface seeds from 1."""
+        return [*self.joints.items(), *((f"surface seed {i + 1}", at) for i, at in enumerate(self.surface))]
+
+    def table(self) -> list[tuple[str, list[tuple[str, list[float]]]]]:
+        """All clicks as plain values, for digests."""
+        clicks = [*self.joints.items(), *((f"surface {i}", at) for i, at in enumerate(self.surface))]
+        return [(name, sorted((view, xy.tolist()) for view, xy in at.items())) for name, at in clicks]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -121,8 +131,8 @@ class Take:
     no_body: bool = False  # the take asks for surface and tracks only: model = "none"
     locked: tuple[str, ...] = ()  # degrees of freedom that are held at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by degree of freedom, in degrees
-    seeds: Seeds = field(default_factory=Seeds)
-    keyframes: tuple[Seeds, ...] = ()  # clicked joints of further frames, one entry per frame
+    clicks: FrameClicks = field(default_factory=FrameClicks)
+    keyframes: tuple[FrameClicks, ...] = ()  # clicked joints of further frames, one entry per frame
     corrections: tuple[Correction, ...] = ()
     keypoints: tuple[KeypointSource, ...] = ()
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -144,9 +154,9 @@ class Take:
         """This take with one frame an image: of both fields the first, which then has the clicks of both."""
         if self.interlaced != BOTH:
             return self
-        seeds, *keys = (replace(s, frame=self.field_layout.image(s.frame)) for s in (self.seeds, *self.keyframes))
+        clicks, *keys = (replace(s, frame=self.field_layout.image(s.frame)) for s in (self.clicks, *self.keyframes))
         frames = None if self.frames is None else (self.frames[0] // 2, (self.frames[1] + 1) // 2)
-        return replace(self, fps=self.fps / 2, interlaced=self.first_field, frames=frames, seeds=seeds, keyframes=tuple(keys))
+        return replace(self, fps=self.fps / 2, interlaced=self.first_field, frames=frames, clicks=clicks, keyframes=tuple(keys))
 
     @property
     def reference(self) -> int:
@@ -227,14 +237,14 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None) ->
     """Open the footage (unless `sequences` are the opened views) and the rig of a take and check that they belong together.
 
     Raises:
-        InputError: a view without camera or images, views of unequal length, frames or seeds outside the footage.
+        InputError: a view without camera or images, views of unequal length, frames or clicks outside the footage.
     """
     rig = read_rig(take.rig_path)
     cameras = tuple(rig[v.name] for v in take.views)
     sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
     frames = footage_frames(take, sequences)
     footage = Footage(take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=frames)
-    _check_seeds(footage)
+    _check_clicks(footage)
     return footage
 
 
@@ -262,15 +272,15 @@ def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
     return range(start, stop)
 
 
-def _check_seeds(footage: Footage) -> None:
-    for seeds in (footage.take.seeds, *footage.take.keyframes):
-        clicks = [(f"joint “{name}”", at) for name, at in seeds.joints.items()]
-        clicks += [(f"surface seed {i + 1}", at) for i, at in enumerate(seeds.surface)]
+def _check_clicks(footage: Footage) -> None:
+    for clicked in (footage.take.clicks, *footage.take.keyframes):
+        clicks = [(f"joint “{name}”", at) for name, at in clicked.joints.items()]
+        clicks += [(f"surface seed {i + 1}", at) for i, at in enumerate(clicked.surface)]
         for label, at in clicks:
             _check_inside(footage, label, at)
-        if clicks and seeds.frame not in footage.frames:
+        if clicks and clicked.frame not in footage.frames:
             raise InputError(
-                f"The clicks of {footage.take.folder.name} in frame {seeds.frame} are not among the frames "
+                f"The clicks of {footage.take.folder.name} in frame {clicked.frame} are not among the frames "
                 f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` in take.toml."
             )
 
@@ -321,7 +331,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         no_body=body.get("model") == NO_BODY,
         locked=_locked(body.get("locked", []), where),
         limits=_limits(body.get("limits", {}), where),
-        seeds=_seeds(table_of(table, "seeds", where), names, where),
+        clicks=_frame_clicks(table_of(table, "seeds", where), names, where),
         keyframes=_keyframes(tables_of(table, "keyframes", where), names, where),
         corrections=tuple(_correction(c, names, where) for c in tables_of(table, "corrections", where)),
         keypoints=keypoint_sources(tables_of(table, "keypoints", where), names, JOINTS, where),
@@ -367,10 +377,10 @@ def _limits(table: Any, where: str) -> Mapping[str, tuple[float, float]]:
     return {name: (float(low), float(high)) for name, (low, high) in table.items()}
 
 
-def _keyframes(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: str) -> tuple[Seeds, ...]:
+def _keyframes(tables: list[Mapping[str, Any]], views: tuple[str, ...], where: str) -> tuple[FrameClicks, ...]:
     for table in tables:
         check_keys(table, ("frame", "joints"), f"a [[keyframes]] of {where}")
-    keyframes = tuple(_seeds(table, views, where) for table in tables)
+    keyframes = tuple(_frame_clicks(table, views, where) for table in tables)
     if len({k.frame for k in keyframes}) < len(keyframes):
         raise InputError(f"Two [[keyframes]] of {where} are for the same frame; write their joints into one.")
     return tuple(sorted(keyframes, key=lambda k: k.frame))
@@ -395,13 +405,13 @@ def _correction(table: Mapping[str, Any], views: tuple[str, ...], where: str) ->
     return Correction(kind=kind, view=view, frames=range(*frames), xy_px=np.array(corners, dtype=np.float64))
 
 
-def _seeds(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> Seeds:
+def _frame_clicks(table: Mapping[str, Any], views: tuple[str, ...], where: str) -> FrameClicks:
     check_keys(table, ("frame", "surface", "joints"), f"[seeds] of {where}")
     frame, surface, joints = table.get("frame", 0), table.get("surface", []), table.get("joints", {})
     if not isinstance(frame, int) or not isinstance(surface, list) or not isinstance(joints, dict):
         raise InputError(f"[seeds] of {where} needs frame (a whole number), surface (a list) and joints (a table).")
     check_keys(joints, JOINTS, f"[seeds.joints] of {where}")
-    return Seeds(
+    return FrameClicks(
         frame=frame,
         surface=tuple(_clicks(s, views, f"surface seed {i + 1} of {where}") for i, s in enumerate(surface)),
         joints={name: _clicks(at, views, f"joint “{name}” of {where}") for name, at in joints.items()},

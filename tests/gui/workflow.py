@@ -41,7 +41,7 @@ def steps() -> drive.Steps:
 def make_film(film: Path) -> Joints:
     """A folder of images for every view and rig.toml, and where the joints are in them."""
     make_arm_take(film, ArmTakeSettings(frames=6, width_px=512, interlaced="none", click_error_px=0.0))
-    joints = read_take(film).seeds.joints
+    joints = read_take(film).clicks.joints
     for name in ("take.toml", "truth.npz"):
         (film / name).unlink()
     return {name: {view: (float(xy[0]), float(xy[1])) for view, xy in at.items()} for name, at in joints.items()}

@@ -25,7 +25,7 @@ from ...geometry.camera import Camera
 from ...images.background import Background, known_background, still_background
 from ...surface.cloud import PointCloud
 from ...take.sources import read_picture
-from ...take.take import Footage, Seeds
+from ...take.take import Footage, FrameClicks
 from ..observations import BackgroundExclusion
 from ..observations.background import DistanceMap
 from ..settings import FitSettings
@@ -179,7 +179,7 @@ def _clicked_limbs(footage: Footage, backgrounds: Mapping[int, Background]) -> d
     take = footage.take
     masks = {k: np.zeros(_coarse(b.grey > 0).shape, bool) for k, b in backgrounds.items()}
     skeleton = read_model(str(take.body_model)).skeleton
-    for clicked in (take.seeds, *take.keyframes):
+    for clicked in (take.clicks, *take.keyframes):
         if clicked.joints and clicked.frame in footage.frames:
             images = footage.read(clicked.frame)
             for k, background in backgrounds.items():
@@ -187,7 +187,7 @@ def _clicked_limbs(footage: Footage, backgrounds: Mapping[int, Background]) -> d
     return masks
 
 
-def _lines(skeleton: Skeleton, clicked: Seeds, view: str) -> list[tuple[np.ndarray, np.ndarray]]:
+def _lines(skeleton: Skeleton, clicked: FrameClicks, view: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """From clicked joint to clicked joint, in squares."""
     at = {joint: pixels[view] / STEP_PX for joint, pixels in clicked.joints.items() if view in pixels}
     return [(at[b.head_joint], at[b.tail_joint]) for b in skeleton.bones if b.head_joint in at and b.tail_joint in at]

@@ -18,7 +18,7 @@ from ...motion.retarget.points import joint_of
 from ...results.folder import Results
 from ...surface.cloud import PointCloud
 from ...take.sources import KeypointSource
-from ...take.take import JOINTS, Footage, Seeds, Take
+from ...take.take import JOINTS, Footage, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import FitSettings
@@ -61,7 +61,7 @@ def fit_input(
         frames=frames,
         time_s=take.time_s(np.array(frames)),
         clicks=clicks_in(footage),
-        click_frame=take.seeds.frame,
+        click_frame=take.clicks.frame,
         trajectories=trajectories,  # type: ignore[arg-type]
         contours=read_contours(results, [v.name for v in take.views]),
         keypoints=[read_source(footage, source) for source in take.keypoints],
@@ -90,7 +90,7 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
     places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
     if not take.keypoints:
         best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
-        initial_clicks(places.get(take.seeds.frame, places[best]), names, [])
+        initial_clicks(places.get(take.clicks.frame, places[best]), names, [])
 
 
 def missing_for_fit(footage: Footage) -> str:
@@ -108,15 +108,15 @@ def clicks_left_out(footage: Footage) -> list[str]:
     outside = [s.frame for s in _with_joints(footage.take) if s.frame not in footage.frames]
     if not outside or missing_for_fit(footage):
         return []
-    begins = "; the fit begins at other clicks or keypoints" if footage.take.seeds.frame in outside else ""
+    begins = "; the fit begins at other clicks or keypoints" if footage.take.clicks.frame in outside else ""
     return [
         f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
         f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."
     ]
 
 
-def _with_joints(take: Take) -> list[Seeds]:
-    return [s for s in (*take.keyframes, take.seeds) if s.joints]
+def _with_joints(take: Take) -> list[FrameClicks]:
+    return [s for s in (*take.keyframes, take.clicks) if s.joints]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -212,5 +212,5 @@ def joint_named(name: str) -> str:
     return OURS.get(part, "") + (dot + side if part in OURS else "")
 
 
-def _clicked(seeds: Seeds) -> ClickedAt:
-    return {name: {view: xy.tolist() for view, xy in at.items()} for name, at in seeds.joints.items()}
+def _clicked(clicks: FrameClicks) -> ClickedAt:
+    return {name: {view: xy.tolist() for view, xy in at.items()} for name, at in clicks.joints.items()}

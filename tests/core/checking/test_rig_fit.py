@@ -16,7 +16,7 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
-from tricap.core.take.take import Seeds, Take, View
+from tricap.core.take.take import FrameClicks, Take, View
 from tricap.core.take.writing import new_table, toml_text
 
 from ..conftest import three_cameras
@@ -95,10 +95,10 @@ def test_clicks_of_all_frames_by_pairs_of_views() -> None:
     def at(*xy: float) -> np.ndarray:
         return np.array(xy)
 
-    seeds = Seeds(joints={"elbow.R": {"L": at(1, 2), "R": at(3, 4)}, "neck": {"C": at(5, 6)}})
-    later = Seeds(frame=3, joints={"elbow.R": {"L": at(7, 8), "C": at(9, 10), "R": at(11, 12)}})
+    clicks = FrameClicks(joints={"elbow.R": {"L": at(1, 2), "R": at(3, 4)}, "neck": {"C": at(5, 6)}})
+    later = FrameClicks(frame=3, joints={"elbow.R": {"L": at(7, 8), "C": at(9, 10), "R": at(11, 12)}})
     views = tuple(View(name=name, images=f"{name}/*.png") for name in NAMES)
-    take = Take(folder=Path(), fps=25.0, views=views, rig_path=Path(), seeds=seeds, keyframes=(later,))
+    take = Take(folder=Path(), fps=25.0, views=views, rig_path=Path(), clicks=clicks, keyframes=(later,))
     pairs = {(p.i, p.j): p for p in clicked_pairs(take)}
     assert pairs[0, 2].xi_px.tolist() == [[1, 2], [7, 8]] and pairs[0, 2].xj_px.tolist() == [[3, 4], [11, 12]]
     assert (len(pairs[0, 1].xi_px), pairs[1, 2].xi_px.tolist()) == (1, [[9, 10]])

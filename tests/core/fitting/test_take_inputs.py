@@ -15,7 +15,7 @@ from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.formats.trc import write_trc
 from tricap.core.results.folder import Results
 from tricap.core.take.sources import keypoint_sources
-from tricap.core.take.take import JOINTS, Seeds
+from tricap.core.take.take import JOINTS, FrameClicks
 
 
 def _footage(folder):
@@ -69,8 +69,8 @@ def test_a_missing_file_shifts_no_other(tmp_path) -> None:
 def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, missing, said) -> None:
     joints = {"knee.R": {"L": np.zeros(2)}}
     take = SimpleNamespace(
-        seeds=Seeds(frame=seeds, joints=joints),
-        keyframes=tuple(Seeds(frame=f, joints=joints) for f in keyframes),
+        clicks=FrameClicks(frame=seeds, joints=joints),
+        keyframes=tuple(FrameClicks(frame=f, joints=joints) for f in keyframes),
         body_model="full",
         keypoints=(),
     )

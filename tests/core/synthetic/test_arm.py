@@ -53,7 +53,7 @@ def test_truth_has_the_promised_layout(take: Path) -> None:
 
 
 def test_clicks_are_near_the_joints_and_not_on_them(take: Path) -> None:
-    truth, clicks = np.load(take / "truth.npz"), read_take(take).seeds.joints
+    truth, clicks = np.load(take / "truth.npz"), read_take(take).clicks.joints
     rig = read_rig(take / "rig.toml")
     error = np.array(
         [

@@ -49,8 +49,8 @@ def test_everything_that_it_says(tmp_path: Path) -> None:
     assert [(v.name, v.images, v.movie, v.offset_frames) for v in take.views] == [(v, f"{v}/*.png", None, 0) for v in "LCR"]
     assert take.rig_path == take.folder / "rig.toml" and take.body_model == "arm.R"
     assert (take.rows_at(3).step, take.rows_at(3).offset) == (2, 1)
-    assert take.seeds.frame == 3 and take.seeds.surface[0]["C"].tolist() == [3, 4.5]
-    assert list(take.seeds.joints) == ["elbow.R"] and take.seeds.joints["elbow.R"]["R"].tolist() == [7, 8]
+    assert take.clicks.frame == 3 and take.clicks.surface[0]["C"].tolist() == [3, 4.5]
+    assert list(take.clicks.joints) == ["elbow.R"] and take.clicks.joints["elbow.R"]["R"].tolist() == [7, 8]
     assert take.settings == {"matching": {"patch_px": 17}}
     assert read_take(tmp_path / "take.toml").folder == take.folder
 
@@ -59,13 +59,13 @@ def test_both_fields(footage: Path) -> None:
     """Five images of 25 a second are ten frames of 50 a second; offsets count images, all other numbers frames."""
     late = VIEWS.replace('"R/*.png"', '"R/*.png"\noffset_frames = 1')
     take = rewrite(footage, dict(interlaced='"both"', first_field='"even"', frames="[3, 8]"), late, "[seeds]\nframe = 5\n")
-    assert (take.fps, take.frames, take.seeds.frame) == (50.0, (3, 8), 5)
+    assert (take.fps, take.frames, take.clicks.frame) == (50.0, (3, 8), 5)
     assert [take.rows_at(n).offset for n in range(4)] == [1, 0, 1, 0]
     opened = open_take(take)
     assert [opened.number(0, n) for n in range(3, 8)] == [1, 2, 2, 3, 3] and [opened.number(2, n) for n in (3, 4)] == [2, 3]
     assert [path.name for path in opened.files(7)] == ["0003.png", "0003.png", "0004.png"]
     single = opened.single()
-    assert (single.take.interlaced, single.take.fps, single.take.seeds.frame, single.frames) == ("even", 25.0, 2, range(1, 4))
+    assert (single.take.interlaced, single.take.fps, single.take.clicks.frame, single.frames) == ("even", 25.0, 2, range(1, 4))
     assert open_take(rewrite(footage, dict(interlaced='"both"'))).frames == range(10)
     with pytest.raises(InputError, match=r"the footage has frames 0 to 8 \(half-open\)"):
         open_take(rewrite(footage, dict(interlaced='"both"', frames="[0, 9]"), late))
@@ -100,7 +100,7 @@ def test_no_body_and_a_body_of_ones_own(tmp_path: Path) -> None:
 def test_what_may_be_left_out(tmp_path: Path) -> None:
     take = read(tmp_path, text(dict(rig=None)))
     assert (take.reference_view, take.interlaced, take.frames, take.body_model) == ("C", "none", None, None)
-    assert take.rig_path.name == "rig.toml" and not take.seeds.joints and not take.seeds.surface
+    assert take.rig_path.name == "rig.toml" and not take.clicks.joints and not take.clicks.surface
     two = read(tmp_path, text(views=VIEWS.split('[[views]]\nname = "R"')[0]))
     assert two.reference_view == "C"
 
