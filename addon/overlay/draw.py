@@ -159,7 +159,7 @@ def _draw_contour(run: RunResults, view: str, frame: int) -> list[tuple[str, Col
     if found is None:
         return [("no outline in this frame", PROBLEM)]
     segments = canvas.chain(found.xy_px, closed=True)
-    for mine, colour in ((found.seen, CONTOUR), (~found.seen, NO_EDGE)):
+    for mine, colour in ((found.on_edge, CONTOUR), (~found.on_edge, NO_EDGE)):
         if mine.any():
             batch = run.cached(("contour batch", view, frame, bool(colour is CONTOUR)), lambda mine=mine: canvas.line_batch(segments[mine]))
             canvas.draw_lines(batch, 1.5, colour)

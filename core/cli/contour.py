@@ -1,4 +1,4 @@
-"""`tricap contour`: the outline of the person in one view, frame after frame, carried by the trajectories."""
+"""`tricap contour`: the outline of the person in one view, tracked frame by frame with the trajectories."""
 
 import argparse
 from collections.abc import Iterator
@@ -36,27 +36,36 @@ from ..tracking.contour import (
 from ..tracking.point_tables import read_polygon
 from .arguments import frame_range, overrides
 
-ALGORITHM = "contours 2"  # part of the checkpoints' keys: raise it when the same input gives other numbers
-BACKGROUND_SIGMAS, OPENING_PX, CLOSING_PX = 4.0, 1, 3
-SHADOW_PX, SHADOW_SCATTER, DARKEST_SHADOW = 7, 0.06, 0.6  # window, and what a shadow leaves of the light
-CLOSING_CELLS, ONE_PIECE = (2, 3, 4, 6), 0.9
-APART_PX, AGREEING = 8.0, 0.95  # a contour of which more than a twentieth is further from the measured outline begins anew
+ALGORITHM = "contours 3"  # part of the checkpoints' keys: raise it when the same input gives other numbers
+BACKGROUND_MEDIANS = 4.0  # smallest difference from the background, in units of its median over the image
+MIN_DIFFERENCE = 4.0  # the same in grey values; the larger limit counts
+DIFFERENCE_BLUR_PX = 1.5  # of differences and ratios to the background
+OPENING_PX = 1  # radius, of the mask of differences
+CLOSING_PX = 3  # radius, of the same
+SHADOW_PX = 7  # window in which a shadow's ratio to the background is uniform
+SHADOW_SCATTER = 0.06  # largest standard deviation of that ratio
+MIN_SHADOW_RATIO = 0.6  # part of the light that a shadow leaves
+CLOSING_CELLS = (2, 3, 4, 6)  # radii that are tried for closing the measured surface, in units of the contour's spacing
+ONE_PIECE = 0.9  # part of the surface within its outline
+MIN_VERTICES = 8  # of an outline
+MAX_DISTANCE_PX = 8.0  # between a predicted contour and the frame's own outline
+AGREEING_PART = 0.95  # of the vertices that must lie within it; otherwise the own outline replaces the contour
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Start:
-    """What the contour begins with; by default the outline of the measured surface."""
+    """The start of a contour; by default the outline of the measured surface."""
 
     polygon: np.ndarray | None = None  # (V, 2) px of the first frame
-    background: np.ndarray | None = None  # (h, w) the view without the person
-    body: bool = False  # the projected skin of the fitted body
+    background: np.ndarray | None = None  # (h, w) image of the view without the person
+    body: bool = False  # the outline of the projected skin of the fitted body
 
 
 MEASURED_SURFACE = Start()
 
 
 def add_command(commands: Any) -> None:
-    """Join `contour` to the parser's commands."""
+    """Add `contour` to the parser's commands."""
     about = "the outline of the person in one view, tracked through the frames"
     parser = commands.add_parser("contour", help=about, description=about[0].upper() + about[1:])
     parser.add_argument("take", type=Path, metavar="TAKE", help="folder with take.toml")
@@ -66,16 +75,16 @@ def add_command(commands: Any) -> None:
     start = parser.add_mutually_exclusive_group()
     start.add_argument("--polygon", type=Path, metavar="FILE", help="CSV with x,y of the outline in the first frame")
     start.add_argument("--background", type=Path, metavar="FILE", help="image of the view without the person")
-    start.add_argument("--from-body", action="store_true", help="begin with the outline of the body that is fitted in OUT")
+    start.add_argument("--from-body", action="store_true", help="start from the outline of the body that was fitted in OUT")
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
     parser.set_defaults(run=run, json=False)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Track the contour (measures and tracks first where that is needed); the lines to show.
+    """Track the contour, after measuring and tracking where needed; the lines to show.
 
     Raises:
-        InputError: the arguments or the take need mending.
+        InputError: the arguments or the take have an error.
     """
     start = Start(
         polygon=read_polygon(args.polygon) if args.polygon else None,
@@ -94,7 +103,7 @@ def _check_views(take: Take, views: list[str]) -> list[str]:
     """The names of a take's views.
 
     Raises:
-        InputError: one that is asked for is not among them.
+        InputError: one of `views` is not among them.
     """
     names = [v.name for v in take.views]
     for name in views:
@@ -103,69 +112,69 @@ def _check_views(take: Take, views: list[str]) -> list[str]:
     return names
 
 
-def write_contours(job: take_run.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
-    """Track the contour in the views of these names: contours/NAME.csv of each.
+def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
+    """Track the contour in the views of these names, write contours/NAME.csv of each, and return a sentence for each.
 
-    Measures and tracks first where that is needed: a background shows the outline in every frame, and what cannot be measured, or is not
-    to be (fitting.use_surface), is followed in the images from a polygon.
+    The take is measured and tracked first where that is needed. It is not needed with a background, which gives the outline in every frame.
+    Where there is no surface (or fitting.use_surface is false), a contour that starts from a polygon is tracked in the images.
 
-    Says what was found. A body that the contours begin with is that of the same frames and settings; with the contours it is stale, and the
-    next fit replaces it.
+    A body from which the contours start must belong to the same frames and settings. The contours make it stale, and the next fit replaces
+    it.
 
     Raises:
         InputError: there is no such view, or nothing to start from.
     """
     names = _check_views(job.footage.take, views)
     if len(views) > 1 and (start.polygon is not None or start.background is not None):
-        raise InputError("A polygon or a background is that of one view; give one --view with it.")
+        raise InputError("A polygon or a background belongs to one view; give it with a single --view.")
     if start.body and not job.results.path("skin").is_dir():
         folder = job.results.folder
-        raise InputError(f"{folder} holds no body with a skin that was fitted to these frames with these settings; run `tricap fit` first.")
+        raise InputError(f"{folder} has no fitted body with a skin for these frames and settings; run `tricap fit` first.")
     own_start = start.polygon is not None or start.background is not None or start.body
     if job.trajectories is None and start.background is None and (job.settings["fitting"].use_surface or not own_start):
         _track_if_possible(job, monitor, own_start)
     return [_write_contour(job, name, names.index(name), monitor, start) for name in views]
 
 
-def _track_if_possible(job: take_run.Run, monitor: Monitor, own_start: bool) -> None:
-    """Measure and track; that there is nothing to measure is no fault where the contour has another start."""
+def _track_if_possible(job: pipeline.Run, monitor: Monitor, own_start: bool) -> None:
+    """Measure and track; a take without a measurable surface is an error only if the contour starts from the surface."""
     try:
         pipeline.track(job, monitor)
     except NothingMeasured as error:
         if not own_start:
             raise
-        job.warn(f"{error} The outline was followed in the images.")
+        job.warn(f"{error} The outline was tracked in the images.")
 
 
-def _write_contour(job: take_run.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
-    path, seen = job.results.path("contours", f"{name}.csv"), list[float]()
+def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
+    path, on_edge = job.results.path("contours", f"{name}.csv"), list[float]()
     with store.written(path) as file:
         file.write(HEAD.encode())
-        for frame, contour in track_contour(job, view, monitor, start, KeptContours(job, view, start)):
+        for frame, contour in track_contour(job, view, monitor, start, ContourCheckpoints(job, view, start)):
             file.write(contour_rows(frame, contour).encode())
-            seen.append(contour.seen.mean())
+            on_edge.append(contour.on_edge.mean())
     job.results.remove(f"cache/{_checkpoints(view)}")
     job.results.write_run(job.record)
-    return f"{path}: the outline in {len(seen)} frames, {100 * float(np.mean(seen)):.0f} % of its vertices on an edge."
+    return f"{path}: the outline in {len(on_edge)} frames, {100 * float(np.mean(on_edge)):.0f} % of its vertices on an edge."
 
 
-class KeptContours:
-    """Checkpoints of the contours of a view, one a frame, with a key of all that the first and the following depend on."""
+class ContourCheckpoints:
+    """Checkpoints of the contours of a view, one per frame, with a key of everything on which they depend."""
 
     def __init__(self, job: take_run.Run, view: int, start: Start) -> None:
         self._results, self._stage = job.results, _checkpoints(view)
-        begun = [b"" if a is None else np.ascontiguousarray(a).tobytes() for a in (start.polygon, start.background)]
+        start_data = [b"" if a is None else np.ascontiguousarray(a).tobytes() for a in (start.polygon, start.background)]
         body = sorted(job.results.path("skin").glob("*.ply")) if start.body else []
-        tracked = "tracked" if job.trajectories is not None else "followed in the images"
-        self._key = store.digest(ALGORITHM, job.keys["track"], repr(job.settings["contour"]), tracked, *begun, *body)
+        tracked = "tracked" if job.trajectories is not None else "tracked in the images"
+        self._key = store.digest(ALGORITHM, job.keys["track"], repr(job.settings["contour"]), tracked, *start_data, *body)
 
     def load(self, frame: int) -> Contour | None:
-        """That of a frame, if it was found before."""
-        kept = self._results.load_checkpoint(self._stage, f"{frame:04d}", self._key)
-        return None if kept is None else Contour(**{f.name: kept[f.name] for f in fields(Contour)})
+        """The contour of a frame, None if it has no valid checkpoint."""
+        arrays = self._results.load_checkpoint(self._stage, f"{frame:04d}", self._key)
+        return None if arrays is None else Contour(**{f.name: arrays[f.name] for f in fields(Contour)})
 
     def save(self, frame: int, contour: Contour) -> None:
-        """Keep that of a frame."""
+        """Write the checkpoint of a frame."""
         arrays = {f.name: getattr(contour, f.name) for f in fields(Contour)}
         self._results.save_checkpoint(self._stage, f"{frame:04d}", self._key, arrays)
 
@@ -175,68 +184,68 @@ def _checkpoints(view: int) -> str:
 
 
 def track_contour(
-    job: take_run.Run, view: int, monitor: Monitor, start: Start, kept: KeptContours | None = None
+    job: pipeline.Run, view: int, monitor: Monitor, start: Start, checkpoints: ContourCheckpoints | None = None
 ) -> Iterator[tuple[int, Contour]]:
-    """(frame, contour) of one view; each predicted by the projected trajectories inside the last one that had any, or else by points that
-    are followed in the images.
+    """(frame, contour) of one view. Each is predicted from the last one by the projected trajectories inside it, or without trajectories by
+    points that are tracked in the images.
 
-    A predicted contour that differs too much from the frame's own outline, of the measured surface, of the fitted body or before the
-    background, gives way to it, unless it began with a polygon.
+    Every frame has an outline of its own: that of the measured surface, of the fitted body, or of the difference from the background. It
+    replaces a predicted contour that differs too much from it, except where the contour started from a polygon.
 
     Raises:
         InputError: there is nothing to start from.
     """
-    follower = _Follower(job, view, start)
+    tracker = _ContourTracker(job, view, start)
     for i, cloud in enumerate(job.clouds):
         monitor.step("contours", i, len(job.clouds))
-        contour = kept.load(cloud.frame) if kept is not None else None
+        contour = checkpoints.load(cloud.frame) if checkpoints is not None else None
         if contour is None:
-            contour = follower.found(i, cloud)
-            if kept is not None:
-                kept.save(cloud.frame, contour)
-        follower.goes_on(i, cloud.frame, contour)
+            contour = tracker.contour_in(i, cloud)
+            if checkpoints is not None:
+                checkpoints.save(cloud.frame, contour)
+        tracker.update(i, cloud.frame, contour)
         yield cloud.frame, contour
 
 
-class _Follower:
-    """The contour from frame to frame: `base` is the last that had something to go by, in frame index `last` of number `frame`."""
+class _ContourTracker:
+    """The state of a tracked contour: `base` is the contour from which the next is predicted, of frame number `frame` with index `last`."""
 
     def __init__(self, job: take_run.Run, view: int, start: Start) -> None:
         self._job, self._view, self._start = job, view, start
         self._camera, self._tracks, self._settings = job.footage.rig.cameras[view], job.trajectories, job.settings["contour"]
         self._base: Contour | None = None
         self._last, self._frame = 0, 0
-        self._image: tuple[int, np.ndarray] | None = None  # the one that was read last, with its frame
+        self._image: tuple[int, np.ndarray] | None = None  # the last one read, with its frame
 
-    def goes_on(self, index: int, frame: int, contour: Contour) -> None:
-        """The next contour begins with this one, unless nothing was seen in its frame."""
-        if self._base is None or (contour.seen.any() if self._tracks is None else self._tracks.seen[index].any()):
+    def update(self, index: int, frame: int, contour: Contour) -> None:
+        """Predict the next contour from this one, unless its frame has neither trajectories nor edges."""
+        if self._base is None or (contour.on_edge.any() if self._tracks is None else self._tracks.visible[index].any()):
             self._base, self._last, self._frame = contour, index, frame
 
-    def found(self, index: int, cloud: PointCloud) -> Contour:
+    def contour_in(self, index: int, cloud: PointCloud) -> Contour:
         """The contour in the frame of a cloud.
 
         Raises:
             InputError: there is nothing to start from.
         """
-        places = None if self._base is None else self._moved(self._base, index, cloud.frame)
+        moved = None if self._base is None else self._moved(self._base, index, cloud.frame)
         grey = self._grey(cloud.frame)
         own = self._own(grey, cloud)
-        if self._base is not None and places is not None:
-            return relax_contour(_renewed(predict_contour(self._base.xy_px, *places), own), grey, self._settings)
+        if self._base is not None and moved is not None:
+            return relax_contour(_replaced(predict_contour(self._base.xy_px, *moved), own), grey, self._settings)
         predicted = own if self._start.polygon is None else resampled(self._start.polygon, self._settings.spacing_px)
-        if len(predicted) < 8:
+        if len(predicted) < MIN_VERTICES:
             raise InputError(f"There is no outline to start from in frame {cloud.frame}; give one with --polygon.")
         return relax_contour(predicted, grey, self._settings)
 
     def _moved(self, base: Contour, index: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Points (N, 2), (N, 2) of the view in the frame of the last contour, and in this one."""
+        """Points of the view (N, 2) in the frame of the base contour, and the same points (N, 2) in this frame."""
         if self._tracks is not None:
             return self._camera.project(self._tracks.xyz_m[self._last]), self._camera.project(self._tracks.xyz_m[index])
         return carried_points(base.xy_px, self._grey(self._frame), self._grey(frame))
 
     def _own(self, grey: np.ndarray, cloud: PointCloud) -> np.ndarray:
-        """The outline (V, 2) that a frame shows by itself; none where the contour began with a polygon."""
+        """The frame's own outline (V, 2); none where the contour started from a polygon."""
         if self._start.body:
             return _of_body(body_outline(self._job.results.folder, cloud.frame, self._camera), self._settings)
         if self._start.background is not None:
@@ -252,18 +261,17 @@ class _Follower:
 
 
 def _before_background(grey: np.ndarray, background: np.ndarray, settings: ContourSettings) -> np.ndarray:
-    """The outline of what differs from the background by more than a pixel's shift of the camera explains, shadows aside: they darken a
-    place by little, and evenly.
+    """The outline of the difference from the background, without shadows and without what a camera shift of a pixel explains.
 
     Raises:
         InputError: the background is of another size.
     """
     if background.shape != grey.shape:
-        raise InputError("The background image has another size than the view; take it with the same camera.")
+        raise InputError("The background image and the view differ in size; use an image of the same camera.")
     room, neighbours = background.astype(np.float32), np.ones((3, 3), np.uint8)
     beyond = np.maximum(grey - cv2.dilate(room, neighbours), cv2.erode(room, neighbours) - grey)
-    difference = cv2.GaussianBlur(np.maximum(beyond, 0.0).astype(np.float32), (0, 0), 1.5)
-    limit = max(float(np.median(difference)) * BACKGROUND_SIGMAS, 4.0)
+    difference = cv2.GaussianBlur(np.maximum(beyond, 0.0).astype(np.float32), (0, 0), DIFFERENCE_BLUR_PX)
+    limit = max(float(np.median(difference)) * BACKGROUND_MEDIANS, MIN_DIFFERENCE)
     mask = ((difference > limit) & ~_shadow(grey, background)).astype(np.uint8)
     for operation, radius in ((cv2.MORPH_OPEN, OPENING_PX), (cv2.MORPH_CLOSE, CLOSING_PX)):
         mask = cv2.morphologyEx(mask, operation, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2))
@@ -271,29 +279,29 @@ def _before_background(grey: np.ndarray, background: np.ndarray, settings: Conto
 
 
 def _shadow(grey: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Where (h, w) an image is the background, darker by a factor that is nearly the same all around (Horprasert et al. 1999)."""
+    """Where (h, w) an image shows the background darkened by a locally uniform factor (Horprasert et al. 1999)."""
     ratio = ((grey + 1) / (background + 1)).astype(np.float32)
     mean, square = (cv2.blur(r, (SHADOW_PX, SHADOW_PX)) for r in (ratio, ratio**2))
     even = np.sqrt(np.maximum(square - mean**2, 0.0)) < SHADOW_SCATTER
-    smooth = cv2.GaussianBlur(ratio, (0, 0), 1.5)
-    return np.asarray(even & (smooth > DARKEST_SHADOW) & (smooth < 1.0))
+    smooth = cv2.GaussianBlur(ratio, (0, 0), DIFFERENCE_BLUR_PX)
+    return np.asarray(even & (smooth > MIN_SHADOW_RATIO) & (smooth < 1.0))
 
 
 def _of_body(outlines: list[np.ndarray], settings: ContourSettings) -> np.ndarray:
-    """The largest of the outlines of a body's skin; none where it has none."""
+    """The largest of the outlines of a body's skin; none if there are none."""
     if not outlines:
         return np.zeros((0, 2))
     return resampled(max(outlines, key=lambda o: cv2.contourArea(o.astype(np.float32))), settings.spacing_px)
 
 
 def _outline(grey: np.ndarray, points: np.ndarray, settings: ContourSettings) -> np.ndarray:
-    """The outline of the measured surface; gaps are closed until nearly all of it is one piece."""
+    """The outline of the measured surface; gaps are closed until nearly all of it is in one piece."""
     size = (grey.shape[1], grey.shape[0])
     outline = np.zeros((0, 2))
     for cells in CLOSING_CELLS:
         mask = mask_of_points(points, size, cells * settings.spacing_px)
         outline = contour_of_mask(mask, settings.spacing_px)
-        if len(outline) >= 8:
+        if len(outline) >= MIN_VERTICES:
             inside = np.zeros(mask.shape, dtype=np.uint8)
             cv2.fillPoly(inside, [np.rint(outline).astype(np.int32)], 1)
             if (mask & (inside > 0)).sum() >= ONE_PIECE * mask.sum():
@@ -301,9 +309,9 @@ def _outline(grey: np.ndarray, points: np.ndarray, settings: ContourSettings) ->
     return outline
 
 
-def _renewed(predicted: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """The predicted contour, or the frame's own outline where both differ too much: limbs crossed, or parted."""
-    if len(outline) < 8:
+def _replaced(predicted: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """The predicted contour, or the frame's own outline where the two differ too much, because limbs crossed or separated."""
+    if len(outline) < MIN_VERTICES:
         return predicted
     there, back = (cKDTree(b).query(a)[0] for a, b in ((predicted, outline), (outline, predicted)))
-    return outline if max(np.quantile(there, AGREEING), np.quantile(back, AGREEING)) > APART_PX else predicted
+    return outline if max(np.quantile(there, AGREEING_PART), np.quantile(back, AGREEING_PART)) > MAX_DISTANCE_PX else predicted

@@ -33,7 +33,7 @@ def figure_rows(
         ("sigma of a point (median)", "mm"): [1e3 * float(np.median(c.sigma_m)) for c in clouds if len(c.sigma_m)],
     }
     if trajectories is not None:
-        per_frame["tracked points a frame", "points"] = trajectories.seen.sum(axis=1).astype(float).tolist()
+        per_frame["tracked points a frame", "points"] = trajectories.visible.sum(axis=1).astype(float).tolist()
     rows = [_row(name, float(np.median(v)), float(np.std(v)), unit, FRAME_TO_FRAME) for (name, unit), v in per_frame.items() if v]
     for view, offset in record.get("offsets", {}).items():
         if offset["late_frames"] is not None and offset["sigma_frames"] is not None:

@@ -148,7 +148,7 @@ def _graphs(report: Report) -> list[str]:
         curve_graph("Sigma of the points (median)", "mm", frames, {"sigma": sigma}),
     ]
     if trajectories is not None:
-        graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.seen.sum(axis=1).astype(float)}))
+        graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.visible.sum(axis=1).astype(float)}))
     if body is not None:
         angles = [i for i, dof in enumerate(body.shape.skeleton.dofs) if i not in set(body.shape.skeleton.layout.group("base").tolist())]
         for i in angles:

@@ -59,7 +59,7 @@ def tracks_over_footage(grey: np.ndarray, camera: Camera, trajectories: Trajecto
     """The points visible in one frame with their paths up to it, coloured by speed (blue slow, red fast), over one view."""
     picture = colour(grey)
     first = max(0, index - TAIL_FRAMES)
-    visible = trajectories.seen[index]
+    visible = trajectories.visible[index]
     paths = camera.project(trajectories.xyz_m[first : index + 1, visible])
     speed = np.nan_to_num(np.linalg.norm(trajectories.velocity_m_s[index, visible], axis=1))
     colours = _colours(speed, 0.0, max(0.2, float(np.percentile(speed, 98)) if len(speed) else 0.2))

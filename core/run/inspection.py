@@ -1,6 +1,6 @@
-"""What a run found, read back to be looked at: matched points with their patches, trajectories with what became of them, outlines.
+"""The results of a run, read back for inspection: matched points with their patches, trajectories with their status, outlines.
 
-Nothing is computed anew here but projections. What lies only in the checkpoints (patches, residuals) is missing once they are deleted.
+Nothing but projections is computed here. Patches and residuals are stored only in the checkpoints, and are missing once these are deleted.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from ..matching.seeds import approximations_at_depth
 from ..motion.formats.ply import read_ply
 from ..tracking.settings import TrackStatus
 
-SAME_M = 2e-6  # a PLY file has single precision
-CHECKPOINT = {  # of a frame's surface: what is shown of it
+SAME_M = 2e-6  # largest difference between a point's coordinates in the checkpoint and in the PLY file, of single precision
+CHECKPOINT = {  # of a frame's surface: the arrays shown
     "cloud_xyz_m": ("f", "N3"), "grid": ("iu", "4"), "field_xy": ("f", "NK2"), "field_shape": ("f", "NK22"), "field_cell": ("iu", "N"),
     "field_residual_px": ("f", "N"), "field_correlation": ("f", "N"),
 }  # fmt: skip
@@ -29,11 +29,11 @@ CHECKPOINT = {  # of a frame's surface: what is shown of it
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FramePoints:
-    """The N points of a frame's cloud as K views saw them. Full-frame pixels."""
+    """The N points of a frame's cloud in K views. Full-frame pixels."""
 
     xyz_m: np.ndarray  # (N, 3)
     sigma_m: np.ndarray  # (N,)
-    xy_px: np.ndarray  # (N, K, 2) where they were matched; their projections where the checkpoint is gone
+    xy_px: np.ndarray  # (N, K, 2) as matched; without checkpoint their projections
     middle_px: np.ndarray  # (N, K, 2) of the patches; NaN without checkpoint
     shape: np.ndarray  # (N, K, 2, 2) of the patches, in rows' pixels; NaN without checkpoint
     residual_px: np.ndarray  # (N,) NaN without checkpoint
@@ -45,22 +45,22 @@ class TrackHistory:
     """All trajectories before filters and corrections."""
 
     frames: np.ndarray  # (T,)
-    xyz_m: np.ndarray  # (T, N, 3) NaN: not seen
-    status: np.ndarray  # (T, N) TrackStatus; MEASURED where it was kept
+    xyz_m: np.ndarray  # (T, N, 3) NaN where not visible
+    status: np.ndarray  # (T, N) TrackStatus; MEASURED where it passed
 
     @property
     def kept(self) -> np.ndarray:
-        """(T, N) positions that the filters and the user left."""
+        """(T, N) positions that neither the filters nor the user removed."""
         return (self.status == TrackStatus.MEASURED) & np.isfinite(self.xyz_m[..., 0])
 
     @property
     def removed(self) -> np.ndarray:
-        """(T, N) positions that they took out."""
+        """(T, N) positions that the filters or the user removed."""
         return (self.status != TrackStatus.MEASURED) & np.isfinite(self.xyz_m[..., 0])
 
     def tails(self, camera: Camera, frame: int, length: int, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What a camera sees of the last `length` frames: segments (M, 2, 2) between neighbouring frames, their trajectories (M,), and how
-        old they are, 0…1 (M,). A segment belongs when `which` (T, N) holds at its newer end."""
+        """The last `length` frames in a camera: segments (M, 2, 2) between neighbouring frames, their trajectories (M,), and their relative
+        ages, 0…1 (M,). Only segments whose newer end is selected by `which` (T, N)."""
         now = int(np.searchsorted(self.frames, frame))
         if now >= len(self.frames) or self.frames[now] != frame:
             return np.zeros((0, 2, 2)), np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -72,7 +72,7 @@ class TrackHistory:
         return np.stack([xy[t, n], xy[t + 1, n]], axis=1), n, 1 - (t + 1) / max(now - first, 1)
 
     def at(self, camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (N, 2) in a frame, NaN where not seen, and what became of them there (N,) TrackStatus."""
+        """Pixels (N, 2) in a frame, NaN where not visible, and the TrackStatus (N,) there."""
         now = np.flatnonzero(self.frames == frame)
         if not len(now):
             return np.full((self.status.shape[1], 2), np.nan), np.zeros(self.status.shape[1], dtype=np.int8)
@@ -100,9 +100,9 @@ def read_points(out: Path, frame: int, cameras: Sequence[Camera], rows: RowGrid)
 
 
 def read_removed(out: Path, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the views (M, K, 2) saw what the surface's filters took out of a frame, and which of `FILTERS` did so, 1 for the first (M,).
+    """The pixels (M, K, 2) of points that the surface's filters removed from a frame, and the filter (M,), 1 for the first of `FILTERS`.
 
-    Nothing where the checkpoint is deleted, damaged or of another version.
+    Empty where the checkpoint is deleted, damaged or of another version.
     """
     try:
         path = Path(out) / "cache" / "surface" / f"{frame:04d}.npz"
@@ -114,7 +114,7 @@ def read_removed(out: Path, frame: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _add_matches(values: dict[str, np.ndarray], path: Path, xyz: np.ndarray, rows: RowGrid) -> None:
-    """Put in what the checkpoint knows of the same points; the user's corrections may have left fewer than it has."""
+    """Add the checkpoint's values of the same points; the user's corrections may have removed some of them from the cloud."""
     try:
         saved, _ = store.load(path)
         store.check_layout(path, saved, **CHECKPOINT)
@@ -147,7 +147,7 @@ def _key(xyz: np.ndarray) -> np.ndarray:
 def patch_boxes(
     points: FramePoints, row: int, cameras: Sequence[Camera], reference: int, rows: RowGrid, patch_px: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A point's patch in every view (K, 4, 2): where matching starts, as if the surface faced the reference camera; and as it was matched.
+    """A point's patch in every view (K, 4, 2): at the start of matching, with a surface that faces the reference camera; and as matched.
 
     NaN without checkpoint.
     """
@@ -162,7 +162,7 @@ def patch_boxes(
 
 
 def read_tracks(out: Path) -> TrackHistory | None:
-    """All trajectories of a run, None where there are none.
+    """All trajectories of a run; None if there are none.
 
     Raises:
         InputError: the file is damaged.
@@ -173,12 +173,12 @@ def read_tracks(out: Path) -> TrackHistory | None:
     arrays, _ = store.load(path)
     store.check_layout(path, arrays, frames=("iu", "T"), xyz_m=("f", "TN3"), status=("iu", "TN"))
     if not np.isin(arrays["status"], list(TrackStatus)).all() or (np.diff(arrays["frames"].astype(np.int64)) < 1).any():
-        raise InputError(f"{path} is damaged: frames or states that cannot be; run the tracking again.")
+        raise InputError(f"{path} is damaged (invalid frames or states); run the tracking again.")
     return TrackHistory(frames=arrays["frames"], xyz_m=arrays["xyz_m"].astype(np.float64), status=arrays["status"])
 
 
 def body_outline(out: Path, frame: int, camera: Camera) -> list[np.ndarray]:
-    """The outline of the fitted body's skin in a camera's picture: closed polylines (M, 2); none where there is no skin.
+    """The outline of the fitted body's skin in a camera: closed polylines (M, 2); none if there is no skin.
 
     Raises:
         InputError: the skin's file is damaged.
@@ -195,6 +195,6 @@ def body_outline(out: Path, frame: int, camera: Camera) -> list[np.ndarray]:
 
 
 def _smoothed(loop: np.ndarray) -> np.ndarray:
-    """A closed chain of pixels (M, 2) without its stairs."""
+    """A closed chain of pixels (M, 2), smoothed."""
     weights = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
     return sum(w * np.roll(loop, k, axis=0) for k, w in zip(range(-2, 3), weights))  # type: ignore[return-value]

@@ -58,7 +58,7 @@ def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | 
 
 def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[str, Any], list[str]]:
     """Figures of the kept trajectories: number, length, sigma, counts of the reasons for removals; and warnings."""
-    seen, started = kept.seen, sum(reasons.values())
+    seen, started = kept.visible, sum(reasons.values())
     count = int(seen.shape[1] if kept.track is None else len(np.unique(kept.track[seen])))
     why = {TrackStatus(r).words: n for r, n in sorted(reasons.items(), key=lambda found: -found[1])}
     warnings = []
@@ -127,6 +127,7 @@ REASONS = {
     "joint_sigma_mm": "joints uncertain",
 }
 DOUBTFUL = 1.5  # times worse than the median frame
+MIN_RATIO = 0.01  # of a value to the median, where fewer is worse
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -145,7 +146,7 @@ class FrameTable:
             known = np.isfinite(value) & (value > 0)
             if known.any():
                 middle = float(np.median(value[known]))
-                worse = middle / np.maximum(value, 0.01 * middle) if name in FEWER_IS_WORSE else value / middle
+                worse = middle / np.maximum(value, MIN_RATIO * middle) if name in FEWER_IS_WORSE else value / middle
                 ratio[i] = np.where(np.isfinite(value), worse, 1.0)
         worst = ratio.argmax(axis=0) if len(self.frames) else np.zeros(0, dtype=int)
         badness = ratio.max(axis=0)
@@ -165,8 +166,8 @@ def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | 
     if trajectories is not None:
         for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
             at = np.searchsorted(frames, trajectories.frames[t])
-            values["tracks"][at] = trajectories.seen[t].sum()
-            values["track_sigma_mm"][at] = 1e3 * _median(trajectories.sigma_m[t][trajectories.seen[t]])
+            values["tracks"][at] = trajectories.visible[t].sum()
+            values["track_sigma_mm"][at] = 1e3 * _median(trajectories.sigma_m[t][trajectories.visible[t]])
     fit = [""] * len(frames)
     if body is not None:
         motion = body.motion

@@ -35,7 +35,7 @@ def inside_polygon(xy: np.ndarray, polygon: np.ndarray) -> np.ndarray:
 
 def in_region(raw: Trajectories, camera: Camera, polygon: np.ndarray, frames: range) -> np.ndarray:
     """(T, N) the positions that project into a polygon (full-frame pixels) in these frames."""
-    inside = np.zeros(raw.seen.shape, dtype=bool)
+    inside = np.zeros(raw.visible.shape, dtype=bool)
     for t in np.flatnonzero(np.isin(raw.frames, frames)):
         inside[t] = inside_polygon(camera.project(raw.xyz_m[t]), polygon)
     return inside
@@ -59,7 +59,7 @@ def clicked(filtered: Filtered, camera: Camera, xy: np.ndarray, frame: int) -> i
 def without(filtered: Filtered, source: int) -> Filtered:
     """The trajectories without all pieces of that of a raw column."""
     verdict = filtered.raw.status.copy()
-    verdict[filtered.raw.seen[:, source], source] = TrackStatus.REMOVED_BY_USER
+    verdict[filtered.raw.visible[:, source], source] = TrackStatus.REMOVED_BY_USER
     left = filtered.source != source
     return Filtered(kept=picked(filtered.kept, left), source=filtered.source[left], raw=replace(filtered.raw, status=verdict))
 
@@ -80,7 +80,7 @@ def corrected_tracks(
 
     Clicks in frames outside the `rows` (None: all) hit nothing.
     """
-    left_out = np.zeros(raw.seen.shape, dtype=bool)
+    left_out = np.zeros(raw.visible.shape, dtype=bool)
     for c in corrections:
         if c.kind == "region":
             left_out |= in_region(raw, rig[c.view], c.xy_px, c.frames)

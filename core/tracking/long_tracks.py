@@ -1,12 +1,12 @@
-"""Trajectories of recordings that are too long to be looked at as one table: stretch after stretch, in memory that does not grow with them.
+"""Trajectories of recordings that are too long for one table in memory: they are filtered in stretches, with bounded memory.
 
-A stretch is a run of frames with all points that were seen in it. It overlaps with the next by twice a margin, so that the filters know on
-both sides what comes before and after; each frame is decided on in one stretch. What was decided goes cell by cell (a point in a frame)
-into a temporary file. At the end every trajectory gets a column of the table, in which it is written in rows, again to temporary files.
-Where the table would be too large, trajectories that are apart in time share columns, the longest first (`Trajectories.track` tells them
-apart); those that find no room are left out and counted.
+A stretch is a run of frames with all points visible in it. It overlaps with the next by twice a margin, so that the filters have the frames
+before and after; the result of each frame is taken from one stretch. Results are written to a temporary file cell by cell, a cell being a
+point in a frame. At the end every trajectory gets a column of the table, which is written row by row, again to temporary files. Where the
+table would be too large, trajectories that do not overlap in time share columns, the longest first (`Trajectories.track` identifies them);
+those for which there is no room are left out and counted.
 
-A trajectory that is false in most of the frames of a stretch is removed there, and not from the stretches before and after.
+A trajectory that is false in most of the frames of a stretch is removed there, but not from the stretches before and after.
 """
 
 import tempfile
@@ -22,40 +22,40 @@ from ..foundation.errors import InputError
 from ..images.interlace import frame_time_s
 from .settings import TrackingSettings, TrackStatus
 from .tracked import TrackedFrame
-from .trajectories import Filtered, Kinematics, Seen, Trajectories, assembled, differences, seen_of, smoothed
+from .trajectories import Filtered, FramePositions, Kinematics, Trajectories, assembled, differences, positions_of, smoothed
 
 STRETCH_CELLS = 500_000  # frames times trajectories of a stretch: filtering it takes about 0.3 GB
-TABLE_CELLS = 4_000_000  # of the table that is written
+TABLE_CELLS = 4_000_000  # frames times columns of the table that is written
 MARGIN_FRAMES = 20  # twice the longest span of the filters
-CELLS_AT_ONCE = 100_000  # whose velocities are found at once
+CELLS_AT_ONCE = 100_000  # whose velocities are computed at once
 CELL = np.dtype([("row", "<i4"), ("track", "<i4"), ("piece", "<i8"), ("xyz_m", "<f4", 3), ("sigma_m", "<f4"), ("status", "i1")])
-NO_PIECE = -1
+NO_PIECE = -1  # of a cell that the filters removed
 
 Decide = Callable[[Trajectories, range], tuple[Filtered, np.ndarray]]
-"""Filters raw trajectories; of a range of rows it tells the columns that the user took out whole."""
+"""Filters raw trajectories; also returns the columns that the user removed by clicks in a range of rows."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Stretch:
-    """Consecutive frames, of which the rows `own` are decided on here."""
+    """Consecutive frames; the results of the rows `own` are taken from this stretch."""
 
-    seen: list[Seen]
+    frames: list[FramePositions]
     own: range
-    whole: bool  # it is the recording
+    whole: bool  # it is the whole recording
 
 
 def in_stretches(steps: Iterable[TrackedFrame], margin: int, most_cells: int = STRETCH_CELLS) -> Iterator[Stretch]:
-    """A recording in stretches of about so many cells."""
-    seen, identity, own, first = list[Seen](), np.zeros(0, dtype=np.int64), 0, True
+    """A recording in stretches of about `most_cells` cells."""
+    frames, identity, own, first = list[FramePositions](), np.zeros(0, dtype=np.int64), 0, True
     for step in steps:
-        seen.append(seen_of(step))
+        frames.append(positions_of(step))
         identity = np.union1d(identity, step.identity)
-        end = len(seen) - margin
-        if len(seen) * len(identity) > most_cells and end > own + margin:
-            yield Stretch(seen=seen, own=range(own, end), whole=False)
-            seen, own, first = seen[end - margin :], margin, False
-            identity = np.unique(np.concatenate([s[1] for s in seen]))
-    yield Stretch(seen=seen, own=range(own, len(seen)), whole=first)
+        end = len(frames) - margin
+        if len(frames) * len(identity) > most_cells and end > own + margin:
+            yield Stretch(frames=frames, own=range(own, end), whole=False)
+            frames, own, first = frames[end - margin :], margin, False
+            identity = np.unique(np.concatenate([f.identity for f in frames]))
+    yield Stretch(frames=frames, own=range(own, len(frames)), whole=first)
 
 
 def trajectories_of(
@@ -74,23 +74,23 @@ def trajectories_of(
     margin = max(MARGIN_FRAMES, settings.min_length, settings.smooth_frames)
     cells = _Cells()
     for stretch in in_stretches(steps, margin, stretch_cells):
-        raw, identity = assembled(stretch.seen, fps, settings.smooth_frames if stretch.whole else 0)
-        filtered, taken_out = decide(raw, stretch.own)
+        raw, identity = assembled(stretch.frames, fps, settings.smooth_frames if stretch.whole else 0)
+        filtered, removed = decide(raw, stretch.own)
         if stretch.whole:
             return filtered, Counter(filtered.reason.tolist())
-        cells.add(filtered, identity, stretch.own, identity[taken_out])
-        del raw, filtered  # before the next is made
+        cells.add(filtered, identity, stretch.own, identity[removed])
+        del raw, filtered  # before the next stretch is assembled
     return cells.tables(fps, settings.smooth_frames, table_cells), cells.reasons
 
 
 @dataclass(kw_only=True)
 class _Extents:
-    """First and last row of what has a number, and its length in cells."""
+    """First and last row of everything that has a number, and its length in cells."""
 
     parts: list[np.ndarray] = field(default_factory=list)  # (M, 4) int64
 
     def add(self, number: np.ndarray, row: np.ndarray) -> None:
-        """Numbers (n,) were found in rows (n,), in ascending rows."""
+        """Numbers (n,) in rows (n,), which ascend."""
         key, first, back = np.unique(number, return_index=True, return_inverse=True)
         last = np.zeros(len(key), dtype=np.int64)
         np.maximum.at(last, back, row)
@@ -107,17 +107,17 @@ class _Extents:
 
 
 class _Cells:
-    """What was decided, cell by cell, in the order of the rows."""
+    """The results of the stretches, cell by cell, in the order of the rows."""
 
     def __init__(self) -> None:
         self._file, self._ends = _temporary(), [0]  # in cells
         self._frames: list[np.ndarray] = []
         self._tracks, self._pieces = _Extents(), _Extents()
-        self._open: dict[int, tuple[int, bool]] = {}  # by identity: how often it was false so far, and whether it was kept at last
-        self._taken_out: set[int] = set()
+        self._open: dict[int, tuple[int, bool]] = {}  # by identity: false frames so far, and whether the last was measured
+        self._removed: set[int] = set()
         self.reasons: Counter[int] = Counter()
 
-    def add(self, filtered: Filtered, identity: np.ndarray, own: range, taken_out: np.ndarray) -> None:
+    def add(self, filtered: Filtered, identity: np.ndarray, own: range, removed: np.ndarray) -> None:
         """The rows `own` of a stretch whose columns have these identities (N,)."""
         raw, rows = filtered.raw, slice(own.start, own.stop)
         there = raw.status != TrackStatus.ABSENT
@@ -131,7 +131,7 @@ class _Cells:
             self._file.write(part.tobytes())
         self._ends.append(self._ends[-1] + len(part))
         self._frames.append(raw.frames[rows])
-        self._taken_out |= set(taken_out.tolist())
+        self._removed |= set(removed.tolist())
         self._tracks.add(part["track"].astype(np.int64), part["row"].astype(np.int64))
         of_piece = part[part["piece"] != NO_PIECE]
         self._pieces.add(of_piece["piece"], of_piece["row"].astype(np.int64))
@@ -139,25 +139,25 @@ class _Cells:
         self.reasons.update(filtered.reason[ends].tolist())
 
     def _numbered(self, raw: Trajectories, there: np.ndarray, identity: np.ndarray, own: range) -> np.ndarray:
-        """Numbers (len(own), N) of the pieces that keep each cell, or that end there."""
-        known = [self._open.get(int(i), (0, False)) for i in identity]
-        false, kept = np.array([k[0] for k in known], dtype=np.int64), np.array([k[1] for k in known], dtype=bool)
-        measured = raw.seen & (raw.status == TrackStatus.MEASURED)
+        """Numbers (len(own), N) of the pieces to which each cell belongs, or which end there."""
+        states = [self._open.get(int(i), (0, False)) for i in identity]
+        false, kept = np.array([s[0] for s in states], dtype=np.int64), np.array([s[1] for s in states], dtype=bool)
+        measured = raw.visible & (raw.status == TrackStatus.MEASURED)
         piece = np.full((len(own), len(identity)), NO_PIECE, dtype=np.int64)
         for i, t in enumerate(own):
             here = there[t] & (measured[t] | kept)
             piece[i, here] = identity[here] << 32 | false[here]
             false += there[t] & ~measured[t]
             kept = np.where(there[t], measured[t], kept)
-        goes_on = np.flatnonzero(there[max(own.stop - MARGIN_FRAMES, 0) :].any(axis=0))
-        self._open = {int(identity[n]): (int(false[n]), bool(kept[n])) for n in goes_on}
+        unfinished = np.flatnonzero(there[max(own.stop - MARGIN_FRAMES, 0) :].any(axis=0))
+        self._open = {int(identity[n]): (int(false[n]), bool(kept[n])) for n in unfinished}
         return piece
 
     def tables(self, fps: float, smooth_frames: int, most_cells: int) -> Filtered:
         """The trajectories in columns."""
         frames = np.concatenate(self._frames)
         tracks, pieces = self._tracks.merged(), self._pieces.merged()
-        pieces = pieces[~np.isin(pieces[:, 0] >> 32, list(self._taken_out))]
+        pieces = pieces[~np.isin(pieces[:, 0] >> 32, list(self._removed))]
         shared = len(frames) * max(len(tracks), len(pieces)) > most_cells
         own = [in_columns(e, len(frames), most_cells) if shared else np.arange(len(e)) for e in (tracks, pieces)]
         raw = self._table(frames, fps, "track", tracks[:, 0], own[0], shared, smooth_frames=0)
@@ -168,7 +168,7 @@ class _Cells:
     def _table(
         self, frames: np.ndarray, fps: float, name: str, number: np.ndarray, column: np.ndarray, shared: bool, smooth_frames: int
     ) -> Trajectories:
-        N, gone = int(column.max(initial=-1)) + 1, list(self._taken_out)
+        N, gone = int(column.max(initial=-1)) + 1, list(self._removed)
         tables = {"xyz_m": _Rows((N, 3), "<f4"), "sigma_m": _Rows((N,), "<f4"), "status": _Rows((N,), "i1"), "track": _Rows((N,), "<i4")}
         for (first, end), part in self._parts():
             part = part[np.isin(part[name], number)].copy()
@@ -208,9 +208,9 @@ class _Cells:
 
 
 def in_columns(extent: np.ndarray, frames: int, most_cells: int) -> np.ndarray:
-    """Columns (M,), −1 where there is no room, for what has a number, a first and a last row and a length (M, 4), the longest first.
+    """Columns (M,), −1 where there is no room, for extents (M, 4): number, first row, last row and length. The longest come first.
 
-    Between two that share a column lies a frame at least.
+    Between two that share a column there is at least one frame.
     """
     taken = np.zeros((frames + 2, max(1, most_cells // frames)), dtype=bool)
     column = np.full(len(extent), -1)
@@ -226,7 +226,7 @@ def in_columns(extent: np.ndarray, frames: int, most_cells: int) -> np.ndarray:
 def _kinematics(
     xyz_m: np.ndarray, sigma_m: np.ndarray, fps: float, frames: np.ndarray, smooth_frames: int
 ) -> tuple[Kinematics, Kinematics]:
-    """Velocities and accelerations of a table, some rows at a time: raw and smoothed (raw where nothing is smoothed)."""
+    """Velocities and accelerations of a table, some rows at a time: raw and smoothed (raw as well if `smooth_frames` is 0)."""
     dt, margin = float(np.median(np.diff(frames))) / fps, max(2, smooth_frames)
     made = [{f.name: _Rows((xyz_m.shape[1], *((3,) if "sigma" not in f.name else ())), "<f4") for f in fields(Kinematics)}
             for _ in range(1 + bool(smooth_frames))]  # fmt: skip
@@ -238,8 +238,8 @@ def _kinematics(
             found = smoothed(xyz, sigma, dt, smooth_frames) if i else differences(xyz, sigma, dt)
             for name, table in rows.items():
                 table.append(getattr(found, name)[begin - first : begin - first + at_once])
-    given = [Kinematics(**{name: table.mapped() for name, table in rows.items()}) for rows in made]
-    return given[0], given[-1]
+    tables = [Kinematics(**{name: table.mapped() for name, table in rows.items()}) for rows in made]
+    return tables[0], tables[-1]
 
 
 class _Rows:
@@ -249,7 +249,7 @@ class _Rows:
         self._file, self._row, self._kind, self._count = _temporary(), row, np.dtype(kind), 0
 
     def empty(self, count: int, value: float) -> np.ndarray:
-        """So many rows of one value."""
+        """`count` rows of one value."""
         return np.full((count, *self._row), value, dtype=self._kind)
 
     def append(self, rows: np.ndarray) -> None:
@@ -259,7 +259,7 @@ class _Rows:
         self._count += len(rows)
 
     def mapped(self) -> np.ndarray:
-        """All rows, read when they are asked for."""
+        """All rows, read on access."""
         shape: Any = (self._count, *self._row)
         if 0 in shape:
             return np.zeros(shape, dtype=self._kind)

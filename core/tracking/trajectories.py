@@ -101,7 +101,17 @@ def _unbroken(visible: np.ndarray, middle: int) -> np.ndarray:
 
 SMOOTH_FRAMES = 7  # the default of `tracking.smooth_frames`
 
-Seen = tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # frame, identity, xyz_m, sigma_m, ended, reason
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FramePositions:
+    """The part of a tracked frame from which trajectories are assembled."""
+
+    frame: int
+    identity: np.ndarray  # (N,) ascending
+    xyz_m: np.ndarray  # (N, 3)
+    sigma_m: np.ndarray  # (N,)
+    ended: np.ndarray  # (M,) identities of the points that were lost in this frame
+    reason: np.ndarray  # (M,) TrackStatus
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -136,32 +146,33 @@ class Trajectories:
         return arrays if self.track is None else arrays | {"track": self.track}
 
     @property
-    def seen(self) -> np.ndarray:
+    def visible(self) -> np.ndarray:
         """(T, N) where a position was measured."""
         return np.isfinite(self.xyz_m[..., 0])
 
 
 def assemble(steps: Iterable[TrackedFrame], fps: float, smooth_frames: int = SMOOTH_FRAMES) -> Trajectories:
     """The trajectories of consecutive tracked frames, by ascending identity; derivatives smoothed over `smooth_frames` (or 0)."""
-    return assembled([seen_of(step) for step in steps], fps, smooth_frames)[0]
+    return assembled([positions_of(step) for step in steps], fps, smooth_frames)[0]
 
 
-def seen_of(step: TrackedFrame) -> Seen:
-    """The part of a tracked frame that belongs to trajectories."""
-    return step.frame, step.identity, step.xyz_m, np.sqrt(np.trace(step.covariance_m2, axis1=1, axis2=2)), step.ended, step.reason
+def positions_of(step: TrackedFrame) -> FramePositions:
+    """The positions of a tracked frame."""
+    sigma = np.sqrt(np.trace(step.covariance_m2, axis1=1, axis2=2))
+    return FramePositions(frame=step.frame, identity=step.identity, xyz_m=step.xyz_m, sigma_m=sigma, ended=step.ended, reason=step.reason)
 
 
-def assembled(seen: Sequence[Seen], fps: float, smooth_frames: int) -> tuple[Trajectories, np.ndarray]:
+def assembled(positions: Sequence[FramePositions], fps: float, smooth_frames: int) -> tuple[Trajectories, np.ndarray]:
     """The trajectories of these frames, and their identities (N,) in ascending order."""
-    identities = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(identity for _, identity, *_ in seen)]))
-    T, N = len(seen), len(identities)
+    identities = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(p.identity for p in positions)]))
+    T, N = len(positions), len(identities)
     xyz, sigma = np.full((T, N, 3), np.nan), np.full((T, N), np.nan)
     status = np.zeros((T, N), dtype=np.int8)
-    for t, (_, identity, place, uncertainty, ended, reason) in enumerate(seen):
-        here, gone = rows_of(identities, identity), rows_of(identities, ended)
-        xyz[t, here], sigma[t, here], status[t, here] = place, uncertainty, TrackStatus.MEASURED
-        status[t, gone[gone >= 0]] = reason[gone >= 0]
-    frames = np.array([frame for frame, *_ in seen], dtype=np.int32)
+    for t, p in enumerate(positions):
+        here, gone = rows_of(identities, p.identity), rows_of(identities, p.ended)
+        xyz[t, here], sigma[t, here], status[t, here] = p.xyz_m, p.sigma_m, TrackStatus.MEASURED
+        status[t, gone[gone >= 0]] = p.reason[gone >= 0]
+    frames = np.array([p.frame for p in positions], dtype=np.int32)
     return with_kinematics(frames, frame_time_s(frames, fps), xyz, sigma, status, smooth_frames), identities
 
 
@@ -179,12 +190,12 @@ class Filtered:
 
         MEASURED: it lasts to the end of the recording. Of a column that several share, that of the last one.
         """
-        status, seen = self.raw.status, self.raw.seen
+        status, visible = self.raw.status, self.raw.visible
         against = np.stack([(status == s).sum(axis=0) for s in TrackStatus])
         against[[TrackStatus.ABSENT, TrackStatus.MEASURED]] = 0
         last = np.where(status != TrackStatus.ABSENT, np.arange(len(status))[:, None], -1).max(axis=0, initial=-1)
         end = status[last, np.arange(status.shape[1])]
-        kept = (seen & (status == TrackStatus.MEASURED)).any(axis=0)
+        kept = (visible & (status == TrackStatus.MEASURED)).any(axis=0)
         return np.where(kept, end, against.argmax(axis=0)).astype(np.int8)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -213,8 +224,8 @@ def filter_trajectories(
     else:
         more = verdict
     verdict = np.where(verdict == TrackStatus.MEASURED, more, verdict)
-    status = np.where(raw.seen, verdict, raw.status)
-    pieces = cut(raw.seen, status, settings)
+    status = np.where(raw.visible, verdict, raw.status)
+    pieces = cut(raw.visible, status, settings)
     xyz, sigma = raw.xyz_m[:, pieces.source].copy(), raw.sigma_m[:, pieces.source].copy()
     xyz[~pieces.kept], sigma[~pieces.kept] = np.nan, np.nan
     kept = with_kinematics(raw.frames, raw.time_s, xyz, sigma, pieces.status, settings.smooth_frames)

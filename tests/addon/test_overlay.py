@@ -274,7 +274,7 @@ def test_a_real_run_is_looked_at_and_corrected(blender: ModuleType, empty: Modul
     assert set(status[np.isfinite(run.tracks().xyz_m[:, number, 0])]) == {TrackStatus.REMOVED_BY_USER}
     assert ops.follow_contours(view="C") == {"FINISHED"} and scene.tricap_overlay.contour
     contour = module("overlay.results").current(scene).contour("C", 1)
-    outline, on_edge = contour.xy_px, contour.seen
+    outline, on_edge = contour.xy_px, contour.on_edge
     assert len(outline) > 50 and on_edge.mean() > 0.4
     scene.tricap.contour.spacing_px = 8.0
     assert ops.follow_contours(view="C") == {"FINISHED"}

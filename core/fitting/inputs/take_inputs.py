@@ -135,7 +135,7 @@ class EdgesOfTable:
         found = self.table.get(frame)
         if found is None:
             return None
-        rows = np.flatnonzero(found.seen)
+        rows = np.flatnonzero(found.on_edge)
         return (found.xy_px[rows], found.normal[rows], found.sigma_px[rows]) if len(rows) else None
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.cli.contour import KeptContours, Start, _before_background, track_contour
+from tricap.core.cli.contour import ContourCheckpoints, Start, _before_background, track_contour
 from tricap.core.cli.main import main
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -51,7 +51,7 @@ class Recorded:
         take = SimpleNamespace(rows_at=lambda frame: RowGrid())
         self.job: Any = SimpleNamespace(
             footage=SimpleNamespace(rig=rig, take=take, read=lambda i: [None, images[i], None]),
-            trajectories=SimpleNamespace(xyz_m=xyz, seen=np.isfinite(xyz[..., 0])),
+            trajectories=SimpleNamespace(xyz_m=xyz, visible=np.isfinite(xyz[..., 0])),
             clouds=[SimpleNamespace(frame=i, xyz_m=x) for i, x in enumerate(xyz)],
             results=SimpleNamespace(folder=folder),
             settings={"contour": ContourSettings()},
@@ -65,18 +65,18 @@ def test_four_corners_are_a_polygon(tmp_path: Path, scenes: Any) -> None:
     recorded = Recorded(scenes, tmp_path)
     found = recorded.contours(Start(polygon=outline_of(scenes, recorded.bodies[0])[::400] + (2.0, -1.0)))
     assert len(found[0].xy_px) == pytest.approx(2 * (0.4 + 0.3) / scenes.pixel_m / 4.0, abs=3)
-    assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 and c.seen.mean() > 0.6 for c, b in zip(found, recorded.bodies))
+    assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 and c.on_edge.mean() > 0.6 for c, b in zip(found, recorded.bodies))
 
 
 @pytest.mark.parametrize("black", [(3,), (2, 3)])
 def test_a_black_frame_carries_the_contour_through(tmp_path: Path, scenes: Any, black: tuple[int, ...]) -> None:
-    """It stays as it was, says that nothing was seen, and goes on where the points went meanwhile, 12 px for two black frames."""
+    """It stays as it was without edges, and resumes where the points moved meanwhile, 12 px for two black frames."""
     recorded = Recorded(scenes, tmp_path, black)
     found = recorded.contours(Start(polygon=outline_of(scenes, recorded.bodies[0])[::400]))
     for i in black:
-        assert not found[i].seen.any() and (found[i].sigma_px == 3.0).all()
+        assert not found[i].on_edge.any() and (found[i].sigma_px == 3.0).all()
         assert np.median(apart(scenes, found[i].xy_px, recorded.bodies[black[0] - 1])) < 0.7
-    assert np.median(apart(scenes, found[-1].xy_px, recorded.bodies[-1])) < 0.7 and found[-1].seen.mean() > 0.6
+    assert np.median(apart(scenes, found[-1].xy_px, recorded.bodies[-1])) < 0.7 and found[-1].on_edge.mean() > 0.6
 
 
 def test_from_the_fitted_body(tmp_path: Path, scenes: Any) -> None:
@@ -101,9 +101,9 @@ def test_an_outline_is_followed_where_nothing_is_measured(tmp_path: Path, scenes
     background = scenes.render(scenes.three_cameras().cameras[1], [], noise=1.0, seed=99)
     start = Start(background=background) if with_background else Start(polygon=outline_of(scenes, recorded.bodies[0])[::400])
     found = recorded.contours(start)
-    assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 and c.seen.mean() > 0.6 for i, (c, b) in enumerate(zip(found, recorded.bodies))
+    assert all(np.median(apart(scenes, c.xy_px, b)) < 0.7 and c.on_edge.mean() > 0.6 for i, (c, b) in enumerate(zip(found, recorded.bodies))
                if with_background or i != 3)  # fmt: skip
-    with pytest.raises(InputError, match="another size"):
+    with pytest.raises(InputError, match="differ in size"):
         recorded.contours(Start(background=background[1:]))
 
 
@@ -162,11 +162,11 @@ def test_a_stopped_contour_goes_on_with_the_same_vertices(tmp_path: Path, scenes
         recorded.job.results, recorded.job.keys = Results(tmp_path / f"out {tracked}"), {"track": "1"}
         start = Start(polygon=outline_of(scenes, recorded.bodies[0])[::400])
         whole = recorded.contours(start)
-        begun = track_contour(recorded.job, 1, Monitor(), start, KeptContours(recorded.job, 1, start))
+        begun = track_contour(recorded.job, 1, Monitor(), start, ContourCheckpoints(recorded.job, 1, start))
         assert [next(begun)[0] for _ in range(4)] == [0, 1, 2, 3]
-        kept = KeptContours(recorded.job, 1, start)
+        kept = ContourCheckpoints(recorded.job, 1, start)
         assert kept.load(3) is not None and kept.load(4) is None
         again = [c for _, c in track_contour(recorded.job, 1, Monitor(), start, kept)]
         assert all(np.array_equal(a.xy_px, b.xy_px) and np.array_equal(a.sigma_px, b.sigma_px) for a, b in zip(whole, again, strict=True))
         recorded.job.settings = {"contour": ContourSettings(spacing_px=8.0)}
-        assert KeptContours(recorded.job, 1, start).load(3) is None
+        assert ContourCheckpoints(recorded.job, 1, start).load(3) is None

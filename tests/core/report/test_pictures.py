@@ -81,7 +81,7 @@ def test_tracks_are_drawn(scenes: Any, n: int) -> None:
                           sigma_m=xyz[..., 0] * 0 + 1e-3, status=np.isfinite(xyz[..., 0]))  # fmt: skip
     for index in (0, 4):
         picture = pictures.tracks_over_footage(GREY, scenes.three_cameras()["C"], tracks, index)
-        assert picture.shape == (150, 200, 3) and (np.ptp(picture, axis=2) > 0).any() == bool(tracks.seen[index].any())
+        assert picture.shape == (150, 200, 3) and (np.ptp(picture, axis=2) > 0).any() == bool(tracks.visible[index].any())
 
 
 def test_png_and_grey() -> None:

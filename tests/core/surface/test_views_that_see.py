@@ -134,7 +134,7 @@ def test_from_two_to_eight_cameras(tmp_path: Path, scenes: Any, plane: Any, coun
     for cloud, (body,) in zip(made.clouds, frames):
         assert len(cloud.xyz_m) > 150 and cloud.rays.max() == count and np.median(cloud.rays) > count / 2
         assert np.median(np.abs(body.distance_m(cloud.xyz_m))) < (1.0e-3 if count == 2 else 0.4e-3)
-    assert made.trajectories is not None and made.trajectories.seen.all(axis=0).sum() > 60
+    assert made.trajectories is not None and made.trajectories.visible.all(axis=0).sum() > 60
     steps = np.diff(made.trajectories.xyz_m, axis=0)[0]
     assert np.median(np.linalg.norm(steps - [0.004, 0, 0], axis=1)) < 1.5e-3
     assert (tmp_path / "out" / "report" / "report.html").is_file()

@@ -41,9 +41,9 @@ def test_a_rough_start_finds_the_outline(noise: float, contrast: float, texture:
     for seed in range(20):
         image = textured_disc((119.3, 100.6), radius, noise, contrast, texture, seed)
         found = relax_contour(circle((121, 99), radius + 4, round(radius * 1.7)), image, SETTINGS)
-        off = (np.linalg.norm(found.xy_px - (119.3, 100.6), axis=1) - radius)[found.seen]
-        assert found.seen.mean() > 0.95 and np.abs(off).max() < 1.2
-        z.append(off / found.sigma_px[found.seen])
+        off = (np.linalg.norm(found.xy_px - (119.3, 100.6), axis=1) - radius)[found.on_edge]
+        assert found.on_edge.mean() > 0.95 and np.abs(off).max() < 1.2
+        z.append(off / found.sigma_px[found.on_edge])
         away.append(off)
     assert np.abs(np.median(np.concatenate(away))) < 0.03
     assert 0.8 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.25
@@ -54,7 +54,7 @@ def test_an_outline_of_many_vertices() -> None:
     y, x = np.mgrid[0:900, 0:900].astype(np.float32)
     image = 60 + 90 * np.clip(420.5 - np.hypot(x - 450, y - 450), 0, 1)
     found = relax_contour(circle((450, 450), 423, 400), image, ContourSettings(spacing_px=2.0))
-    assert len(found.xy_px) > 32_767 / 25 and found.seen.all()
+    assert len(found.xy_px) > 32_767 / 25 and found.on_edge.all()
     assert np.abs(np.linalg.norm(found.xy_px - 450, axis=1) - 420).max() < 0.2  # at most 0.11 with OpenCV 4, less with 5
     places = np.random.default_rng(0).uniform(0, 100, (40_000, 2))
     assert np.allclose(_sample(x, places), places[:, 0], atol=0.02)  # it looks up at 1/32 px
@@ -78,7 +78,7 @@ def test_without_an_edge_the_contour_stays(image: str) -> None:
     for _ in range(10):
         flat = np.full((200, 240), 20, np.float32) + (image == "noise") * random.standard_normal((200, 240)).astype(np.float32)
         found = relax_contour(xy, flat, SETTINGS)
-        assert found.seen.mean() < 0.1 and (found.sigma_px[~found.seen] == 3.0).all()
+        assert found.on_edge.mean() < 0.1 and (found.sigma_px[~found.on_edge] == 3.0).all()
         xy = found.xy_px
     away = np.abs(np.linalg.norm(xy - (120, 100), axis=1) - 50)
     assert away.max() < (0.2 if image == "black" else 3.0) and np.median(away) < 0.3
@@ -107,8 +107,8 @@ def test_a_disc_is_followed_through_frames() -> None:
         centre, inner = nxt, inner + (9.0, 1.5)
         found = relax_contour(contour, disc((centre[0], centre[1]), 40, 2.0, i), SETTINGS)
         contour = found.xy_px
-        assert np.abs(np.linalg.norm(contour - centre, axis=1) - 40)[found.seen].max() < 1.2
-    assert found.seen.mean() > 0.95
+        assert np.abs(np.linalg.norm(contour - centre, axis=1) - 40)[found.on_edge].max() < 1.2
+    assert found.on_edge.mean() > 0.95
 
 
 def test_masks_become_contours() -> None:

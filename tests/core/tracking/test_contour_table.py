@@ -12,7 +12,7 @@ from tricap.core.tracking.contour import HEAD, Contour, ContourTable, Polygons, 
 
 def contour(frame: int, vertices: int = 4) -> Contour:
     xy = frame + np.arange(2.0 * vertices).reshape(-1, 2)
-    return Contour(xy_px=xy, normal=np.tile([0.0, 1.0], (vertices, 1)), sigma_px=np.full(vertices, 0.25), seen=np.arange(vertices) > 0)
+    return Contour(xy_px=xy, normal=np.tile([0.0, 1.0], (vertices, 1)), sigma_px=np.full(vertices, 0.25), on_edge=np.arange(vertices) > 0)
 
 
 def test_what_was_written_comes_back_frame_by_frame(tmp_path: Path) -> None:
@@ -23,7 +23,7 @@ def test_what_was_written_comes_back_frame_by_frame(tmp_path: Path) -> None:
     assert list(table) == [3, 5, -2] and [table.vertices(f) for f in table] == [4, 2, 3] and 4 not in table
     for frame in table:
         a, b = table[frame], contour(frame, table.vertices(frame))
-        assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("xy_px", "normal", "sigma_px", "seen"))
+        assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("xy_px", "normal", "sigma_px", "on_edge"))
     polygons = Polygons(table, range(0, 9), least_corners=3)
     assert list(polygons) == [3] and np.array_equal(polygons[3], contour(3).xy_px) and polygons.get(5) is None
 

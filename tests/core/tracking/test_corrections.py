@@ -46,8 +46,8 @@ def region(frames: range, x0: float, x1: float) -> Correction:
 def test_a_clicked_trajectory_goes_whole() -> None:
     clicks = [click(147, 152, 3), click(10, 10, 3)]  # column 2 is at 146
     filtered, hit = corrected_tracks(row(), clicks, RIG, SETTINGS, Monitor())
-    assert filtered.source.tolist() == [0, 1, 3, 4, 5, 6, 7, 8] and filtered.kept.seen.all()
-    assert (filtered.raw.status[:, 2] == TrackStatus.REMOVED_BY_USER).all() and filtered.raw.seen.all()
+    assert filtered.source.tolist() == [0, 1, 3, 4, 5, 6, 7, 8] and filtered.kept.visible.all()
+    assert (filtered.raw.status[:, 2] == TrackStatus.REMOVED_BY_USER).all() and filtered.raw.visible.all()
     assert filtered.reason[2] == TrackStatus.REMOVED_BY_USER and filtered.reason[3] == TrackStatus.MEASURED
     missed = missed_clicks(clicks, hit)
     assert hit == {0: 2} and len(missed) == 1 and "(10, 10)" in missed[0]
@@ -58,12 +58,12 @@ def test_a_region_leaves_gaps_and_takes_the_points_of_the_clouds() -> None:
     take_out = [region(range(4, 7), 135, 165)]
     raw = row()
     filtered, hit = corrected_tracks(raw, take_out, RIG, SETTINGS, Monitor())
-    u = CAMERA.project(raw.xyz_m.reshape(-1, 3))[:, 0].reshape(raw.seen.shape)
+    u = CAMERA.project(raw.xyz_m.reshape(-1, 3))[:, 0].reshape(raw.visible.shape)
     gone = (u > 135) & (u < 165) & ((np.arange(FRAMES) >= 4) & (np.arange(FRAMES) < 7))[:, None]
     assert gone.any() and not hit
     assert np.array_equal(filtered.raw.status == TrackStatus.REMOVED_BY_USER, gone)
-    assert np.array_equal(filtered.kept.seen, ~gone) and np.array_equal(filtered.kept.status == TrackStatus.REMOVED_BY_USER, gone)
-    n = raw.seen.shape[1]
+    assert np.array_equal(filtered.kept.visible, ~gone) and np.array_equal(filtered.kept.status == TrackStatus.REMOVED_BY_USER, gone)
+    n = raw.visible.shape[1]
     cloud = PointCloud(frame=4, xyz_m=raw.xyz_m[4], covariance_m2=np.tile(np.eye(3), (n, 1, 1)), normals=np.zeros((n, 3)),
                        intensity=np.arange(n), xy_px=np.zeros((n, 1, 2)), residual_px=np.zeros(n))  # fmt: skip
     assert np.array_equal(corrected_cloud(cloud, take_out, RIG).intensity, np.flatnonzero(~gone[4]))
@@ -73,7 +73,7 @@ def test_a_region_leaves_gaps_and_takes_the_points_of_the_clouds() -> None:
 @pytest.mark.parametrize("frames", [2, 3, 4])
 def test_a_short_recording_keeps_what_lasts(frames: int) -> None:
     raw = row(frames)
-    assert filter_trajectories(raw, SETTINGS).kept.seen.all()
+    assert filter_trajectories(raw, SETTINGS).kept.visible.all()
     xyz = raw.xyz_m.copy()
     xyz[1:, 0] = np.nan
     short = with_kinematics(raw.frames, raw.time_s, xyz, raw.sigma_m, np.where(np.isnan(xyz[..., 0]), 0, 1), 0)

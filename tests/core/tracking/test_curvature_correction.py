@@ -35,7 +35,7 @@ def turned_points(body: list[Any], tracks: Any) -> np.ndarray:
     """By how much [m] each trajectory (T, N) has slid around the limb since its first position."""
     own = np.stack([(tracks.xyz_m[t] - b.t) @ b.R for t, b in enumerate(body)])
     angle = np.arctan2(own[..., 0], -own[..., 2])
-    return body[0].radius_m * (angle - angle[tracks.seen.argmax(axis=0), np.arange(tracks.seen.shape[1])])
+    return body[0].radius_m * (angle - angle[tracks.visible.argmax(axis=0), np.arange(tracks.visible.shape[1])])
 
 
 @pytest.mark.parametrize("interlaced", ["none", pytest.param("odd", marks=pytest.mark.slow)])

@@ -43,7 +43,7 @@ def test_a_rotating_limb_loses_nothing(rate: float) -> None:
     random = np.random.default_rng(int(rate))
     true = limb(random, 150, np.array([0, 0, 1.4]), np.array([0.8, 0.6, 0.0]), rate, np.array([0.2, 0.1, 0.0]))
     kept = filter_trajectories(recording(true, random), SETTINGS).kept
-    assert 150 <= kept.seen.shape[1] <= 153 and kept.seen.sum() > 0.998 * 150 * FRAMES
+    assert 150 <= kept.visible.shape[1] <= 153 and kept.visible.sum() > 0.998 * 150 * FRAMES
 
 
 def planted(kind: str, true: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -114,12 +114,12 @@ def test_what_is_left_of_a_jump_are_two_pieces() -> None:
     true = limb(random, 100, np.array([0, 0, 1.4]), np.array([1.0, 0, 0]), 0.0, np.array([0.5, 0.0, 0.2]))
     true[12:, 7] += (0.0, 0.03, 0.0)
     kept = filter_trajectories(recording(true, random), SETTINGS).kept
-    assert kept.seen.shape[1] == 101
-    pieces = np.flatnonzero(kept.seen.sum(axis=0) < FRAMES)
-    assert len(pieces) == 2 and not kept.seen[:, pieces].all(axis=1).any()
+    assert kept.visible.shape[1] == 101
+    pieces = np.flatnonzero(kept.visible.sum(axis=0) < FRAMES)
+    assert len(pieces) == 2 and not kept.visible[:, pieces].all(axis=1).any()
     assert set(kept.status[12, pieces]) == {TrackStatus.NOT_RIGID}
     long_only = filter_trajectories(recording(true, random), replace(SETTINGS, min_length=15)).kept
-    assert long_only.seen.shape[1] == 100
+    assert long_only.visible.shape[1] == 100
 
 
 def test_few_points_are_not_held_against_each_other() -> None:
@@ -127,7 +127,7 @@ def test_few_points_are_not_held_against_each_other() -> None:
     random = np.random.default_rng(0)
     t = np.arange(FRAMES)[:, None, None] * DT
     x = np.array([[[0, 0, 0]], [[1.0, 0, 0]], [[0, 1.0, 0]]]).transpose(1, 0, 2) + np.sin(3 * t) * random.standard_normal((1, 3, 3)) * 0.2
-    assert filter_trajectories(recording(x, random), SETTINGS).kept.seen.all()
+    assert filter_trajectories(recording(x, random), SETTINGS).kept.visible.all()
 
 
 def test_thresholds_stand_above_the_noise() -> None:
@@ -136,6 +136,6 @@ def test_thresholds_stand_above_the_noise() -> None:
     settings = replace(SETTINGS, max_acceleration=1.0, max_speed=0.5, uniformity="off")
     still = recording(np.zeros((FRAMES, 50, 3)), random)
     assert (np.linalg.norm(still.acceleration_m_s2[1:-1], axis=2) > 1.0).mean() > 0.05
-    assert filter_trajectories(still, settings).kept.seen.mean() > 0.98
+    assert filter_trajectories(still, settings).kept.visible.mean() > 0.98
     fast = recording(np.arange(FRAMES)[:, None, None] * DT * np.ones((1, 5, 3)), random)
-    assert filter_trajectories(fast, settings).kept.seen.shape[1] == 0
+    assert filter_trajectories(fast, settings).kept.visible.shape[1] == 0

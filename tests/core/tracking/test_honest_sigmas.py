@@ -82,11 +82,11 @@ def test_points_of_a_small_limb(tmp_path: Path, scenes: Any, radius_m: float, tu
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
     measured = scenes.measure(take, tmp_path / "out")
     tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 8}}), 25.0)
-    first = tracks.seen.argmax(axis=0)
+    first = tracks.visible.argmax(axis=0)
     own = np.stack([(x[t] - bodies[t].t) @ bodies[t].R for t, x in zip(first, tracks.xyz_m.transpose(1, 0, 2))])
     own[:, [0, 2]] *= radius_m / np.hypot(own[:, 0], own[:, 2])[:, None]
     error = np.stack([x - (own @ b.R.T + b.t) for x, b in zip(tracks.xyz_m, bodies)])
-    later = tracks.seen & (np.arange(len(bodies))[:, None] > first)
+    later = tracks.visible & (np.arange(len(bodies))[:, None] > first)
     distance = np.linalg.norm(error, axis=2)[later]
     z = (distance / tracks.sigma_m[later])[distance < 0.01]
     assert len(z) > 100 and 0.8 < np.sqrt(np.mean(z**2)) < 1.25

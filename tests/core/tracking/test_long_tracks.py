@@ -44,10 +44,10 @@ def decide(raw: Trajectories, rows: range) -> tuple[Filtered, np.ndarray]:
 
 def test_stretches_overlap_and_decide_on_each_frame_once(steps: list[TrackedFrame]) -> None:
     stretches = list(in_stretches(iter(steps), MARGIN_FRAMES, 1500))
-    own = [stretch.seen[t][0] for stretch in stretches for t in stretch.own]
+    own = [stretch.frames[t].frame for stretch in stretches for t in stretch.own]
     assert own == list(range(FRAMES)) and len(stretches) > 2 and not any(s.whole for s in stretches)
     assert all(s.own.start == MARGIN_FRAMES for s in stretches[1:])
-    assert all(s.own.stop == len(s.seen) - MARGIN_FRAMES for s in stretches[:-1])
+    assert all(s.own.stop == len(s.frames) - MARGIN_FRAMES for s in stretches[:-1])
     assert [s.whole for s in in_stretches(iter(steps), MARGIN_FRAMES, 10**6)] == [True]
 
 
@@ -74,14 +74,14 @@ def test_columns_are_shared_where_the_table_has_no_room(steps: list[TrackedFrame
     parts = trajectories_of(iter(steps), FPS, SETTINGS, decide, stretch_cells=1500, table_cells=12 * FRAMES)[0]
     kept, raw = parts.kept, parts.raw
     assert kept.track is not None and raw.track is not None and kept.xyz_m.shape == (FRAMES, 12, 3) and kept.omitted > 0
-    assert np.array_equal(kept.track[kept.seen] >= 0, np.ones(kept.seen.sum(), dtype=bool))
-    t, n = np.nonzero(kept.seen)
+    assert np.array_equal(kept.track[kept.visible] >= 0, np.ones(kept.visible.sum(), dtype=bool))
+    t, n = np.nonzero(kept.visible)
     assert np.allclose(kept.xyz_m[t, n], whole.raw.xyz_m[t, kept.track[t, n]], atol=1e-6)
-    both = kept.seen[:-1] & kept.seen[1:]
+    both = kept.visible[:-1] & kept.visible[1:]
     assert np.array_equal(kept.track[:-1][both], kept.track[1:][both])  # a frame lies between two in a column
     longest = {i for i in range(NEW * FRAMES) if len(life(i)) == 90}
-    assert longest <= set(kept.track[kept.seen].tolist())
-    assert kept.seen.sum() > 2 * sum(len(life(i)) for i in longest)  # which alone would not fill twelve columns of their own
+    assert longest <= set(kept.track[kept.visible].tolist())
+    assert kept.visible.sum() > 2 * sum(len(life(i)) for i in longest)  # which alone would not fill twelve columns of their own
 
 
 def test_what_the_user_takes_out_goes_from_all_stretches(steps: list[TrackedFrame]) -> None:
@@ -93,7 +93,7 @@ def test_what_the_user_takes_out_goes_from_all_stretches(steps: list[TrackedFram
 
     parts = trajectories_of(iter(steps), FPS, SETTINGS, without_one, stretch_cells=1500)[0]
     assert DAMAGED not in parts.source and len(set(parts.source)) > 10
-    seen = parts.raw.seen[:, DAMAGED]
+    seen = parts.raw.visible[:, DAMAGED]
     assert seen.sum() == 90 and (parts.raw.status[seen, DAMAGED] == TrackStatus.REMOVED_BY_USER).all()
 
 

@@ -24,8 +24,8 @@ def moving_plane(scenes: Any, frames: int, half_m: tuple[float, float] = (0.24, 
 
 def errors(bodies: list[Any], tracks: Trajectories, margin_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Position (T, N, 3) less where the material point of each trajectory's first position has gone, and which started on the plane."""
-    T, N = tracks.seen.shape
-    first = tracks.seen.argmax(axis=0)
+    T, N = tracks.visible.shape
+    first = tracks.visible.argmax(axis=0)
     own = np.stack([(tracks.xyz_m[first[n], n] - bodies[first[n]].t) @ bodies[first[n]].R for n in range(N)])
     on_it = (np.abs(own[:, :2]) < np.array(bodies[0].half_m) - margin_m).all(axis=1)
     own[:, 2] = 0.0  # the material point is on the plane
@@ -41,15 +41,15 @@ def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced:
     tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 25.0)
     error, on_it = errors(bodies, tracks, 0.035)
     assert on_it.sum() > 50 and np.array_equal(tracks.frames, np.arange(FRAMES))
-    seen = tracks.seen[:, on_it]
-    old = on_it & tracks.seen[0]
-    assert tracks.seen[-1, old].mean() > 0.95  # the rest came too near to the edge
+    seen = tracks.visible[:, on_it]
+    old = on_it & tracks.visible[0]
+    assert tracks.visible[-1, old].mean() > 0.95  # the rest came too near to the edge
     drift_px = np.linalg.norm(error[..., :2], axis=2)[:, on_it] / scenes.pixel_m
     assert np.nanmax(drift_px) < 1.0  # no false one at all
     assert np.nanpercentile(drift_px[-1], 99) < 0.3 and np.nanmedian(drift_px[-1]) < 0.15
     assert np.abs(np.nanmean(error[-1][on_it][:, :2], axis=0)).max() < 0.1 * scenes.pixel_m  # no common drift
     assert np.nanmax(np.abs(error[:, on_it, 2])) < 0.012 and np.nanstd(error[:, on_it, 2]) < 0.002
-    lateral = np.abs(error[0][tracks.seen[0] & on_it])
+    lateral = np.abs(error[0][tracks.visible[0] & on_it])
     assert lateral[:, :2].max() < 0.1 * scenes.pixel_m
     assert seen.sum(axis=0).max() == FRAMES
 
@@ -62,7 +62,7 @@ def test_both_fields_follow_the_plane_at_twice_the_rate(tmp_path: Path, scenes: 
     assert [m.frame for m in measured] == list(range(4)) and [m.field.grid.rows.offset for m in measured] == [0, 1, 0, 1]
     tracks = assemble(scenes.track(take, tmp_path / "out", measured, {"tracking": {"spacing_px": 12}}), 50.0)
     error, on_it = errors(bodies, tracks, 0.035)
-    whole = on_it & tracks.seen.all(axis=0)
+    whole = on_it & tracks.visible.all(axis=0)
     assert whole.sum() > 50
     across = error[:, whole, :2]
     assert np.abs(across).max() < 1.0 * scenes.pixel_m
@@ -76,7 +76,7 @@ def test_velocity_and_acceleration(tmp_path: Path, scenes: Any) -> None:
     bodies = moving_plane(scenes, 5)
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
     tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out")), 25.0)
-    whole = tracks.seen.all(axis=0)
+    whole = tracks.visible.all(axis=0)
     assert whole.sum() > 60
     X = tracks.xyz_m[2, whole]
     own = (X - bodies[2].t) @ bodies[2].R
@@ -197,7 +197,7 @@ def test_assembled_trajectories() -> None:
     assert np.allclose(tracks.velocity_m_s[:2, 1, 0], 1.0) and np.isnan(tracks.velocity_m_s[2, 1]).all()
     assert np.allclose(tracks.velocity_m_s[1:, 2, 1], 5.0) and np.isnan(tracks.velocity_m_s[:, 0]).all()
     assert np.isnan(tracks.acceleration_m_s2).all()
-    assert np.allclose(tracks.sigma_m[tracks.seen], np.sqrt(3e-6))
+    assert np.allclose(tracks.sigma_m[tracks.visible], np.sqrt(3e-6))
     for few in ([], [0]):
         assert assemble([step(0, few, [[0, 0, 0]] * len(few))], 25.0).xyz_m.shape == (1, len(few), 3)
 
@@ -217,7 +217,7 @@ def test_a_black_frame_is_bridged(tmp_path: Path, scenes: Any) -> None:
     black = cv2.imencode(".png", np.zeros((150, 200), np.uint8))[1].tobytes()
     (take / "C" / "0002.png").write_bytes(black)
     tracks = assemble(scenes.track(take, tmp_path / "out", scenes.measure(take, tmp_path / "out")), 25.0)
-    seen = tracks.seen
+    seen = tracks.visible
     assert not seen[2].any() and (seen[1] & seen[3]).sum() > 0.8 * seen[1].sum()
     error, on_it = errors(bodies, tracks, 0.035)
     assert np.nanmax(np.linalg.norm(error[:, on_it, :2], axis=2)) < 1.0 * scenes.pixel_m
