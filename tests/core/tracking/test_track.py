@@ -10,7 +10,7 @@ import pytest
 
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.tracking.published_step import STEPS
-from tricap.core.tracking.settings import AFTERWARDS
+from tricap.core.tracking.settings import FILTER_KNOBS
 from tricap.core.tracking.step import TrackedFrame
 
 
@@ -83,7 +83,7 @@ def test_filters_ask_for_no_new_tracking(
     """Other knobs of the filters: every checkpoint is used again, and the result is that of a fresh run. A knob of the step tracks anew."""
     other = {"tracking": {"max_speed": 8.0, "max_acceleration": 90.0, "uniformity": "voxels", "max_sigma_ratio": 2.0, "min_length": 3,
                           "smooth_frames": 5}}  # fmt: skip
-    assert set(other["tracking"]) == set(AFTERWARDS)
+    assert set(other["tracking"]) == set(FILTER_KNOBS)
     shutil.copytree(whole, tmp_path / "out")
     measured = scenes.measure(plane_take, tmp_path / "out")
     fresh = scenes.track(plane_take, tmp_path / "fresh", measured, other)
