@@ -1,6 +1,6 @@
 """The content of run.json: the take, settings and inputs of a run, the command that repeats it, and figures of its results.
 
-frames.csv: the quality of every frame in one row, for the panel's graph and for finding doubtful frames.
+Also frames.csv: the quality of every frame in one row, for the panel's graph and for finding doubtful frames.
 """
 
 import csv

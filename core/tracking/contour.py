@@ -24,9 +24,8 @@ Texture on both sides displaces the largest gradient as well. With σ_t, the tex
 
 Full-frame pixels; contours are closed, with vertices at equal distances.
 
-contours/VIEW.csv, the outline of the person in one view, read frame by frame on access, so that memory does not limit its length.
-
-The file is scanned once for the positions at which each frame's rows begin and end; the rows of a frame are consecutive.
+Their file, contours/VIEW.csv, is read frame by frame on access, so that memory does not limit its length. It is scanned once for the
+positions at which each frame's rows begin and end; the rows of a frame are consecutive.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

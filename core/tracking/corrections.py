@@ -1,10 +1,7 @@
-"""Corrections by the user: trajectories removed by a click, and points removed by a polygon drawn over a view.
+"""The user's corrections of a take (take.toml, [[corrections]]), applied to clouds and trajectories.
 
-These are pure functions of positions. take.toml lists the corrections of a take; measured frames and tracks stay valid when they change.
-
-The user's corrections of a take (take.toml, [[corrections]]), applied to clouds and trajectories.
-
-They are applied after measuring and tracking, whose checkpoints stay valid: neither adding nor removing a correction needs new matching.
+A correction removes a trajectory that was clicked, or everything inside a polygon that was drawn over a view. Corrections are applied after
+measuring and tracking, whose checkpoints stay valid: neither adding nor removing one needs new matching.
 """
 
 from collections.abc import Collection, Sequence

@@ -4,7 +4,7 @@
     search    the box about the prediction for the largest correlation with the patch of frame i                   (2)
     temporal  least squares matching of the patch of frame i in frame i + 1, in every view                         (3)
     control   the reference view's result is adjusted with a match of the point's key template (templates.py),     (4)
-              both corrected for the curvature of a turning body where the frame's surface was measured (relief.py)
+              both corrected for the curvature of a turning body where the frame's surface was measured (curvature_correction.py)
     spatial   least squares matching of the reference view's patch in the other views of frame i + 1               (5)
     verify    Δ = x_s − x_t,  Δᵀ (K_s + K_t + Q)⁻¹ Δ ≤ s² χ²(0.999; 2), else again in a larger box, else stop       (6)
 

@@ -14,9 +14,8 @@ template itself.
 Only tiles are stored, not images: memory grows with the points, not with the frames. Their gradients and normal matrices are computed once,
 when they are cut, from the new tiles laid out as one image.
 
-Control of drift: a point's temporal result adjusted with a match of its key template (equation (1) of templates.py).
-
-The box search: the position in a box at which a patch correlates best, for many patches (equation (2) of step.py).
+The module has the templates, the control of drift by (1), and the box search (equation (2) of step.py), which precedes a match where the
+position is uncertain.
 """
 
 from collections.abc import Callable

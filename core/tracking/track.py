@@ -1,14 +1,12 @@
-"""Tracking of a whole take: the points of each frame tracked into the next, in the order of time, with a checkpoint per frame.
+"""Tracking of the surface through a whole take: points of each frame are tracked into the next, in the order of time, with a checkpoint
+per frame; new points start where the surface has none (D'Apuzzo et al. 2000, §3.2).
 
 A frame in which next to no point is found, because one view is black or the recorder lost it, is left out: the points are tracked from
 the frame before it into the one after.
 
-Tracking the whole surface: which points are tracked, where new ones start, and each frame's measured surface as a control
-(D'Apuzzo et al. 2000, §3.2).
-
 At the outline of a limb, half of a patch shows the background. Such a point belongs to neither surface: it slides along the outline, with a
 high correlation. A point is therefore tracked only while its patch lies on the surface measured in the same frame, faces the camera, and
-has the depth of that surface. Its depth is then replaced by the surface's, which is corrected for curvature (surface/cloud.py).
+has the depth of that surface. Its depth is then replaced by the surface's, which is corrected for curvature (surface/local_surface.py).
 """
 
 from collections.abc import Iterator, Sequence

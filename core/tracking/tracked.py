@@ -17,8 +17,8 @@ class TrackedFrame:
 
     A point has a key template (templates.py), its patch in an earlier frame: `key_drift` is the covariance of that template's place on the
     body, `drift` that of the point against the template; their sum is the covariance of the point's drift since its first frame.
-    `local_surface` has the slopes and the sag of the surface under the point (relief.py), `key_local_surface` those where its key
-    template was cut.
+    `local_surface` has the slopes and the sag of the surface under the point (curvature_correction.py), `key_local_surface` those where its
+    key template was cut.
     """
 
     frame: int

@@ -1,6 +1,4 @@
-"""Trajectories: position, velocity and acceleration of every tracked point, raw and smoothed (kinematics.py), and why it ended.
-
-Velocity and acceleration of trajectories, raw and smoothed, with their sigmas.
+"""Trajectories: position, velocity and acceleration of every tracked point, raw and smoothed, with sigmas, and why it ended.
 
     v_i = (X_{i+1} − X_{i−1}) / 2 dt ,   a_i = (X_{i+1} − 2 X_i + X_{i−1}) / dt²                            (1)
     σ_v = √(σ²_{i+1} + σ²_{i−1}) / 2 dt ,   σ_a = √(σ²_{i+1} + 4 σ²_i + σ²_{i−1}) / dt²                     (2)
