@@ -112,7 +112,7 @@ def _check_views(take: Take, views: list[str]) -> list[str]:
     return names
 
 
-def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
+def write_contours(job: take_run.Run, views: list[str], monitor: Monitor, start: Start = MEASURED_SURFACE) -> list[str]:
     """Track the contour in the views of these names, write contours/NAME.csv of each, and return a sentence for each.
 
     The take is measured and tracked first where that is needed. It is not needed with a background, which gives the outline in every frame.
@@ -136,7 +136,7 @@ def write_contours(job: pipeline.Run, views: list[str], monitor: Monitor, start:
     return [_write_contour(job, name, names.index(name), monitor, start) for name in views]
 
 
-def _track_if_possible(job: pipeline.Run, monitor: Monitor, own_start: bool) -> None:
+def _track_if_possible(job: take_run.Run, monitor: Monitor, own_start: bool) -> None:
     """Measure and track; a take without a measurable surface is an error only if the contour starts from the surface."""
     try:
         pipeline.track(job, monitor)
@@ -146,7 +146,7 @@ def _track_if_possible(job: pipeline.Run, monitor: Monitor, own_start: bool) -> 
         job.warn(f"{error} The outline was tracked in the images.")
 
 
-def _write_contour(job: pipeline.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
+def _write_contour(job: take_run.Run, name: str, view: int, monitor: Monitor, start: Start) -> str:
     path, on_edge = job.results.path("contours", f"{name}.csv"), list[float]()
     with store.written(path) as file:
         file.write(HEAD.encode())
@@ -184,7 +184,7 @@ def _checkpoints(view: int) -> str:
 
 
 def track_contour(
-    job: pipeline.Run, view: int, monitor: Monitor, start: Start, checkpoints: ContourCheckpoints | None = None
+    job: take_run.Run, view: int, monitor: Monitor, start: Start, checkpoints: ContourCheckpoints | None = None
 ) -> Iterator[tuple[int, Contour]]:
     """(frame, contour) of one view. Each is predicted from the last one by the projected trajectories inside it, or without trajectories by
     points that are tracked in the images.
