@@ -1,22 +1,19 @@
 """Which limb does a measured point belong to? (D'Apuzzo et al. 1999, §3.3: the closest limb in the pose so far.)
 
-    distance = |X − bone's segment| − radius of the limb in the direction of X                            (1)
+    d = |X − bone's segment| − radius of the limb in the direction of X                                           (1)
+    α_ij = π_ij N(d_ij; σ) max(0, n_i·n_j) / (Σ_k π_ik N(d_ik; σ) max(0, n_i·n_k) + π_0 / (2 gate))               (2)
+    π_j = mean of α_ij over i ,   π_0 = 1 − Σ_j π_j ,   σ² = Σ α d² / Σ α , within 3 and 30 mm                    (3)
 
-The closest limb has the smallest distance from its surface (`body.bone_profile`), not from its axis: a fat trunk must not swallow the
-points of a thin arm. A point belongs to no limb when it is further from that surface than a gate, when it lies along the bone where the
-surface is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the hand), or when its
-normal points into the limb.
+Hard segmentation: the closest limb has the smallest distance (1) from its surface (`body.bone_profile`), not from its axis: a fat trunk
+must not swallow the points of a thin arm. A point belongs to no limb when it is further from that surface than a gate, when it lies along
+the bone where the surface is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the
+hand), or when its normal points into the limb.
 
-Points that may belong to several limbs, to each in part (Horaud, Niskanen, Dewaele & Boyer 2009, IEEE TPAMI 31(1), §4).
-
-    α_ij = π_ij N(d_ij; σ) max(0, n_i·n_j) / (Σ_k π_ik N(d_ik; σ) max(0, n_i·n_k) + π_0 / (2 gate))               (1)
-    π_j = mean of α_ij over i ,   π_0 = 1 − Σ_j π_j ,   σ² = Σ α d² / Σ α , within 3 and 30 mm                  (2)
-
-d_ij is the distance of point i from the surface of limb j, n are their normals, and the last term of (1) is the class of outliers, even
-within the gate. Few of a body's limbs are near a point: π_ij is π_j among those that are, together 1 − π_0. A few rounds of (1) and (2)
-begin at σ = 30 mm; as the body approaches its points σ falls with their distances, so a far start remains undecided, and a good fit decides
-as sharply as the hard segmentation. The part of a point that goes to a limb where the surface is another part's (`segmentation`) is
-dropped.
+Soft segmentation: points may belong to several limbs, to each in part (Horaud, Niskanen, Dewaele & Boyer 2009, IEEE TPAMI 31(1), §4). d_ij
+is the distance of point i from the surface of limb j, n are their normals, and the last term of (2) is the class of outliers, even within
+the gate. Few of a body's limbs are near a point: π_ij is π_j among those that are, together 1 − π_0. A few rounds of (2) and (3) begin at σ
+= 30 mm; as the body approaches its points σ falls with their distances, so a far start remains undecided, and a good fit decides as sharply
+as the hard segmentation. The share of a limb where the surface is another part's is dropped.
 """
 
 from collections.abc import Callable, Hashable
@@ -29,6 +26,10 @@ from .state import CROSS, BodyState
 
 HYSTERESIS_M = 0.004  # motion of the body within which points keep their limbs
 FACING = 0.6  # least cosine between a point's normal and the limb's
+WIDEST_M, NARROWEST_M = 0.030, 0.003  # of σ in (3)
+ROUNDS = 6  # of (2) and (3)
+OUTLIERS = (0.05, 0.5)  # π_0 at the start, and at most
+LEAST_SHARE = 0.05  # of a point for a limb; a smaller one is not worth its equation
 
 
 def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
@@ -124,18 +125,12 @@ def _gap(xyz_m: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np
     return np.sqrt(aside + beyond**2) - radius, along, outward / axes
 
 
-WIDEST_M, NARROWEST_M = 0.030, 0.003
-ROUNDS = 6  # of (1) and (2)
-OUTLIERS = (0.05, 0.5)  # π_0 at the start, and at most
-LEAST_SHARE = 0.05  # of a point for a limb; a smaller one is not worth its equation
-
-
 def soft_segment(
     points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of the points (K,), a limb's bone (K,), and the limb's share of the point (K,). A row may occur several times.
 
-    Arguments as in `segmentation.segment`.
+    Arguments as in `segment`.
     """
     gate = np.broadcast_to(gate_m, (len(state.lengths_m),))
     found = candidates(points.xyz_m, state, gate)
@@ -151,17 +146,17 @@ def soft_segment(
 
 
 def responsibilities(gap_m: np.ndarray, likely: np.ndarray, gate_m: float) -> np.ndarray:
-    """α (N, J) of distances (N, J) and of factors (N, J) that are 0 where a limb cannot be.  (1), (2)"""
+    """α (N, J) of distances (N, J) and of factors (N, J) that are 0 where a limb cannot be.  (2), (3)"""
     share, sigma = np.zeros_like(gap_m), WIDEST_M
     mixture, outliers, near = np.ones(gap_m.shape[1]), OUTLIERS[0], likely > 0
     for _ in range(ROUNDS):
         among = (1 - outliers) * mixture / np.maximum((near * mixture).sum(axis=1, keepdims=True), 1e-12)
         density = among * likely * np.exp(-0.5 * (gap_m / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
-        share = density / (density.sum(axis=1, keepdims=True) + outliers / (2 * gate_m))  # (1)
+        share = density / (density.sum(axis=1, keepdims=True) + outliers / (2 * gate_m))  # (2)
         total = float(share.sum())
         if total < 1e-9:
             break
         mixture = share.sum(axis=0) / max(int(near.any(axis=1).sum()), 1)  # points beyond every gate do not count as outliers
         outliers = float(np.clip(1 - mixture.sum(), *OUTLIERS))
-        sigma = float(np.clip(np.sqrt((share * gap_m**2).sum() / total), NARROWEST_M, WIDEST_M))  # (2)
+        sigma = float(np.clip(np.sqrt((share * gap_m**2).sum() / total), NARROWEST_M, WIDEST_M))  # (3)
     return share

@@ -1,13 +1,11 @@
 """Background regions of the views, frame by frame, as observations of a body: no limb is there.
 
-Only of limbs whose pose must be observed; and, with a larger sigma, of the middle of a hand, whose prior is a straight wrist: the tip of a
-bent one would pull its forearm.
+Only limbs whose pose must be observed take part; and, with a larger sigma, the middle of a hand, whose prior is a straight wrist: the tip
+of a bent one would pull its forearm.
 
-Where the views show the still background and so no part of the person, for the fit.
-
-A pixel is empty when it shows what the view's `background` in take.toml shows, or without one what it shows when no measured point is
-near, or most of the time (`images.background`). What stands still most of the time may also be the person: of that, nothing is empty near a
-measured point. Nor is anything along the clicked limbs if the pixels there have not changed since the click.
+A pixel is background when it shows what the view's `background` image in take.toml shows; without such an image, what it shows when no
+measured point is near, or most of the time (`images.background`). A person may stand still most of the time, too: so without the image
+nothing near a measured point is background, nor along clicked limbs where the pixels have not changed since the click.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,6 +31,12 @@ from ..state import ShapeParameters, free_bones
 from .fit_input import BackgroundDistances, FitInput, Packed
 
 FRACTIONS = (0.2, 0.5, 0.8, 1.0)  # of a bone's axis, where its places are
+SAMPLES = 11  # frames for a view's background
+STEP_PX, UNIT_PX = 4, 0.5  # size of a square, unit of stored distances
+SPECK = 9  # squares: noise in one window of the comparison affects no more
+STILL = 0.25  # of a limb's line looks like the background, if the limb stands still
+LIMB_M = 0.06  # nothing so near to a measured point or a clicked limb is background
+BAND = 0.5  # width of a clicked limb over the mean length of the limbs
 HAND_FRACTION, HAND_SIGMA = 0.5, 3.0  # of a hand's axis; its sigma over that of the outline
 
 
@@ -71,15 +75,8 @@ class BackgroundRegions:
         return [BackgroundExclusion(views=views, head=self._head, tail=self._tail, fraction=self._fraction, sigma_px=self._sigma_px)]
 
 
-SAMPLES = 11  # frames for the background
-STEP_PX, UNIT_PX = 4, 0.5
-SPECK = 9  # squares: noise in one window of the comparison spoils no more
-STILL = 0.25  # of a limb's line shows the background, if the limb stands still
-LIMB_M = 0.06  # nothing is empty so near to a measured point or a clicked limb
-
-
 def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor) -> list[BackgroundDistances]:
-    """The empty parts of the views in the frames of the clouds; without those of which nothing tells the background.
+    """The background regions in the frames of the clouds, of the views whose background is known.
 
     Raises:
         InputError: an image cannot be read, or the background in take.toml is not that of the view.
@@ -96,9 +93,9 @@ def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Mon
         monitor.step("background", t, len(clouds))
         images = footage.read(cloud.frame)
         for k, background in known.items():
-            apart = bare[k] | ~_near(footage.rig.cameras[k], cloud.xyz_m, persons[k].shape)
-            empty = _shown(background, images[k]) & ~persons[k] & apart
-            squares = cv2.distanceTransform(empty.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # endless where all is empty
+            away = bare[k] | ~_near(footage.rig.cameras[k], cloud.xyz_m, persons[k].shape)
+            background_px = _shown(background, images[k]) & ~persons[k] & away
+            squares = cv2.distanceTransform(background_px.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
             distances[k].append((np.minimum(squares, 255 * UNIT_PX / STEP_PX) * (STEP_PX / UNIT_PX)).astype(np.uint8))
     return [
         BackgroundDistances(view=footage.take.views[k].name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
@@ -109,7 +106,7 @@ def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Mon
 def still_backgrounds(footage: Footage, frames: np.ndarray, clouds: Sequence[PointCloud] | None = None) -> list[Background | None]:
     """The still background of every view: the image of it in take.toml, or from some of the frames (T,); None where they are too few.
 
-    `clouds` (T,): what was measured of the person. A frame in which that is nothing does not tell where the background shows.
+    `clouds` (T,): the measured points of the person. A frame without points does not show where the background is.
 
     Raises:
         InputError: an image cannot be read, or the one in take.toml is not that of the view.
@@ -146,7 +143,7 @@ def _coarse(mask: np.ndarray) -> np.ndarray:
 
 
 def _shown(background: Background, image: np.ndarray) -> np.ndarray:
-    """The squares (h, w) in which an image shows the background, and the specks between them that are smaller than a hand."""
+    """The squares (h, w) in which an image shows the background, and the specks between them, smaller than a hand."""
     whole = _coarse(background.shown_by(image))
     _, label, stats, _ = cv2.connectedComponentsWithStats((~whole).astype(np.uint8), connectivity=8)
     small = stats[:, cv2.CC_STAT_AREA] < SPECK
@@ -155,19 +152,19 @@ def _shown(background: Background, image: np.ndarray) -> np.ndarray:
 
 def _near(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Squares (h, w) near the images of points (N, 3)."""
-    seen = np.zeros(shape, np.uint8)
+    hit = np.zeros(shape, np.uint8)
     if not len(xyz_m):
-        return seen.astype(bool)
+        return hit.astype(bool)
     xy = camera.project(xyz_m)
     at = np.floor(xy[camera.sees(xy)] / STEP_PX).astype(int)
     at = at[(at >= 0).all(axis=1) & (at[:, 0] < shape[1]) & (at[:, 1] < shape[0])]
-    seen[at[:, 1], at[:, 0]] = 1
+    hit[at[:, 1], at[:, 0]] = 1
     radius = max(1, round(LIMB_M * camera.focal_px / float(np.median(camera.to_camera(xyz_m)[:, 2])) / STEP_PX))
-    return cv2.dilate(seen, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))).astype(bool)
+    return cv2.dilate(hit, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))).astype(bool)
 
 
 def _near_pixels(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Pixels (h, w) near the images of points (N, 3); all of them where there are none."""
+    """Pixels (h, w) near the images of points (N, 3); all pixels if there are no points."""
     if not len(xyz_m):
         return np.ones(shape, dtype=bool)
     squares = _near(camera, xyz_m, tuple(-(-n // STEP_PX) for n in shape))
@@ -175,7 +172,7 @@ def _near_pixels(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> n
 
 
 def _clicked_limbs(footage: Footage, backgrounds: Mapping[int, Background]) -> dict[int, np.ndarray]:
-    """Squares (h, w) of every view along the clicked limbs whose middle looks in the click's frame like the background."""
+    """Squares (h, w) of every view along those clicked limbs that look like the background in the click's frame."""
     take = footage.take
     masks = {k: np.zeros(_coarse(b.grey > 0).shape, bool) for k, b in backgrounds.items()}
     skeleton = read_model(str(take.body_model)).skeleton
@@ -188,18 +185,18 @@ def _clicked_limbs(footage: Footage, backgrounds: Mapping[int, Background]) -> d
 
 
 def _lines(skeleton: Skeleton, clicked: FrameClicks, view: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """From clicked joint to clicked joint, in squares."""
+    """The lines from clicked joint to clicked joint, in squares."""
     at = {joint: pixels[view] / STEP_PX for joint, pixels in clicked.joints.items() if view in pixels}
     return [(at[b.head_joint], at[b.tail_joint]) for b in skeleton.bones if b.head_joint in at and b.tail_joint in at]
 
 
 def _add_still(mask: np.ndarray, lines: Sequence[tuple[np.ndarray, np.ndarray]], shown: np.ndarray) -> None:
-    """Add to a mask (h, w) the lines along which the background shows, half the lines' mean length wide."""
+    """Add to a mask (h, w) the lines along which the image looks like the background, as bands (`BAND`)."""
     if not lines:
         return
-    width = max(2, round(0.5 * float(np.mean([np.linalg.norm(a - b) for a, b in lines]))))
+    width = max(2, round(BAND * float(np.mean([np.linalg.norm(a - b) for a, b in lines]))))
     for line in lines:
         a, b = (np.rint(end).astype(int).tolist() for end in line)
-        middle, band = (cv2.line(np.zeros(mask.shape, np.uint8), a, b, 1, wide) > 0 for wide in (1, width))
+        middle, band = (cv2.line(np.zeros(mask.shape, np.uint8), a, b, 1, thickness) > 0 for thickness in (1, width))
         if (shown & middle).sum() > STILL * middle.sum():
             mask |= band

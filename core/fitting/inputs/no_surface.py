@@ -1,4 +1,4 @@
-"""Recordings whose surface cannot be measured (views far apart, a person without texture) or need not be: what a body can rest on then."""
+"""Fits without a measured surface (views far apart, a person without texture, or no need of one): outlines and keypoints remain."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,11 +15,12 @@ from ..settings import FitSettings
 from .background import STEP_PX, UNIT_PX, find_background, still_backgrounds
 from .fit_input import BackgroundDistances, Packed
 
-LEAST_CORNERS = 3
+LEAST_CORNERS = 3  # of a polygon
+SUBPIXEL_BITS = 4  # of a polygon's vertices in OpenCV's fixed-point coordinates
 
 
 def can_fit_without_surface(footage: Footage, results: Results) -> bool:
-    """Whether outlines (`tricap contour`) or keypoints can stand for measured points."""
+    """Whether there are outlines (`tricap contour`) or keypoints for a fit without measured points."""
     return bool(footage.take.keypoints) or any(results.path("contours", f"{v.name}.csv").is_file() for v in footage.take.views)
 
 
@@ -41,7 +42,7 @@ def empty_clouds(footage: Footage) -> list[PointCloud]:
 
 
 def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[int, np.ndarray]]:
-    """The polygon (V, 2) px that `tricap contour` found about the person, by view and frame; views without one are left out.
+    """The outline (V, 2) px of the person from `tricap contour`, by view and frame; views without one are omitted.
 
     Raises:
         InputError: a table of contours is damaged.
@@ -54,7 +55,7 @@ def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[in
 def known_silhouettes(
     footage: Footage, results: Results, settings: FitSettings
 ) -> tuple[dict[str, Mapping[int, np.ndarray]], dict[str, Background]]:
-    """The outlines, and the still backgrounds of views that have none: what tells the person's silhouette.
+    """The outlines, and the still backgrounds of views that have none: they show the person's silhouette.
 
     Raises:
         InputError: an image or a table of contours cannot be read.
@@ -70,14 +71,14 @@ def known_silhouettes(
 def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """The mask (h, w) of a polygon (V, 2)."""
     mask = np.zeros(size_px[::-1], np.uint8)
-    cv2.fillPoly(mask, [np.rint(polygon_px * 16).astype(np.int32)], 1, shift=4)
+    cv2.fillPoly(mask, [np.rint(polygon_px * 2**SUBPIXEL_BITS).astype(np.int32)], 1, shift=SUBPIXEL_BITS)
     return mask.astype(bool)
 
 
 def background_regions(
     footage: Footage, results: Results, clouds: Sequence[PointCloud], settings: FitSettings, monitor: Monitor
 ) -> list[BackgroundDistances]:
-    """Where the views show no part of the person: outside the outline, and in views without one where the still background is seen.
+    """The background regions of the views: outside the outline; in views without one, where the still background is visible.
 
     Raises:
         InputError: an image or a table of contours cannot be read.
@@ -87,11 +88,11 @@ def background_regions(
         return []
     outlines = outline_polygons(footage, results) if settings.use_contours else {}
     others = find_background(footage, clouds, monitor) if len(outlines) < len(footage.take.views) else []
-    return background_outside_outlines(footage, outlines) + [empty for empty in others if empty.view not in outlines]
+    return background_outside_outlines(footage, outlines) + [region for region in others if region.view not in outlines]
 
 
 def background_outside_outlines(footage: Footage, outlines: Mapping[str, Mapping[int, np.ndarray]]) -> list[BackgroundDistances]:
-    """Where the views show no part of the person: outside of the outline."""
+    """The background regions outside of the outlines."""
     found = []
     for name, polygons in outlines.items():
         tables = Packed(_distances(filled(xy, footage.rig[name].size_px)) for xy in polygons.values())
@@ -100,7 +101,7 @@ def background_outside_outlines(footage: Footage, outlines: Mapping[str, Mapping
 
 
 def _distances(inside: np.ndarray) -> np.ndarray:
-    """Distance (h', w') of the middles of squares from the mask, in steps of `UNIT_PX`."""
+    """Distance (h', w') of the middles of squares from the mask, in units of `UNIT_PX`."""
     far = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     h, w = (n // STEP_PX for n in inside.shape)
     middles = far[: h * STEP_PX, : w * STEP_PX].reshape(h, STEP_PX, w, STEP_PX).mean(axis=(1, 3))

@@ -1,4 +1,4 @@
-"""Where the fit's input comes from: the take's clicks and limits, the run's clouds and trajectories, contours/*.csv in OUT, keypoints."""
+"""The fit's input from a take and its run: clicks and limits of take.toml, clouds and trajectories, contours/*.csv in OUT, keypoints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from ..settings import FitSettings
 from .clicks import initial_clicks, read_clicks
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
-OURS = {
+JOINT_OF_ROLE = {
     "upper_arm": "shoulder",
     "forearm": "elbow",
     "hand": "wrist",
@@ -36,9 +36,9 @@ OURS = {
     "clavicle": "clavicle",
     "hips": "pelvis",
     "neck": "neck",
-}  # of the roles that retargeting reads in names
-LOOSE = {"toe.L": 2.0, "toe.R": 2.0, "neck": 2.0, "pelvis": 2.0}  # where detectors mean another place than we do: times the sigma
-LEAST_CONFIDENCE = 0.2
+}  # the roles that retargeting recognises in names
+LOOSE = {"toe.L": 2.0, "toe.R": 2.0, "neck": 2.0, "pelvis": 2.0}  # factors of the sigma, where detectors place the joint elsewhere
+LEAST_CONFIDENCE = 0.2  # of a detector's keypoint
 
 
 def fit_input(
@@ -48,7 +48,7 @@ def fit_input(
     results: Results,
     background: Sequence[BackgroundDistances] = (),
 ) -> FitInput:
-    """All that the fit can use of a run; clicks in other frames than the footage's are left out.
+    """The fit's input from a run; clicks outside the footage's frames are omitted.
 
     Raises:
         InputError: a table of contours or keypoints cannot be read.
@@ -77,7 +77,7 @@ def clicks_in(footage: Footage) -> dict[int, ClickedAt]:
 
 
 def check_body(footage: Footage, settings: FitSettings) -> None:
-    """See that clicks and degrees of freedom are those of the body that is wanted, before anything is computed for hours.
+    """Check that clicks and degrees of freedom are those of the take's body model, before hours of computation.
 
     Raises:
         InputError: the model has no such degree of freedom, clicks contradict each other, or too few joints are clicked.
@@ -104,7 +104,7 @@ def missing_for_fit(footage: Footage) -> str:
 
 
 def clicks_left_out(footage: Footage) -> list[str]:
-    """What the user should know of clicked joints outside the footage's frames."""
+    """Warnings about clicked joints outside the footage's frames."""
     outside = [s.frame for s in _with_joints(footage.take) if s.frame not in footage.frames]
     if not outside or missing_for_fit(footage):
         return []
@@ -121,7 +121,7 @@ def _with_joints(take: Take) -> list[FrameClicks]:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class EdgesOfTable:
-    """The outlines of a table (`fitting.fit_input.Outlines`): the vertices on an edge only, read when they are asked for."""
+    """The outlines of a table (`fit_input.Outlines`): the vertices on an edge only, read on demand."""
 
     view: str
     table: ContourTable
@@ -158,7 +158,7 @@ def read_source(footage: Footage, source: KeypointSource) -> JointPlaces:
     folder = footage.take.folder
     paths = sorted((p for p in folder.glob(source.files) if p.is_file()), key=lambda p: natural_order(p.name))
     if not paths:
-        raise InputError(f"There are no keypoints “{source.files}” in {folder}; mend `files` under [[keypoints]].")
+        raise InputError(f"There are no keypoints “{source.files}” in {folder}; correct `files` under [[keypoints]].")
     if source.view:
         points = read_keypoints(paths)
         view = next(v for v in footage.take.views if v.name == source.view)
@@ -180,10 +180,10 @@ def _markers(path: Path, axes: str | None) -> Markers:
 def _places(
     source: KeypointSource, names: Sequence[str], frames: np.ndarray, places: np.ndarray, confidence: np.ndarray, path: Path
 ) -> JointPlaces:
-    """What a file says of joints, one row per place; a point of confidence c has the sigma over √c."""
+    """The joints of a file, one row per place; the sigma of a point of confidence c is divided by √c."""
     for name in source.names:
         if name not in names:
-            raise InputError(f"{path} has no point “{name}”.{nearest_name(name, list(names))} Mend `names` under [[keypoints]].")
+            raise InputError(f"{path} has no point “{name}”.{nearest_name(name, list(names))} Correct `names` under [[keypoints]].")
     joints = [source.names.get(name, joint_named(name)) for name in names]
     rows = [
         (t, n)
@@ -192,7 +192,7 @@ def _places(
         if joint and confidence[t, n] >= LEAST_CONFIDENCE and np.isfinite(places[t, n]).all()
     ]
     if not rows:
-        raise InputError(f"None of the points in {path} ({', '.join(names[:6])} …) is a joint of ours; say which under `names`.")
+        raise InputError(f"None of the points in {path} ({', '.join(names[:6])} …) is a joint of the body; map them under `names`.")
     t, n = np.array(rows).T
     loose = np.array([LOOSE.get(joint, 1.0) for joint in joints])
     return JointPlaces(
@@ -205,11 +205,11 @@ def _places(
 
 
 def joint_named(name: str) -> str:
-    """Our joint of another system's name: "RKnee", "left_hip" -> "knee.R", "hip.L"; "" for what is no joint of ours."""
+    """The model's joint for another system's name: "RKnee", "left_hip" -> "knee.R", "hip.L"; "" if there is none."""
     if name in JOINTS:
         return name
     part, dot, side = joint_of(name).partition(".")
-    return OURS.get(part, "") + (dot + side if part in OURS else "")
+    return JOINT_OF_ROLE.get(part, "") + (dot + side if part in JOINT_OF_ROLE else "")
 
 
 def _clicked(clicks: FrameClicks) -> ClickedAt:

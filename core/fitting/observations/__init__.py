@@ -11,9 +11,9 @@ from ..state import Block, BodyState, FromBlocks
 from .background import BackgroundExclusion
 from .joints import ClickedJoints, FootOnFloor, Keypoints
 from .material_step import MaterialSteps, StepsFromFixed
-from .pose_priors import JointLimits, PosePrior, ShapePrior
+from .pose_priors import JointLimits, PosePrior
 from .self_collision import SelfCollision
-from .shape_priors import EqualRadii, Proportions, Symmetry
+from .shape_priors import EqualRadii, Proportions, ShapePrior, Symmetry
 from .silhouette_ray import SilhouetteRays
 from .surface_point import SurfacePoints
 

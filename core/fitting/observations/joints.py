@@ -1,16 +1,11 @@
-"""Joints clicked in the views, or detected in them by another system:
+"""Observations of joints X: clicked in the views, or located by another system, and those of standing feet.
 
-    (projection(joint) − click) / σ = ε ,    σ about 5 px                                                 (1)
+    (projection(X) − click) / σ = ε ,    σ about 5 px                                                     (1)
+    (X − keypoint) / σ = ε ,             each coordinate                                                  (2)
+    (up · X − floor − h) / σ = ε                                                                          (3)
 
-(D'Apuzzo et al. 1999, §3.3: the initialisation.)
-
-Imported keypoints K in space, for each coordinate of a joint X (a keypoint in an image is a `ClickedJoints`):
-
-(X − K) / σ = ε                                                                                       (1)
-
-A standing foot neither sinks into the floor nor hovers (optional): its joints X have given heights h above the floor,
-
-(up · X − floor − h) / σ = ε                                                                          (1)
+(1) is the initialisation of D'Apuzzo et al. 1999, §3.3; keypoints of other systems in images are observed in the same way. (2) is for
+keypoints in space. (3) is optional: a standing foot neither sinks into the floor nor hovers, its joints have given heights h above it.
 """
 
 from dataclasses import dataclass
@@ -52,7 +47,7 @@ class ClickedJoints:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Keypoints:
-    """K joints located in space by another system (TRC, C3D, CSV).  (1)"""
+    """K joints located in space by another system (TRC, C3D, CSV).  (2)"""
 
     joint: np.ndarray  # (K,) index in Skeleton.joint_names
     xyz_m: np.ndarray  # (K, 3)
@@ -73,7 +68,7 @@ class Keypoints:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FootOnFloor:
-    """K joints at given heights above a plane. `up` is the plane's unit normal, `floor_m` its height along `up`.  (1)"""
+    """K joints at given heights above a plane. `up` is the plane's unit normal, `floor_m` its height along `up`.  (3)"""
 
     joint: np.ndarray  # (K,) index in Skeleton.joint_names
     height_m: np.ndarray  # (K,) of the joint's centre above the floor when the foot stands

@@ -1,13 +1,9 @@
-"""Gaussian priors of parameters:
+"""Priors of the pose: Gaussian ones, and joint limits as soft one-sided observations.
 
     (θ − mean) / σ = ε                                                                                    (1)
+    max(0, θ − θ_max) / σ = ε ,    min(0, θ − θ_min) / σ = ε ,    σ about 2°                              (2)
 
-For the prediction 2θ_i − θ_{i−1}, for DOFs that observations hardly constrain (twist), and for radii (in logarithms, so that σ is
-relative).
-
-Joint limits as soft one-sided observations:
-
-max(0, θ − θ_max) / σ = ε ,    min(0, θ − θ_min) / σ = ε ,    σ about 2°                              (1)
+(1) is for the prediction 2θ_i − θ_{i−1}, and for DOFs that observations hardly constrain (twist).
 """
 
 from collections.abc import Iterator
@@ -15,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..state import Block, BodyState, FromBlocks, shape_vector
+from ..state import Block, BodyState, FromBlocks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,29 +39,8 @@ class PosePrior(FromBlocks):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ShapePrior:
-    """Mean and sigma of the shape vector (S,), logarithms of lengths and cross radii; with an infinite sigma there is no prior.  (1)"""
-
-    mean: np.ndarray
-    sigma: np.ndarray
-    kind: str = ""
-    variance_inflation: float = 1.0
-
-    def residual(self, state: BodyState) -> np.ndarray:
-        """(S,)"""
-        return (shape_vector(state) - self.mean) / self.sigma
-
-    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
-        """(S, D + S); zeros (S, D) without shape"""
-        J = state.layout.empty_jacobian(state.layout.n_shape, shape)
-        if shape:
-            J[:, state.layout.columns("shape")] = np.diag(1 / self.sigma)
-        return J
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class JointLimits(FromBlocks):
-    """Lowest and highest value of every DOF (D,); infinite: free.  (1)"""
+    """Lowest and highest value of every DOF (D,); infinite: free.  (2)"""
 
     low: np.ndarray
     high: np.ndarray

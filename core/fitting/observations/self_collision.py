@@ -5,7 +5,7 @@
 X lies at a fraction of a bone, F is the field of the other part; |∇D| and the radius ρ are constants, evaluated at a reference state. A
 limb that the trunk occludes is measured by nothing; this at least keeps it out of the trunk.
 
-Places on limbs that are near other parts of the body, and have to stay outside of them (`observations.SelfCollision`).
+`CollisionPairs` finds the places on limbs that are near other parts of the body.
 """
 
 from collections.abc import Iterator
@@ -17,6 +17,10 @@ from ...body.skeleton import Skeleton
 from ..part_field import PartField
 from ..state import Block, BodyState, FromBlocks
 
+FRACTIONS = (0.65, 1.0)  # of a limb's bone: nearer its head it joins the others
+SOFTNESS = 0.8  # of the limb's radius: flesh is compressed
+SIGMA_M = 0.01  # of (1)
+NEAR_M = 0.03  # between the surfaces, for an observation
 LEAST_SLOPE = 0.3  # of |∇D|, in units of 1 / (mean l of the part): on a limb's axis it vanishes
 
 
@@ -95,12 +99,6 @@ def _places(state: BodyState, bone: np.ndarray, fraction: np.ndarray) -> np.ndar
     """X of (1): places (N, 3) at fractions (N,) of bones (N,)."""
     along = fraction * state.lengths_m[bone]
     return np.asarray(state.head_m[bone] + along[:, None] * state.R[bone][:, :, 1])
-
-
-FRACTIONS = (0.65, 1.0)  # of a limb's bone: nearer its head it joins the others
-SOFTNESS = 0.8  # of the limb's radius: flesh is compressed
-SIGMA_M = 0.01
-NEAR_M = 0.03  # between the surfaces, for an observation
 
 
 class CollisionPairs:

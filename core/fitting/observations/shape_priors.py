@@ -1,35 +1,29 @@
-"""Joint prior of the bone lengths, a person's proportions (`bone_lengths`): with WᵀW the inverse of the covariance,
+"""Priors of the shape: radii, proportions of the bones, roundness and symmetry.
 
-W (ln L − mean) = ε                                                                                   (1)
+    (x − mean) / σ = ε                                                                                                 (1)
+    W (ln L − mean) = ε ,   WᵀW = covariance⁻¹ of                                                                      (2)
+    ln L_b = ln L_b,model + g + c_k + d_b + j_b ,   g ~ N(0, σ_g²) ,   c_k ~ N(0, σ_k²) ,   d_b ~ N(0, σ_d²)           (3)
+    σ_k² = σ_c⁴ / (σ_c² + (e / L_k)²)                                                                                  (4)
+    (ln l_x − ln l_z − ln (l_x⁰ / l_z⁰)) / σ = ε ,    σ about 10 %                                                     (5)
+    (ln p_L − ln p_R) / σ = ε                                                                                          (6)
 
-Limbs are nearly round, trunks as flat as the model's. For every ball, with the model's cross radii l_x⁰ and l_z⁰,
+(1): x are the logarithms of lengths, cross radii and weights, so that σ is relative.
 
-    (ln l_x − ln l_z − ln (l_x⁰ / l_z⁰)) / σ = ε ,    σ about 10 %                                         (1)
+(2)–(4), proportions: g is the person's size, common to all bones. d_b is the deviation of one bone from those of other people of that size,
+a few per cent. c_k belongs to a chain k of bones whose two ends were clicked: there the length is the clicked one (an operator or a
+detector places a joint elsewhere than an anatomist), so it is free by σ_c, as far as two clicks with an error e determine a length L_k (4);
+a neck is too short for that. Inside a chain (collarbones; pelvis, spine and chest), and where nothing was clicked (head, hands), bones have
+the model's proportions: clouds and outlines show no joints there, and the model's error (a cap, fingers, loose clothes) is the same in all
+frames. However many they are, frames must not outvote σ_d and σ_g, which count once for each of them: otherwise unclicked bones grow with
+the others, while clicked chains adapt by c_k. j_b ~ N(0, model.length_sigma²) is for a joint without an agreed place, clicked or not. A
+neck's base is placed anywhere between the breastbone and the vertebrae in the middle of the neck, 25 mm up or down. A neck of fixed
+proportions above such a click lifts the skull off the measured head; with j_b its length follows from the head's surface.
 
-Points from one side of a limb determine its depth and its thickness only together.
+(5), roundness: limbs are nearly round, trunks as flat as the model's, with its cross radii l_x⁰ and l_z⁰. Points from one side of a limb
+determine its depth and its thickness only together.
 
-Both sides of a body are alike: for a length or radius p on the left and on the right,
-
-    (ln p_L − ln p_R) / σ = ε                                                                             (1)
-
-People's bones differ by 1 to 2 % at most (Auerbach & Ruff 2006, J. Hum. Evol. 50: 203-218), their flesh by more.
-
-The prior of the bone lengths.
-
-    ln L_b = ln L_b,model + g + c_k + d_b + j_b ,   g ~ N(0, σ_g²) ,   c_k ~ N(0, σ_k²) ,   d_b ~ N(0, σ_d²)                (1)
-    σ_k² = σ_c⁴ / (σ_c² + (e / L_k)²)                                                                                  (2)
-
-g is the person's size, common to all bones. d_b is the deviation of one bone from those of other people of that size, a few per cent. c_k
-belongs to a chain k of bones whose two ends were clicked: there the length is the clicked one (an operator or a detector places a joint
-elsewhere than an anatomist), so it is free by σ_c, as far as two clicks with an error e determine a length L_k (2); a neck is too short for
-that. Inside a chain (collarbones; pelvis, spine and chest), and where nothing was clicked (head, hands), bones have the model's
-proportions: clouds and outlines show no joints there, and the model's error (a cap, fingers, loose clothes) is the same in all frames.
-However many they are, frames must not outvote σ_d and σ_g, which count once for each of them: otherwise unclicked bones grow with the
-others, while clicked chains adapt by c_k.
-
-j_b ~ N(0, model.length_sigma²) is for a joint without an agreed place, clicked or not. A neck's base is placed anywhere between the
-breastbone and the vertebrae in the middle of the neck, 25 mm up or down. A neck of fixed proportions above such a click lifts the skull off
-the measured head; with j_b its length follows from the head's surface.
+(6), symmetry of a length or radius p on the left and on the right: people's bones differ by 1 to 2 % at most (Auerbach & Ruff 2006, J. Hum.
+Evol. 50: 203-218), their flesh by more.
 """
 
 from collections.abc import Sequence
@@ -42,10 +36,34 @@ from ...body.model_file import BodyModel
 from ...body.skeleton import Skeleton
 from ..state import BodyState, shape_vector
 
+STATURE_SIGMA = 0.07  # σ_g, relative, of a person about the model
+CLICK_ERROR_M = 0.02  # e of (4), of both ends of a length together
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShapePrior:
+    """Mean and sigma of the shape vector (S,), logarithms of lengths and cross radii; with an infinite sigma there is no prior.  (1)"""
+
+    mean: np.ndarray
+    sigma: np.ndarray
+    kind: str = ""
+    variance_inflation: float = 1.0
+
+    def residual(self, state: BodyState) -> np.ndarray:
+        """(S,)"""
+        return (shape_vector(state) - self.mean) / self.sigma
+
+    def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
+        """(S, D + S); zeros (S, D) without shape"""
+        J = state.layout.empty_jacobian(state.layout.n_shape, shape)
+        if shape:
+            J[:, state.layout.columns("shape")] = np.diag(1 / self.sigma)
+        return J
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Proportions:
-    """Mean (B,) and covariance (B, B) of the logarithms of the bone lengths [m]."""
+    """Mean (B,) and covariance (B, B) of the logarithms of the bone lengths [m].  (2)"""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -53,7 +71,7 @@ class Proportions:
     variance_inflation: float = 1.0
 
     def residual(self, state: BodyState) -> np.ndarray:
-        """(B,)  (1)"""
+        """(B,)"""
         return np.asarray(self._root @ (np.log(state.lengths_m) - self.mean))
 
     def jacobian(self, state: BodyState, shape: bool = True) -> np.ndarray:
@@ -70,7 +88,7 @@ class Proportions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EqualRadii:
-    """One observation (1) for each of the M balls."""
+    """One observation for each of the M balls.  (5)"""
 
     sigma: float
     log_ratio: np.ndarray | float = 0.0  # (M,) the model's ln l_x − ln l_z
@@ -93,7 +111,7 @@ class EqualRadii:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Symmetry:
-    """K pairs of shape parameters.  (1)"""
+    """K pairs of shape parameters.  (6)"""
 
     left: np.ndarray  # (K,) indices in the shape vector
     right: np.ndarray  # (K,)
@@ -115,10 +133,6 @@ class Symmetry:
         return J
 
 
-STATURE_SIGMA = 0.07  # relative, of a person about the model
-CLICK_ERROR_M = 0.02  # e of (2), of both ends of a length together
-
-
 def proportions(
     model: BodyModel,
     lengths_m: np.ndarray,
@@ -127,13 +141,13 @@ def proportions(
     own_sigma: float,
     stature_sigma: float = STATURE_SIGMA,
 ) -> Proportions:
-    """(1) about the lengths (B,) of a model, with joints (J,) that were located: σ_c, σ_d and σ_g. Given lengths fix the size."""
+    """(3) about the lengths (B,) of a model, with joints (J,) that were located: σ_c, σ_d and σ_g. Given lengths fix the size."""
     stature = min(stature_sigma, clicked_sigma)
     of_joints = np.minimum(model.length_sigma, 2 * clicked_sigma)
-    covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(own_sigma**2 + of_joints**2)  # (1)
+    covariance = np.full((len(lengths_m), len(lengths_m)), stature**2) + np.diag(own_sigma**2 + of_joints**2)  # (3)
     for chain in clicked_chains(model.skeleton, located):
         of_clicks = (CLICK_ERROR_M / lengths_m[chain].sum()) ** 2
-        covariance[np.ix_(chain, chain)] += clicked_sigma**4 / (clicked_sigma**2 + of_clicks)  # (2)
+        covariance[np.ix_(chain, chain)] += clicked_sigma**4 / (clicked_sigma**2 + of_clicks)  # (4)
     return Proportions(mean=np.log(lengths_m), covariance=covariance)
 
 

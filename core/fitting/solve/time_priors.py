@@ -1,17 +1,16 @@
-"""Weak smoothness over time: every DOF's acceleration is zero within a sigma.
+"""Observations that couple the poses of successive frames: weak accelerations, and the marginal prior from frames that were adjusted
+before.
 
-a_t = 2/(h1 + h2) · ((θ_{t+1} − θ_t)/h2 − (θ_t − θ_{t−1})/h1) = 0 ± σ ,   h1, h2: the times between the three frames           (1)
+    2/(h1 + h2) · ((θ_{t+1} − θ_t)/h2 − (θ_t − θ_{t−1})/h1) = 0 ± σ ,   h1, h2: the times between the three frames               (1)
+    (x − x₀)ᵀ Λ (x − x₀) − 2 gᵀ (x − x₀)  →  min                                                                                 (2)
+    Λ = A_bb − A_bi A_ii⁻¹ A_ib ,   g = g_b − A_bi A_ii⁻¹ g_i                                                                    (3)
 
-Marginal prior: what all frames on one side of a stretch contribute to its first two, or last two, frames.
+(1), smoothness: every DOF's acceleration is zero within a sigma.
 
-The frames i on that side are eliminated from their normal equations (Schur complement); accelerations and tracked points couple frames that
-are at most two apart, so what is left concerns the poses x of two frames b,
-
-    Λ = A_bb − A_bi A_ii⁻¹ A_ib ,   g = g_b − A_bi A_ii⁻¹ g_i                                                                     (1)
-    (x − x₀)ᵀ Λ (x − x₀) − 2 gᵀ (x − x₀)  →  min                                                                                  (2)
-
-with x₀ where the equations were linearised. Nothing linear is lost: a twist that only tracked points constrain stays determined over any
-number of stretches.
+(2), marginal prior: what all frames i on one side of a stretch contribute to its first two, or last two, frames b with the poses x. The
+frames i are eliminated from their normal equations (3) (Schur complement); accelerations and tracked points couple frames that are at most
+two apart, so only two are left. x₀ is where the equations were linearised. Nothing linear is lost: a twist that only tracked points
+constrain stays determined over any number of stretches.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from .problem import Estimate, Problem, Scales, linearise
 
 SPAN_S = 0.1  # accelerations of a first motion are taken over this time, which averages its noise
 LEAST = 0.1  # of the loosest sigma: however steady the observed motion
+SMALLEST_DIAGONAL = 1e-12  # of Λ, before its rows are scaled
 ENOUGH = 3  # second differences of a DOF, for a sigma of its own
 
 
@@ -76,9 +76,6 @@ def typical_acceleration(motion: np.ndarray, observed: np.ndarray, time_s: np.nd
     count = good.sum(axis=0)
     rms = np.sqrt((np.where(good, a, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1))
     return np.where(count >= ENOUGH, np.clip(rms, LEAST * loosest, loosest), loosest)
-
-
-SMALLEST_DIAGONAL = 1e-12  # of Λ, before its rows are scaled
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -151,7 +148,7 @@ def marginal_prior(
     smoothness = replace(coupling, acceleration=replace(coupling.acceleration, time_s=coupling.acceleration.time_s[frames]))
     part = replace(problem, smoothness=smoothness, shape_observations=(), observe=observe, observe_step=step)
     e = linearise(part, Estimate(motion=at.motion[frames], vector=at.vector, scales=at.scales), factors).equations
-    left = eliminated(e, len(own)) if ahead else reversed_in_time(eliminated(reversed_in_time(e), len(own)))  # (1)
+    left = eliminated(e, len(own)) if ahead else reversed_in_time(eliminated(reversed_in_time(e), len(own)))  # (3)
     motion = at.motion[frames]
     return MarginalPrior(equations=_semidefinite(left), motion=motion[-2:] if ahead else motion[:2], first=ahead)
 

@@ -1,9 +1,9 @@
-"""A recording in stretches: the frames that are adjusted at once, so that the memory of a fit does not grow with the length of the clip.
+"""A long recording in stretches: the frames that are adjusted at once, so that the memory of a fit does not grow with the length of the
+clip.
 
 Points are read when their stretch is adjusted, and released after it. The stretches follow each other from the click frame outwards. All
-frames of earlier stretches contribute a marginal prior (`handed_over`); of the frames ahead, `MARGIN` take part.
-
-Checkpoints of a fit in stretches: an interrupted fit resumes with the next stretch.
+frames of earlier stretches contribute a marginal prior (`solve.time_priors`); of the frames ahead, `MARGIN` take part. The shape and every
+adjusted stretch are stored, so that an interrupted fit resumes with the next one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,6 +25,8 @@ from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
 from .pose_tracking import Checkpoints
 
+A = TypeVar("A")
+DIRECTIONS = {1: "ahead", -1: "back"}
 AT_ONCE = 300  # frames: a whole body with 4,000 points a frame takes 2 MB each while it is adjusted
 BLOCKS = 3  # of frames for the shape
 MARGIN = 50
@@ -165,10 +167,6 @@ def outwards(frames: int, click: int) -> list[tuple[range, range, int]]:
         *((span, extended(span, 0, MARGIN), 1) for span in every[first + 1 :]),
         *((span, extended(span, MARGIN, 0), -1) for span in every[:first][::-1]),
     ]
-
-
-A = TypeVar("A")
-DIRECTIONS = {1: "ahead", -1: "back"}
 
 
 @dataclass(frozen=True, kw_only=True)

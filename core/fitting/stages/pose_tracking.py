@@ -8,7 +8,7 @@ less than the neighbour's pose did, the frame is also started from the neighbour
 gets the prediction. A frame with clicks is also started from the clicked pose, and if that is better, it corrects the frames before it,
 too. The predicted velocity of an occluded limb is damped by d, and its gate widens with every frame, until the limb reappears.
 
-The state of pose tracking, frame after frame: all that the next frame depends on, stored so that an interrupted fit resumes.
+`PoseTrackingState` is all that the next frame depends on; it is stored so that an interrupted fit resumes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,6 +30,14 @@ from .hidden_limbs import reacquired_poses
 from .inverse_kinematics import pose_as_clicked, shared_over_time
 
 CHECKPOINT_EVERY = 25  # frames: some seconds of work
+LOST_SUPPORT = 0.6  # a frame with a smaller share of its neighbour's support is also started from its neighbour's pose
+LONGEST_PREDICTION = 5  # frames without a tracked pose; after more the prediction is the last pose
+REACH_M = 0.20  # of the points that take part in one frame
+MOST_POINTS = 1000  # of a frame: enough for a start of the adjustment over the sequence
+DAMPING = 0.7  # d of (1), of DOFs that nothing constrains, per frame
+GATE_GROWTH, LARGEST_GATE = 0.25, 4.0  # of the gate of an occluded limb: per frame, and the largest factor
+STAGE = "fit frame after frame"
+CHECKPOINT = "pose_tracking"
 
 
 class Checkpoints(Protocol):
@@ -79,16 +87,6 @@ class PoseTrackingState:
             support=None if np.isnan(support) else support,
             done=int(checkpoint["done"][0]),
         )
-
-
-LOST_SUPPORT = 0.6  # a frame with a smaller share of its neighbour's support is also started from its neighbour's pose
-LONGEST_PREDICTION = 5  # frames without a tracked pose; after more the prediction is the last pose
-REACH_M = 0.20  # of the points that take part in one frame
-MOST_POINTS = 1000  # of a frame: enough for a start of the adjustment over the sequence
-DAMPING = 0.7  # d of (1), of DOFs that nothing constrains, per frame
-GATE_GROWTH, LARGEST_GATE = 0.25, 4.0  # of the gate of an occluded limb: per frame, and the largest factor
-STAGE = "fit frame after frame"
-CHECKPOINT = "pose_tracking"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

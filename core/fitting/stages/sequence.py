@@ -2,7 +2,7 @@
 
 1. The clicked joints determine pose and bone lengths at the click frame (`inverse_kinematics`).
 2. At that frame the cloud determines pose and radii (`click_frame`).
-3. With that shape fixed, poses are tracked frame after frame, forwards and backwards (`frame_to_frame`).
+3. With that shape fixed, poses are tracked frame after frame, forwards and backwards (`pose_tracking`).
 4. One adjustment over the whole sequence: one shape, a pose per frame, coupled over time by tracked points and weak accelerations. Frames
    whose residuals stay suspicious restart once from between their neighbours.
 5. Where the complete model is asked for, it is made from that body (`body.complete`), and step 4 is repeated with its radii.
@@ -14,7 +14,7 @@ Points, outlines and keypoints are each enough alone.
 The metaball model has systematic error that may recur in every frame. `shared_frames` lets the prior of the shape weigh as much against the
 points of so many frames as against those of one. By default it counts once: other poses determine radii, and the lengths between clicked
 joints. The prior that bones are as long as other people's counts for all frames, for other poses do not show what was not clicked either
-(`bone_lengths`). A body of one ellipsoid a bone has far larger errors: there the whole prior counts for all frames.
+(`shape_priors`). A body of one ellipsoid a bone has far larger errors: there the whole prior counts for all frames.
 """
 
 from collections.abc import Mapping, Sequence

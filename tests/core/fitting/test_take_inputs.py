@@ -168,7 +168,7 @@ def test_bad_files_are_refused(tmp_path) -> None:
         with pytest.raises(InputError, match=sentence):
             read_source(footage, _source(files="k.json", view="C"))
     (tmp_path / "p.csv").write_text("frame,time_s,a x,a y,a z\n0,0,1,2,3\n")
-    with pytest.raises(InputError, match="is a joint of ours"):
+    with pytest.raises(InputError, match="is a joint of the body; map them"):
         read_source(footage, _source(files="p.csv"))
     with pytest.raises(InputError, match="no point “b”"):
         read_source(footage, _source(files="p.csv", names={"b": "knee.R"}))
