@@ -12,7 +12,7 @@ import numpy as np
 from ..body.motion import BodyFit
 from ..surface.cloud import PointCloud
 from ..tracking.trajectories import Trajectories
-from .silhouettes import SilhouetteFit
+from .silhouettes import PERSON, SilhouetteFit
 
 FRAME_TO_FRAME = "scatter from frame to frame"
 ESTIMATED = "from the adjustment"
@@ -47,8 +47,8 @@ def _of_silhouettes(fits: Sequence[SilhouetteFit]) -> list[Row]:
     for view, person in dict.fromkeys((f.view, f.person) for f in fits):
         mine = [f for f in fits if (f.view, f.person) == (view, person)]
         for name, unit, values in (
-            (f"silhouette of view {view}, IoU with the person's {person}", "", [f.iou for f in mine]),
-            (f"silhouette of view {view}, share inside the person's {person}", "", [f.inside for f in mine]),
+            (f"silhouette of view {view}, IoU with {PERSON[person]}", "", [f.iou for f in mine]),
+            (f"silhouette of view {view}, share inside {PERSON[person]}", "", [f.inside for f in mine]),
             (f"outline of view {view} from the body's", "px", [f.distance_px for f in mine]),
         ):
             known = [v for v in values if np.isfinite(v)]

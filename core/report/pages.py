@@ -19,7 +19,7 @@ from ..take.take import Footage
 from ..tracking.trajectories import Trajectories
 from . import pictures
 from .figures import Row, curve_graph, figure_rows, number, quoted
-from .silhouettes import OUTLINE, Silhouettes
+from .silhouettes import OUTLINE, PERSON, Silhouettes
 
 STYLE = (
     "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}img,svg{max-width:100%}"
@@ -127,7 +127,7 @@ def _agreement_caption(silhouettes: Silhouettes, view: str, frame: int) -> str:
     drawn = " (red)" if found[0].person == OUTLINE else ""
     fit = found[0]
     agreement = f"IoU {fit.iou:.3f} with" if silhouettes.whole else f"{100 * fit.inside:.1f} % of it inside"
-    return f" and its outline (green); {agreement} the person's {fit.person}{drawn}"
+    return f" and its outline (green); {agreement} {PERSON[fit.person]}{drawn}"
 
 
 def _silhouette_graphs(silhouettes: Silhouettes) -> list[str]:

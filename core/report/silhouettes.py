@@ -32,6 +32,7 @@ from ..take.take import Footage
 
 OUTLINE, BACKGROUND = "outline", "background"
 MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take: a frame of four views takes a third of a second
+PERSON = {OUTLINE: "the person's outline", BACKGROUND: "the person in front of the background"}  # by source
 WHOLE_BODY = frozenset({"head", "forearm.L", "forearm.R", "shin.L", "shin.R"})  # bones; a model without one of them is a part of a body
 
 

@@ -114,6 +114,8 @@ def test_a_silhouette_before_the_background(scenes: Any) -> None:
     fits = silhouettes_of(footage, _body(ARM, ARM_MOTION), SkinSettings(), {}, {"L": Background(grey=still, noise=1.0)}, Monitor()).fits
     assert {(f.view, f.person) for f in fits} == {("L", "background")} and len(fits) == 3
     assert fits[0].inside > 0.95
+    rows = figure_rows({}, [], None, None, fits)
+    assert [r["name"] for r in rows] == ["silhouette of view L, share inside the person in front of the background"]
     assert silhouettes_of(footage, _body(ARM, ARM_MOTION), SkinSettings(), {}, {}, Monitor()).fits == ()
 
 
