@@ -4,10 +4,7 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import calibrate, clicking, command, jobs, operators, properties, session, steps
-    from .correcting import registration as correcting
-    from .overlay import registration as overlay
-    from .retarget import registration as retarget
+    from . import calibrate, clicking, command, correcting, jobs, operators, overlay, properties, retarget, session, steps
 
     return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, command
 

@@ -41,6 +41,8 @@ class FileState:
     bar_counts: dict[str, tuple[int, int]] = field(default_factory=dict)  # by view: images searched, and images that show the whole bar
     open_results: OpenResults = field(default_factory=OpenResults)
     inspection: tuple[int, Any] = (-1, None)  # the frame, and what is under the pointer in it (overlay.layers.Inspection)
+    inspecting: bool = False  # the modal operator of the inspection runs
+    correcting: bool = False  # a modal operator of the corrections runs
     region_corners: tuple[str, list[tuple[float, float]]] = ("", [])  # the view, and the corners clicked so far
 
 

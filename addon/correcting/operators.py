@@ -12,6 +12,7 @@ from .. import project
 from ..overlay import canvas, draw, layers, results
 from ..overlay.operators import pointed
 from ..panels import show_status
+from ..session import get_session
 from . import tables
 
 
@@ -19,12 +20,11 @@ class Correct:
     """Common to both corrections: clicks in a view, and one undo step."""
 
     hint = ""
-    running = False
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """With footage, and while no other correction runs."""
-        return len(context.scene.tricap.views) > 0 and not Correct.running
+        return len(context.scene.tricap.views) > 0 and not get_session().file.correcting
 
     def begin(self, context: bpy.types.Context) -> set[str]:
         """Go modal."""
@@ -32,14 +32,14 @@ class Correct:
         if area is None or canvas.clip_of(area) is None:
             self.report({"ERROR"}, "Press this in the sidebar of a Clip Editor that shows a view; Open the Views opens one for each view.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
-        Correct.running = True
+        get_session().file.correcting = True
         show_status(context, self.hint)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def end(self, context: bpy.types.Context, how: set[str]) -> set[str]:
         """Leave the modal state."""
-        Correct.running = False
+        get_session().file.correcting = False
         draw.show_region("", [])
         draw.show_inspection(-1, None)
         show_status(context, None)
@@ -230,11 +230,6 @@ def footage_frames(scene: bpy.types.Scene) -> tuple[int, int]:
     """First and last frame of the footage of any view."""
     clips = list(project.clips_of(scene).values())
     return max(0, min(c.frame_start for c in clips)), max(c.frame_start + c.frame_duration - 1 for c in clips)
-
-
-def stop_correcting() -> None:
-    """Forget a running correction, whose class is being unregistered."""
-    Correct.running = False
 
 
 CLASSES = (RemoveTrajectory, RemoveRegion, RemoveCorrection, ListDofs)

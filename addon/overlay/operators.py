@@ -12,6 +12,7 @@ from ...core.run import take_run
 from .. import project
 from ..jobs import JobOperator
 from ..panels import show_status
+from ..session import get_session
 from . import canvas, draw, layers, results
 
 REACH_SCREEN_PX = 14.0  # around the pointer
@@ -24,20 +25,18 @@ class InspectPoints(bpy.types.Operator):
     bl_idname = "tricap.look_closer"
     bl_label = "Inspect Points"
 
-    running = False
-
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """In a view, after a run."""
         clip = canvas.clip_of(context.area) if context.area is not None else None
-        return clip is not None and bool(results.view_of(clip)) and not cls.running
+        return clip is not None and bool(results.view_of(clip)) and not get_session().file.inspecting
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Follow the pointer."""
         if results.current(context.scene) is None:
             self.report({"ERROR"}, f"There is nothing to inspect: {results.problem()}")
             return {"CANCELLED"}
-        InspectPoints.running = True
+        get_session().file.inspecting = True
         show_status(context, "Point at the footage    Click: leave it shown    Esc: end")
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
@@ -63,7 +62,7 @@ class InspectPoints(bpy.types.Operator):
         self._end(context, {"CANCELLED"})
 
     def _end(self, context: bpy.types.Context, how: set[str]) -> set[str]:
-        InspectPoints.running = False
+        get_session().file.inspecting = False
         show_status(context, None)
         canvas.redraw_clips(context)
         return how
