@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...core.geometry.robust import finite_median
 from ...core.run.inspection import TrackHistory, patch_boxes
 from ...core.surface.cloud import FILTERS
 from ...core.tracking.settings import TrackStatus
@@ -99,8 +100,7 @@ def removal_counts(history: TrackHistory, frame: int, by: str = ALL) -> list[tup
 
 def graph_curve(values: np.ndarray) -> tuple[np.ndarray, float]:
     """Heights 0…1 of a graph's curve (T,), NaN where unknown, and the median, which lies at half height."""
-    known = values[np.isfinite(values)]
-    usual = float(np.median(known)) if len(known) else 0.0
+    usual = finite_median(values, 0.0)
     return np.clip(values / (2 * usual), 0.0, 1.0) if usual > 0 else np.where(np.isfinite(values), 0.5, np.nan), usual
 
 

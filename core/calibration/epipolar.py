@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..geometry.robust import mad_sigma
+
 REWEIGHTINGS = 4
 PAIR_TOLERANCE = 0.008  # of the image width: distortion is still inside the points
 MAGSAC_ITERATIONS = 6000
@@ -79,7 +81,7 @@ def try_guesses(ui: np.ndarray, uj: np.ndarray, bars: int, fi: np.ndarray, fj: n
     points = ((hi * depth_i[..., None]) @ R.transpose(0, 2, 1) + t[:, None] + hj * depth_j[..., None]) / 2
     lengths = np.linalg.norm(points[:, 0 : 2 * bars : 2] - points[:, 1 : 2 * bars : 2], axis=-1)
     median = np.maximum(np.median(lengths, axis=1), 1e-12)
-    variation = 1.4826 * np.median(np.abs(lengths - median[:, None]), axis=1) / median
+    variation = mad_sigma(lengths - median[:, None], 1) / median
     score = np.log(np.maximum(variation, 1e-5)) + 0.5 * np.log(np.maximum(distance, 0.02)) - 4 * np.log(np.maximum(before, 1e-3))
     return PairGuesses(score=score, R=R, t_m=t * (length_m / median)[:, None])
 

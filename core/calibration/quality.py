@@ -16,6 +16,7 @@ import numpy as np
 from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR, Camera
 from ..geometry.intersection import forward_intersection
+from ..geometry.robust import finite_median
 from .bars import BarObservations, met_ends
 from .bundle import Network, adjust
 from .precision import PredictedError, predicted_error
@@ -50,7 +51,7 @@ class Lengths:
     @property
     def median_m(self) -> float:
         """Median of the magnitudes."""
-        return float(np.median(np.abs(self.residual_m))) if len(self.residual_m) else np.nan
+        return finite_median(np.abs(self.residual_m))
 
     @property
     def drift_m(self) -> np.ndarray:

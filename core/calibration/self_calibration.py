@@ -21,6 +21,7 @@ from scipy.stats import f as f_distribution
 
 from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR
+from ..geometry.robust import mad_sigma
 from .bars import BarObservations, enough_rays, labelled_ends, with_bars
 from .bundle import Adjusted, Network, Unknowns, adjust, design, eliminated, inverse_factors, normal_equations
 from .precision import camera_covariance, group_of, with_left_out
@@ -122,8 +123,7 @@ def _ordered(network: Network, observations: BarObservations, tolerance_px: floa
 
 def robust_sigma(residual_px: np.ndarray, used: np.ndarray) -> float:
     """Sigma of an image coordinate from the median of the residuals [px], untouched by a third of blunders."""
-    values = np.abs(residual_px[used])
-    return max(MIN_SIGMA_PX, float(1.4826 * np.median(values))) if values.size else 1.0
+    return max(MIN_SIGMA_PX, float(mad_sigma(residual_px[used]))) if used.any() else 1.0
 
 
 def without_blunders(

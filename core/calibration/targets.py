@@ -28,6 +28,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from ..foundation.arrays import frozen
+from ..geometry.robust import MAD_TO_SIGMA, mad_sigma
 
 MIN_CONTRAST = 30.0  # grey values between a target's peak and the background
 RELATIVE_THRESHOLD = 0.5  # of a blob's own contrast, where its outline is
@@ -41,6 +42,7 @@ ITERATIONS, CONVERGED_PX = 16, 1e-3
 SETTLED = 5  # iterations after which the target's outline is known
 SECTORS, RING_PX, BESIDE, MOST_BESIDE = 24, 3.0, 0.015, 0.4
 ROBUST = 3.0  # sigmas of the grey values
+LEAST_NOISE = 0.3 * MAD_TO_SIGMA  # grey values; the MAD of rounding to whole ones is 0.25
 MAX_MISFIT = 0.08  # RMS of the grey values as a part of g1
 
 
@@ -181,7 +183,8 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
             active, converged[:] = np.flatnonzero(np.isfinite(p).all(axis=1)), False
         v, J = _disc(p[active], grid, grey[active])
         misfit[active] = np.sqrt(np.sum(v * v * near[active], axis=1) / np.maximum(near[active].sum(axis=1) - 8, 1))
-        weight = near[active] / (1 + (v / (ROBUST * 1.4826 * _median_of_near(np.abs(v), near[active]))) ** 2)  # the bar takes no part
+        noise = np.maximum(mad_sigma(v, 1, near[active]), LEAST_NOISE)[:, None]
+        weight = near[active] / (1 + (v / (ROBUST * noise)) ** 2)  # the bar takes no part
         J *= weight[:, :, None] ** 0.5
         v *= weight**0.5
         N = J.transpose(0, 2, 1) @ J
@@ -219,16 +222,11 @@ def _beside_something(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> np.n
     total = np.bincount(flat, weights=(grey - p[:, 6, None])[ring], minlength=len(p) * SECTORS).reshape(-1, SECTORS)
     mean = np.nan_to_num(total / np.maximum(count, 1))  # a match that ran away has none
     level = np.median(mean, axis=1, keepdims=True)
-    spread = 1.4826 * np.median(np.abs(mean - level), axis=1, keepdims=True)
+    spread = mad_sigma(mean - level, 1)[:, None]
     bright = (count > 0) & (mean - level > np.maximum(BESIDE * p[:, 7, None], 4 * spread))
     bright[bright.mean(axis=1) > MOST_BESIDE] = False
     bright |= np.roll(bright, 1, axis=1) | np.roll(bright, -1, axis=1)
     return np.take_along_axis(bright, sector, axis=1) & (q > 0.5)
-
-
-def _median_of_near(values: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Median (m, 1) of the values (m, k) that are near, not below a fraction of a grey value."""
-    return np.maximum(np.nanmedian(np.where(near, values, np.nan), axis=1), 0.3)[:, None]
 
 
 def _disc(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

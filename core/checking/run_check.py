@@ -10,6 +10,7 @@ from ..body.shape import read_body
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..geometry.robust import finite_median
 from ..motion.formats.ply import read_ply
 from ..motion.tables import MotionTable, read_joints, read_motion
 from ..results.run_json import read_run
@@ -116,8 +117,8 @@ def _clouds(run: Mapping[str, Any], folder: Path, figures: dict[str, Any], monit
         monitor.step("reading the clouds", i, len(chosen))
         vertex = read_ply(folder / "clouds" / f"{frame:04d}.ply").vertex
         counts.append(len(vertex["x"]))
-        sigmas.append(float(np.median(vertex["sigma"])) if "sigma" in vertex and counts[-1] else np.nan)
-    usual = float(np.median(counts)) if counts else 0.0
+        sigmas.append(finite_median(vertex["sigma"]) if "sigma" in vertex else np.nan)
+    usual = finite_median(counts, 0.0)
     thin = [f for f, n in zip(chosen, counts) if n < THIN * usual]
     if thin:
         found.append(
@@ -128,7 +129,7 @@ def _clouds(run: Mapping[str, Any], folder: Path, figures: dict[str, Any], monit
                 usual_points=usual,
             )
         )
-    sigma_mm = 1e3 * float(np.nanmedian(sigmas)) if np.isfinite(sigmas).any() else 0.0
+    sigma_mm = 1e3 * finite_median(sigmas, 0.0)
     figures |= {"points_per_frame": usual, "sigma_mm": sigma_mm}
     if sigma_mm > UNSURE_MM:
         found.append(

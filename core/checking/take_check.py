@@ -20,6 +20,7 @@ from ..body.model_file import read_model
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
+from ..geometry.robust import finite_median
 from ..images.sampling import noise_sigma
 from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
@@ -66,7 +67,7 @@ def seed_findings(footage: Footage) -> list[Finding]:
             depth[name] = clicked_depth(footage, name, at)
         except InputError as error:
             found.append(wrong("clicks", str(error)))
-    middle = float(np.median(list(depth.values()))) if depth else 0.0
+    middle = finite_median([*depth.values()], 0.0)
     far = {name: d for name, d in depth.items() if abs(d - middle) > FAR_M}
     for name, d in far.items():
         advice = "Is it on the background, or clicked on different spots in the views? Click it again."
@@ -254,7 +255,7 @@ def doubts(footage: Footage, frames: list[int], points: list[int], miss_px: list
     """
     empty = [frame for frame, n in zip(frames, points) if not n]
     there = [(frame, miss) for frame, n, miss in zip(frames, points, miss_px) if n and math.isfinite(miss)]
-    residual_px = float(np.median([miss for _, miss in there])) if there else 0.0
+    residual_px = finite_median([miss for _, miss in there], 0.0)
     said = [f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}."] if empty else []
     if residual_px > DOUBTFUL_RESIDUAL_PX:
         said.append(

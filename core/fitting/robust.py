@@ -2,7 +2,8 @@
 
 import numpy as np
 
-MAD_TO_SIGMA = 1.4826
+from ..geometry.robust import mad_sigma
+
 SMALLEST_SCALE = 0.05  # of unit-weight residuals: perfect data must not make infinite weights
 ENOUGH_FOR_SCALE = 5  # residuals for a median
 ENOUGH = 20  # residuals for a variance factor
@@ -12,7 +13,7 @@ FACTOR_RANGE = (0.5, 10.0)
 
 def robust_scale(residuals: np.ndarray, fallback: float = 1.0) -> float:
     """Standard deviation of the good residuals from the median of their absolute values."""
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), SMALLEST_SCALE) if len(residuals) >= ENOUGH_FOR_SCALE else fallback
+    return max(float(mad_sigma(residuals)), SMALLEST_SCALE) if len(residuals) >= ENOUGH_FOR_SCALE else fallback
 
 
 def robust_weights(x: np.ndarray, kind: str, width: float) -> np.ndarray:

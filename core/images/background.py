@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ..foundation.arrays import frozen
+from ..geometry.robust import mad_sigma
 
 FEWEST, FEWEST_BARE = 5, 3  # images that tell what stands still, and of these without anybody near
 ROWS = 64
@@ -73,5 +74,5 @@ def still_background(images: Sequence[np.ndarray], near: Sequence[np.ndarray] | 
             stack[np.array([there[part] for there in near])] = np.nan
             bare[part] = np.isfinite(stack).sum(axis=0) >= FEWEST_BARE
             median[part][bare[part]] = np.nanmedian(stack[:, bare[part]], axis=0)
-    noise = np.median([1.4826 * float(np.median(np.abs(image - median))) for image in images])
+    noise = np.median([mad_sigma(image - median) for image in images])
     return Background(grey=median, noise=float(noise), bare=bare)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
+from ..geometry.robust import mad_sigma, masked_median
 from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
 from .patches import monomials
@@ -160,7 +161,7 @@ def _fitted(
         weighted = (robust[:, :, None] * m).transpose(0, 2, 1)
         c = np.linalg.solve(weighted @ m + ridge, weighted @ z[:, :, None])[..., 0]
         residual = z - np.einsum("nmi,ni->nm", m, c)
-        scatter = 1.4826 * _median(np.abs(residual), valid)
+        scatter = mad_sigma(residual, 1, valid)
         if step < ROBUST_STEPS:
             ratio = residual / (TUKEY * np.maximum(scatter, min_scale))[:, None]
             robust = valid * np.clip(1 - ratio**2, 0, 1) ** 2
@@ -179,16 +180,7 @@ def unlike_neighbours(grid: TemplateGrid, cell: np.ndarray, parameters: np.ndarr
     bad = np.zeros(len(cell), dtype=bool)
     for q in range(parameters.shape[1]):
         z = np.where(valid, parameters[neighbour, q], np.nan)
-        middle = _median(np.nan_to_num(z), valid)
-        deviation = 1.4826 * _median(np.abs(np.nan_to_num(z) - middle[:, None]), valid)
+        middle = masked_median(np.nan_to_num(z), valid)
+        deviation = mad_sigma(np.nan_to_num(z) - middle[:, None], 1, valid)
         bad |= np.abs(parameters[:, q] - middle) > sigmas * np.maximum(deviation, least[q])
     return bad & (valid.sum(axis=1) >= 3)
-
-
-def _median(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Median of each row over its mask; zero for empty rows."""
-    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
-    n = mask.sum(axis=1)
-    rows = np.arange(len(values))
-    low, high = ordered[rows, np.maximum(n - 1, 0) // 2], ordered[rows, np.minimum(n // 2, values.shape[1] - 1)]
-    return np.where(n > 0, 0.5 * (np.where(n > 0, low, 0.0) + np.where(n > 0, high, 0.0)), 0.0)

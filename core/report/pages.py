@@ -13,6 +13,7 @@ from ..body.skin.contour_skin import SkinSettings
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..geometry.robust import finite_median
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..take.take import Footage
@@ -140,7 +141,7 @@ def _silhouette_graphs(silhouettes: Silhouettes) -> list[str]:
 
 def _graphs(report: Report) -> list[str]:
     clouds, trajectories, body = report.clouds, report.trajectories, report.body
-    rows = [(c.frame, len(c.xyz_m), _median(c.residual_px), 1e3 * _median(c.sigma_m)) for c in clouds]
+    rows = [(c.frame, len(c.xyz_m), finite_median(c.residual_px), 1e3 * finite_median(c.sigma_m)) for c in clouds]
     frames, points, residual, sigma = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     graphs = [
         curve_graph("Measured points", "", frames, {"points": points}),
@@ -204,7 +205,3 @@ def _figures(figures: Mapping[str, Any]) -> str:
         )
         rows.append(f"{html.escape(LABELS.get(name, name.replace('_', ' ')))}: {html.escape(text)}")
     return "; ".join(rows)
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else np.nan

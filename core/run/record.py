@@ -16,6 +16,7 @@ from ..body.motion import FITTED, BodyFit
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
+from ..geometry.robust import finite_median
 from ..matching.foreground import Foreground
 from ..surface.frames import FrameSummary
 from ..take.take import Footage
@@ -49,8 +50,8 @@ def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | 
     return {
         "frames": len(summaries),
         "points_per_frame": float(np.mean([f.points for f in summaries])),
-        "residual_px": median([f.residual_px for f in summaries]),
-        "sigma_mm": 1e3 * median([f.sigma_m for f in summaries]),
+        "residual_px": finite_median([f.residual_px for f in summaries], 0.0),
+        "sigma_mm": 1e3 * finite_median([f.sigma_m for f in summaries], 0.0),
         "foreground": foreground.method if foreground else "",
         "background_planes": len(foreground.planes) if foreground else 0,
     }
@@ -74,7 +75,7 @@ def track_figures(kept: Trajectories, reasons: Mapping[int, int]) -> tuple[dict[
         "trajectories": count,
         "points_per_frame": float(seen.sum(axis=1).mean()),
         "mean_length_frames": float(seen.sum() / count) if count else 0.0,
-        "sigma_mm": 1e3 * median(kept.sigma_m[seen]),
+        "sigma_mm": 1e3 * finite_median(kept.sigma_m[seen], 0.0),
         "reasons": why,
     }
     return figures, warnings
@@ -86,11 +87,11 @@ def fit_figures(body: BodyFit, silhouettes: Mapping[str, Any], tracked_again: Ma
         "frames": frame_states(body),
         "iterations": body.iterations,
         "converged": body.converged,
-        "sigma0": median(body.motion.sigma0),
-        "joint_sigma_mm": 1e3 * median(body.motion.joint_sigma_m),
+        "sigma0": finite_median(body.motion.sigma0, 0.0),
+        "joint_sigma_mm": 1e3 * finite_median(body.motion.joint_sigma_m, 0.0),
     }
     if len(body.outline_m):
-        figures["outline_mm"] = 1e3 * median(body.outline_m)
+        figures["outline_mm"] = 1e3 * finite_median(body.outline_m, 0.0)
     return figures | ({"silhouettes": silhouettes} if silhouettes else {}) | ({"tracked_again": tracked_again} if tracked_again else {})
 
 
@@ -106,13 +107,6 @@ def fit_warnings(body: BodyFit) -> list[str]:
     if not body.converged:
         warnings.append(f"The fit has not converged after {body.iterations} steps: look at the pictures, and raise fitting.sequence_steps.")
     return warnings
-
-
-def median(values: Sequence[float] | np.ndarray) -> float:
-    """The median of the finite values, 0 if there are none."""
-    finite = np.asarray(values, dtype=np.float64)
-    finite = finite[np.isfinite(finite)]
-    return float(np.median(finite)) if len(finite) else 0.0
 
 
 COLUMNS = ("points", "sigma_mm", "residual_px", "tracks", "track_sigma_mm", "fit_sigma0", "joint_sigma_mm")
@@ -167,14 +161,14 @@ def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | 
         for t in np.flatnonzero(np.isin(trajectories.frames, frames)):
             at = np.searchsorted(frames, trajectories.frames[t])
             values["tracks"][at] = trajectories.visible[t].sum()
-            values["track_sigma_mm"][at] = 1e3 * _median(trajectories.sigma_m[t][trajectories.visible[t]])
+            values["track_sigma_mm"][at] = 1e3 * finite_median(trajectories.sigma_m[t][trajectories.visible[t]])
     fit = [""] * len(frames)
     if body is not None:
         motion = body.motion
         for t in np.flatnonzero(np.isin(motion.frames, frames)):
             at = int(np.searchsorted(frames, motion.frames[t]))
             fit[at] = motion.status[t]
-            values["fit_sigma0"][at], values["joint_sigma_mm"][at] = motion.sigma0[t], 1e3 * _median(motion.joint_sigma_m[t])
+            values["fit_sigma0"][at], values["joint_sigma_mm"][at] = motion.sigma0[t], 1e3 * finite_median(motion.joint_sigma_m[t])
     return FrameTable(frames=frames, values=values, fit=tuple(fit))
 
 
@@ -204,7 +198,3 @@ def read_frame_table(path: Path) -> FrameTable:
         raise InputError(f"Cannot read {path}: {error.strerror or error}; run the take again.") from error
     except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise InputError(f"{path} is damaged; run the take again.") from error
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else np.nan

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..foundation.arrays import LazySequence
 from ..foundation.errors import InputError
+from ..geometry.robust import finite_median
 from ..results.folder import Results
 from ..take.take import Footage
 from .cloud import PointCloud
@@ -32,7 +33,7 @@ class FrameSummary:
 
 def summary_of(m: MeasuredFrame) -> FrameSummary:
     """The summary of a frame that was measured."""
-    residual, sigma = (float(np.median(a)) if len(a) else np.nan for a in (m.cloud.residual_px, m.cloud.sigma_m))
+    residual, sigma = finite_median(m.cloud.residual_px), finite_median(m.cloud.sigma_m)
     return FrameSummary(frame=m.frame, key=m.key, points=len(m.cloud.xyz_m), limit_px=m.field.limit_px, residual_px=residual, sigma_m=sigma)
 
 

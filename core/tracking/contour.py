@@ -37,6 +37,7 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from ..foundation.settings import knob
+from ..geometry.robust import mad_sigma
 from ..images.sampling import LONGEST_LOOK_UP
 
 REACH_PX = 40.0  # of (1): largest distance between a vertex and a point
@@ -267,13 +268,13 @@ def _roughness(xy: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def _typical(size: np.ndarray) -> np.ndarray:
     """Robust standard deviation of values of these magnitudes (V, ...), from their median over neighbours on the contour."""
-    return 1.4826 * np.median([np.roll(size, d, axis=0) for d in range(-NEIGHBOURS, NEIGHBOURS + 1)], axis=0)
+    return mad_sigma(np.array([np.roll(size, d, axis=0) for d in range(-NEIGHBOURS, NEIGHBOURS + 1)]), 0)
 
 
 def gradient_noise(grey: np.ndarray, blur_px: float) -> float:
     """Standard deviation of the blurred gradient from the image's noise σ (Immerkær 1996): σ / (√(8 π) blur²)."""
-    response = np.abs(cv2.filter2D(np.ascontiguousarray(grey, dtype=np.float32), cv2.CV_32F, IMMERKAER))
-    sigma = max(MIN_NOISE, 1.4826 * float(np.median(response)))
+    response = cv2.filter2D(np.ascontiguousarray(grey, dtype=np.float32), cv2.CV_32F, IMMERKAER)
+    sigma = max(MIN_NOISE, float(mad_sigma(response)))
     return float(sigma / (np.sqrt(8 * np.pi) * blur_px**2))
 
 

@@ -5,7 +5,7 @@ There are three filters, each a table (T, N) of statuses:
 thresholds   |v| ≤ v_max + 3 σ_v ,  |a| ≤ a_max + 3 σ_a: the noise of a difference is added to the limits (D'Apuzzo et al. 2000, §3.3);
              and a sigma not much larger than the recording's median
 voxels       as published: in each time step the velocity must agree with the median of the other trajectories in the same voxel,
-             |v − v̄| ≤ max(3 · 1.4826 MAD, 0.15 |v̄| + 60 mm/s)                                                              (1)
+             |v − v̄| ≤ max(3 · MAD / Φ⁻¹(3/4), 0.15 |v̄| + 60 mm/s)                                                              (1)
 rigid        a rotating limb has no common velocity, so here the point must follow the rigid motion of its neighbours, over one step and
              over longer spans, in which a slow slide accumulates to a detectable deviation:
              |X_{i+s} − X̂_{i+s}| ≤ max(√s d, 3.5 c √(σ_i² + σ_{i+s}² + (1 + h) spread²)) ,  h: leverage of X̂         (2)
@@ -26,6 +26,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from ..geometry.robust import mad_sigma, masked_median
 from .neighbours import common_motion, nearest_neighbours, same_distance
 from .settings import TrackingSettings, TrackStatus
 
@@ -86,13 +87,12 @@ def against_voxels(xyz_m: np.ndarray, velocity_m_s: np.ndarray, settings: Tracki
 def _differs(inside: np.ndarray, velocity: np.ndarray, owner: np.ndarray, all_velocities: np.ndarray) -> np.ndarray:
     """Which of the trajectories in a voxel violate (1), each against the others (leave one out)."""
     other = inside[:, None] != owner
-    every = np.where(other[..., None], all_velocities, np.nan)
     enough = other.sum(axis=1) >= VOXEL_MEMBERS
     bad = np.zeros(len(inside), dtype=bool)
     if enough.any():
-        mean = np.nanmedian(every[enough], axis=1)
-        mad = np.nanmedian(np.linalg.norm(every[enough] - mean[:, None], axis=2), axis=1)
-        limit = np.maximum(3 * 1.4826 * mad, VOXEL_TOLERANCE * np.linalg.norm(mean, axis=1) + VOXEL_TOLERANCE_M_S)
+        mean = masked_median(np.broadcast_to(all_velocities, (*other[enough].shape, 3)), other[enough][..., None], axis=1)
+        sigma = mad_sigma(np.linalg.norm(all_velocities - mean[:, None], axis=2), 1, other[enough])
+        limit = np.maximum(3 * sigma, VOXEL_TOLERANCE * np.linalg.norm(mean, axis=1) + VOXEL_TOLERANCE_M_S)
         bad[enough] = np.linalg.norm(velocity[enough] - mean, axis=1) > limit
     return bad
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from ...foundation.arrays import check_sparse, frozen
 from ...foundation.errors import InputError
+from ...geometry.robust import finite_median
 
 COCO = (
     "nose",
@@ -123,8 +124,7 @@ def _size(person: Person) -> float:
 
 def _distance(person: Person, before: Person) -> float:
     apart = np.linalg.norm(person[:, :2] - before[:, :2], axis=1)[person[:, 2] > 0]
-    apart = apart[np.isfinite(apart)]
-    return float(np.median(apart)) if len(apart) else np.inf
+    return finite_median(apart, np.inf)
 
 
 def _coco(table: Any, path: Path) -> tuple[list[tuple[int, list[Person]]], tuple[str, ...]]:
