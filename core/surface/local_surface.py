@@ -14,6 +14,7 @@ import numpy as np
 
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
+from ..matching.grid import neighbours_of
 from ..matching.region_growing import MatchedField
 
 RADIUS_CELLS = 3
@@ -60,7 +61,8 @@ def curvatures(field: MatchedField, camera: Camera, reference: int, rows: np.nda
 def _quadrics(field: MatchedField, camera: Camera, reference: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(1) about these rows: coefficients (n, 6), the neighbours' scatter (n,) about it and how many support it (n,)."""
     depth, at = camera.to_camera(field.xyz_m)[:, 2], field.grid.rows.to_frame(field.xy[:, reference])
-    neighbour, spacing_m = _neighbourhoods(field, rows), field.grid.spacing_px * depth / camera.focal_px
+    neighbour = neighbours_of(field.grid, field.cell, field.cell[rows], RADIUS_CELLS)
+    spacing_m = field.grid.spacing_px * depth / camera.focal_px
 
     def fit(piece: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         near, middle = neighbour[piece], rows[piece, None]
@@ -74,17 +76,6 @@ def _quadrics(field: MatchedField, camera: Camera, reference: int, rows: np.ndar
     parts = in_threads(fit, equal_pieces(len(rows), LARGEST, LARGEST))
     coefficients, scatter, support = (np.concatenate(part) for part in zip(*parts))
     return coefficients, scatter, support
-
-
-def _neighbourhoods(field: MatchedField, rows: np.ndarray) -> np.ndarray:
-    """Rows of the points in the cells about these rows (n, m), −1 where there is none."""
-    gh, gw = field.grid.shape
-    r = RADIUS_CELLS
-    row_of = np.full((gh + 2 * r, gw + 2 * r), -1, dtype=np.int64)
-    j, i = field.cell // gw + r, field.cell % gw + r
-    row_of[j, i] = np.arange(len(field.cell))
-    dj, di = (d.ravel() for d in np.mgrid[-r : r + 1, -r : r + 1])
-    return row_of[j[rows, None] + dj, i[rows, None] + di]
 
 
 def _robust_quadric(
