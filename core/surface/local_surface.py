@@ -14,6 +14,7 @@ import numpy as np
 
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
+from ..geometry.robust import mad_sigma
 from ..matching.grid import neighbours_of
 from ..matching.region_growing import MatchedField
 
@@ -90,17 +91,10 @@ def _robust_quadric(
         weighted = (robust[:, :, None] * basis).transpose(0, 2, 1)
         c = np.linalg.solve(weighted @ basis + ridge, (weighted @ D[:, :, None]))[..., 0]
         residual = D - np.einsum("nmi,ni->nm", basis, c)
-        scatter = 1.4826 * _masked_median(np.abs(residual), weight > 0)
+        scatter = mad_sigma(residual, 1, weight > 0)
         ratio = residual / (TUKEY * np.maximum(scatter, min_scale))[:, None]
         robust = weight * np.clip(1 - ratio**2, 0, 1) ** 2
     return c / scale, scatter
-
-
-def _masked_median(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Median of each row over its mask; zero for empty rows."""
-    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
-    middle = np.maximum(mask.sum(axis=1) - 1, 0) // 2
-    return np.where(mask.any(axis=1), ordered[np.arange(len(values)), middle], 0.0)
 
 
 def _normals(field: MatchedField, camera: Camera, reference: int, depth: np.ndarray, coefficients: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..geometry.robust import mad_sigma
 from ..geometry.rotation import cross_matrix, rotation_from_vector
 
 NEIGHBOURS = 14
@@ -65,7 +66,7 @@ def common_motion(
         R = rotation_from_vector(_turn(P, after_m - q0[:, None], w)) @ R  # (1)
         miss = np.linalg.norm((before_m - p0[:, None]) @ R.transpose(0, 2, 1) + q0[:, None] - after_m, axis=2)
         if step >= PLAIN_STEPS - 1:
-            spread = 1.4826 * masked_median(miss, w > 0.25 * w.max(axis=1, keepdims=True))
+            spread = mad_sigma(miss, 1, w > 0.25 * w.max(axis=1, keepdims=True))
             w = weight / (1 + (miss / (2 * np.maximum(spread, scale))[:, None]) ** 2) ** 2  # Geman & McClure
     members = (there & (miss < 3 * np.maximum(spread, scale)[:, None])).sum(axis=1)
     goal = np.einsum("nij,nj->ni", R, xyz_m - p0) + q0
@@ -102,10 +103,3 @@ def same_distance(
     d0 = np.linalg.norm(neighbours_before - before_m[:, None], axis=2)
     d1 = np.linalg.norm(neighbours_after - after_m[:, None], axis=2)
     return 1 / (1 + ((d1 - d0) / (2 * np.reshape(np.asarray(scale_m), (-1, 1)))) ** 2) ** 2
-
-
-def masked_median(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Median of each row (N, m) over its mask; zero for empty rows."""
-    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
-    middle = np.maximum(mask.sum(axis=1) - 1, 0) // 2
-    return np.where(mask.any(axis=1), ordered[np.arange(len(values)), middle], 0.0)
