@@ -22,8 +22,9 @@ import numpy as np
 
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
+from ..geometry.robust import PolynomialFit
 from .foreground import Foreground
-from .grid import RADIUS_CELLS, NeighbourFit, TemplateGrid, Views, fit_neighbours, neighbours_of
+from .grid import RADIUS_CELLS, TemplateGrid, Views, fit_neighbours, neighbours_of
 from .least_squares import MatchingSettings, MatchStatus
 from .multi_image import MultiImageMatches, MultiImageStarts, match_multi_image
 from .object_space import Epipolar, SurfacePatch, SurfacePrior, SurfaceStarts, match_surface, normal_to, px_per_inverse_metre
@@ -81,7 +82,7 @@ def constrain(
     return result.select(ok & _in_foreground(result, foreground, views.base))
 
 
-def _surface_of(field: MatchedField, views: Views) -> NeighbourFit:
+def _surface_of(field: MatchedField, views: Views) -> PolynomialFit:
     """The quadric of inverse depth about every cell of the field."""
     w = 1 / views.base.to_camera(field.xyz_m)[:, 2]
     return fit_neighbours(
@@ -266,7 +267,7 @@ def _model_covariance(
     return ray[:, :, None] * ray[:, None] * of_ray[:, None, None] + of_all[:, None, None] * np.eye(3)
 
 
-def _over_outline(around: NeighbourFit, grid: TemplateGrid, patch_px: int) -> np.ndarray:
+def _over_outline(around: PolynomialFit, grid: TemplateGrid, patch_px: int) -> np.ndarray:
     """The share (N,) of each patch's window where no neighbour belongs to the same surface."""
     cells = np.arange(-RADIUS_CELLS, RADIUS_CELLS + 1) * grid.spacing_px
     window = np.exp(-0.5 * np.add.outer(cells**2, cells**2).ravel() / (WINDOW_SIGMA * patch_px) ** 2)

@@ -15,10 +15,9 @@ import numpy as np
 
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
-from ..geometry.robust import mad_sigma, masked_median
+from ..geometry.robust import PolynomialFit, fit_polynomial, mad_sigma, masked_median
 from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
-from .patches import monomials
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -96,23 +95,6 @@ def template_grid(image_shape: tuple[int, int], rows: RowGrid, spacing_px: int) 
 
 RADIUS_CELLS = 3
 LARGEST = 512  # points whose neighbours stay in the cache
-ROBUST_STEPS = 3
-TUKEY = 4.685
-RIDGE = (1e-9, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2)  # with coordinates in units of the radius: a thin neighbourhood falls back to a plane
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class NeighbourFit:
-    """The polynomials (1) at M points."""
-
-    coefficients: np.ndarray  # (M, P)
-    scatter: np.ndarray  # (M,) robust scatter of the neighbours about (1)
-    weights: np.ndarray  # (M, m) how far each neighbour lies on (1): 1 to 0, and 0 where there is none
-
-    @property
-    def support(self) -> np.ndarray:
-        """(M,) the share of the neighbourhood's cells that lie on (1); at an outline half of them or less."""
-        return np.asarray(self.weights.mean(axis=1))
 
 
 def neighbours_of(
@@ -131,43 +113,31 @@ def neighbours_of(
 
 def fit_neighbours(
     neighbour: np.ndarray, xy: np.ndarray, values: np.ndarray, query_xy: np.ndarray, *, degree: int, min_scale: np.ndarray, radius_px: float
-) -> NeighbourFit:
+) -> PolynomialFit:
     """Fit (1) about `query_xy` (M, 2) to `values` (N,) at `xy` (N, 2) of the rows `neighbour` (M, m), by Tukey's weights.
 
     Residuals below `min_scale` (M,) count fully; `radius_px` is the reach of the neighbourhood. Where there is no neighbour,
     coefficients are zero.
     """
 
-    def fit(rows: slice) -> NeighbourFit:
+    def fit(rows: slice) -> PolynomialFit:
         return _fitted(neighbour[rows], xy, values, query_xy[rows], degree, min_scale[rows], radius_px)
 
     parts = in_threads(fit, equal_pieces(len(neighbour), LARGEST, LARGEST))
-    return NeighbourFit(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(NeighbourFit)})
+    return PolynomialFit(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(PolynomialFit)})
 
 
 def _fitted(
     neighbour: np.ndarray, xy: np.ndarray, values: np.ndarray, query_xy: np.ndarray, degree: int, min_scale: np.ndarray, radius_px: float
-) -> NeighbourFit:
+) -> PolynomialFit:
     valid = neighbour >= 0
-    a, b = np.moveaxis(np.where(valid[..., None], xy[neighbour] - query_xy[:, None], 0.0) / radius_px, -1, 0)
+    a, b = np.moveaxis(np.where(valid[..., None], xy[neighbour] - query_xy[:, None], 0.0), -1, 0)
     z = np.where(valid, values[neighbour], 0.0)
     base = np.where(valid.any(axis=1), z.sum(axis=1) / np.maximum(valid.sum(axis=1), 1), 0.0)
-    z = np.where(valid, z - base[:, None], 0.0)
-    m = monomials(a, b, degree).astype(np.float64)
-    ridge = np.diag(RIDGE[: m.shape[2]])
-    robust, scatter = valid.astype(np.float64), np.zeros(len(z))
-    c = np.zeros((len(z), m.shape[2]))
-    for step in range(ROBUST_STEPS + 1):
-        weighted = (robust[:, :, None] * m).transpose(0, 2, 1)
-        c = np.linalg.solve(weighted @ m + ridge, weighted @ z[:, :, None])[..., 0]
-        residual = z - np.einsum("nmi,ni->nm", m, c)
-        scatter = mad_sigma(residual, 1, valid)
-        if step < ROBUST_STEPS:
-            ratio = residual / (TUKEY * np.maximum(scatter, min_scale))[:, None]
-            robust = valid * np.clip(1 - ratio**2, 0, 1) ** 2
-    c[:, 0] += base
-    power = np.array([0, 1, 1, 2, 2, 2])[: m.shape[2]]
-    return NeighbourFit(coefficients=c / radius_px**power, scatter=scatter, weights=robust)
+    z = z - base[:, None]
+    fit = fit_polynomial(a, b, z, valid, degree=degree, radius=radius_px, min_scale=min_scale)
+    fit.coefficients[:, 0] += base
+    return fit
 
 
 def unlike_neighbours(grid: TemplateGrid, cell: np.ndarray, parameters: np.ndarray, *, sigmas: float, least: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from ..geometry import robust
 from ..images.sampling import SplineImage, correlated_noise, difference
 
 PIECE = 1 << 17  # pixels of a piece
@@ -278,8 +279,7 @@ class TemplatePatches:
 
 def monomials(u: np.ndarray, v: np.ndarray, degree: int) -> np.ndarray:
     """1, u, v (degree 1) and ½ u², u v, ½ v² (degree 2) as columns (n, 3 or 6) float32."""
-    columns = [np.ones_like(u), u, v] + ([0.5 * u * u, u * v, 0.5 * v * v] if degree == 2 else [])
-    return np.stack(columns, axis=-1).astype(np.float32)
+    return robust.monomials(u, v, degree).astype(np.float32)
 
 
 def _sample(image: SplineImage, xy: np.ndarray, half: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,15 +14,13 @@ import numpy as np
 
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
-from ..geometry.robust import mad_sigma
+from ..geometry.robust import fit_polynomial
 from ..matching.grid import neighbours_of
 from ..matching.region_growing import MatchedField
 
 RADIUS_CELLS = 3
 LARGEST = 512  # points whose neighbours stay in the cache
 MIN_NEIGHBOURS = 8
-ROBUST_STEPS = 3
-TUKEY = 4.685
 MIN_SCALE = 0.15  # of the spacing on the surface: finer scatter than this is not told from the surface's own shape
 
 
@@ -71,30 +69,13 @@ def _quadrics(field: MatchedField, camera: Camera, reference: int, rows: np.ndar
         a, b = np.moveaxis(np.where(valid[..., None], at[near] - at[middle], 0.0), -1, 0)
         D = np.where(valid, depth[near], 0.0)
         weight = valid & (np.abs(D - own) < 3.0 * spacing * np.hypot(a, b) / field.grid.spacing_px + spacing)
-        unit, scale = RADIUS_CELLS * field.grid.spacing_px, MIN_SCALE * spacing[:, 0]
-        return (*_robust_quadric(a, b, unit, D - own, weight.astype(np.float64), scale), weight.sum(axis=1) - 1)
+        radius, scale = RADIUS_CELLS * field.grid.spacing_px, MIN_SCALE * spacing[:, 0]
+        found = fit_polynomial(a, b, D - own, weight, degree=2, radius=radius, min_scale=scale)
+        return found.coefficients, found.scatter, weight.sum(axis=1) - 1
 
     parts = in_threads(fit, equal_pieces(len(rows), LARGEST, LARGEST))
     coefficients, scatter, support = (np.concatenate(part) for part in zip(*parts))
     return coefficients, scatter, support
-
-
-def _robust_quadric(
-    a: np.ndarray, b: np.ndarray, unit: float, D: np.ndarray, weight: np.ndarray, min_scale: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (N, 6) of (1) and the scatter (N,), by iteratively reweighted least squares (Tukey)."""
-    scale = np.array([1, unit, unit, unit**2, unit**2, unit**2])
-    basis = np.stack([np.ones_like(a), a, b, 0.5 * a * a, a * b, 0.5 * b * b], axis=2) / scale  # (N, m, 6)
-    ridge = np.diag([1e-9, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2])  # a thin neighbourhood falls back to a plane
-    robust = weight
-    for _ in range(ROBUST_STEPS):
-        weighted = (robust[:, :, None] * basis).transpose(0, 2, 1)
-        c = np.linalg.solve(weighted @ basis + ridge, (weighted @ D[:, :, None]))[..., 0]
-        residual = D - np.einsum("nmi,ni->nm", basis, c)
-        scatter = mad_sigma(residual, 1, weight > 0)
-        ratio = residual / (TUKEY * np.maximum(scatter, min_scale))[:, None]
-        robust = weight * np.clip(1 - ratio**2, 0, 1) ** 2
-    return c / scale, scatter
 
 
 def _normals(field: MatchedField, camera: Camera, reference: int, depth: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
