@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAD_TO_SIGMA = 1.4826  # 1 / Φ⁻¹(3/4)
+MAD_TO_SIGMA = 1.482602218505602  # 1 / Φ⁻¹(3/4)
 TUKEY = 4.685  # of (3), in sigmas: 95 % efficiency for normal errors
 REWEIGHTINGS = 3
 RIDGE = (1e-9, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2)  # with coordinates in units of the radius: a thin neighbourhood falls back to a plane

@@ -12,6 +12,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import BSpline
 from scipy.ndimage import spline_filter1d
 
+from ..geometry.robust import mad_sigma
+
 FINENESS, ORDER = 4, 5
 IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6  # unit response to white noise
 MIN_NOISE = 0.3  # grey values: rounding alone
@@ -138,8 +140,8 @@ def noise_sigma(image: np.ndarray) -> float:
     g = np.asarray(image, dtype=np.float32)
     inner = g[1:-1, 1:-1]
     usable = (inner > SATURATED * 255) & (inner < max(255.0, float(g.max())) - SATURATED * 255)
-    residual = np.abs(cv2.filter2D(g, cv2.CV_32F, IMMERKAER)[1:-1, 1:-1])[usable]
-    return max(MIN_NOISE, float(np.median(residual)) / 0.6745) if residual.size > 100 else MIN_NOISE
+    residual = cv2.filter2D(g, cv2.CV_32F, IMMERKAER)[1:-1, 1:-1][usable]
+    return max(MIN_NOISE, float(mad_sigma(residual))) if residual.size > 100 else MIN_NOISE
 
 
 def _refine(image: np.ndarray, axis: int) -> np.ndarray:
