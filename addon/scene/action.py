@@ -12,8 +12,8 @@ import numpy as np
 
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone
+from ...core.motion.retarget.keys import needed_keys
 from . import armature
-from .simplify import kept_keys
 
 NAME, SIMPLE_NAME = "Measured motion", "Simplified motion"
 MEASURED_KEY = "tricap_measured_motion"  # custom property of the armature: the measured action while another one plays
@@ -61,7 +61,7 @@ def add_simplified(
         bone_name, channel, index = channels[name]
         known = np.flatnonzero(np.isfinite(values[:, column]))
         tolerance = np.radians(tolerance_deg) * (1.0 if channel == "rotation_euler" else METRES_PER_RADIAN)
-        kept = known[kept_keys(frames[known], values[known, column], tolerance)]
+        kept = known[needed_keys(frames[known], values[known, column], tolerance)]
         path = f"{armature_object.pose.bones[bone_name].path_from_id()}.{channel}"
         key(action, armature_object, path, index, frames[kept], values[kept, column])
     return action

@@ -216,15 +216,6 @@ def test_fewer_keys_stay_within_the_tolerance_and_the_measured_motion_is_kept(em
     assert 0.1 < worst < 0.501
 
 
-def test_keys_of_a_straight_line_are_its_ends() -> None:
-    from tricap.addon.scene.simplify import kept_keys
-
-    frames = np.array([0, 1, 2, 5, 9])
-    assert kept_keys(frames, 2.0 * frames, 1e-9).tolist() == [0, 4]
-    assert kept_keys(frames, np.array([0, 0, 5, 0, 0]), 1.0).tolist() == [0, 1, 2, 3, 4]
-    assert kept_keys(frames[:1], frames[:1], 1.0).tolist() == [0]
-
-
 def test_colours_arrows_and_nothing_piles_up(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     from tricap.addon.scene.build import SceneOptions, build_scene
 

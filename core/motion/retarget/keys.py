@@ -1,7 +1,8 @@
 """Keyframes: resampling a motion at another frame rate, and key reduction.
 
 Key reduction keeps those keys of a motion keyed in every frame from which linear interpolation gives the others within a tolerance: Ramer
-(1972), Douglas and Peucker (1973), on all channels of a bone at once.
+(1972), Douglas and Peucker (1973), with the distance along
+the values, of one channel or of all channels of a bone at once.
 """
 
 from dataclasses import replace
@@ -29,9 +30,14 @@ def resampled(motion: Motion, fps: float, first_frame: float) -> Motion:
 
 
 def needed_keys(times: np.ndarray, values: np.ndarray, tolerance: float) -> np.ndarray:
-    """Indices of the keys to keep, of values (T, C) at times (T,): linear interpolation between them is nowhere off by more than
-    `tolerance`, all channels together (Euclidean). The first and the last are always kept, unless one key says all."""
+    """Indices (n,) of the keys to keep, of values (T,) or (T, C) at times (T,), in order.
+
+    Linear interpolation between them is nowhere off by more than `tolerance`, all channels together (Euclidean). The first and the last
+    are always among them, unless all values lie within the tolerance of the first.
+    """
     t = len(times)
+    values = np.asarray(values, dtype=np.float64)
+    values = values[:, None] if values.ndim == 1 else values
     if t < 2 or tolerance <= 0:
         return np.arange(t)
     if np.linalg.norm(values - values[0], axis=1).max() <= tolerance:

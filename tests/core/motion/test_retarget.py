@@ -428,6 +428,14 @@ def test_fewer_keys_within_the_tolerance() -> None:
     assert len(needed_keys(t, values, 0.0)) == 200
 
 
+def test_keys_of_one_channel() -> None:
+    frames = np.array([0, 1, 2, 5, 9])
+    assert needed_keys(frames, 2.0 * frames, 1e-9).tolist() == [0, 4]
+    assert needed_keys(frames, np.array([0, 0, 5, 0, 0]), 1.0).tolist() == [0, 1, 2, 3, 4]
+    assert needed_keys(frames, np.array([3.0, 3.5, 2.5, 3.0, 3.0]), 0.5).tolist() == [0]
+    assert needed_keys(frames[:1], frames[:1], 1.0).tolist() == [0] and needed_keys(frames[:0], frames[:0], 1.0).tolist() == []
+
+
 def test_another_frame_rate() -> None:
     motion = flail(person(), frames=61)
     twice = resampled(motion, 60.0, 5.0)
