@@ -10,14 +10,13 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from ...core.fitting.inputs.clicks import intersection
 from ...core.foundation.errors import InputError
+from ...core.geometry.intersection import intersect_clicks
 from ...core.matching.foreground import around_clicks
 from ...core.matching.proposals import Proposal, below_surface, epipolar_curve, where_rays_meet
 from .. import clicks
 from .finder import Answer, Finder, Question
 
-CLICK_SIGMA_PX = 3.0
 ARMS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("shoulder", "elbow", "wrist"))
 LEGS = tuple(f"{joint}.{side}" for side in "RL" for joint in ("hip", "knee", "ankle", "toe"))
 ORDER = ("head", "neck", *ARMS, "pelvis", *LEGS)
@@ -166,7 +165,7 @@ class ClickSession:
             return
         if len(clicked) > 1:
             number = {self.views.index(view): xy for view, xy in clicked.items()}
-            self._offer(where_rays_meet(self.finder.cameras, number, CLICK_SIGMA_PX))
+            self._offer(where_rays_meet(self.finder.cameras, number, self.finder.click_sigma_px))
             return
         ((view, xy),) = clicked.items()
         at = self.views.index(view)
@@ -233,7 +232,7 @@ class ClickSession:
             at = self.clicks(name) if name != self.name else {}
             if len(at) > 1:
                 clicked = [cameras[self.views.index(v)] for v in at]
-                depths.append(cameras[view].to_camera(intersection(clicked, np.array(list(at.values()))))[2])
+                depths.append(float(cameras[view].to_camera(intersect_clicks(clicked, np.array([list(at.values())])).xyz_m)[0, 2]))
         valid = [depth for depth in depths if np.isfinite(depth) and depth > 0]
         return around_clicks(np.array(valid)).depth_range_m if valid else None
 

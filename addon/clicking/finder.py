@@ -57,6 +57,11 @@ class Finder:
         """The cameras in the order of the views."""
         return self._footage.rig.cameras
 
+    @property
+    def click_sigma_px(self) -> float:
+        """How exactly joints are clicked."""
+        return self._footage.click_sigma_px
+
     def prepare(self, frame: int) -> None:
         """Read and prepare the images of a frame, before the first click."""
         self._pool.submit(self._load, frame)

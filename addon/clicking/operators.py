@@ -293,11 +293,12 @@ def make_finder(scene: bpy.types.Scene) -> tuple[Finder | None, str]:
     """The finder of proposals; None and the reason if cameras or images are missing."""
     try:
         take = project.take(scene)
-        footage = open_take(replace(take, clicks=FrameClicks(), keyframes=(), corrections=(), frames=None))
-        settings = take_run.settings_of(take.settings, properties.overrides(scene), "take.toml")["matching"]
+        settings = take_run.settings_of(take.settings, properties.overrides(scene), "take.toml")
+        bare = replace(take, clicks=FrameClicks(), keyframes=(), corrections=(), frames=None)
+        footage = open_take(bare, click_sigma_px=settings["fitting"].click_sigma_px)
     except InputError as error:
         return None, f"Epipolar lines and proposals are not available: {error}"
-    return Finder(footage, settings), ""
+    return Finder(footage, settings["matching"]), ""
 
 
 def model_joints(scene: bpy.types.Scene) -> tuple[str, ...]:

@@ -177,7 +177,8 @@ def _cameras(scene: bpy.types.Scene, found: _Project) -> State:
                 f"Camera {view.name} was calibrated with images of {size[0]}×{size[1]} pixels, its footage has "
                 f"{view.clip.size[0]}×{view.clip.size[1]}. Use the footage at the size at which it was calibrated."
             )
-    found.footage = open_take(found.take, found.sequences)
+    sigma_px = settings_of(found.take.settings, {}, "The panel")["fitting"].click_sigma_px
+    found.footage = open_take(found.take, found.sequences, click_sigma_px=sigma_px)
     return State(status=Status.DONE, message=f"{len(found.footage.rig.cameras)} cameras, one for each view.")
 
 
@@ -217,7 +218,7 @@ def _check_clicks(footage: Footage) -> None:
     problems = get_session().file.click_problems
     for name, at in take.clicks.joints.items():
         clicks = tuple((view, *xy.tolist()) for view, xy in sorted(at.items()))
-        key = (take.rig_path, rig.st_mtime_ns, rig.st_size, take.reference, name, clicks)
+        key = (take.rig_path, rig.st_mtime_ns, rig.st_size, take.reference, name, clicks, footage.click_sigma_px)
         if key not in problems:
             if len(problems) > CACHED_CLICKS:
                 problems.clear()

@@ -16,7 +16,7 @@ import numpy as np
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from ..geometry.camera import Camera
-from ..geometry.intersection import forward_intersection
+from ..geometry.intersection import clicks_contradict, intersect_clicks
 from ..geometry.rig import Rig
 
 LEAST_ARM_M, OTHERWISE = 0.1, 0.3  # length to which directions count; a rig that differs by more than this part of it is another
@@ -130,7 +130,6 @@ def frame_of_points(origin_m: np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> W
 
 
 POINTS = ("origin", "x", "y")
-CLICK_PX = 5.0  # rays of a clicked point that miss each other by more than twice this contradict each other
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -191,9 +190,9 @@ def frame_of_clicks(cameras: Sequence[Camera], points: Mapping[str, Mapping[str,
             xy[i, names.index(view)] = pixel
         if len(at) < 2:
             raise InputError(f"The point “{point}” of the world's frame is clicked in {len(at)} view(s); click it in two at least.")
-    found = forward_intersection(cameras, xy, np.broadcast_to(CLICK_PX**2 * np.eye(2), (3, len(cameras), 2, 2)))
-    for point, miss in zip(POINTS, found.rms_residual_px):
-        if not miss < 2 * CLICK_PX:
+    found = intersect_clicks(cameras, xy)
+    for point, miss, contradicting in zip(POINTS, found.rms_residual_px, clicks_contradict(found)):
+        if contradicting:
             raise InputError(
                 f"The clicks of the point “{point}” of the world's frame miss each other by {miss:.0f} px; click the same "
                 "point in every view."

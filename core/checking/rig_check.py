@@ -15,8 +15,8 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from ..geometry.camera import Camera
+from ..geometry.intersection import CLICK_SIGMA_PX
 from ..geometry.rig import Rig, read_rig
-from ..take.clicked_points import CLICK_SIGMA_PX
 from ..take.take import Take
 from .findings import Checked, Finding, doubtful, wrong
 from .view_matches import PairMatches
@@ -193,7 +193,11 @@ def share(pairs: Sequence[PairMatches], cameras: Sequence[Camera]) -> float:
 
 
 def rig_findings(
-    pairs: Sequence[PairMatches], clicks: Sequence[PairMatches], cameras: Sequence[Camera], names: Sequence[str]
+    pairs: Sequence[PairMatches],
+    clicks: Sequence[PairMatches],
+    cameras: Sequence[Camera],
+    names: Sequence[str],
+    click_sigma_px: float = CLICK_SIGMA_PX,
 ) -> list[Finding]:
     """Views that are exchanged, or a rig of another recording; nothing where there is too little to judge by.
 
@@ -222,7 +226,7 @@ def rig_findings(
         ]
     asked = [c for c in clicks if len(c.xi_px) and (c.i, c.j) in {(p.i, p.j) for p in usable}]
     clicked = _misses(asked, cameras) if asked else np.zeros(0)
-    vouched = len(clicked) >= FEWEST_CLICKS and np.median(clicked) < min(CLICK_SIGMA_PX, 0.5 * figures["miss_px"])
+    vouched = len(clicked) >= FEWEST_CLICKS and np.median(clicked) < min(click_sigma_px, 0.5 * figures["miss_px"])
     if agreeing >= AGREES or vouched:
         return []
     return [

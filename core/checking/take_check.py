@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from ..body.model_file import read_model
+from ..fitting.settings import FitSettings
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
@@ -195,7 +196,9 @@ def check_take(folder: Path, monitor: Monitor) -> Checked:
     What cannot even be opened is a finding too.
     """
     try:
-        footage = open_take(read_take(folder))
+        take = read_take(folder)
+        fitting = from_table(FitSettings, take.settings.get("fitting", {}), "[fitting]")
+        footage = open_take(take, click_sigma_px=fitting.click_sigma_px)
         findings, figures = check_footage(footage, monitor)
         findings += joint_findings(footage.take)
     except InputError as error:
@@ -217,7 +220,7 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     pairs = film.matches()
     alike = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
-    found += alike or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names)
+    found += alike or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
     found += [*weak, *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
@@ -300,7 +303,10 @@ def first_look(footage: Footage, frame: int) -> list[Finding]:
     still = still_views(footage, frame, pictures)
     pairs = match_views([[rows.rows(image) for image in pictures]], rows)
     beside = [*unit_findings(footage.rig), *(frozen_view(name) for name in still)]
-    return same_views(pairs, names) or [*beside, *rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names)]
+    return same_views(pairs, names) or [
+        *beside,
+        *rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px),
+    ]
 
 
 def still_views(footage: Footage, frame: int, pictures: list[np.ndarray]) -> list[str]:

@@ -151,8 +151,9 @@ def _summary(job: take_run.Run, as_json: bool) -> list[str]:
 def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from ..surface.measure import MeasureSettings, first_seeds
 
-    footage = open_take(read_take(args.take))
-    settings = take_run.settings_of(footage.take.settings, overrides(args.set), str(args.take))
+    take = read_take(args.take)
+    settings = take_run.settings_of(take.settings, overrides(args.set), str(args.take))
+    footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
     frame = footage.take.clicks.frame if footage.take.clicks.frame in footage.frames else footage.frames.start
     where, seeds = first_seeds(footage, MeasureSettings.of(settings), frame, monitor)
     near, far = where.depth_range_m

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """
     take = read_take(args.take)
     settings = take_run.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
-    footage, frames = open_take(take), frame_range(args.frames)
+    footage, frames = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), frame_range(args.frames)
     check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
     footage = footage if frames is None else take_run.only_frames(footage, frames)
     first = footage.frames.start if args.points_frame is None else args.points_frame

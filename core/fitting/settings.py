@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from ..foundation.settings import knob
+from ..geometry.intersection import CLICK_SIGMA_PX
 
 ALGORITHM = "body 3"  # part of the fit's key: raise it when the same input gives another body
 
@@ -50,7 +51,13 @@ class FitSettings:
     gate_m: float = knob(0.035, "A point further than this from a limb's surface does not belong to it.", unit="m", low=0.005, high=0.3)
     outline_gate_m: float = knob(0.10, "A ray of an outline further than this from every limb is ignored.", unit="m", low=0.005, high=1.0)
     floor: bool = knob(False, "A standing foot has the height that feet have when they stand (world: Z up, a level floor).")
-    click_sigma_px: float = knob(5.0, "Sigma of a clicked joint.", unit="px", low=0.1, high=100.0)
+    click_sigma_px: float = knob(
+        CLICK_SIGMA_PX,
+        "Sigma of a click. Clicks of one point are refused if the residual of their rays exceeds three times this.",
+        unit="px",
+        low=0.1,
+        high=100.0,
+    )
     length_sigma: float = knob(
         0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.", low=0.001, high=1.0
     )

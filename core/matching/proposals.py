@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.intersection import forward_intersection
+from ..geometry.intersection import MOST_MISS_SIGMAS, Intersection, intersect_clicks
 from .grid import Views
 from .least_squares import MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .seeds import approximations_at_depth, sweep_ray
@@ -110,7 +110,9 @@ def propose(
         matched = _find(views.select((view, *group)), at, patch, depth_range_m)
         found |= {group[k - 1]: proposal for k, proposal in matched.items()}
         if found and group == others:
-            found = _where_rays_meet(cameras, {view: Proposal(xy_px=rows.to_frame(at), sigma_px=PIXEL_SIGMA_PX, correlation=1.0)} | found)
+            limit_px = max(MAX_MISS_PX, MOST_MISS_SIGMAS * max(p.sigma_px for p in found.values()))
+            clicked = Proposal(xy_px=rows.to_frame(at), sigma_px=PIXEL_SIGMA_PX, correlation=1.0)
+            found = _where_rays_meet(cameras, {view: clicked} | found, limit_px)
             break
     return tuple(found.get(k) if k != view else None for k in range(len(cameras)))
 
@@ -121,7 +123,7 @@ def where_rays_meet(cameras: Sequence[Camera], clicks: Mapping[int, np.ndarray],
     The clicks' sigma enters the proposals' sigmas.
     """
     known = {k: Proposal(xy_px=np.asarray(xy, dtype=np.float64), sigma_px=sigma_px, correlation=1.0) for k, xy in clicks.items()}
-    found = _where_rays_meet(cameras, known) if len(known) > 1 else known
+    found = _where_rays_meet(cameras, known, MOST_MISS_SIGMAS * sigma_px) if len(known) > 1 else known
     return tuple(found.get(k) if k not in clicks else None for k in range(len(cameras)))
 
 
@@ -136,28 +138,23 @@ def below_surface(
     known = {k: place for k, place in enumerate(surface) if place is not None}
     if not known:
         return tuple(surface)
-    xy, K = np.full((1, len(cameras), 2), np.nan), np.tile(np.eye(2), (1, len(cameras), 1, 1))
-    for k, place in {view: Proposal(xy_px=xy_px, sigma_px=PIXEL_SIGMA_PX, correlation=1.0), **known}.items():
-        xy[0, k], K[0, k] = place.xy_px, np.eye(2) * place.sigma_px**2
-    depth = float(cameras[view].to_camera(forward_intersection(cameras, xy, K).xyz_m)[0, 2])
+    point = _intersected(cameras, {view: Proposal(xy_px=xy_px, sigma_px=PIXEL_SIGMA_PX, correlation=1.0), **known})
+    depth = float(cameras[view].to_camera(point.xyz_m)[0, 2])
     ray = cameras[view].rays(np.asarray(xy_px, dtype=np.float64))
-    point = cameras[view].centre_m + ray * (depth + depth_m)
+    X = cameras[view].centre_m + ray * (depth + depth_m)
     sure, found = min(p.correlation for p in known.values()), []
     for k, camera in enumerate(cameras):
-        at, J = camera.project_with_jacobian(point)
+        at, J = camera.project_with_jacobian(X)
         sigma = np.hypot(np.linalg.norm(J @ ray) * DEPTH_SHARE * depth_m, known[k].sigma_px if k in known else 0.5)
         seen = k != view and bool(camera.sees(at))
         found.append(Proposal(xy_px=at, sigma_px=float(sigma), correlation=sure) if seen else None)
     return tuple(found)
 
 
-def _where_rays_meet(cameras: Sequence[Camera], known: Mapping[int, Proposal]) -> dict[int, Proposal]:
-    """The known places, and those of their forward intersection in the other views."""
-    xy, K = np.full((1, len(cameras), 2), np.nan), np.tile(np.eye(2), (1, len(cameras), 1, 1))
-    for k, place in known.items():
-        xy[0, k], K[0, k] = place.xy_px, np.eye(2) * place.sigma_px**2
-    point, found = forward_intersection(cameras, xy, K), dict(known)
-    if not np.isfinite(point.xyz_m).all() or point.rms_residual_px[0] > max(MAX_MISS_PX, 3 * max(p.sigma_px for p in known.values())):
+def _where_rays_meet(cameras: Sequence[Camera], known: Mapping[int, Proposal], limit_px: float) -> dict[int, Proposal]:
+    """The known places, and those of their forward intersection in the other views if their rays miss each other by no more."""
+    point, found = _intersected(cameras, known), dict(known)
+    if not point.rms_residual_px[0] <= limit_px:
         return found
     for k in set(range(len(cameras))) - set(known):
         at, J = cameras[k].project_with_jacobian(point.xyz_m[0])
@@ -165,6 +162,14 @@ def _where_rays_meet(cameras: Sequence[Camera], known: Mapping[int, Proposal]) -
             sigma = np.sqrt(np.diag(J @ point.covariance_m2[0] @ J.T).max())
             found[k] = Proposal(xy_px=at, sigma_px=float(sigma), correlation=min(p.correlation for p in known.values()))
     return found
+
+
+def _intersected(cameras: Sequence[Camera], known: Mapping[int, Proposal]) -> Intersection:
+    """The point (one) that the known places (view number → place) agree on."""
+    xy, sigma = np.full((1, len(cameras), 2), np.nan), np.ones((1, len(cameras)))
+    for k, place in known.items():
+        xy[0, k], sigma[0, k] = place.xy_px, place.sigma_px
+    return intersect_clicks(cameras, xy, sigma)
 
 
 def _find(views: Views, at: np.ndarray, settings: MatchingSettings, depth_range_m: tuple[float, float] | None) -> dict[int, Proposal]:

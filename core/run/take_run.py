@@ -150,7 +150,7 @@ def open_run(
     """
     take = read_take(take_folder)
     settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
-    footage = open_take(take)
+    footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
     if frames is not None:
         footage = only_frames(footage, frames)
     for name, at in take.clicks.joints.items():

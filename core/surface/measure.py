@@ -136,6 +136,7 @@ def measure_frames(footage: Footage, settings: MeasureSettings, results: Results
         repr((take.interlaced, take.first_field, take.reference_view, take.clicks.table())),
         repr([(v.name, v.offset_frames) for v in take.views]),
         repr(footage.delay_images) if any(footage.delay_images) else "",
+        repr(footage.click_sigma_px) if take.clicks.surface else "",
     )
     start = before = None
     for done, frame in enumerate(order):

@@ -9,14 +9,11 @@ from dataclasses import fields
 import numpy as np
 
 from ..foundation.errors import InputError
-from ..geometry.intersection import Intersection, forward_intersection
+from ..geometry.intersection import Intersection, clicks_contradict, intersect_clicks
 from ..matching.grid import Views
 from ..matching.least_squares import MatchingSettings
 from ..matching.seeds import Approximations, approximations_at_depth, settled_depths
 from .take import Clicks, Footage
-
-CLICK_SIGMA_PX = 4.0
-CLICK_MISS_PX = 3 * CLICK_SIGMA_PX  # from each click to where the rays meet: two clicks may be 24 px apart across their epipolar lines
 
 
 def clicked_depth(footage: Footage, name: str, at: Clicks) -> float:
@@ -37,10 +34,10 @@ def clicked_point(footage: Footage, name: str, at: Clicks) -> Intersection:
     """
     cameras = footage.rig.cameras
     xy = np.array([[at.get(c.name, np.full(2, np.nan)) for c in cameras]])
-    point = forward_intersection(cameras, xy, np.tile(np.eye(2) * CLICK_SIGMA_PX**2, (1, len(cameras), 1, 1)))
+    point = intersect_clicks(cameras, xy, footage.click_sigma_px)
     if not 0 < cameras[footage.take.reference].to_camera(point.xyz_m)[0, 2] < np.inf:
         raise InputError(f"The click “{name}” is seen by {len(at)} view(s) and has no place in space; click it in two views at least.")
-    if float(point.rms_residual_px[0]) > CLICK_MISS_PX:
+    if clicks_contradict(point, footage.click_sigma_px)[0]:
         raise InputError(
             f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px; click the same spot in every view, "
             "and check that rig.toml belongs to this footage."

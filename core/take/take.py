@@ -15,6 +15,7 @@ import numpy as np
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
+from ..geometry.intersection import CLICK_SIGMA_PX
 from ..geometry.rig import Rig, read_rig
 from ..images.interlace import BOTH, INTERLACE, FieldLayout, RowGrid, field_layout, frame_time_s
 from ..images.sequence import ImageSequence, open_sequence
@@ -172,6 +173,7 @@ class Footage:
     rig: Rig
     sequences: tuple[ImageSequence, ...]
     frames: range
+    click_sigma_px: float = CLICK_SIGMA_PX  # of the take's clicks
     delay_images: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
 
     def number(self, view: int, frame: int) -> int:
@@ -233,8 +235,10 @@ def take_of_text(text: str, path: Path) -> Take:
     return _take(table, path.parent.resolve(), str(path))
 
 
-def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None) -> Footage:
+def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *, click_sigma_px: float = CLICK_SIGMA_PX) -> Footage:
     """Open the footage (unless `sequences` are the opened views) and the rig of a take and check that they belong together.
+
+    `click_sigma_px`: the knob fitting.click_sigma_px, for what depends on the clicks.
 
     Raises:
         InputError: a view without camera or images, views of unequal length, frames or clicks outside the footage.
@@ -243,7 +247,9 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None) ->
     cameras = tuple(rig[v.name] for v in take.views)
     sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
     frames = footage_frames(take, sequences)
-    footage = Footage(take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=frames)
+    footage = Footage(
+        take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=frames, click_sigma_px=click_sigma_px
+    )
     _check_clicks(footage)
     return footage
 

@@ -16,7 +16,7 @@ import numpy as np
 from ..calibration.targets import TargetStatus, find_targets
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..geometry.intersection import forward_intersection
+from ..geometry.intersection import forward_intersection, intersect_clicks
 from ..images.sampling import SplineImage
 from ..matching.least_squares import SearchImage, TemplatePoints, match_patches
 from ..matching.patches import patch_offsets
@@ -27,7 +27,6 @@ from .templates import REACQUIRE_CORRELATION, Templates, Tiles, atlas, cut_tiles
 from .tracked import TrackedFrame, born, joined, nothing, rows_of
 
 DEFAULT_SETTINGS = KeyPointSettings()
-CLICK_SIGMA_PX = 2.0
 CLICK_REACH_PX = 6.0  # a click may be wrong by as much
 SLOPES = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))  # tried for the surface at a point: up to 35° each way
 MAX_MISFIT_PX = 4.0  # of a point's rays
@@ -82,7 +81,7 @@ def _clicked(points: Mapping[str, Mapping[str, np.ndarray]], view: TrackingView)
     """Clicks (N, K, 2) in rows' pixels; in a view without one, the projection of the point from its other clicks."""
     xy = np.array([[at.get(c.name, (np.nan, np.nan)) for c in view.cameras] for at in points.values()], dtype=np.float64)
     xy = xy.reshape(-1, len(view.cameras), 2)
-    point = forward_intersection(view.cameras, xy, np.tile(np.eye(2) * CLICK_SIGMA_PX**2, (*xy.shape[:2], 1, 1)))
+    point = intersect_clicks(view.cameras, xy)
     for name, X in zip(points, point.xyz_m):
         if not np.isfinite(X).all():
             raise InputError(f"The position of the key point “{name}” cannot be computed; click it in at least two views.")
@@ -238,7 +237,7 @@ def _induced_shapes(clicks: np.ndarray, slope: np.ndarray, view: TrackingView) -
     `slope` (2,) is the relative growth of their depth per distance across, in units of the depth; (0, 0) faces the reference camera.
     """
     base, to_frame = view.cameras[view.reference], view.rows.to_frame
-    point = forward_intersection(view.cameras, to_frame(clicks), np.tile(np.eye(2) * CLICK_SIGMA_PX**2, (*clicks.shape[:2], 1, 1)))
+    point = intersect_clicks(view.cameras, to_frame(clicks))
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     depth = base.to_camera(point.xyz_m)[:, 2, None] * (1 + (corners * (1, view.rows.step)) @ slope / base.focal_px)
     X = base.points_at_depth(to_frame(clicks[:, view.reference, None] + corners), depth)  # (N, 3, 3)

@@ -7,12 +7,10 @@ import numpy as np
 
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
+from ...geometry.intersection import Intersection, clicks_contradict, doubtful_view, intersect_clicks
 from ...geometry.rig import Rig
 from ..observations import ClickedJoints, Observation
 from .fit_input import ClickedAt
-
-CONTRADICTION = 6.0  # sigmas between a click and the projection of the joint that the views agree on
-STEPS = 10
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,8 +42,10 @@ def read_clicks(rig: Rig, joint_names: Sequence[str], joints: ClickedAt, sigma_p
         views = {view: np.asarray(p, dtype=np.float64) for view, p in joints.get(name, {}).items() if np.isfinite(p).all()}
         seen = [rig[view] for view in views]
         if len(seen) >= 2:
-            places[j] = intersection(seen, np.array(list(views.values())))
-            _check_agreement(name, seen, np.array(list(views.values())), places[j], sigma_px)
+            clicked = np.array(list(views.values()))
+            point = intersect_clicks(seen, clicked[None], sigma_px)
+            _check_agreement(name, seen, clicked, point, sigma_px)
+            places[j] = point.xyz_m[0]
         cameras += seen
         index += [j] * len(seen)
         xy += list(views.values())
@@ -71,42 +71,12 @@ def initial_clicks(xyz_m: np.ndarray, joint_names: Sequence[str], observations: 
     return Clicks(observations=tuple(observations), xyz_m=xyz_m)
 
 
-def intersection(cameras: Sequence[Camera], xy_px: np.ndarray) -> np.ndarray:
-    """The point (3,) whose projections are closest to K image points (K, 2): rays first, then Gauss-Newton in the images."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
-    for camera, xy in zip(cameras, xy_px):
-        ray = camera.rays(xy)
-        P = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
-        A, b = A + P, b + P @ camera.centre_m
-    X = np.linalg.lstsq(A, b, rcond=None)[0]
-    for _ in range(STEPS):
-        pairs = [camera.project_with_jacobian(X) for camera in cameras]
-        r = np.concatenate([p - xy for (p, _), xy in zip(pairs, xy_px)])
-        if not np.isfinite(r).all():
-            break
-        step = np.linalg.lstsq(np.concatenate([J for _, J in pairs]), -r, rcond=None)[0]
-        X = X + step
-        if np.linalg.norm(step) < 1e-9:
-            break
-    return X
-
-
-def _check_agreement(name: str, cameras: Sequence[Camera], xy_px: np.ndarray, X: np.ndarray, sigma_px: float) -> None:
-    error = np.array([np.linalg.norm(camera.project(X) - xy) for camera, xy in zip(cameras, xy_px)])
-    if np.isfinite(error).all() and error.max() < CONTRADICTION * sigma_px:
+def _check_agreement(name: str, cameras: Sequence[Camera], xy_px: np.ndarray, point: Intersection, sigma_px: float) -> None:
+    if not clicks_contradict(point, sigma_px)[0]:
         return
-    worst = _odd_one_out(cameras, xy_px) if len(cameras) > 2 else int(np.argmax(np.nan_to_num(error, nan=np.inf)))
+    miss = np.nan_to_num(np.linalg.norm(point.residual_px[0], axis=1), nan=np.inf)
+    worst = doubtful_view(cameras, xy_px) if len(cameras) > 2 else int(np.argmax(miss))
     raise InputError(
-        f"The clicks on “{name}” contradict each other by up to {np.nan_to_num(error, nan=np.inf).max():.0f} px; "
+        f"The clicks on “{name}” contradict each other by up to {miss.max():.0f} px; "
         f"check view {cameras[worst].name} first and click the joint again."
     )
-
-
-def _odd_one_out(cameras: Sequence[Camera], xy_px: np.ndarray) -> int:
-    left = []
-    for k in range(len(cameras)):
-        others = [i for i in range(len(cameras)) if i != k]
-        X = intersection([cameras[i] for i in others], xy_px[others])
-        error = [np.linalg.norm(cameras[i].project(X) - xy_px[i]) for i in others]
-        left.append(float(np.nan_to_num(np.max(error), nan=np.inf)))
-    return int(np.argmin(left))

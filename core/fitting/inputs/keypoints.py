@@ -10,8 +10,8 @@ from copy import copy
 import numpy as np
 
 from ...geometry.camera import Camera
+from ...geometry.intersection import intersect_clicks
 from ..observations import ClickedJoints, Keypoints, Observation
-from .clicks import intersection
 from .fit_input import FitInput, JointPlaces
 
 CORRELATION_S = 0.2  # of a detector's errors
@@ -82,7 +82,7 @@ class JointTracks:
                 in_views.setdefault(j, []).append((self._rig[table.view], xy))
         for j, views in in_views.items():
             if len(views) > 1 and not np.isfinite(places[j]).all():
-                places[j] = intersection([camera for camera, _ in views], np.array([xy for _, xy in views]))
+                places[j] = intersect_clicks([camera for camera, _ in views], np.array([[xy for _, xy in views]])).xyz_m[0]
         return places
 
     def joints(self, t: int) -> list[int]:

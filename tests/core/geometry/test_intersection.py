@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tricap.core.geometry.intersection import forward_intersection
+from tricap.core.geometry.intersection import clicks_contradict, doubtful_view, forward_intersection, intersect_clicks
 
 
 def cloud(n: int, seed: int = 0) -> np.ndarray:
@@ -86,3 +86,24 @@ def test_none_at_all(scenes: Any) -> None:
     cameras = scenes.three_cameras().cameras
     point = forward_intersection(cameras, np.zeros((0, 3, 2)), np.zeros((0, 3, 2, 2)))
     assert point.xyz_m.shape == (0, 3) and point.rms_residual_px.shape == (0,)
+
+
+def test_clicks_that_contradict_each_other_by_their_own_sigma(scenes: Any) -> None:
+    """A tenth of a percent of clicks as good as their sigma is refused at most; of clicks three times as bad many are."""
+    cameras, rng, n = scenes.three_cameras().cameras, np.random.default_rng(7), 4000
+    X = cloud(n)
+    for count in (2, 3):
+        for worse, low, high in ((1.0, 0.0, 0.001), (3.0, 0.1, 1.0)):
+            xy = images(cameras[:count], X) + rng.normal(0, 5.0 * worse, (n, count, 2))
+            share = clicks_contradict(intersect_clicks(cameras[:count], xy, 5.0), 5.0).mean()
+            assert low <= share <= high
+    point = intersect_clicks(cameras[:2], np.full((1, 2, 2), np.nan))
+    assert clicks_contradict(point).tolist() == [True], "no rays, no point"
+
+
+def test_the_view_to_look_at_first(scenes: Any) -> None:
+    cameras, X = scenes.three_cameras().cameras, cloud(1)
+    for k in range(3):
+        xy = images(cameras, X)[0]
+        xy[k] += (30.0, 40.0)
+        assert doubtful_view(cameras, xy) == k
