@@ -84,15 +84,20 @@ class CurvatureCorrection:
         good = np.isfinite(xy).all(axis=1) & (len(self.field.cell) > 0)
         if not good.any():
             return good, np.ones((0, count)), np.zeros((0, count), dtype=np.int64)
-        k = min(count, len(self.field.cell))
-        distance, near = self._tree.query(self.field.grid.rows.to_frame(xy[good]), k=k)
-        return good, distance.reshape(-1, k), near.reshape(-1, k)
+        return good, *nearest_points(self._tree, self.field.grid.rows.to_frame(xy[good]), count)
 
     def corrected(self, match: Matches, template: np.ndarray) -> Matches:
         """Matches in this frame without b of (2); `template` (N, 3) is the local surface where the templates were cut."""
         scale = np.array([1.0, self.field.grid.rows.step])
         b = turning_bias(match.shape * scale[:, None] / scale, template, self.slopes(match.xy)) / scale
         return replace(match, xy=match.xy - b, covariance=match.covariance + REMAINING_PART**2 * b[:, :, None] * b[:, None])
+
+
+def nearest_points(tree: cKDTree, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and rows (N, k) of the points in a tree nearest to places (N, 2): `count`, or all if there are fewer."""
+    k = min(count, tree.n)
+    distance, near = tree.query(at, k=k)
+    return distance.reshape(-1, k), near.reshape(-1, k)
 
 
 def turning_bias(A: np.ndarray, template: np.ndarray, slopes: np.ndarray) -> np.ndarray:

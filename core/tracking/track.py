@@ -24,7 +24,7 @@ from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import FrameImages, MeasuredFrame, load_images
 from ..take.take import Footage
-from .curvature_correction import NEAREST_POINTS, CurvatureCorrection
+from .curvature_correction import NEAREST_POINTS, CurvatureCorrection, nearest_points
 from .lost_points import Guide, LostPoints, none_lost
 from .published_step import STEPS
 from .settings import TrackingSettings, TrackStatus
@@ -67,8 +67,7 @@ def on_surface(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, vi
     camera, to_frame = view.cameras[view.reference], field.grid.rows.to_frame
     at = to_frame(tracked.xy[:, view.reference])
     ray, depth = camera.rays(at), camera.to_camera(tracked.xyz_m)[:, 2]
-    distance, near = cKDTree(to_frame(field.xy[:, view.reference])).query(at, k=min(NEAREST_POINTS, len(field.cell)))
-    distance, near = distance.reshape(len(at), -1), near.reshape(len(at), -1)
+    distance, near = nearest_points(cKDTree(to_frame(field.xy[:, view.reference])), at, NEAREST_POINTS)
     slope = np.einsum("nki,ni->nk", cloud.normals[near], ray)  # negative: towards the camera
     facing = -slope[:, 0] / np.linalg.norm(ray, axis=1)
     met = np.einsum("nki,nki->nk", cloud.normals[near], cloud.xyz_m[near] - camera.centre_m) / np.minimum(slope, -MIN_FACING)
