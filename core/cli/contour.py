@@ -36,7 +36,7 @@ from ..tracking.contour import (
 from ..tracking.point_tables import read_polygon
 from .arguments import frame_range, overrides
 
-ALGORITHM = "contours 3"  # part of the checkpoints' keys: raise it when the same input gives other numbers
+ALGORITHM = "contours 4"  # part of the checkpoints' keys: raise it when the same input gives other numbers
 BACKGROUND_MEDIANS = 4.0  # smallest difference from the background, in units of its median over the image
 MIN_DIFFERENCE = 4.0  # the same in grey values; the larger limit counts
 DIFFERENCE_BLUR_PX = 1.5  # of differences and ratios to the background

@@ -33,7 +33,7 @@ from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from ..take.take import Footage, footage_frames
 from .cloud import OCCLUDED, PointCloud, SurfaceSettings, point_cloud, why_removed
 
-ALGORITHM = "surface 18"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 19"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
 ANY_DEPTH_M = (fg.NEAREST_M, 1e3)
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")  # stored in single precision
