@@ -14,7 +14,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.intersection import CLICK_SIGMA_PX, MOST_MISS_SIGMAS
 from tricap.core.matching.proposals import where_rays_meet
-from tricap.core.run import pipeline
+from tricap.core.run import take_run
 from tricap.core.run.stages import stage_keys
 from tricap.core.take.clicked_points import clicked_point
 from tricap.core.take.take import Footage, open_take, read_take
@@ -51,7 +51,7 @@ def test_raising_the_knob_accepts_a_click_and_lowering_it_refuses_it(tmp_path: P
     at = footage.take.seeds.joints["elbow.R"]
 
     def begin(overrides: Any = None) -> None:
-        with pipeline.open_run(folder, tmp_path / "out", overrides):
+        with take_run.open_run(folder, tmp_path / "out", overrides):
             pass
 
     assert refused(begin) != accepted
@@ -75,6 +75,6 @@ def test_clicked_surface_is_measured_again_with_another_sigma(tmp_path: Path, sc
     """How far the depth about a clicked surface point is swept depends on it; nothing of the surface does for clicked joints."""
     for line, again in (("[seeds]\nsurface = [{}]", True), ('[seeds.joints]\n"elbow.R" = {}', False)):
         footage = [opened(scenes, tmp_path / f"{again} {sigma}", line, sigma) for sigma in (5.0, 8.0)]
-        settings = pipeline.settings_of({}, {}, "take.toml")
+        settings = take_run.settings_of({}, {}, "take.toml")
         keys = [stage_keys(replace(footage[0], click_sigma_px=f.click_sigma_px), settings, tmp_path) for f in footage]
         assert (keys[0]["measure"] != keys[1]["measure"]) == again
