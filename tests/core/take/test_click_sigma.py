@@ -48,7 +48,7 @@ def refused(what: Any) -> bool:
 def test_raising_the_knob_accepts_a_click_and_lowering_it_refuses_it(tmp_path: Path, scenes: Any, sigma_px: float, accepted: bool) -> None:
     footage = opened(scenes, tmp_path / "take", '[seeds.joints]\n"elbow.R" = {}', sigma_px)
     folder, cameras = footage.take.folder, footage.rig.cameras
-    at = footage.take.seeds.joints["elbow.R"]
+    at = footage.take.clicks.joints["elbow.R"]
 
     def begin(overrides: Any = None) -> None:
         with take_run.open_run(folder, tmp_path / "out", overrides):
