@@ -244,12 +244,10 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *,
         InputError: a view without camera or images, views of unequal length, frames or clicks outside the footage.
     """
     rig = read_rig(take.rig_path)
-    cameras = tuple(rig[v.name] for v in take.views)
+    rig = Rig(cameras=tuple(rig[v.name] for v in take.views), metadata=rig.metadata)
     sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
     frames = footage_frames(take, sequences)
-    footage = Footage(
-        take=take, rig=Rig(cameras=cameras, metadata=rig.metadata), sequences=sequences, frames=frames, click_sigma_px=click_sigma_px
-    )
+    footage = Footage(take=take, rig=rig, sequences=sequences, frames=frames, click_sigma_px=click_sigma_px)
     _check_clicks(footage)
     return footage
 
