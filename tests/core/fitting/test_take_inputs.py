@@ -160,7 +160,7 @@ def test_bad_files_are_refused(tmp_path) -> None:
         ("{", "no JSON"),
         ("[1]", "no known kind"),
         ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "x, y, confidence"),
-        ('{"people": []}', "nobody"),
+        ('{"people": []}', "no person"),
         ('{"people": [{"pose_keypoints_2d": [1, 2, 1]}]}', "no known layout"),
         ('[{"image_id": 1, "keypoints": "abc"}]', "x, y, confidence"),
     ):
