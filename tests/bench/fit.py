@@ -1,10 +1,10 @@
-"""The fit: speed of a whole body, and its solver beside scipy's on one problem, all in one run.
+"""The fit: speed of a whole body, and its solver against scipy's on one problem, all in one run.
 
     python dev.py bench fit [--json FILE]
 
 The scene is the model's own surface seen from the front, with 1 mm noise: 48 DOF, 57 balls, 4,000 points a frame, some 3,300 after
-thinning. All of them are in the adjustment of the whole sequence; from frame to frame, where a start for it is all that is wanted, no more
-than `frame_to_frame.MOST_POINTS` (1,000) of them are adjusted. Times are CPU times.
+thinning. All of them are in the adjustment of the whole sequence; from frame to frame, which only needs to find a start for it, no more
+than `pose_tracking.MOST_POINTS` (1,000) of them are adjusted. Times are CPU times.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 
 POINTS, NOISE_M, FPS = 4000, 0.001, 25.0
-POSTURES = 5  # whose median is told beside scipy
+POSES = 5  # whose median is compared with scipy's
 MOST, EQUAL = 60, 1.01  # steps; the cost that counts as reached, over the worse of what both end with
 
 
@@ -130,8 +130,8 @@ def fit_times(frames: int, settings: FitSettings) -> dict[str, float]:
     }
 
 
-def beside_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
-    """One frame's posture from 0.05 rad off: our solver, and scipy's with 2-point differences and with our Jacobian, on the same points.
+def against_scipy(settings: FitSettings, seed: int) -> dict[str, float]:
+    """One frame's pose from 0.05 rad off: our solver, and scipy's with 2-point differences and with our Jacobian, on the same points.
 
     `…_s` is until each ends, wherever that is; `…_equal_s` until the cost that both reach, `…_equal_times` that over ours.
     """
@@ -288,13 +288,13 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     settings = FitSettings()
-    postures = [beside_scipy(settings, seed) for seed in range(1, 1 + POSTURES)]
+    poses = [against_scipy(settings, seed) for seed in range(1, 1 + POSES)]
     result = {
         "sequence": [fit_times(frames, settings) for frames in (10, 40)],
-        "one_frame": {key: float(np.median([row[key] for row in postures])) for key in postures[0]},
+        "one_frame": {key: float(np.median([row[key] for row in poses])) for key in poses[0]},
         "ablation": [*ablation(), *of_muscles()],
     }
-    for row in (*result["sequence"], *postures, result["one_frame"]):
+    for row in (*result["sequence"], *poses, result["one_frame"]):
         print("  ".join(f"{key} {value:.4g}" for key, value in row.items()))
     for row in result["ablation"]:
         print("  ".join(f"{value:<34}" if key == "with" else f"{key} {value:6.2f}" for key, value in row.items()))

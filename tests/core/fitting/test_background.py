@@ -29,7 +29,7 @@ def test_nothing_of_a_moving_arm_is_empty(tmp_path: Path) -> None:
             assert distance is not None and 0.2 < (distance > 0).mean() < 0.9
             at = np.floor(camera.project(truth["vertices_m"][t][seen[t]]) / STEP_PX).astype(int)
             assert (distance[at[:, 1], at[:, 0]] > 0).mean() < 0.01
-    assert find_background(footage, clouds[:4], Monitor()) == []  # too few to tell what stands still
+    assert find_background(footage, clouds[:4], Monitor()) == []  # too few to find what stands still
     assert views[0].of_frame(99) is None
 
 

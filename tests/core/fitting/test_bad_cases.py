@@ -29,7 +29,7 @@ def _given(scene, **changes) -> FitInput:
 
 
 def _near(cloud, a: np.ndarray, b: np.ndarray) -> SimpleNamespace:
-    """The points of a cloud that are beside the segment from a to b."""
+    """The points of a cloud that are near the segment from a to b."""
     axis = (b - a) / np.linalg.norm(b - a)
     along = (cloud.xyz_m - a) @ axis / np.linalg.norm(b - a)
     keep = (along > 0.05) & (along < 0.9)
@@ -76,7 +76,7 @@ def test_a_straight_limb_stays_within_its_sigmas(make_scene) -> None:
     assert np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2).mean() < 0.01
 
 
-def test_a_second_person_beside_the_first_does_not_matter(make_scene) -> None:
+def test_a_second_person_next_to_the_first_does_not_matter(make_scene) -> None:
     scene = make_scene(frames=3, seed=4)
     alone = fit_sequence(_given(scene), SETTINGS)
     for t, c in enumerate(scene.clouds):

@@ -1,4 +1,4 @@
-"""What is believed of bone lengths: clicked ones are free, the others follow the person's size and the model's proportions."""
+"""The prior of bone lengths: clicked ones are free, the others follow the person's size and the model's proportions."""
 
 import numpy as np
 import pytest
@@ -27,15 +27,15 @@ def _located(model) -> np.ndarray:
     return np.isin(model.skeleton.joint_names, CLICKED)
 
 
-def _believed(model) -> tuple[dict[str, int], Proportions]:
+def _prior(model) -> tuple[dict[str, int], Proportions]:
     names = [bone.name for bone in model.skeleton.bones]
-    believed = proportions(model, default_shape(model).lengths_m, _located(model), 0.15, 0.04)
-    return {name: i for i, name in enumerate(names)}, believed
+    prior = proportions(model, default_shape(model).lengths_m, _located(model), 0.15, 0.04)
+    return {name: i for i, name in enumerate(names)}, prior
 
 
-def _told(believed: Proportions, rows: list[int], by: float) -> tuple[np.ndarray, np.ndarray]:
+def _updated(prior: Proportions, rows: list[int], by: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean change and sigma (B,) of all lengths' logarithms when those of some bones are seen to be `by` larger."""
-    K = believed.covariance
+    K = prior.covariance
     gain = K[:, rows] @ np.linalg.inv(K[np.ix_(rows, rows)])
     return gain @ np.full(len(rows), by), np.sqrt(np.maximum(np.diag(K - gain @ K[rows]), 0.0))
 
@@ -50,31 +50,31 @@ def test_bones_between_clicks_are_chains_and_those_beyond_are_none(full) -> None
 
 
 def test_what_nobody_clicked_follows_the_size_that_the_clicked_limbs_have(full) -> None:
-    at, believed = _believed(full)
+    at, prior = _prior(full)
     limbs = [at[f"{bone}.{side}"] for bone in ("thigh", "shin", "upper_arm", "forearm") for side in "LR"]
-    change, sigma = _told(believed, limbs, 0.08)
+    change, sigma = _updated(prior, limbs, 0.08)
     assert 0.04 < change[at["head"]] < 0.08 and abs(change[at["head"]] - change[at["hand.R"]]) < 1e-12
     assert 0.04 < sigma[at["head"]] < 0.06  # its own 4 %, and what is left open of the size
 
 
 def test_one_clicked_bone_does_not_pull_the_others(full) -> None:
-    at, believed = _believed(full)
-    change, _ = _told(believed, [at["forearm.R"]], -0.12)
+    at, prior = _prior(full)
+    change, _ = _updated(prior, [at["forearm.R"]], -0.12)
     assert abs(change[at["head"]]) < 0.03
-    assert np.sqrt(believed.covariance[at["forearm.R"], at["forearm.R"]]) > 0.13  # what was clicked is free
+    assert np.sqrt(prior.covariance[at["forearm.R"], at["forearm.R"]]) > 0.13  # what was clicked is free
 
 
 def test_a_chain_shares_what_its_ends_say_and_a_short_one_is_held(full) -> None:
-    at, believed = _believed(full)
-    change, _ = _told(believed, [at["chest"]], 0.10)
+    at, prior = _prior(full)
+    change, _ = _updated(prior, [at["chest"]], 0.10)
     assert change[at["spine"]] > 0.08 and change[at["pelvis"]] > 0.08  # the three are seen as one length
-    free = {bone: believed.covariance[at[bone], at[bone]] for bone in ("shoulder.R", "hip.R", "thigh.R")}
+    free = {bone: prior.covariance[at[bone], at[bone]] for bone in ("shoulder.R", "hip.R", "thigh.R")}
     assert free["hip.R"] < free["shoulder.R"] < free["thigh.R"]  # the shoulder's chain is collarbone and shoulder
 
 
 def test_a_neck_is_as_long_as_the_heads_surface_says_and_the_head_keeps_its_size(full) -> None:
-    at, believed = _believed(full)
-    K, rows = believed.covariance, np.array([at["neck"], at["head"]])
+    at, prior = _prior(full)
+    K, rows = prior.covariance, np.array([at["neck"], at["head"]])
     lower = default_shape(full).lengths_m[rows]  # the crown is seen 40 mm lower than proportions have it
     gain = K[:, rows] @ lower / (lower @ K[np.ix_(rows, rows)] @ lower)
     change = -0.04 * gain
@@ -124,5 +124,5 @@ def test_clicks_that_scatter_along_the_view_do_not_lengthen_the_person(full, sma
 def test_a_head_that_is_seen_too_long_makes_no_other_person_of_one_whose_joints_were_clicked(full) -> None:
     names, lengths = [bone.name for bone in full.skeleton.bones], default_shape(full).lengths_m
     at = [names.index(name) for name in ("head", "hand.R")]
-    told = [_told(proportions(full, lengths, _located(full), 0.15, 0.01, sigma), at[:1], 0.15)[0][at[1]] for sigma in (0.02, 0.07)]
-    assert told[0] < 0.13 < told[1]
+    changes = [_updated(proportions(full, lengths, _located(full), 0.15, 0.01, sigma), at[:1], 0.15)[0][at[1]] for sigma in (0.02, 0.07)]
+    assert changes[0] < 0.13 < changes[1]

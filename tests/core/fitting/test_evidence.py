@@ -224,7 +224,7 @@ def test_outlines_make_a_thick_arm_thick(make_scene) -> None:
 
 
 def test_a_standing_foot_keeps_its_height(make_scene) -> None:
-    """A leg whose foot stands in the first half and swings in the second; a noisy start says when, and its height is held."""
+    """A leg whose foot stands in the first half and swings in the second; a noisy start shows when, and its height is constrained."""
     time_s, rng = np.arange(30) / 30, np.random.default_rng(0)
     names = ("hip.R", "knee.R", "ankle.R", "toe.R")
     joints = np.zeros((30, 4, 3))

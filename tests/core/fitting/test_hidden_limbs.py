@@ -116,10 +116,10 @@ def test_a_shin_that_has_somebody_elses_points_is_found_where_its_own_are(standi
     found = reacquired_poses(fit, both, folded, vector)
     true, was, now = (joint_positions(shape.skeleton, shape.lengths_m, m)["ankle.L"] for m in (straight, folded, found[-1]))
     assert np.linalg.norm(was - true) > 0.4 and np.linalg.norm(now - true) < 0.08
-    assert not reacquired_poses(fit, with_other(points_of(shape, straight, seen)), folded, vector)  # nothing says that it is elsewhere
+    assert not reacquired_poses(fit, with_other(points_of(shape, straight, seen)), folded, vector)  # nothing shows that it is elsewhere
 
 
-def test_points_are_looked_for_as_far_as_a_limb_may_have_swung(standing) -> None:
+def test_points_take_part_as_far_as_a_limb_may_have_swung(standing) -> None:
     fit, shape, before = standing
     bent = before.copy()
     bent[shape.skeleton.layout["elbow.R flexion"]] = np.radians(120.0)

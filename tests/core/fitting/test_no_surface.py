@@ -1,4 +1,4 @@
-"""Recordings whose surface cannot be measured: a blank scene in which an arm is known by keypoints or by its outlines."""
+"""Recordings whose surface cannot be measured: a blank scene with an arm that has only keypoints or outlines."""
 
 import json
 from pathlib import Path

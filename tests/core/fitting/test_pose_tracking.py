@@ -1,4 +1,4 @@
-"""A fit that was stopped goes on from what it kept, and ends with the same bytes."""
+"""A stopped fit resumes from its checkpoints, with the same bytes in the end."""
 
 import gc
 from dataclasses import replace
@@ -52,23 +52,23 @@ def given(make_scene, monkeypatch: pytest.MonkeyPatch) -> FitInput:
     )
 
 
-def test_a_stopped_fit_goes_on_with_the_same_bytes(given: FitInput, tmp_path: Path) -> None:
+def test_a_stopped_fit_resumes_with_the_same_bytes(given: FitInput, tmp_path: Path) -> None:
     """Stopped on the way to the end, and on the way back to the beginning."""
     whole = arrays(fit_sequence(given, SETTINGS))
     for stopped_at, left in ((4, 5), (7, 1)):
-        goes_on(given, tmp_path / str(stopped_at), stopped_at, left, whole)
+        resumes(given, tmp_path / str(stopped_at), stopped_at, left, whole)
 
 
-def goes_on(given: FitInput, folder: Path, stopped_at: int, left: int, whole: dict[str, bytes]) -> None:
-    kept = FitCheckpoints(Results(folder), "key")
+def resumes(given: FitInput, folder: Path, stopped_at: int, left: int, whole: dict[str, bytes]) -> None:
+    checkpoints = FitCheckpoints(Results(folder), "key")
     with pytest.raises(Cancelled):
-        fit_sequence(given, SETTINGS, Stopper(stopped_at), kept)
+        fit_sequence(given, SETTINGS, Stopper(stopped_at), checkpoints)
     monitor = Stopper()
-    assert arrays(fit_sequence(given, SETTINGS, monitor, kept)) == whole
+    assert arrays(fit_sequence(given, SETTINGS, monitor, checkpoints)) == whole
     assert monitor.frames == left
 
 
-def test_what_was_kept_of_another_take_is_not_used(given: FitInput, tmp_path: Path) -> None:
+def test_checkpoints_of_another_take_are_not_used(given: FitInput, tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
         fit_sequence(given, SETTINGS, Stopper(6), FitCheckpoints(Results(tmp_path / "out"), "key"))
     monitor = Stopper(0)
@@ -78,7 +78,7 @@ def test_what_was_kept_of_another_take_is_not_used(given: FitInput, tmp_path: Pa
 
 
 class StoppedStretches(Monitor):
-    """Notes what is begun of an adjustment in stretches, and stops the fit where the n-th is begun."""
+    """Notes each part of an adjustment in stretches as it begins, and stops the fit when the n-th begins."""
 
     def __init__(self, at: int | None = None) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class StoppedStretches(Monitor):
 
 
 @pytest.mark.parametrize("balls", ["three", pytest.param("complete", marks=pytest.mark.slow)])
-def test_a_fit_in_stretches_goes_on_with_the_next(given: FitInput, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, balls: str) -> None:
+def test_a_fit_in_stretches_resumes_with_the_next(given: FitInput, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, balls: str) -> None:
     """Stopped after the shape, and after the second of three stretches."""
     for module in (sequence, long_sequence):
         monkeypatch.setattr(module, "AT_ONCE", 3)
@@ -109,27 +109,27 @@ def test_a_fit_in_stretches_goes_on_with_the_next(given: FitInput, tmp_path: Pat
     whole = arrays(fit_sequence(given, settings, monitor := StoppedStretches()))
     assert monitor.begun == ["shape", "1 of 3", "2 of 3", "3 of 3"]
     for stopped_at in (1, 3):
-        kept = FitCheckpoints(Results(tmp_path / str(stopped_at)), "key")
+        checkpoints = FitCheckpoints(Results(tmp_path / str(stopped_at)), "key")
         with pytest.raises(Cancelled):
-            fit_sequence(given, settings, StoppedStretches(stopped_at), kept)
-        assert arrays(fit_sequence(given, settings, again := StoppedStretches(), kept)) == whole
+            fit_sequence(given, settings, StoppedStretches(stopped_at), checkpoints)
+        assert arrays(fit_sequence(given, settings, again := StoppedStretches(), checkpoints)) == whole
         assert again.begun == monitor.begun[stopped_at:]
 
 
-def test_what_stretches_handed_over_is_let_go(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is as large as a stretch's covariances: a long fit would need twice the memory."""
-    scene, held, adjusted = make_scene(frames=21, click=9), list[int](), sequence._stretch
+def test_marginal_priors_of_earlier_stretches_are_released(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are as large as a stretch's covariances: a long fit would need twice the memory."""
+    scene, alive, adjusted = make_scene(frames=21, click=9), list[int](), sequence._stretch
     for module in (sequence, long_sequence):
         monkeypatch.setattr(module, "AT_ONCE", 3)
     monkeypatch.setattr(long_sequence, "MARGIN", 2)
 
     def counted(*given: object) -> object:
         gc.collect()
-        held.append(sum(isinstance(thing, MarginalPrior) for thing in gc.get_objects()))
+        alive.append(sum(isinstance(thing, MarginalPrior) for thing in gc.get_objects()))
         return adjusted(*given)
 
     monkeypatch.setattr(sequence, "_stretch", counted)
     given = FitInput(rig=scene.rig, model=scene.model, clouds=scene.clouds, clicks={9: scene.clicks}, click_frame=9, time_s=scene.time_s)
     fit_sequence(given, replace(SETTINGS, sequence_steps=1))
-    assert len(held) == 7
-    assert max(held) == 4  # the last that was handed over ahead, and the last back: to the adjustment, and to covariances
+    assert len(alive) == 7
+    assert max(alive) == 4  # the last one ahead, and the last one back: for the adjustment, and for covariances

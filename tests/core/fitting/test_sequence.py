@@ -1,6 +1,6 @@
-"""The whole fit on a synthetic arm with known truth: accuracy, honesty of the sigmas, convergence, symmetry, and bad input.
+"""The whole fit on a synthetic arm with known truth: accuracy, calibrated sigmas, convergence, symmetry, and bad input.
 
-Bounds are those of the project's plan (a simulation with 3 mm one-sided noise gave 2.2 mm and 0.6°); what was measured stands beside each.
+Bounds are those of the project's plan (a simulation with 3 mm one-sided noise gave 2.2 mm and 0.6°); the measured value is next to each.
 """
 
 from dataclasses import replace
@@ -82,7 +82,7 @@ def test_gross_points_hardly_matter(make_scene) -> None:
 
 
 @pytest.mark.slow
-def test_sigmas_are_honest(make_scene) -> None:
+def test_sigmas_are_calibrated(make_scene) -> None:
     z_joints, z_dofs = [], []
     for seed in range(40):
         scene = make_scene(seed=seed, click_px=0.0)
@@ -224,11 +224,11 @@ def test_cancelling_stops_the_fit(make_scene) -> None:
 
 
 class _Heard(Monitor):
-    """What was told, and how many adjustments and searches were made since the last word."""
+    """The reported progress, and the number of adjustments and searches since the last report."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__()
-        self.told: list[tuple[str, float]] = []
+        self.reported: list[tuple[str, float]] = []
         self.most, self.since = 0, 0
         for module, name in ((solver, "linearise"), (hidden_limbs, "_poses")):
             monkeypatch.setattr(module, name, self._counted(getattr(module, name)))
@@ -243,13 +243,13 @@ class _Heard(Monitor):
 
     def step(self, stage: str, done: float, total: float) -> None:
         self.since = 0
-        self.told.append((stage, done / total))
+        self.reported.append((stage, done / total))
         super().step(stage, done, total)
 
 
 @pytest.mark.parametrize("method", ["joint", "alternating"])
-def test_every_step_of_the_click_frame_is_told_and_can_be_stopped(make_scene, monkeypatch, method: str) -> None:
-    """A whole body's click frame can take a minute: a word comes before every adjustment of it, and the bar never goes back."""
+def test_every_step_of_the_click_frame_is_reported_and_can_be_stopped(make_scene, monkeypatch, method: str) -> None:
+    """A whole body's click frame can take a minute: each of its adjustments is reported first, and the bar never goes back."""
     scene = make_scene(frames=2, seed=1, points=80)
     monkeypatch.setattr(click_frame, "OTHERS_AROUND", 1)
     monkeypatch.setattr(click_frame, "LARGEST_SIGMA0", 0.0)  # all other starts are tried too
@@ -257,9 +257,9 @@ def test_every_step_of_the_click_frame_is_told_and_can_be_stopped(make_scene, mo
     monkeypatch.setattr(hidden_limbs, "_unexplained", lambda fit, points, state, limb: np.arange(40))
     monitor = _Heard(monkeypatch)
     fit_sequence(_given(scene), replace(KNOWN, method=method), monitor)
-    parts = [part for stage, part in monitor.told if stage == "fit the click frame"]
+    parts = [part for stage, part in monitor.reported if stage == "fit the click frame"]
     assert len(set(parts)) > 40 and np.diff(parts).min() >= 0 and np.diff(parts).max() < 0.2 and parts[-1] > 0.9
-    assert monitor.most < 8  # the posture of the clicks alone takes a few, quick ones
+    assert monitor.most < 8  # the pose of the clicks alone takes a few, quick ones
 
 
 def test_a_stop_is_obeyed_within_a_frame(make_scene, monkeypatch) -> None:

@@ -1,4 +1,4 @@
-"""After the fit: rings that nothing proves are evened out; what was measured, lengths, and a body's own proportions stay."""
+"""Post-fit smoothing: rings that no measurement supports disappear; measured radii, lengths, and a body's own proportions stay."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def with_a_ring(parameters: ShapeParameters) -> tuple[np.ndarray, np.ndarray]:
     return vector, rows
 
 
-def test_a_ring_is_evened_out_as_far_as_it_was_not_measured(parameters: ShapeParameters) -> None:
+def test_a_ring_is_smoothed_as_far_as_it_was_not_measured(parameters: ShapeParameters) -> None:
     vector, rows = with_a_ring(parameters)
     for sigma, low, high in ((0.005, 0.99, 1.0), (1.0, 0.0, 0.3)):
         found, covariance = smooth_radii(parameters, vector, sigma**2 * np.eye(len(vector)), SIGMA)
@@ -42,7 +42,7 @@ def test_a_body_thicker_all_along_or_towards_its_ends_stays_as_it_is(parameters:
     np.testing.assert_allclose(found, vector, atol=1e-12)
 
 
-def test_lengths_stay_even_where_they_are_seen_with_the_radii(parameters: ShapeParameters) -> None:
+def test_lengths_stay_even_where_they_are_correlated_with_the_radii(parameters: ShapeParameters) -> None:
     vector, rows = with_a_ring(parameters)
     J = np.random.default_rng(3).normal(size=(2 * len(vector), len(vector)))
     found, _ = smooth_radii(parameters, vector, np.linalg.inv(J.T @ J), SIGMA)

@@ -29,7 +29,7 @@ def test_shares_follow_distances_normals_and_the_spread() -> None:
     assert (1 - lost.sum(axis=1) > OUTLIERS[0]).all()
 
 
-def test_a_good_posture_decides_as_the_hard_segmentation(make_scene) -> None:
+def test_a_good_pose_decides_as_the_hard_segmentation(make_scene) -> None:
     scene = make_scene(noise=0.001, points=400)
     parameters, cloud = ShapeParameters(scene.shape), scene.clouds[0]
     points = CloudPoints(frame=0, xyz_m=cloud.xyz_m, normals=cloud.normals, sigma_m=np.full(len(cloud.xyz_m), 0.001))

@@ -1,4 +1,4 @@
-"""A long recording is adjusted in stretches: as good as at once, with sigmas as honest, and nothing is kept of a stretch but its result."""
+"""A long recording is adjusted in stretches: as good as at once, with calibrated sigmas; only the result of a stretch stays in memory."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.00
 
 @pytest.mark.slow
 def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three stretches, of which two hand over to the left and to the right; what tracks tell of a twist reaches all of them."""
+    """Three stretches, with marginal priors to the left and to the right; what tracks contribute to a twist reaches all of them."""
     scene = make_scene(frames=24, seed=2)
     given = FitInput(
         rig=scene.rig,

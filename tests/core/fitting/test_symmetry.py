@@ -1,4 +1,4 @@
-"""How alike both sides of a person are believed to be."""
+"""The prior that both sides of a person are alike."""
 
 from dataclasses import replace
 

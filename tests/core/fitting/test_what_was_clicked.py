@@ -1,4 +1,4 @@
-"""Clicks in further frames are kept, mend the frames about them, and it is told when they are not kept."""
+"""Clicks in further frames: the fit follows them, they correct the frames around them, and a warning names those it does not follow."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def projected(scene: Scene, frame: int, *joints: str) -> dict:
 
 
 @pytest.mark.parametrize(("shoulder", "elbow"), [(-75, 45), (-110, 60), (60, -60)])
-def test_a_limb_that_took_another_way_is_mended_by_a_click_after_it_and_before_it(make_scene, shoulder: int, elbow: int) -> None:
+def test_a_limb_that_went_wrong_is_corrected_by_a_click_after_it_and_before_it(make_scene, shoulder: int, elbow: int) -> None:
     scene = make_scene(frames=9, seed=1)
     layout = scene.shape.skeleton.layout
     for t in range(3, 9):  # at once far from where it was, with a quarter of the points
@@ -36,9 +36,9 @@ def test_a_limb_that_took_another_way_is_mended_by_a_click_after_it_and_before_i
     for clicks in ({0: scene.clicks}, {0: scene.clicks, 6: projected(scene, 6, "elbow.R", "wrist.R")}):
         fit = fit_sequence(given_of(scene, clicks), SETTINGS)
         errors.append(np.linalg.norm(fit.motion.joints_m[:, 2] - scene.joints_m[:, 2], axis=1))
-    assert (errors[0][4:] > 0.15).all(), "or there is nothing to mend"
+    assert (errors[0][4:] > 0.15).all(), "or there is nothing to correct"
     assert errors[1][6] < 0.01
-    assert errors[1][4] < 0.19 and (errors[1][[5, 7, 8]] < 0.04).all()  # frame 3 is beside those that stay on the other way
+    assert errors[1][4] < 0.19 and (errors[1][[5, 7, 8]] < 0.04).all()  # frame 3 is next to those that stay wrong
 
 
 def test_joints_that_do_not_lie_where_they_were_clicked_are_told(make_scene) -> None:
