@@ -30,7 +30,7 @@ class Correct:
         """Go modal."""
         area = context.area
         if area is None or canvas.clip_of(area) is None:
-            self.report({"ERROR"}, "Press this in the sidebar of a Clip Editor that shows a view; Open the Views opens one for each view.")  # type: ignore[attr-defined]
+            self.report({"ERROR"}, "Press this in the sidebar of a Clip Editor that shows a view; Open Views opens one for each view.")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         get_session().file.correcting = True
         show_status(context, self.hint)

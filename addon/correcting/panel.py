@@ -57,7 +57,7 @@ class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
             row.operator("tricap.remove_correction", text="", icon="REMOVE").index = -1
             self._draw_active(layout, correcting)
             sentence(layout, context, "They take effect when the outdated steps run again:", "INFO")
-            layout.operator("tricap.run", icon="FF", text="Do Everything That Is Missing")
+            layout.operator("tricap.run", icon="FF", text="Run Remaining Steps")
 
     def _draw_active(self, layout: bpy.types.UILayout, correcting: TricapCorrecting) -> None:
         if 0 <= correcting.active < len(correcting.corrections) and correcting.corrections[correcting.active].kind == "region":

@@ -14,6 +14,14 @@ ICONS = {
     Status.STALE: "FILE_REFRESH",
     Status.FAILED: "ERROR",
 }
+LABELS = {
+    Status.EMPTY: "not ready",
+    Status.READY: "ready",
+    Status.RUNNING: "running",
+    Status.DONE: "done",
+    Status.STALE: "out of date",
+    Status.FAILED: "failed",
+}
 
 
 class TRICAP_UL_views(bpy.types.UIList):
@@ -49,7 +57,7 @@ class TRICAP_PT_main(TricapPanel, bpy.types.Panel):
         header.label(text=f"{STEPS.index(step) + 1}  {TITLES[STEPS.index(step)]}", icon=ICONS[Status.READY if is_next else state.status])
         right = header.row()
         right.alignment, right.alert = "RIGHT", state.status in (Status.FAILED, Status.STALE)
-        right.label(text=f"{'next' if is_next else state.status} ")
+        right.label(text=f"{'next' if is_next else LABELS[state.status]} ")
         if body is None:
             return
         column = body.column()

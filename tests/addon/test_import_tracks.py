@@ -82,7 +82,7 @@ def test_undo_and_what_is_refused(blender: ModuleType, empty: ModuleType, files:
     (tmp_path / "none.csv").write_text("frame,point,x,y\n1,a,b,c\n")
     for changed, said in (
         ({"points": str(tmp_path / "other.csv")}, "“ear”"),
-        ({"filepath": str(tmp_path / "none.csv")}, "no table of 2-D"),
+        ({"filepath": str(tmp_path / "none.csv")}, "not a table of 2-D"),
         ({"filepath": str(tmp_path / "gone.csv")}, "Cannot read"),
         ({"footage": str(tmp_path / "gone.mp4")}, "missing"),
     ):

@@ -59,7 +59,7 @@ def test_a_file_with_footage_is_left_alone(blender: ModuleType, small: ModuleTyp
     from bl_ext.user_default.tricap.addon import project
 
     project.open_take(blender.context.scene, tmp_path / "mine")
-    with pytest.raises(RuntimeError, match="footage of its own"):
+    with pytest.raises(RuntimeError, match="already has footage"):
         blender.ops.tricap.load_sample()
     assert Path(blender.context.scene.tricap.take) == tmp_path / "mine"
 

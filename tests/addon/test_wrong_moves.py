@@ -220,7 +220,8 @@ def test_nothing_to_retarget_onto_or_to_export(scene: ModuleType, tmp_path: Path
     refused(lambda: scene.ops.tricap.retarget(), "as the target")
     scene.context.scene.tricap_retarget.target = scene.data.objects["Body"]
     refused(lambda: scene.ops.tricap.retarget(), "both source and target")
-    refused(lambda: scene.ops.tricap.export(kind="bvh", filepath=str(tmp_path / "a.bvh"), out=str(tmp_path / "none")), "no motion", "none")
+    nowhere = {"filepath": str(tmp_path / "a.bvh"), "out": str(tmp_path / "none")}
+    refused(lambda: scene.ops.tricap.export(kind="bvh", **nowhere), "no file or folder", "none")
     refused(lambda: scene.ops.tricap.export(kind="bvh"), "Choose the file")
 
 
