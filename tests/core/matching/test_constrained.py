@@ -75,7 +75,7 @@ def plane(surfaces: ModuleType) -> Scene:
 
 @pytest.mark.parametrize("row_step", [1, 2])
 def test_warp_is_the_projection_of_the_surface(surfaces: ModuleType, row_step: int) -> None:
-    """Every pixel of a patch lands where the camera sees its point of the surface; what is left is distortion's own curvature."""
+    """Every pixel of a patch lands where the camera projects its point of the surface; the rest is the curvature of the distortion."""
     rig, rows = surfaces.cameras(), RowGrid(row_step, row_step - 1)
     xy = np.array([[100.0, 60.0 / row_step], [200.0, 150.0 / row_step]])
     theta = np.array([[0.7, 2e-3, -1e-3, 2e-5, -1e-5, 3e-5], [0.72, -1e-3, 2e-3, 1e-5, 2e-5, 1e-5]])
@@ -90,7 +90,7 @@ def test_warp_is_the_projection_of_the_surface(surfaces: ModuleType, row_step: i
 
 
 def test_derivatives_of_the_epipolar_geometry(surfaces: ModuleType) -> None:
-    """∂x/∂w and A of the patch's middle against differences."""
+    """∂x/∂w and A of the patch's centre against differences."""
     rig, rows, step = surfaces.cameras(), RowGrid(2, 1), 1e-5
     xy, theta = np.array([[120.0, 50.0]]), np.array([[0.71, 3e-3, -2e-3]])
 
@@ -165,8 +165,8 @@ def test_object_space_finds_the_plane_and_knows_its_error(surfaces: ModuleType, 
     assert abs(np.mean(np.concatenate(bias))) < 0.01
 
 
-def test_beliefs_that_are_better_than_their_weight(plane: Scene) -> None:
-    """Curvatures that are known to be right, though they take part with a wide sigma: the depth is as sure as it is."""
+def test_priors_whose_errors_are_smaller_than_their_sigmas(plane: Scene) -> None:
+    """Curvatures that are exact but have a wide sigma: the sigma of the depth is calibrated."""
     sigma = np.tile([np.inf, 5e-4, 5e-4, 5e-6, 5e-6, 5e-6], (len(plane.xy), 1))
     z = []
     for error in (None, 0.01 * sigma):
@@ -177,7 +177,7 @@ def test_beliefs_that_are_better_than_their_weight(plane: Scene) -> None:
     assert z[0] < 0.9 < z[1] < 1.2
 
 
-def test_collinearity_holds_the_rays_together(plane: Scene) -> None:
+def test_collinearity_makes_the_rays_meet(plane: Scene) -> None:
     """With σ_c = 10 px the images are free, with 0.001 px their rays meet; well-textured depths agree within their sigma."""
     scene, rows = plane, RowGrid()
     lines = [Epipolar(scene.rig[1], scene.rig[k], rows, scene.xy).centre(scene.theta[:, :3]) for k in (0, 2)]
@@ -194,7 +194,7 @@ def test_collinearity_holds_the_rays_together(plane: Scene) -> None:
 
 
 def test_curvature_removes_the_flattening(surfaces: ModuleType) -> None:
-    """On a cylinder a plane is measured too deep; with curvatures known to be there it is not."""
+    """On a cylinder a plane is measured too deep; with a prior of curvature it is not."""
     scene = Scene(surfaces, surfaces.cylinder(0.06), "strong")
     settings, sigma = replace(SETTINGS, patch_px=17), np.array([np.inf, 4e-4, 4e-4, 4e-5, 4e-5, 4e-5])
     biases = []
@@ -210,7 +210,7 @@ def test_curvature_removes_the_flattening(surfaces: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("kind", ["strong", "weak"])
-def test_constraints_earn_their_place(surfaces: ModuleType, kind: str) -> None:
+def test_constraints_reduce_the_error(surfaces: ModuleType, kind: str) -> None:
     scene = Scene(surfaces, surfaces.cylinder(0.06), kind)
     field = scene.grown()
     rms = {}
@@ -226,8 +226,8 @@ def test_constraints_earn_their_place(surfaces: ModuleType, kind: str) -> None:
 
 @pytest.mark.slow
 def test_a_rig_that_is_half_a_pixel_off_still_helps(surfaces: ModuleType) -> None:
-    """The outer views look 0.55 px too high and too low, where calibration was not good or the person moved between exposures. What the
-    pieces of surface hold together counts for more: measured 0.86 mm RMS, 1.27 mm without constraint."""
+    """The outer views are 0.55 px too high and too low, as after a poor calibration or a movement between exposures. The constraint
+    by pieces of surface outweighs this: measured 0.86 mm RMS, 1.27 mm without."""
     scene, rms, residual = Scene(surfaces, surfaces.cylinder(0.15), "weak"), {}, {}
     for k, up in ((0, 1.0), (2, -1.0)):
         camera, turn = scene.rig[k], rotation_from_vector(np.array([up * 0.55 / surfaces.FOCAL_PX, 0.0, 0.0]))
@@ -244,7 +244,7 @@ def test_a_rig_that_is_half_a_pixel_off_still_helps(surfaces: ModuleType) -> Non
 
 
 def test_an_outline_moves_points_across_the_ray(surfaces: ModuleType) -> None:
-    """Neighbours on one side only: what that costs is hardly said of a surface that faces the camera, and in full of one seen edge-on."""
+    """Neighbours on one side only: hardly any covariance is added across a surface that faces the camera, and all of it edge-on."""
     base, w, grid = surfaces.cameras()[1], np.array([0.5]), template_grid((80, 100), RowGrid(), 4)
     ray = base.rays(np.array([[40.0, 200.0]]))
     facing = ray[0] / np.linalg.norm(ray[0])
@@ -263,7 +263,7 @@ def test_an_outline_moves_points_across_the_ray(surfaces: ModuleType) -> None:
 
 
 def test_points_on_which_two_ways_of_matching_disagree_are_rejected(surfaces: ModuleType) -> None:
-    """At an outline the unconstrained patch settles on a mixture of two surfaces; here such points are made."""
+    """At an outline the unconstrained patch settles on a mixture of two surfaces; such points are simulated."""
     scene = Scene(surfaces, surfaces.cylinder(0.06), "strong")
     field = scene.grown()
     kept = constrain(field, scene.views, SETTINGS, foreground=EVERYWHERE, monitor=Monitor())
@@ -294,7 +294,7 @@ def edge(surfaces: ModuleType, behind_m: float = 0.03) -> Any:
 
 
 def test_points_between_two_surfaces_are_left_out(surfaces: ModuleType) -> None:
-    """Along the edge of something nearer, patches hold both surfaces; their points lie between them, and their middles tell."""
+    """Along the edge of something nearer, patches cover both surfaces; their points lie between them, and fail the occlusion check."""
     scene = Scene(surfaces, edge(surfaces), "strong")
     field = scene.grown()
 

@@ -1,4 +1,4 @@
-"""Least squares matching, measured: bias, scatter against the Cramér–Rao bound, reported sigma against scatter, warps, and refusals.
+"""Least squares matching, measured: bias, scatter against the Cramér–Rao bound, reported sigma against scatter, warps, and limits.
 
 The images are band-limited speckle shifted exactly in the Fourier domain, so that the truth has no interpolation in it.
 """
@@ -257,7 +257,7 @@ def test_rows_never_shift_and_failures_keep_theirs() -> None:
 
 
 def test_unlike_speckle_is_not_matched() -> None:
-    """Patches that have nothing in common: the limits of one match alone let few through (the rays must still meet)."""
+    """Patches without common texture: the limits of one match alone accept few (the rays must still meet)."""
     xy = points()
     found = [find(noisy_pair(1.5, 1.0, (0, 0), i)[0], noisy_pair(1.5, 1.0, (0, 0), i + 50)[0], xy, MatchingSettings()).ok for i in range(5)]
     assert np.mean(found) < 0.02  # measured 0.009; 0.003 to 0.019 of 324
@@ -277,7 +277,7 @@ def test_cancelling_stops_within_a_chunk() -> None:
 
 
 def test_smoothing_helps_weak_texture_and_its_sigma_allows_for_it() -> None:
-    """Skin-like: texture of 3 px, contrast 10, noise 2. Raw 0.24 px, smoothed 0.13 px by simulation (SCIENCE §4)."""
+    """Skin-like: texture of 3 px, contrast 10, noise 2. Simulated scatter: raw 0.24 px, smoothed 0.13 px."""
     errors, z = {0.0: [], 1.0: []}, []
     for seed in range(3):
         spectrum, random = speckle(3.0, seed) / 2, np.random.default_rng(50 + seed)
@@ -307,7 +307,7 @@ def test_without_its_texture_a_patch_is_its_middle() -> None:
 
 @pytest.mark.parametrize(("noise", "most_iterations"), [(1.0, 1.2), (2.0, 1.4)])
 def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float, most_iterations: float) -> None:
-    """From starts a third of a pixel off or a few hundredths, against what many iterations end at; sigmas are those of the end."""
+    """From starts a third of a pixel off, or a few hundredths, against the result of many iterations and its sigmas."""
     a, b = noisy_pair(1.5, noise, (0.3, -0.2), 0)
     xy = points()
     off = np.random.default_rng(4).standard_normal(xy.shape)
@@ -326,7 +326,7 @@ def test_an_iteration_is_spared_only_where_it_would_change_nothing(noise: float,
 
 
 def test_images_searched_together_or_alone_and_prepared_or_not_give_the_same() -> None:
-    """One patch's result is its own: it does not depend on what is matched beside it. 1400 points are several pieces."""
+    """The result of a patch does not depend on the other patches. 1400 points are several pieces."""
     random = np.random.default_rng(2)
     (a, b), again = (SplineImage(g) for g in noisy_pair(1.5, 2.0, (0.4, -0.3), 0)), SplineImage(noisy_pair(1.5, 2.0, (0, 0), 0)[1])
     xy = random.uniform(20, SIZE - 20, (1400, 2))
@@ -348,7 +348,7 @@ def test_images_searched_together_or_alone_and_prepared_or_not_give_the_same() -
             assert np.allclose(other.covariance[good], together[k].covariance[rows][good], rtol=1e-3)
 
 
-def test_patches_about_whole_pixels_are_those_that_a_look_up_finds() -> None:
+def test_patches_about_whole_pixels_are_those_by_interpolation() -> None:
     image, half = SplineImage(noisy_pair(1.5, 2.0, (0, 0), 0)[0]), (6, 3)
     xy = np.array([[8, 5], [150, 120], [SIZE - 9, SIZE - 6]])
     upright = np.tile(np.eye(2), (3, 1, 1))

@@ -1,4 +1,4 @@
-"""Weak texture without its shape: nearer to the truth and fewer lost than with all parameters; texture that can tell keeps them."""
+"""Weak texture without shape parameters: smaller errors and fewer failures than with all; strong texture keeps all parameters."""
 
 from dataclasses import replace
 

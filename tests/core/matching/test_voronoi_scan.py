@@ -1,4 +1,4 @@
-"""The published scan: regions, directions, retries, holes, the filter, and the same surface as the growth."""
+"""The published scan: regions, directions, retries, holes, the filter, and the same surface as region growing."""
 
 from dataclasses import replace
 from types import ModuleType
@@ -56,7 +56,7 @@ def test_two_seeds_cover_the_surface(scene) -> None:
 
 
 def test_search_images_are_independent(scene) -> None:
-    """A search image without content costs its own matches, and so the triplets; the other's scan goes on."""
+    """A search image without content loses its own matches, and so all points; the other's scan is complete."""
     _, _, views, grid, seeds = scene
     blind = replace(views, images=[*views.images[:2], SplineImage(np.full(views.images[2].shape, 80.0))])
     field = voronoi_scan(blind, grid, seeds, MatchingSettings(), GrowingSettings(), foreground=EVERYWHERE, monitor=Monitor())

@@ -96,7 +96,7 @@ def test_curvature_correction_halves_the_bias_of_a_cylinder(tmp_path: Path, scen
 
 
 def test_a_rounder_bodys_sigma_tells_what_is_left(tmp_path: Path, scenes: Any) -> None:
-    """Radius 120 mm: measured −1.0 mm without and −0.05 mm with the correction (medians); the sigma holds half of what was corrected."""
+    """Radius 120 mm: measured −1.0 mm without and −0.05 mm with the correction (medians); the sigma contains half of the correction."""
     cylinder = scenes.Body(radius_m=0.120, half_m=(1.0, 0.2))
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[cylinder]], noise=1.0)
     (m,) = scenes.measure(take, tmp_path / "out")
@@ -143,7 +143,7 @@ def test_mirrored_pictures_give_the_mirrored_cloud(tmp_path: Path, scenes: Any) 
 
 
 def test_nothing_is_measured_on_what_has_no_texture(tmp_path: Path, scenes: Any) -> None:
-    """A textured plane before a bare wall: the cloud ends at the plane, but for patches that hang over its edge."""
+    """A textured plane before a bare wall: the cloud ends at the plane, except for patches that hang over its edge."""
     plane = scenes.Body(half_m=(0.12, 0.12))
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[plane]], noise=1.0)
     (m,) = scenes.measure(take, tmp_path / "out")
@@ -162,7 +162,7 @@ def test_clouds_and_fields_of_nothing(scenes: Any) -> None:
 
 
 def test_each_filter_says_what_it_took(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
-    """Points moved off a plane disagree with it; a corner that is cut off is a small island; a small limit lets it stand."""
+    """Points moved off a plane disagree with it; a corner that is cut off is a small island; with a small limit it remains."""
     footage = open_take(read_take(plane_take))
     field, ref = scenes.measure(plane_take, tmp_path / "out")[0].field, footage.take.reference
     camera = footage.rig.cameras[ref]
@@ -180,7 +180,7 @@ def test_each_filter_says_what_it_took(plane_take: Path, tmp_path: Path, scenes:
 
 
 def test_neighbours_that_scatter_make_a_point_less_sure(tmp_path: Path, scenes: Any) -> None:
-    """Depths of a plane, whose noise its covariances tell: nothing is added. Rougher than that: what is more counts, along the ray."""
+    """A plane with the noise of its covariances: nothing is added. Rougher than that: the excess is added along the ray."""
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[scenes.Body()]], noise=0.5)
     (m,) = scenes.measure(take, tmp_path / "out")
     camera, sigma_m, random = scenes.three_cameras().cameras[1], 1e-3, np.random.default_rng(0)

@@ -138,7 +138,7 @@ def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any
 
 
 def test_a_checkpoint_belongs_to_the_frame_that_showed_the_room(tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames 0:2 first and then all of them, into one folder, must give what all of them give at once. What is found of the room differs
+    """Frames 0:2 first and then all of them, into one folder, must give what all of them give at once. The background planes differ
     with the frame that frame 0 is compared with; here the number of seeds that stand still is written into a plane far away."""
     monkeypatch.setattr(measure.fg, "background_planes", lambda static, every, eyes: np.array([[0, 0, -1.0, -20.0 - len(static)]]))
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), moving_body_before_a_wall(scenes, 4))
@@ -190,7 +190,7 @@ def test_one_clicked_seed_is_enough(
 
 
 def test_seeds_follow_the_reference_and_the_settings(tmp_path: Path, scenes: Any) -> None:
-    """`tricap seeds` covers a reference view that is larger than the first view, and looks at enhanced images where they are asked for."""
+    """`tricap seeds` covers a reference view that is larger than the first view, and uses enhanced images where they are set."""
     small, large = scenes.three_cameras(width=120, height=90), scenes.three_cameras()
     rig = Rig(cameras=(small["L"], large["C"], large["R"]))
     footage = open_take(read_take(scenes.write_take(tmp_path / "take", rig, [[scenes.Body()]])))

@@ -1,4 +1,4 @@
-"""Points are measured in the views that see them: a flat view of four costs nothing but its rays, and pairs reach the cloud's file."""
+"""Points are measured in the views that show them: a flat view of four costs nothing but its rays, and pairs reach the cloud's file."""
 
 import shutil
 from pathlib import Path

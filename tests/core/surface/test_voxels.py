@@ -1,4 +1,4 @@
-"""One point for a cube of space: weighted by sigma, on the surface, with an honest sigma; in the written cloud only."""
+"""One point for a cube of space: weighted by sigma, on the surface, with a calibrated sigma; in the written cloud only."""
 
 from pathlib import Path
 
