@@ -119,7 +119,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def register() -> None:
-    """Make `blender --command tricap …` known."""
+    """Register `blender --command tricap …`."""
     import bpy
 
     from .session import get_session
@@ -128,7 +128,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Forget it again."""
+    """Unregister it."""
     import bpy
 
     from .session import get_session

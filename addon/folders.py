@@ -33,8 +33,8 @@ def output_folder(given: str, scene: bpy.types.Scene, take: str = "") -> Path:
     if chosen:
         return absolute(chosen)
     folder = take_folder(take, scene)
-    beside = Path(bpy.data.filepath).parent if bpy.data.filepath else folder.parent
-    return beside / f"{folder.name}_tricap"
+    parent = Path(bpy.data.filepath).parent if bpy.data.filepath else folder.parent
+    return parent / f"{folder.name}_tricap"
 
 
 def check_writable(folder: Path) -> None:

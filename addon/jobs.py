@@ -149,7 +149,7 @@ class JobState(bpy.types.PropertyGroup):
     step: bpy.props.StringProperty(name="Step", get=lambda _: job.step if (job := _watched()) else "")  # type: ignore[valid-type]
 
 
-JobEnded = Callable[[bpy.types.Context, str, str, str], None]  # the step, the error or "", and what was kept when it was stopped or ""
+JobEnded = Callable[[bpy.types.Context, str, str, str], None]  # the step, the error or "", the message of the stop or ""
 
 
 def _watched() -> Job | None:

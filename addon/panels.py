@@ -35,7 +35,7 @@ def wrapped(text: str, width: int) -> list[str]:
 def show_status(context: bpy.types.Context, words: str | None) -> None:
     """Show a text in the status bar of the workspace that is shown, and in no other; None takes ours away."""
     here = context.window.workspace if context.window is not None else context.workspace  # the context's may be the one before
-    shown = get_session().status_workspaces  # Blender keeps a text with each workspace
+    shown = get_session().status_workspaces  # Blender stores a text with each workspace
     for name in shown:
         there = bpy.data.workspaces.get(name)
         if there is not None and there != here:

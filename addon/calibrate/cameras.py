@@ -61,9 +61,9 @@ def add_tracks(clip: bpy.types.MovieClip, xy_px: np.ndarray, size_px: tuple[int,
     """The measured targets (T, 2, 2) as two tracks of the clip; the clip's own frames count from 1."""
     uv = axes.uv_from_pixel(xy_px, size_px)
     for end in range(2):
-        seen = np.flatnonzero(np.isfinite(uv[:, end]).all(axis=1))
-        made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(seen[0]) + 1 if len(seen) else 1)
-        for n in seen:
+        visible = np.flatnonzero(np.isfinite(uv[:, end]).all(axis=1))
+        made = clip.tracking.tracks.new(name=f"Bar end {end + 1}", frame=int(visible[0]) + 1 if len(visible) else 1)
+        for n in visible:
             made.markers.insert_frame(int(n) + 1, co=tuple(uv[n, end]))
 
 

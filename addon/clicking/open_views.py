@@ -43,18 +43,18 @@ class OpenViews(bpy.types.Operator):
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        window, known = context.window, bpy.data.workspaces.get(NAME)
+        window, ours = context.window, bpy.data.workspaces.get(NAME)
         if window is None:
             self.report({"ERROR"}, "Views can only be opened in Blender's window, not in background mode.")
             return {"CANCELLED"}
-        if known is None:
+        if ours is None:
             before = set(bpy.data.workspaces)
             bpy.ops.workspace.duplicate()
-            (known,) = set(bpy.data.workspaces) - before
-            known.name = NAME
-        if window.workspace != known:
-            known[FROM_KEY] = window.workspace.name
-            window.workspace = known
+            (ours,) = set(bpy.data.workspaces) - before
+            ours.name = NAME
+        if window.workspace != ours:
+            ours[FROM_KEY] = window.workspace.name
+            window.workspace = ours
         if self.show != "nothing":
             setattr(context.scene.tricap_overlay, self.show, True)
         if not any(clicks.clicked_frames(clip) for clip in clips):
@@ -79,8 +79,8 @@ class BackToSteps(bpy.types.Operator):
         """Show that workspace; if it was deleted, any other with a 3-D view."""
         others = [w for w in bpy.data.workspaces if w.name != NAME]
         spatial = [w for w in others if any(a.type == "VIEW_3D" for screen in w.screens for a in screen.areas)]
-        known = bpy.data.workspaces.get(context.workspace.get(FROM_KEY, ""))
-        back = known if known in others else next(iter([*spatial, *others]), None)
+        origin = bpy.data.workspaces.get(context.workspace.get(FROM_KEY, ""))
+        back = origin if origin in others else next(iter([*spatial, *others]), None)
         if back is None:
             self.report({"ERROR"}, "There is no other workspace. Add one with the + at the top of the window.")
             return {"CANCELLED"}
@@ -106,8 +106,8 @@ def _waiter(window: bpy.types.Window, clip_names: Sequence[str], *, switches: bo
         if window.workspace.name != NAME:
             return SOON_S
         if not steps:
-            known = [bpy.data.movieclips[name] for name in clip_names if name in bpy.data.movieclips]
-            steps.append(lay_out(window, known, switches=switches))
+            clips = [bpy.data.movieclips[name] for name in clip_names if name in bpy.data.movieclips]
+            steps.append(lay_out(window, clips, switches=switches))
         return SOON_S if next(steps[0], None) else None
 
     return wait

@@ -35,7 +35,7 @@ class StageOperator(JobOperator):
 
 
 def report_run(operator: Any, context: bpy.types.Context, run: take_run.Run) -> None:
-    """Show a run's warnings and its summary, and keep the summary for the panel."""
+    """Show a run's warnings and its summary, and store the summary for the panel."""
     context.scene.tricap.last = str(run)
     for sentence in run.record["warnings"]:
         operator.report({"WARNING"}, sentence)
