@@ -56,7 +56,7 @@ class TRICAP_PT_corrections(ClipPanel, bpy.types.Panel):
             row.template_list("TRICAP_UL_corrections", "", correcting, "corrections", correcting, "active", rows=3)
             row.operator("tricap.remove_correction", text="", icon="REMOVE").index = -1
             self._draw_active(layout, correcting)
-            sentence(layout, context, "They take effect when the outdated steps run again:", "INFO")
+            sentence(layout, context, "They take effect when the stale steps run again:", "INFO")
             layout.operator("tricap.run", icon="FF", text="Run Remaining Steps")
 
     def _draw_active(self, layout: bpy.types.UILayout, correcting: TricapCorrecting) -> None:

@@ -159,7 +159,7 @@ def _optional(path: Path, what: str, read: Callable[[Path], Any], warnings: list
 
 def _motion(path: Path, shape: BodyShape | None, warnings: list[str]) -> MotionTable | None:
     if shape is None and path.is_file():
-        warnings.append(f"No action in the scene: {path.name} needs body.toml beside it.")
+        warnings.append(f"No action in the scene: {path.name} needs body.toml in the same folder.")
         return None
     return _optional(path, "action", lambda file: read_motion(file, shape.skeleton), warnings)
 

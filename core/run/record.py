@@ -46,7 +46,7 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | None) -> dict[str, Any]:
-    """Figures of the measured frames: number, points, residuals, sigma, and how the person was told from the room."""
+    """Figures of the measured frames: number, points, residuals, sigma, and how the person was separated from the background."""
     return {
         "frames": len(summaries),
         "points_per_frame": float(np.mean([f.points for f in summaries])),

@@ -1,7 +1,7 @@
-"""The inputs of each stage, defined once: a run removes, and the panel marks as outdated, exactly the results that a change affects.
+"""The inputs of each stage, defined once: a run removes, and the panel marks as stale, exactly the results that a change affects.
 
 The key of a stage is a digest of everything that its result depends on, including the earlier stages. run.json stores the key with which
-each stage ran; a stage is outdated when its current key differs. Footage enters a key by file names, sizes and modification times (an
+each stage ran; a stage is stale when its current key differs. Footage enters a key by file names, sizes and modification times (an
 export of the same size is another file); checkpoints compare its content.
 """
 
@@ -30,7 +30,7 @@ class StageInput:
 
     settings: tuple[str, ...]  # groups of knobs
     take: Callable[[Footage], Any]  # the parts of take.toml, rig.toml and the footage, as values with a `repr`
-    files: tuple[str, ...]  # results in OUT, which a run removes once they are outdated
+    files: tuple[str, ...]  # results in OUT, which a run removes once they are stale
 
 
 def _measure_input(footage: Footage) -> Any:
