@@ -11,9 +11,9 @@ import numpy as np
 from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.images.sampling import SplineImage
-from ...core.matching.grid import Views
 from ...core.matching.least_squares import MatchingSettings
 from ...core.matching.proposals import Proposal, propose
+from ...core.matching.views import Views
 from ...core.take.take import Footage
 from ..session import get_session
 

@@ -15,21 +15,22 @@ variance (of a first adjustment in which these shifts are free). Where σ_c is l
 is returned as it was matched.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TypeVar
 
 import numpy as np
 
 from ..foundation.progress import Monitor
+from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
-from ..geometry.robust import PolynomialFit
+from ..geometry.robust import PolynomialFit, fit_polynomial
 from .foreground import Foreground
-from .grid import RADIUS_CELLS, TemplateGrid, Views, fit_neighbours, neighbours_of
 from .least_squares import MatchingSettings, MatchStatus
 from .multi_image import MultiImageMatches, MultiImageStarts, match_multi_image
 from .object_space import Epipolar, SurfacePatch, SurfacePrior, SurfaceStarts, match_surface, normal_to, px_per_inverse_metre
 from .patches import monomials, patch_offsets
 from .region_growing import RETRY_SMOOTHING_PX, MatchedField, loosened
+from .views import RADIUS_CELLS, TemplateGrid, Views
 
 WINDOW_EXTRA_PX = 4  # px by which the window is wider than `patch_px`
 WINDOW_SIGMA = 0.38  # sigma of the Gaussian window, in units of `patch_px`
@@ -49,6 +50,7 @@ RAY_SIGMA_PX = 0.01  # px across the ray, on which the point lies by definition:
 MAX_RIG_SIGMA_PX = 1.0  # px; a worse rig does not belong to these images, and up to there its weight decreases
 SAMPLE = 1000  # points from which the rig's quality is estimated
 NEIGHBOUR_NOISE_PX = 0.05  # px: smaller residuals of neighbours have full weight
+LARGEST = 512  # points whose neighbours stay in the cache
 MEDIAN_OF_CHI2 = 0.4549  # of one degree of freedom
 LOOSER_SIGMA0 = 2.0  # times the largest sigma0: a piece of surface that all views and its neighbours determine may fit each view less well
 MAX_STEEPNESS = 5.0  # change of depth per distance across
@@ -86,7 +88,7 @@ def _surface_of(field: MatchedField, views: Views) -> PolynomialFit:
     """The quadric of inverse depth about every cell of the field."""
     w = 1 / views.base.to_camera(field.xyz_m)[:, 2]
     return fit_neighbours(
-        neighbours_of(field.grid, field.cell, field.cell),
+        field.grid.neighbours(field.cell, field.cell),
         field.xy[:, views.reference],
         w,
         field.grid.xy(field.cell),
@@ -94,6 +96,35 @@ def _surface_of(field: MatchedField, views: Views) -> PolynomialFit:
         min_scale=np.full(len(w), NEIGHBOUR_NOISE_PX / px_per_inverse_metre(views)),
         radius_px=RADIUS_CELLS * field.grid.spacing_px,
     )
+
+
+def fit_neighbours(
+    neighbour: np.ndarray, xy: np.ndarray, values: np.ndarray, query_xy: np.ndarray, *, degree: int, min_scale: np.ndarray, radius_px: float
+) -> PolynomialFit:
+    """Fit polynomials about `query_xy` (M, 2) to `values` (N,) at `xy` (N, 2) of the rows `neighbour` (M, m), by Tukey's weights.
+
+    Residuals below `min_scale` (M,) count fully; `radius_px` is the reach of the neighbourhood. Where there is no neighbour,
+    coefficients are zero.
+    """
+
+    def fit(rows: slice) -> PolynomialFit:
+        return _fitted(neighbour[rows], xy, values, query_xy[rows], degree, min_scale[rows], radius_px)
+
+    parts = in_threads(fit, equal_pieces(len(neighbour), LARGEST, LARGEST))
+    return PolynomialFit(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(PolynomialFit)})
+
+
+def _fitted(
+    neighbour: np.ndarray, xy: np.ndarray, values: np.ndarray, query_xy: np.ndarray, degree: int, min_scale: np.ndarray, radius_px: float
+) -> PolynomialFit:
+    valid = neighbour >= 0
+    a, b = np.moveaxis(np.where(valid[..., None], xy[neighbour] - query_xy[:, None], 0.0), -1, 0)
+    z = np.where(valid, values[neighbour], 0.0)
+    base = np.where(valid.any(axis=1), z.sum(axis=1) / np.maximum(valid.sum(axis=1), 1), 0.0)
+    z = z - base[:, None]
+    fit = fit_polynomial(a, b, z, valid, degree=degree, radius=radius_px, min_scale=min_scale)
+    fit.coefficients[:, 0] += base
+    return fit
 
 
 def _object_space(field: MatchedField, views: Views, settings: MatchingSettings, monitor: Monitor, required: int) -> Measured | None:

@@ -20,10 +20,10 @@ import numpy as np
 
 from ..foundation.progress import Monitor
 from ..foundation.threads import equal_pieces, in_threads
-from .grid import Views
 from .least_squares import INSIDE_SHARE, SIGMA0_CONTRAST, MatchingSettings, MatchStatus
 from .object_space import MIN_NOISE, MOST_CONVERGED_PX, SHARED_FROM, inverse_normals, solve_normals, without_noise
 from .patches import TemplatePatches
+from .views import Views
 
 LARGEST = 512  # points of a piece
 NEIGHBOUR_SHIFT_PX = 1.0  # rows' px, sigma of the neighbours' prediction of c_k in (4)

@@ -36,9 +36,9 @@ from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from ..geometry.small_matrices import invert_spd
 from ..images.interlace import RowGrid
-from .grid import Views
 from .least_squares import INSIDE_SHARE, SIGMA0_CONTRAST, MatchingSettings, MatchStatus
 from .patches import TemplatePatches, monomials, pieces
+from .views import Views
 
 LARGEST = 2048  # points of a piece
 SHARED_FROM = 513  # points from which on threads share them

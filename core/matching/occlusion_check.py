@@ -13,11 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from .grid import Views
 from .least_squares import MatchingSettings
 from .object_space import Epipolar, SurfacePrior, SurfaceStarts, match_surface, px_per_inverse_metre
 from .patches import TemplatePatches
 from .region_growing import MatchedField
+from .views import Views
 
 CENTRE_PX = 5  # side of the patch about the point itself
 DEPTH_SIGMA_PX = 0.5  # px in the search view that moves fastest: prior of the centre's depth, by which a mixture may be off

@@ -15,9 +15,9 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.intersection import MOST_MISS_SIGMAS, Intersection, intersect_clicks
-from .grid import Views
 from .least_squares import MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .seeds import approximations_at_depth, sweep_ray
+from .views import Views
 
 CURVE_STEP_PX = 6.0
 NEAREST_M = 0.05  # of the ray, when nothing is known

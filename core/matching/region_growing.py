@@ -20,9 +20,9 @@ from ..foundation.settings import knob
 from ..geometry.camera import Camera
 from ..geometry.intersection import Intersection, forward_intersection
 from .foreground import Foreground
-from .grid import TemplateGrid, Views
 from .least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .seeds import Approximations
+from .views import TemplateGrid, Views
 
 NEIGHBOURS = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
 TEMPLATE_SIGMA_PX = 0.02  # px, of the template point itself, so that the adjustment can move it

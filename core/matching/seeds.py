@@ -21,9 +21,9 @@ from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from ..images.interlace import RowGrid
 from ..images.sampling import SplineImage
-from .grid import TemplateGrid, Views
 from .least_squares import MatchingSettings
 from .patches import patch_offsets
+from .views import TemplateGrid, Views
 
 NEAREST_BASES = 0.8  # nearest depth of the sweep, in lengths of the longest base, where nothing else limits it
 FARTHEST_BASES = 40.0  # farthest depth

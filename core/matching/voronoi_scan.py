@@ -21,18 +21,20 @@ from scipy.spatial import cKDTree
 
 from ..foundation.progress import Monitor
 from ..geometry.intersection import forward_intersection
+from ..geometry.robust import mad_sigma, masked_median
 from ..images.sampling import SplineImage
 from .foreground import Foreground
-from .grid import TemplateGrid, Views, neighbours_of, unlike_neighbours
 from .least_squares import Matches, MatchingSettings, SearchImage, TemplatePoints, match_patches
 from .region_growing import MAX_LIMIT_PX, SEED_MEDIANS, TEMPLATE_SIGMA_PX, GrowingSettings, MatchedField
 from .seeds import Approximations
+from .views import TemplateGrid, Views
 
 HORIZONTAL, VERTICAL = np.array([(-1, 0), (1, 0)]), np.array([(0, -1), (0, 1)])
 AROUND = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy])
 BIGGER_PX = (4, 8)  # px by which patches are larger in the retries
 FILTER_SIGMAS = 3.0  # robust deviations from the neighbours' median at which a point is removed
 FILTER_LEAST = np.array([0.02, 0.02, 0.02, 0.02, 0.3, 0.3])  # least deviation of the four shape parameters, and of the two shifts [px]
+FILTER_NEIGHBOURS = 3  # of a point; one with fewer is not judged
 FILTER_PASSES = 2
 HOLES_CLOSED = 0.002  # closing holes ends when a pass adds less than this part of the matched cells
 
@@ -156,7 +158,7 @@ class _Scan:
 
     def _local_shift(self, cell: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """Parallax (N, 2) less the mean of the predictions (1) from the neighbours."""
-        neighbour = neighbours_of(self._grid, cell, cell, radius=1, itself=False)
+        neighbour = self._grid.neighbours(cell, cell, radius=1, itself=False)
         valid = (neighbour >= 0)[..., None]
         at = self._grid.xy(cell)
         A = self.shape[cell][neighbour] - np.eye(2)
@@ -245,6 +247,22 @@ class _Scan:
         self.centre[cells], self.xy[cells], self.shape[cells] = m.xy[rows], m.transfer_xy[rows], m.shape[rows]
         self.covariance[cells], self.correlation[cells] = m.transfer_covariance[rows], m.correlation[rows]
         self.offset[cells], self.spread[cells] = m.offset[rows], m.spread[rows]
+
+
+def unlike_neighbours(grid: TemplateGrid, cell: np.ndarray, parameters: np.ndarray, *, sigmas: float, least: np.ndarray) -> np.ndarray:
+    """(N,) points one of whose `parameters` (N, Q) differs from its neighbours' median by more than `sigmas` robust deviations.
+
+    `least` (Q,) are the smallest deviations that count as a standard deviation. A point with fewer than three neighbours is not judged.
+    """
+    neighbour = grid.neighbours(cell, cell, itself=False)
+    valid = neighbour >= 0
+    bad = np.zeros(len(cell), dtype=bool)
+    for q in range(parameters.shape[1]):
+        z = np.where(valid, parameters[neighbour, q], np.nan)
+        middle = masked_median(np.nan_to_num(z), valid)
+        deviation = mad_sigma(np.nan_to_num(z) - middle[:, None], 1, valid)
+        bad |= np.abs(parameters[:, q] - middle) > sigmas * np.maximum(deviation, least[q])
+    return bad & (valid.sum(axis=1) >= FILTER_NEIGHBOURS)
 
 
 def _merged(scans: Sequence[_Scan], views: Views, grid: TemplateGrid, growing: GrowingSettings, foreground: Foreground) -> MatchedField:

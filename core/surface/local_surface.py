@@ -15,10 +15,9 @@ import numpy as np
 from ..foundation.threads import equal_pieces, in_threads
 from ..geometry.camera import Camera
 from ..geometry.robust import fit_polynomial
-from ..matching.grid import neighbours_of
 from ..matching.region_growing import MatchedField
+from ..matching.views import RADIUS_CELLS
 
-RADIUS_CELLS = 3
 LARGEST = 512  # points whose neighbours stay in the cache
 MIN_NEIGHBOURS = 8
 MIN_SCALE = 0.15  # of the spacing on the surface: finer scatter than this is not told from the surface's own shape
@@ -60,7 +59,7 @@ def curvatures(field: MatchedField, camera: Camera, reference: int, rows: np.nda
 def _quadrics(field: MatchedField, camera: Camera, reference: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(1) about these rows: coefficients (n, 6), the neighbours' scatter (n,) about it and how many support it (n,)."""
     depth, at = camera.to_camera(field.xyz_m)[:, 2], field.grid.rows.to_frame(field.xy[:, reference])
-    neighbour = neighbours_of(field.grid, field.cell, field.cell[rows], RADIUS_CELLS)
+    neighbour = field.grid.neighbours(field.cell, field.cell[rows])
     spacing_m = field.grid.spacing_px * depth / camera.focal_px
 
     def fit(piece: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -21,11 +21,11 @@ from ..images.sampling import SplineImage
 from ..images.sequence import IMAGE_ENDINGS
 from ..matching import foreground as fg
 from ..matching.constraints import constrain
-from ..matching.grid import TemplateGrid, Views, template_grid
 from ..matching.least_squares import MatchingSettings
 from ..matching.occlusion_check import fails_occlusion_check
 from ..matching.region_growing import GrowingSettings, MatchedField, grow_regions
 from ..matching.seeds import Approximations, sweep_seeds
+from ..matching.views import TemplateGrid, Views, template_grid
 from ..matching.voronoi_scan import voronoi_scan
 from ..results.folder import Results
 from ..take.clicked_points import clicked_depth, with_clicked

@@ -10,9 +10,9 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from ..geometry.intersection import Intersection, clicks_contradict, intersect_clicks
-from ..matching.grid import Views
 from ..matching.least_squares import MatchingSettings
 from ..matching.seeds import Approximations, approximations_at_depth, settled_depths
+from ..matching.views import Views
 from .take import Clicks, Footage
 
 

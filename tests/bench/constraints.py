@@ -22,10 +22,10 @@ from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import constrain
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import Views, template_grid
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.matching.region_growing import GrowingSettings, MatchedField, grow_regions
 from tricap.core.matching.seeds import sweep_seeds
+from tricap.core.matching.views import Views, template_grid
 from tricap.core.surface.cloud import PointCloud, SurfaceSettings, clean_field, point_cloud
 
 GROSS_M = 0.005

@@ -24,11 +24,11 @@ import numpy as np
 from _recordings import Row
 
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.grid import Views
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.matching.object_space import SurfaceStarts, match_surface
 from tricap.core.matching.patches import monomials
 from tricap.core.matching.region_growing import GrowingSettings, MatchedField
+from tricap.core.matching.views import Views
 from tricap.core.surface.cloud import SurfaceSettings
 
 BODIES = {"cylinder 40 mm": surfaces.cylinder(0.04), "sphere 60 mm": surfaces.sphere(0.06)}

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.robust import PolynomialFit
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
 from tricap.core.matching.constraints import OUTLINE_ACROSS_PX, OUTLINE_ALONG_PX, RAY_SIGMA_PX, _model_covariance, _over_outline, constrain
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import NeighbourFit, Views, template_grid
 from tricap.core.matching.least_squares import MatchingSettings, MatchStatus
 from tricap.core.matching.multi_image import MultiImageStarts, match_multi_image
 from tricap.core.matching.object_space import Epipolar, SurfacePrior, SurfaceStarts, match_surface
@@ -21,6 +21,7 @@ from tricap.core.matching.occlusion_check import acceptable, depth_uncertainty, 
 from tricap.core.matching.patches import TemplatePatches, monomials, patch_offsets
 from tricap.core.matching.region_growing import GrowingSettings, MatchedField, grow_regions, rounds_of_larger_patches
 from tricap.core.matching.seeds import sweep_seeds
+from tricap.core.matching.views import Views, template_grid
 
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 SETTINGS = MatchingSettings()
@@ -251,7 +252,7 @@ def test_an_outline_moves_points_across_the_ray(surfaces: ModuleType) -> None:
     edge_on = np.cross(facing, [0.0, 1.0, 0.0]) / np.linalg.norm(np.cross(facing, [0.0, 1.0, 0.0]))
     there = (np.arange(49) % 7 < 4).astype(float)[None]
     half, near, far = (
-        _over_outline(NeighbourFit(coefficients=np.zeros((1, 6)), scatter=np.zeros(1), weights=a), grid, 13)[0]
+        _over_outline(PolynomialFit(coefficients=np.zeros((1, 6)), scatter=np.zeros(1), weights=a), grid, 13)[0]
         for a in (there, np.where(np.arange(49) % 7 < 6, 1.0, 0.0)[None], np.ones((1, 49)))
     )
     assert 0.3 < half < 0.5 and near < 0.1 * half and far == 0.0  # the window hardly reaches the last column

@@ -8,9 +8,9 @@ import pytest
 from tricap.core.geometry.camera import Camera
 from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
-from tricap.core.matching.grid import Views
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.matching.proposals import below_surface, epipolar_curve, propose, where_rays_meet
+from tricap.core.matching.views import Views
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.truth import Truth, read_truth
 from tricap.core.take.take import Footage, open_take, read_take

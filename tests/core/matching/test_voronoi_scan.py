@@ -9,12 +9,13 @@ import pytest
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.images.interlace import RowGrid
 from tricap.core.images.sampling import SplineImage
+from tricap.core.matching.constraints import fit_neighbours
 from tricap.core.matching.foreground import Foreground
-from tricap.core.matching.grid import Views, fit_neighbours, neighbours_of, template_grid, unlike_neighbours
 from tricap.core.matching.least_squares import MatchingSettings
 from tricap.core.matching.region_growing import GrowingSettings
 from tricap.core.matching.seeds import Approximations, approximations_at_depth
-from tricap.core.matching.voronoi_scan import CASES, _Scan, limits_of, voronoi_scan
+from tricap.core.matching.views import Views, template_grid
+from tricap.core.matching.voronoi_scan import CASES, _Scan, limits_of, unlike_neighbours, voronoi_scan
 
 EVERYWHERE = Foreground(depth_range_m=(1.0, 2.0), method="everything")
 
@@ -125,9 +126,7 @@ def test_neighbours_fit_a_quadric_in_spite_of_outliers() -> None:
     z = 3 + 0.02 * x - 0.01 * y + 0.5 * 1e-3 * x * x + 2e-4 * x * y
     noisy = z + np.where(np.random.default_rng(0).random(len(z)) < 0.1, 5.0, 0.0)
     inner = cell[(np.abs(x) < 20) & (np.abs(y) < 20)]
-    fit = fit_neighbours(
-        neighbours_of(grid, cell, inner), xy, noisy, xy[inner], degree=2, min_scale=np.full(len(inner), 0.01), radius_px=12.0
-    )
+    fit = fit_neighbours(grid.neighbours(cell, inner), xy, noisy, xy[inner], degree=2, min_scale=np.full(len(inner), 0.01), radius_px=12.0)
     assert fit.coefficients[:, 0] == pytest.approx(z[inner], abs=2e-3)
     assert fit.coefficients[:, 3] == pytest.approx(1e-3, abs=1e-5)
     assert np.median(fit.support) > 0.8
