@@ -5,7 +5,7 @@ of a bent one would pull its forearm.
 
 A pixel is background when it shows what the view's `background` image in take.toml shows; without such an image, what it shows when no
 measured point is near, or most of the time (`images.background`). A person may stand still most of the time, too: so without the image
-nothing near a measured point is background, nor along clicked limbs where the pixels have not changed since the click.
+nothing near a measured point is background. Nor is anything along clicked limbs where the pixels have not changed since the click.
 """
 
 from collections.abc import Mapping, Sequence

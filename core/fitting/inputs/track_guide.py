@@ -68,6 +68,6 @@ class BodyGuide:
             while len(self._skins) > 1:
                 del self._skins[next(iter(self._skins))]
             skin = body_skin(self._shape, self._motion.values[self._row[frame]])
-            seen = rasterize(self._camera, skin.vertices_m, skin.triangles)
-            self._skins[frame] = skin, seen.image(seen.depth_m, np.inf)
+            raster = rasterize(self._camera, skin.vertices_m, skin.triangles)
+            self._skins[frame] = skin, raster.image(raster.depth_m, np.inf)
         return self._skins[frame]

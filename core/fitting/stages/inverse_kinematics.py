@@ -86,9 +86,9 @@ def coarse_pose(parameters: ShapeParameters, clicks: Clicks) -> np.ndarray:
     turned = len(placed) >= LEAST_TRUNK_JOINTS
     if turned:
         _turn_trunk(skeleton, lengths, clicks.xyz_m, placed, motion)
-    known = placed if turned else np.flatnonzero(clicks.located)[:1].tolist()
-    _shift(skeleton, lengths, clicks.xyz_m, known, motion)
-    return _towards(skeleton, lengths, clicks.xyz_m, motion, trunk if turned else [], known)
+    placed = placed if turned else np.flatnonzero(clicks.located)[:1].tolist()
+    _shift(skeleton, lengths, clicks.xyz_m, placed, motion)
+    return _towards(skeleton, lengths, clicks.xyz_m, motion, trunk if turned else [], placed)
 
 
 def pose_as_clicked(parameters: ShapeParameters, xyz_m: np.ndarray, motion: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -217,7 +217,31 @@ def test_accelerations_equal_differences_of_their_cost() -> None:
     assert not few.diagonal.any() and smooth.cost(motion[:2]) == 0
 
 
-def test_fields_are_let_go_after_their_derivatives_and_found_again() -> None:
+@pytest.mark.parametrize("weights", [False, True])
+def test_the_layout_gives_every_parameter_its_own_column(weights: bool) -> None:
+    layout = _parameters("full", weights).layout
+    bones, balls = np.arange(layout.n_bones), np.arange(layout.n_balls)
+    parts = [np.arange(layout.n_pose), layout.lengths(bones), layout.radii(balls).ravel(), *([layout.weights(balls)] if weights else [])]
+    assert np.array_equal(np.concatenate(parts), np.arange(layout.size()))
+    assert layout.size(shape=False) == layout.n_pose and layout.size() == layout.n_pose + len(layout)
+    for group, columns in (("lengths", parts[1]), ("radii", parts[2]), ("shape", np.concatenate(parts[1:]))):
+        assert np.array_equal(layout.columns(group), columns)
+    ball, names = 7, layout.names
+    assert [names[c - layout.n_pose].rpartition(" ")[2] for c in layout.radii(balls[ball : ball + 1])[0]] == ["x", "z"]
+
+
+def test_columns_of_two_frames_are_those_of_each_and_of_the_shape() -> None:
+    layout, dofs, bones = _parameters("arm.R").layout, np.array([0, 4]), np.array([1])
+    both, D = layout.two_frames(dofs, bones, shape=True), layout.n_pose
+    poses, shape = layout.split(both, frames=2)
+    assert poses.tolist() == [0, 4, D, D + 4] and shape.tolist() == [1]
+    for second, own in ((False, [True, True, False, False, True]), (True, [False, False, True, True, True])):
+        mine, columns = layout.one_of_two(both, second)
+        assert mine.tolist() == own and columns.tolist() == [0, 4, int(layout.lengths(bones)[0])]
+    assert layout.two_frames(dofs, bones, shape=False).tolist() == [0, 4, D, D + 4]
+
+
+def test_fields_are_released_after_their_derivatives_and_evaluated_again() -> None:
     rng = np.random.default_rng(6)
     parameters = _parameters("arm.R")
     state = parameters.state(_motion(parameters, rng), parameters.vector())
