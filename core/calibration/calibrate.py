@@ -246,6 +246,7 @@ def calibrate_rig(
         "predicted_error_m": quality.predicted.rms_m,
         "held_out_length_rms_m": quality.held_out.rms_m,
         "verdict": judged.sentence,
+        **({} if judged.light is verdict.Light.GREEN else {"light": judged.light.value}),
         "floor": world.on_floor,
     }
     cameras = calibration.network.cameras(observations.names, observations.size_px)

@@ -6,6 +6,7 @@ Pictures of a calibration: where each image was covered and what residuals are l
 """
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import cv2
@@ -26,11 +27,22 @@ MIRROR = 4.0
 MIN_FITTING = 0.4
 
 
+class Light(StrEnum):
+    """How good a calibration is."""
+
+    GREEN = "green"
+    YELLOW = "yellow"
+    RED = "red"
+
+
+WORDS = {Light.GREEN: "Good", Light.YELLOW: "Usable", Light.RED: "Poor"}
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Verdict:
-    """`light` is green, yellow or red; `sentence` says what to expect, `advice` what to do better."""
+    """`sentence` is the accuracy to expect, `advice` what would improve it most."""
 
-    light: str
+    light: Light
     sentence: str
     advice: str
 
@@ -87,16 +99,15 @@ def refuse_if_undetermined(calibration: Calibration, quality: Quality) -> None:
 def judge(calibration: Calibration, quality: Quality) -> Verdict:
     """The verdict in one sentence, from the predicted error over the volume."""
     error, distance = quality.predicted.rms_m, _distance(calibration)
-    light = "green" if error <= GOOD_PART * distance else "yellow" if error <= FAIR_PART * distance else "red"
-    word = {"green": "Good", "yellow": "Usable", "red": "Poor"}[light]
+    light = Light.GREEN if error <= GOOD_PART * distance else Light.YELLOW if error <= FAIR_PART * distance else Light.RED
     size = " × ".join(f"{s:.1f}" for s in np.ptp(quality.box_m, axis=0))
     tested = quality.held_out
     sentence = (
-        f"{word}: the cameras place points within {_mm(error)} (RMS) in the {size} m in which the bar was waved, {distance:.1f} m away; "
-        f"the length of bars left out is right within {_mm(tested.rms_m)}."
+        f"{WORDS[light]}: the cameras place points within {_mm(error)} (RMS) in the {size} m in which the bar was waved, "
+        f"{distance:.1f} m away; the length of bars left out is right within {_mm(tested.rms_m)}."
     )
     if not calibration.converged:
-        light, sentence = "red", f"The adjustment did not settle, so its figures may be too good. {sentence}"
+        light, sentence = Light.RED, f"The adjustment did not settle, so its figures may be too good. {sentence}"
     return Verdict(light=light, sentence=sentence, advice=advice(calibration, quality))
 
 
@@ -172,7 +183,7 @@ def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dic
     return {
         "format": "tricap-calibration",
         "version": 1,
-        "light": verdict.light,
+        "light": verdict.light.value,
         "verdict": verdict.sentence,
         "advice": verdict.advice,
         "bar_length_m": observations.length_m,

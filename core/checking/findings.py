@@ -1,16 +1,58 @@
-"""A finding: one thing that is wrong or doubtful, what it comes from, and what to do about it."""
+"""A finding: one fault or doubt, its cause, and what to do about it."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from typing import Any
+
+
+class Cause(StrEnum):
+    """The kind of fault, for programs; the values are those of `tricap check --json`."""
+
+    BLANK_VIEW = "blank view"
+    CLICKS = "clicks"
+    COVERAGE = "coverage"
+    DARK = "dark"
+    FEW_CLICKS = "few clicks"
+    FILES_MISSING = "files missing"
+    FOREIGN_RIG = "foreign rig"
+    FRAMES_MISSING = "frames missing"
+    FROZEN_VIEW = "frozen view"
+    IDENTICAL_VIEWS = "identical views"
+    INPUT = "input"
+    LARGE_SIGMA = "large sigma"
+    NO_CLICKS = "no clicks"
+    NO_COMMON_VIEW = "no common view"
+    NO_MATCHES = "nothing in common"
+    NO_TEXTURE = "no texture"
+    NOT_FINISHED = "not finished"
+    NOT_SYNCHRONISED = "out of step"
+    ODD_CAMERA = "odd camera"
+    ONE_CAMERA = "one camera"
+    OVEREXPOSED = "overexposed"
+    POOR_CALIBRATION = "poor calibration"
+    RAYS_MISS = "rays miss"
+    REPEATED_FRAMES = "repeated frames"
+    ROLLING_SHUTTER = "rolling shutter"
+    SAME_PLACE = "same place"
+    SEED_ON_BACKGROUND = "seed on the background"
+    STALE_CALIBRATION = "stale calibration"
+    STALE_RESULT = "stale result"
+    SWAPPED_VIEWS = "swapped views"
+    UNIT = "unit"
+    VARIABLE_FRAME_RATE = "variable frame rate"
+    WARNING = "warning"
+    WEAK_TEXTURE = "weak texture"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Finding:
-    """`cause` names the kind of fault in a word or two, for machines; `sentence` and `advice` are for people. What is certain is wrong and
-    spoils the measurement; what is not certain deserves a look. `figures` carries the numbers with their units in their names."""
+    """`sentence` and `advice` are for people. A `certain` finding is an error that spoils the measurement; others deserve a look.
 
-    cause: str
+    `figures` holds the numbers, with their units in their names.
+    """
+
+    cause: Cause
     sentence: str
     advice: str
     certain: bool = True
@@ -22,22 +64,22 @@ class Finding:
 
     def to_table(self) -> dict[str, Any]:
         """As a plain table, for JSON."""
-        return asdict(self) | {"figures": dict(self.figures)}
+        return asdict(self) | {"cause": self.cause.value, "figures": dict(self.figures)}
 
 
-def wrong(cause: str, sentence: str, advice: str = "", **figures: Any) -> Finding:
-    """Something that spoils the measurement."""
+def wrong(cause: Cause, sentence: str, advice: str = "", **figures: Any) -> Finding:
+    """An error that spoils the measurement."""
     return Finding(cause=cause, sentence=sentence, advice=advice, figures=figures)
 
 
-def doubtful(cause: str, sentence: str, advice: str = "", **figures: Any) -> Finding:
+def doubtful(cause: Cause, sentence: str, advice: str = "", **figures: Any) -> Finding:
     """Something that deserves a look."""
     return Finding(cause=cause, sentence=sentence, advice=advice, certain=False, figures=figures)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Checked:
-    """All that was found about one take, rig or result; `figures` says what was looked at and how good it is where nothing is wrong."""
+    """The findings about one take, rig or result; `figures` are the quantities examined, also where nothing is wrong."""
 
     subject: str
     kind: str
@@ -45,8 +87,8 @@ class Checked:
     figures: Mapping[str, Any]
 
     def lines(self) -> list[str]:
-        """The findings, or that there are none."""
-        return [f"{self.subject}: nothing to complain about."] if not self.findings else [str(f) for f in self.findings]
+        """The findings, or a line that there are none."""
+        return [f"{self.subject}: no problems found."] if not self.findings else [str(f) for f in self.findings]
 
     def to_table(self) -> dict[str, Any]:
         """As a plain table, for JSON."""

@@ -1,4 +1,4 @@
-"""One look at the footage, frame after frame in a small size: how much moves when, how bright it is, and what repeats."""
+"""One pass over the reduced footage: how much moves in each frame, how bright it is, and which frames repeat."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,19 @@ from ..foundation.progress import Monitor
 from ..images.retime import Recent
 from ..images.sequence import Movie
 from ..take.take import Footage
-from .findings import Finding, doubtful, wrong
+from .findings import Cause, Finding, doubtful, wrong
 
-LONGEST = 240  # frames; a longer take is looked at from its middle
-WIDTH_PX = 96
-BLANK_SPREAD, DARK, WHITE, WHITE_SHARE = 1.0, 24.0, 253.0, 0.03  # grey values; share of the pixels
+LONGEST = 240  # frames; of a longer take its middle is used
+WIDTH_PX = 96  # of the reduced images
+BLANK_SPREAD = 1.0  # standard deviation of the grey values of a blank image
+DARK = 24.0  # grey value: the brightest parts of a dark image are below
+WHITE = 253.0  # grey value of an overexposed pixel
+WHITE_SHARE = 0.03  # of the pixels
+BRIGHT_PERCENTILE = 98  # of the grey values: the brightest parts
 BEGINNING = 50  # frames of a movie
 UNEVEN = 0.6  # frames; time stamps are rounded
-REPEATED = 0.2  # of a view's usual motion energy, noise included
+REPEATED = 0.2  # of a view's usual motion energy, which includes the noise
+FEWEST_FRAMES = 4  # for a usual motion energy
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -24,14 +29,14 @@ class Survey:
     """Figures (V, T) of V views in T consecutive frames."""
 
     frames: range
-    energy: np.ndarray  # mean grey difference from the frame before, NaN in the first
+    energy: np.ndarray  # motion energy: mean grey difference from the frame before, NaN in the first
     spread: np.ndarray  # standard deviation of the grey values
     bright: np.ndarray  # 98th percentile of the grey values
-    white: np.ndarray  # share of pixels at the upper end of the range
+    white: np.ndarray  # share of overexposed pixels
 
 
 def survey(footage: Footage, monitor: Monitor) -> Survey:
-    """Look at the frames of a take, at most LONGEST from its middle.
+    """The figures of a take, of at most LONGEST frames from its middle.
 
     Raises:
         InputError: see `Footage.read`.
@@ -43,54 +48,54 @@ def survey(footage: Footage, monitor: Monitor) -> Survey:
     figures = np.full((4, len(footage.sequences), len(frames)), np.nan)
     before: list[np.ndarray] = []
     for t, frame in enumerate(frames):
-        monitor.step("looking at the footage", t, len(frames))
-        pictures = [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
-        small = [_reduced(picture) for picture in pictures]
-        for k, picture in enumerate(pictures):
+        monitor.step("checking the footage", t, len(frames))
+        images = [footage.take.rows_at(frame).rows(image) for image in footage.read(frame)]
+        small = [_reduced(image) for image in images]
+        for k, image in enumerate(images):
             energy = float(np.abs(small[k] - before[k]).mean()) if before else np.nan
-            figures[:, k, t] = energy, small[k].std(), np.percentile(small[k], 98), (picture[::4, ::4] >= WHITE).mean()
+            figures[:, k, t] = energy, small[k].std(), np.percentile(small[k], BRIGHT_PERCENTILE), (image[::4, ::4] >= WHITE).mean()
         before = small
     return Survey(frames=frames, energy=figures[0], spread=figures[1], bright=figures[2], white=figures[3])
 
 
-def _reduced(picture: np.ndarray) -> np.ndarray:
-    width = min(WIDTH_PX, picture.shape[1])
-    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
+def _reduced(image: np.ndarray) -> np.ndarray:
+    width = min(WIDTH_PX, image.shape[1])
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def picture_findings(seen: Survey, names: tuple[str, ...]) -> list[Finding]:
+def picture_findings(figures: Survey, names: tuple[str, ...]) -> list[Finding]:
     """Views that are blank, dark or overexposed, and frames that repeat the frame before."""
-    found = []
+    findings = []
     for k, name in enumerate(names):
-        blank = seen.spread[k] < BLANK_SPREAD
+        blank = figures.spread[k] < BLANK_SPREAD
         if blank.any():
-            found.append(_blank(seen, name, blank))
+            findings.append(_blank(figures, name, blank))
             continue
-        if np.median(seen.bright[k]) < DARK:
-            found.append(
+        if np.median(figures.bright[k]) < DARK:
+            findings.append(
                 doubtful(
-                    "dark",
-                    f"View {name} is very dark: its brightest parts have {np.median(seen.bright[k]):.0f} of 255 grey values.",
-                    "Open the camera's iris, or use footage with more bits a pixel.",
-                    bright_grey=float(np.median(seen.bright[k])),
+                    Cause.DARK,
+                    f"View {name} is very dark: its brightest parts have {np.median(figures.bright[k]):.0f} of 255 grey values.",
+                    "Open the iris of the camera, or use footage with more bits per pixel.",
+                    bright_grey=float(np.median(figures.bright[k])),
                 )
             )
-        if np.median(seen.white[k]) > WHITE_SHARE:
-            found.append(
+        if np.median(figures.white[k]) > WHITE_SHARE:
+            findings.append(
                 doubtful(
-                    "overexposed",
-                    f"{100 * np.median(seen.white[k]):.0f} % of view {name} is white: nothing can be matched there.",
-                    "Close the iris or shorten the exposure, if that is on the person.",
-                    white_share=float(np.median(seen.white[k])),
+                    Cause.OVEREXPOSED,
+                    f"{100 * np.median(figures.white[k]):.0f} % of view {name} is white: nothing can be matched there.",
+                    "Close the iris or shorten the exposure if these parts are on the person.",
+                    white_share=float(np.median(figures.white[k])),
                 )
             )
-    return [*found, *_frozen(seen, names), *_repeated(seen, names)]
+    return [*findings, *_frozen(figures, names), *_repeated(figures, names)]
 
 
 def rate_findings(footage: Footage) -> list[Finding]:
-    """Movies whose frames, as far as they were looked at (or in the first second or two), do not follow each other evenly."""
-    found = []
+    """Movies whose frame rate varies among the frames read so far, or in the first second or two."""
+    findings = []
     for k, (view, sequence) in enumerate(zip(footage.take.views, footage.sequences)):
         movie = sequence.behind if isinstance(sequence, Recent) else sequence
         if not isinstance(movie, Movie):
@@ -100,50 +105,50 @@ def rate_findings(footage: Footage) -> list[Finding]:
             movie.read(beginning - 1)
         uneven = movie.unevenness
         if uneven > UNEVEN:
-            said = f"View {view.name} has a variable frame rate: its frames are up to {uneven:.1f} frames off an even rate."
-            advice = "Convert the movie to a constant frame rate, each frame at its own moment."
-            found.append(wrong("variable frame rate", said, advice, uneven_frames=uneven))
-    return found
+            sentence = f"View {view.name} has a variable frame rate: its frames are up to {uneven:.1f} frames off an even rate."
+            advice = "Convert the movie to a constant frame rate that keeps each frame at its own moment."
+            findings.append(wrong(Cause.VARIABLE_FRAME_RATE, sentence, advice, uneven_frames=uneven))
+    return findings
 
 
-def _blank(seen: Survey, name: str, blank: np.ndarray) -> Finding:
-    first, bright = seen.frames[int(np.argmax(blank))], float(np.median(seen.bright[:, blank]))
-    word = "black" if np.median(seen.bright[:, blank].min(axis=0)) < DARK else "blank"
+def _blank(figures: Survey, name: str, blank: np.ndarray) -> Finding:
+    first, bright = figures.frames[int(np.argmax(blank))], float(np.median(figures.bright[:, blank]))
+    word = "black" if np.median(figures.bright[:, blank].min(axis=0)) < DARK else "blank"
     where = "in every frame" if blank.all() else f"in {int(blank.sum())} of {len(blank)} frames, first in frame {first}"
     return wrong(
-        "blank view",
+        Cause.BLANK_VIEW,
         f"View {name} is {word} {where}.",
-        "Give the view its right footage, or leave those frames out with `frames` in take.toml.",
+        "Give the view the right footage, or leave those frames out with `frames` in take.toml.",
         frames=int(blank.sum()),
         first=first,
         bright_grey=bright,
     )
 
 
-def _frozen(seen: Survey, names: tuple[str, ...]) -> list[Finding]:
-    """Views that show one picture, without even noise, while another view does not."""
-    energy = np.nanmax(seen.energy, axis=1) if len(seen.frames) > 1 else np.zeros(len(names))
+def _frozen(figures: Survey, names: tuple[str, ...]) -> list[Finding]:
+    """Views that repeat one image, noise included, while another view does not."""
+    energy = np.nanmax(figures.energy, axis=1) if len(figures.frames) > 1 else np.zeros(len(names))
     return [frozen_view(name) for name, most in zip(names, energy) if not most > 0] if (energy > 0).any() else []
 
 
 def frozen_view(name: str) -> Finding:
-    """A view that shows one picture again and again."""
-    said = f"View {name} shows the same picture in every frame that was looked at: its camera or its export stood still."
-    return wrong("frozen view", said, "Give the view its right footage, or leave the view out of take.toml.")
+    """A view that repeats one image."""
+    sentence = f"View {name} shows the same image in every frame that was checked: its camera or its export froze."
+    return wrong(Cause.FROZEN_VIEW, sentence, "Give the view the right footage, or leave the view out of take.toml.")
 
 
-def _repeated(seen: Survey, names: tuple[str, ...]) -> list[Finding]:
-    """Frames without even the noise's difference from the frame before: a camera, or a conversion, repeated a picture."""
-    found = []
+def _repeated(figures: Survey, names: tuple[str, ...]) -> list[Finding]:
+    """Frames that differ from the frame before by less than the noise: a camera, or a conversion, repeated an image."""
+    findings = []
     for k, name in enumerate(names):
-        usual = float(np.nanmedian(seen.energy[k])) if len(seen.frames) > 3 else 0.0
+        usual = float(np.nanmedian(figures.energy[k])) if len(figures.frames) >= FEWEST_FRAMES else 0.0
         with np.errstate(invalid="ignore"):
-            same = (seen.energy[k] < REPEATED * usual) & (seen.spread[k] >= BLANK_SPREAD)
+            same = (figures.energy[k] < REPEATED * usual) & (figures.spread[k] >= BLANK_SPREAD)
         if usual > 0 and same.any():
-            first = seen.frames[int(np.argmax(same))]
-            found.append(
+            first = figures.frames[int(np.argmax(same))]
+            findings.append(
                 wrong(
-                    "repeated frames",
+                    Cause.REPEATED_FRAMES,
                     f"View {name} repeats the frame before in {int(same.sum())} of {len(same)} frames, "
                     f"first in frame {first}: the camera dropped frames, or a conversion filled them in.",
                     "Convert the recording again at its own frame rate, or leave those frames out.",
@@ -151,4 +156,4 @@ def _repeated(seen: Survey, names: tuple[str, ...]) -> list[Finding]:
                     first=first,
                 )
             )
-    return found
+    return findings

@@ -1,12 +1,12 @@
 """`tricap check TAKE`: the footage, its timing, its texture, and whether the rig belongs to it.
 
-Clicks that are missing, contradict each other or lie on the room instead of the person.
+Clicks that are missing, contradict each other, or lie on the room instead of the person.
 
-Where the cloth has too little texture to be measured: the sigma that matching could reach at best, before anything is matched.
+Limbs with too little texture to be measured: the best sigma that matching could reach, before anything is matched.
 
     S = Σ ∇f ∇fᵀ − n σ_∇² I ,   σ_px = √2 σ_noise / √λ_min(S)                     (1)
 
-over the pixels of a patch: the Cramér–Rao bound of a shift between two equally noisy pictures, the noise's own gradients taken off.
+over the pixels of a patch: the Cramér–Rao bound of a shift between two equally noisy images, less the gradients of the noise itself.
 """
 
 import math
@@ -27,20 +27,30 @@ from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
 from ..take.take import Footage, Take, open_take, read_take
-from .findings import Checked, Finding, doubtful, wrong
-from .rig_check import ENOUGH, clicked_pairs, geometry_findings, rig_findings, rig_misses, same_views, share, stale_finding, unit_findings
+from .findings import Cause, Checked, Finding, doubtful, wrong
+from .rig_check import (
+    FEWEST_MATCHES,
+    agreeing_share,
+    clicked_pairs,
+    geometry_findings,
+    rig_distances,
+    rig_findings,
+    same_views,
+    stale_finding,
+    unit_findings,
+)
 from .survey import frozen_view, picture_findings, rate_findings, survey
 from .timing import Film, TimeOffset, estimate_offsets
 from .view_matches import match_views
 
-FAR_M = 1.0  # in depth: more than a stretched-out arm reaches from the body
+FAR_M = 1.0  # in depth: more than the reach of a stretched-out arm
 
 LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joints) for side in ("right", "left")
          for limb, joints in (("arm", ("shoulder", "elbow", "wrist")), ("leg", ("hip", "knee", "ankle")))}  # fmt: skip
 
 
 def joint_findings(take: Take) -> list[Finding]:
-    """A body that is wanted and not clicked, or limbs of it: which way a limb goes is what the fit takes from clicks.
+    """A body, or limbs of it, without clicks: clicks decide which way the fit bends a limb.
 
     Raises:
         InputError: there is no such body model.
@@ -51,38 +61,40 @@ def joint_findings(take: Take) -> list[Finding]:
     clicked = {name for frame in (take.clicks, *take.keyframes) for name, at in frame.joints.items() if len(at) > 1}
     advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
     if not clicked:
-        sentence = f"No joint of the body “{take.body_model}” is clicked: there will be surface and tracks, but no body."
-        return [doubtful("no clicks", sentence, advice)]
+        sentence = f"No joint of the body “{take.body_model}” is clicked: the result will have surface and tracks, but no body."
+        return [doubtful(Cause.NO_CLICKS, sentence, advice)]
     bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
     if not bare:
         return []
-    said = ", ".join(bare)
-    return [doubtful("few clicks", f"Fewer than two joints are clicked of: {said}. The fit has to guess where they are.", advice)]
+    sentence = f"Fewer than two joints are clicked of: {', '.join(bare)}. The fit has to guess their pose."
+    return [doubtful(Cause.FEW_CLICKS, sentence, advice)]
 
 
 def seed_findings(footage: Footage) -> list[Finding]:
-    """Clicks without a place in space, far behind the others, or surface seeds on what never moves."""
-    clicks, found, depth = footage.take.clicks, [], dict[str, float]()
+    """Clicks whose rays do not meet, clicks at another depth than the others, and surface seeds on what never moves."""
+    clicks, findings, depth = footage.take.clicks, [], dict[str, float]()
     for name, at in clicks.named:
         try:
             depth[name] = clicked_depth(footage, name, at)
         except InputError as error:
-            found.append(wrong("clicks", str(error)))
+            findings.append(wrong(Cause.CLICKS, str(error)))
     middle = finite_median([*depth.values()], 0.0)
     far = {name: d for name, d in depth.items() if abs(d - middle) > FAR_M}
     for name, d in far.items():
         advice = "Is it on the background, or clicked on different spots in the views? Click it again."
-        found.append(doubtful("clicks", f"The click “{name}” is {abs(d - middle):.1f} m away from the others in depth.", advice, depth_m=d))
-    rest = [i for i in _resting(footage) if f"surface seed {i + 1}" not in far]
-    if rest:
-        said = ", ".join(str(i + 1) for i in rest)
-        advice = "Is it on the background? What is measured is taken from the clicks' depths; click it on the person."
-        found.append(doubtful("seed on the background", f"Surface seed {said} lies on something that never moves.", advice))
-    return found
+        findings.append(
+            doubtful(Cause.CLICKS, f"The click “{name}” is {abs(d - middle):.1f} m away from the others in depth.", advice, depth_m=d)
+        )
+    static = [i for i in _static_seeds(footage) if f"surface seed {i + 1}" not in far]
+    if static:
+        numbers = ", ".join(str(i + 1) for i in static)
+        advice = "Is it on the background? The range of depths that is measured follows the clicks; click it on the person."
+        findings.append(doubtful(Cause.SEED_ON_BACKGROUND, f"Surface seed {numbers} lies on something that never moves.", advice))
+    return findings
 
 
-def _resting(footage: Footage) -> list[int]:
-    """Surface seeds (their numbers from 0) around which the reference picture is the same in the frame furthest in time."""
+def _static_seeds(footage: Footage) -> list[int]:
+    """Surface seeds (their numbers from 0) around which the reference image is the same in the frame furthest in time."""
     take, name = footage.take, footage.take.reference_view
     frame = take.clicks.frame
     clicked = [i for i, at in enumerate(take.clicks.surface) if name in at]
@@ -97,14 +109,18 @@ def _resting(footage: Footage) -> list[int]:
 
 GRADIENT_NOISE = 0.5  # variance of a central difference of noise of variance 1
 LEAST_NOISE = 0.3  # grey values: rounding alone
-POOR_SHARE = 0.5  # of the places of a limb
-ALONG = (0.15, 0.85)  # of a limb, from joint to joint
-SAMPLES = 24
-MOVES = 3.0  # times the noise
+POOR_SHARE = 0.5  # of the positions along a limb
+ALONG = (0.15, 0.85)  # part of a limb, from joint to joint
+SAMPLES = 24  # positions along a limb
+MOVES = 3.0  # times the noise: a pixel that changes by more is moving
+BLUR_PX = 9  # side of the window in which changes are averaged
+FEWEST_MOVING = 50  # pixels
+MOST_MOVING = 5000  # pixels that are evaluated, about
+TEXTURED_SHARE = 1e-3  # of an image without texture, at most
 
 
 def bound_px(grey: np.ndarray, patch_px: int, row_step: int) -> np.ndarray:
-    """Smallest sigma [px] (h, w) of a match at each pixel of the measured rows; inf where the noise is all there is.  (1)"""
+    """Smallest sigma [px] (h, w) of a match at each pixel of the measured rows; inf where there is only noise.  (1)"""
     noise = max(noise_sigma(grey), LEAST_NOISE)
     gx = cv2.filter2D(grey, cv2.CV_32F, np.array([[-0.5, 0.0, 0.5]], np.float32))
     gy = cv2.filter2D(grey, cv2.CV_32F, np.array([[-0.5], [0.0], [0.5]], np.float32))
@@ -117,37 +133,37 @@ def bound_px(grey: np.ndarray, patch_px: int, row_step: int) -> np.ndarray:
 
 
 def texture_findings(footage: Footage, patch_px: int, max_sigma_px: float) -> tuple[list[Finding], dict[str, float]]:
-    """Limbs between clicked joints, or what moves, with too little texture in the reference view; and the median bound [px] of each."""
+    """Limbs between clicked joints, or moving parts, with too little texture in the reference view; and the median bound [px] of each."""
     take, ref = footage.take, footage.take.reference
     frame = take.clicks.frame if take.clicks.frame in footage.frames else footage.frames.start
     grey = take.rows_at(frame).rows(footage.read(frame)[ref])
     bound = bound_px(grey, patch_px, take.rows_at(frame).step)
     view = take.views[ref].name
-    if not np.isfinite(bound).any() or np.mean(bound < max_sigma_px) < 1e-3:
+    if not np.isfinite(bound).any() or np.mean(bound < max_sigma_px) < TEXTURED_SHARE:
         return [
             wrong(
-                "no texture",
+                Cause.NO_TEXTURE,
                 f"View {view} has no texture in frame {frame}: nothing in it can be matched.",
                 "Wear clothes with a fine pattern, and focus the cameras on the person.",
                 frame=frame,
             )
         ], {}
-    places = _limbs(footage, view) or _moving(footage, grey, frame)
-    medians = {name: _median_at(bound, xy) for name, xy in places.items()}
-    found = [
+    parts = _limbs(footage, view) or _moving(footage, grey, frame)
+    medians = {name: _median_at(bound, xy) for name, xy in parts.items()}
+    findings = [
         doubtful(
-            "weak texture",
+            Cause.WEAK_TEXTURE,
             f"The texture of {name} is too poor in view {view}: "
-            + (f"a match there has a sigma of {value:.2g} px at best" if np.isfinite(value) else "it drowns in the noise")
+            + (f"a match there has a sigma of {value:.2g} px at best" if np.isfinite(value) else "it is lost in the noise")
             + f" ({max_sigma_px:g} px is allowed).",
-            "Wear a pattern there, or more light; or try --set matching.patch_px=21.",
+            "Wear a pattern there, or use more light; or try --set matching.patch_px=21.",
             bound_px=value if np.isfinite(value) else None,
             limit_px=max_sigma_px,
         )
         for name, value in medians.items()
         if value > max_sigma_px
     ]
-    return found, {name: value for name, value in medians.items() if np.isfinite(value)}
+    return findings, {name: value for name, value in medians.items() if np.isfinite(value)}
 
 
 def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
@@ -166,12 +182,12 @@ def _limbs(footage: Footage, view: str) -> Mapping[str, np.ndarray]:
 
 
 def _moving(footage: Footage, grey: np.ndarray, frame: int) -> Mapping[str, np.ndarray]:
-    """Pixels (n, 2) of what moved until the frame furthest in time."""
+    """Pixels (n, 2) of the parts that move until the frame furthest in time."""
     other = max(footage.frames, key=lambda f: abs(f - frame))
     later = footage.take.rows_at(other).rows(footage.read(other)[footage.take.reference])
-    difference = cv2.blur(np.abs((grey - np.median(grey)) - (later - np.median(later))), (9, 9))
+    difference = cv2.blur(np.abs((grey - np.median(grey)) - (later - np.median(later))), (BLUR_PX, BLUR_PX))
     y, x = np.nonzero(difference > MOVES * max(1.0, noise_sigma(grey)))
-    return {"what moves": np.stack([x, y], axis=1)[:: max(1, len(x) // 5000)]} if len(x) > 50 else {}
+    return {"what moves": np.stack([x, y], axis=1)[:: max(1, len(x) // MOST_MOVING)]} if len(x) > FEWEST_MOVING else {}
 
 
 def _median_at(bound: np.ndarray, xy: np.ndarray) -> float:
@@ -181,20 +197,25 @@ def _median_at(bound: np.ndarray, xy: np.ndarray) -> float:
     return float(np.quantile(values, POOR_SHARE, method="higher")) if len(values) else 0.0
 
 
-DOUBTFUL_RESIDUAL_PX = 1.0
-FROZEN_FRAMES = 3
+DOUBTFUL_RESIDUAL_PX = 1.0  # median distance between the rays of matched points
+FROZEN_FRAMES = 3  # that are compared
 FEWEST_BESIDE = 4  # frames on either side of a step
-STEP, STEP_PX = 2.0, 0.05  # sound takes: medians of two parts differ by a twelfth at most
+STEP_RATIO = 2.0  # of the medians before and after it; in sound takes those of two parts differ by a twelfth at most
+STEP_PX = 0.05  # between these medians
 SMALL = 0.05  # frames: not worth an interpolation
-SPARE = 0.25  # frames: an offset beyond it spoils a measurement
-UNUSABLE = ("blank view", "frozen view", "identical views", "swapped views", "foreign rig", "no texture")  # after them, timing says nothing
+SPOILS = 0.25  # frames: a larger offset spoils a measurement
+UNUSABLE = (  # footage with which time offsets cannot be estimated
+    Cause.BLANK_VIEW,
+    Cause.FROZEN_VIEW,
+    Cause.IDENTICAL_VIEWS,
+    Cause.SWAPPED_VIEWS,
+    Cause.FOREIGN_RIG,
+    Cause.NO_TEXTURE,
+)
 
 
 def check_take(folder: Path, monitor: Monitor) -> Checked:
-    """Everything that can be said of a take before it is measured; seconds for a short clip.
-
-    What cannot even be opened is a finding too.
-    """
+    """All checks of a take before it is measured; a few seconds for a short clip. A take that cannot be opened is a finding, too."""
     try:
         take = read_take(folder)
         fitting = from_table(FitSettings, take.settings.get("fitting", {}), "[fitting]")
@@ -202,7 +223,7 @@ def check_take(folder: Path, monitor: Monitor) -> Checked:
         findings, figures = check_footage(footage, monitor)
         findings += joint_findings(footage.take)
     except InputError as error:
-        findings, figures = [wrong("input", str(error))], {}
+        findings, figures = [wrong(Cause.INPUT, str(error))], {}
     return Checked(subject=str(folder), kind="take", findings=tuple(findings), figures=figures)
 
 
@@ -216,33 +237,33 @@ def check_footage(footage: Footage, monitor: Monitor) -> tuple[list[Finding], di
     names = tuple(v.name for v in footage.take.views)
     matching = from_table(MatchingSettings, footage.take.settings.get("matching", {}), "[matching]")
     film = Film(footage, survey(footage, monitor))
-    found = [*geometry_findings(footage.rig), *picture_findings(film.seen, names), *rate_findings(footage)]
+    findings = [*geometry_findings(footage.rig), *picture_findings(film.survey, names), *rate_findings(footage)]
     pairs = film.matches()
-    alike = same_views(pairs, names)
+    identical = same_views(pairs, names)
     weak, bounds = texture_findings(footage, matching.patch_px, matching.max_sigma_px)
-    found += alike or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
-    found += [*weak, *seed_findings(footage)]
+    findings += identical or rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px)
+    findings += [*weak, *seed_findings(footage)]
     figures: dict[str, object] = {
         "frames": len(footage.frames),
         "matches": {f"{names[p.i]}-{names[p.j]}": len(p.xi_px) for p in pairs},
-        "agreeing_share": round(share(pairs, footage.rig.cameras), 4),
+        "agreeing_share": round(agreeing_share(pairs, footage.rig.cameras), 4),
         "texture_bound_px": bounds,
     }
-    if not any(f.cause in UNUSABLE for f in found):
+    if not any(f.cause in UNUSABLE for f in findings):
         offsets = estimate_offsets(footage, monitor, film)
-        lonely = [n for k, n in enumerate(names) if max(len(p.xi_px) for p in pairs if k in (p.i, p.j)) < ENOUGH]
-        found += [_lonely(name) for name in lonely]
-        found += [timing_finding(o) for o in offsets if o.doubtful]
-        found += [rolling_finding(o) for o in offsets if o.rolls]
-        without_time = rig_misses(pairs, footage.rig.cameras, names)  # for views whose offset in time cannot be estimated
-        misses = {o.view: o.miss_px if math.isfinite(o.miss_px) else without_time.get(o.view, 0.0) for o in offsets if not o.doubtful}
-        found += stale_finding(misses | {o.view: o.miss_px for o in offsets if o.doubtful and math.isfinite(o.miss_px)})
+        unmatched = [n for k, n in enumerate(names) if max(len(p.xi_px) for p in pairs if k in (p.i, p.j)) < FEWEST_MATCHES]
+        findings += [_unmatched(name) for name in unmatched]
+        findings += [timing_finding(o) for o in offsets if o.doubtful]
+        findings += [rolling_finding(o) for o in offsets if o.rolls]
+        without_time = rig_distances(pairs, footage.rig.cameras, names)  # for views whose time offset cannot be estimated
+        distance = {o.view: without_time[o.view] for o in offsets if o.view in without_time and not o.doubtful}
+        findings += stale_finding(distance | {o.view: o.distance_px for o in offsets if math.isfinite(o.distance_px)})
         figures["offsets"] = {o.view: o.to_table() for o in offsets}
-    return found, figures
+    return findings, figures
 
 
 def causes_of_failure(footage: Footage, monitor: Monitor) -> list[Finding]:
-    """Why a take could not be measured, or only badly, what is certain first.
+    """Why a take could not be measured, or only poorly; certain findings first.
 
     Raises:
         InputError: an image cannot be read.
@@ -250,100 +271,100 @@ def causes_of_failure(footage: Footage, monitor: Monitor) -> list[Finding]:
     return sorted(check_footage(footage, monitor)[0], key=lambda finding: not finding.certain)
 
 
-def doubts(footage: Footage, frames: list[int], points: list[int], miss_px: list[float], monitor: Monitor) -> list[str]:
-    """What is odd about measured clouds, in sentences, and the causes: frames without points, rays that miss by much (the median of
-    each frame), or by more from some frame on.
+def check_clouds(footage: Footage, frames: list[int], points: list[int], residual_px: list[float], monitor: Monitor) -> list[str]:
+    """Warnings about measured clouds, and the causes: frames without points, rays that miss each other by much (`residual_px` is the
+    median of each frame), or by more from some frame on.
 
-    Every run has a look at its first frame; one with odd figures is checked throughout.
+    Every run checks its first frame; a run with such warnings checks the whole take.
     """
     empty = [frame for frame, n in zip(frames, points) if not n]
-    there = [(frame, miss) for frame, n, miss in zip(frames, points, miss_px) if n and math.isfinite(miss)]
-    residual_px = finite_median([miss for _, miss in there], 0.0)
-    said = [f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}."] if empty else []
-    if residual_px > DOUBTFUL_RESIDUAL_PX:
-        said.append(
-            f"The rays of matched points miss each other by {residual_px:.1f} px: "
-            "does rig.toml belong to this recording, and were the views in step?"
+    measured = [(frame, px) for frame, n, px in zip(frames, points, residual_px) if n and math.isfinite(px)]
+    usual_px = finite_median([px for _, px in measured], 0.0)
+    warnings = [f"No surface was found in {len(empty)} frame(s), the first is {empty[0]}."] if empty else []
+    if usual_px > DOUBTFUL_RESIDUAL_PX:
+        warnings.append(
+            f"The rays of matched points miss each other by {usual_px:.1f} px: "
+            "does rig.toml belong to this recording, and were the cameras synchronised?"
         )
-    said += sudden_step([frame for frame, _ in there], np.array([miss for _, miss in there]))
-    causes = causes_of_failure(footage, monitor) if said else [*first_look(footage, frames[0]), *rate_findings(footage)]
-    return said + [f"{cause.sentence} {cause.advice}".strip() for cause in causes]
+    warnings += sudden_step([frame for frame, _ in measured], np.array([px for _, px in measured]))
+    causes = causes_of_failure(footage, monitor) if warnings else [*check_first_frame(footage, frames[0]), *rate_findings(footage)]
+    return warnings + [f"{cause.sentence} {cause.advice}".strip() for cause in causes]
 
 
-def sudden_step(frames: list[int], miss_px: np.ndarray) -> list[str]:
-    """A sentence where the rays' misses (T,) jump in some frame and stay: a view lost a frame there, or a camera was moved.
+def sudden_step(frames: list[int], residual_px: np.ndarray) -> list[str]:
+    """A warning where the residuals (T,) jump in some frame and stay: a view lost a frame there, or a camera was moved.
 
-    The frame is the one whose two sides differ most in their mean logarithm, by what the numbers on either side let it weigh.
+    The frame is the one before and after which the mean logarithms differ most, weighted by the numbers of frames on both sides.
     """
-    if len(frames) < 2 * FEWEST_BESIDE or not (miss_px > 0).all():
+    if len(frames) < 2 * FEWEST_BESIDE or not (residual_px > 0).all():
         return []
-    log, n = np.log(miss_px), np.arange(1, len(frames))
+    log, n = np.log(residual_px), np.arange(1, len(frames))
     sums = np.cumsum(log)
-    apart = (sums[-1] - sums[:-1]) / (len(log) - n) - sums[:-1] / n
-    weight = np.abs(apart) * np.sqrt(n * (len(log) - n))
+    difference = (sums[-1] - sums[:-1]) / (len(log) - n) - sums[:-1] / n
+    weight = np.abs(difference) * np.sqrt(n * (len(log) - n))
     weight[: FEWEST_BESIDE - 1] = weight[len(weight) - FEWEST_BESIDE + 1 :] = 0
     at = int(np.argmax(weight)) + 1
-    before, after = float(np.median(miss_px[:at])), float(np.median(miss_px[at:]))
-    if max(before, after) < STEP * min(before, after) or abs(after - before) < STEP_PX:
+    before, after = float(np.median(residual_px[:at])), float(np.median(residual_px[at:]))
+    if max(before, after) < STEP_RATIO * min(before, after) or abs(after - before) < STEP_PX:
         return []
     return [
-        f"From frame {frames[at]} on the rays of matched points miss each other by {after:.2g} px, before by {before:.2g} px: "
-        "a view may have lost or doubled a frame there, or a camera was moved; compare the views around it, run the parts apart (--frames)."
+        f"From frame {frames[at]} on, the rays of matched points miss each other by {after:.2g} px, before by {before:.2g} px: a view may "
+        "have lost or doubled a frame there, or a camera was moved. Compare the views around it, and run both parts separately (--frames)."
     ]
 
 
-def first_look(footage: Footage, frame: int) -> list[Finding]:
-    """Views that are identical, swapped or frozen, or a rig of another recording, from the first frames: a second's work in every run.
+def check_first_frame(footage: Footage, frame: int) -> list[Finding]:
+    """Views that are identical, swapped or frozen, or the rig of another recording, from the first frames: about a second in every run.
 
     Raises:
         InputError: an image cannot be read.
     """
     names, rows = tuple(v.name for v in footage.take.views), footage.take.rows_at(frame)
-    pictures = footage.read(frame)
-    still = still_views(footage, frame, pictures)
-    pairs = match_views([[rows.rows(image) for image in pictures]], rows)
-    beside = [*unit_findings(footage.rig), *(frozen_view(name) for name in still)]
+    images = footage.read(frame)
+    frozen = [frozen_view(name) for name in frozen_views(footage, frame, images)]
+    pairs = match_views([[rows.rows(image) for image in images]], rows)
     return same_views(pairs, names) or [
-        *beside,
+        *unit_findings(footage.rig),
+        *frozen,
         *rig_findings(pairs, clicked_pairs(footage.take), footage.rig.cameras, names, footage.click_sigma_px),
     ]
 
 
-def still_views(footage: Footage, frame: int, pictures: list[np.ndarray]) -> list[str]:
-    """Views of which a few frames after `frame` have its very picture, noise and all, while those of another view differ."""
+def frozen_views(footage: Footage, frame: int, images: list[np.ndarray]) -> list[str]:
+    """Views whose next frames repeat the image of `frame` exactly, noise included, while those of another view differ."""
     names, step = [v.name for v in footage.take.views], footage.take.field_layout.per_image
     after = [f for f in (frame + n * step for n in range(1, FROZEN_FRAMES)) if f in footage.frames]
     same = np.ones(len(names), dtype=bool)
     for f in after:
-        same &= [np.array_equal(a, b) for a, b in zip(pictures, footage.read(f))]
-    return [name for name, stood in zip(names, same) if stood] if len(after) == FROZEN_FRAMES - 1 and not same.all() else []
+        same &= [np.array_equal(a, b) for a, b in zip(images, footage.read(f))]
+    return [name for name, frozen in zip(names, same) if frozen] if len(after) == FROZEN_FRAMES - 1 and not same.all() else []
 
 
 def with_cause(error: InputError, footage: Footage, frame: int) -> InputError:
-    """What is certainly wrong with the footage instead of what came of it, where there is such a thing."""
-    cause = next((finding for finding in first_look(footage, frame) if finding.certain), None)
+    """A certain fault of the footage instead of its consequence, `error`; `error` where there is none."""
+    cause = next((finding for finding in check_first_frame(footage, frame) if finding.certain), None)
     return error if cause is None else InputError(f"{cause.sentence} {cause.advice}".strip())
 
 
 def timing_finding(offset: TimeOffset) -> Finding:
-    """What to do about a view that is early or late."""
-    late, sigma = offset.delay_frames, offset.sigma_frames
-    word = "later" if late > 0 else "earlier"
-    steps = [f"add {-round(late):+d} to `offset_frames` of view {offset.view} in take.toml"] if round(late) else []
-    if abs(late - round(late)) > SMALL:
-        steps.append("set `correct = true` under [settings.timing], which puts its pictures to the others' moment")
+    """A view that is not synchronised, and what to do about it."""
+    delay, sigma = offset.delay_frames, offset.sigma_frames
+    word = "later" if delay > 0 else "earlier"
+    steps = [f"add {-round(delay):+d} to `offset_frames` of view {offset.view} in take.toml"] if round(delay) else []
+    if abs(delay - round(delay)) > SMALL:
+        steps.append("set `correct = true` under [settings.timing], which interpolates its images to the moment of the others")
     advice = " and ".join(steps or ["measure it as it is"]) + "; or synchronize the cameras."
     advice = advice[0].upper() + advice[1:]
     if offset.method == "energy":
         return doubtful(
-            "out of step",
-            f"View {offset.view} seems to be {abs(late):.0f} frames {word} than the reference view, going by when how much moves.",
-            f"Compare the views at a sudden movement. If it is so: {advice[0].lower()}{advice[1:]}",
+            Cause.NOT_SYNCHRONISED,
+            f"View {offset.view} seems to be {abs(delay):.0f} frames {word} than the reference view, judging by the amount of motion only.",
+            f"Compare the views at a sudden movement. If that is right: {advice[0].lower()}{advice[1:]}",
             **offset.to_table(),
         )
-    return (wrong if abs(late) > SPARE else doubtful)(
-        "out of step",
-        f"View {offset.view} is {abs(late):.2f} ± {sigma:.2g} frames {word} than the reference view; "
+    return (wrong if abs(delay) > SPOILS else doubtful)(
+        Cause.NOT_SYNCHRONISED,
+        f"View {offset.view} is {abs(delay):.2f} ± {sigma:.2g} frames {word} than the reference view; "
         f"the rays of moving points miss by up to {offset.effect_px:.1f} px.",
         advice,
         **offset.to_table(),
@@ -351,21 +372,21 @@ def timing_finding(offset: TimeOffset) -> Finding:
 
 
 def rolling_finding(offset: TimeOffset) -> Finding:
-    """What to do about a view whose rows are exposed one after the other, otherwise than the reference view's."""
+    """A view whose rolling shutter differs from the reference view's, and what to do about it."""
     r, word = offset.readout_frames, "longer" if offset.readout_frames > 0 else "shorter"
     return doubtful(
-        "rolling shutter",
-        f"View {offset.view} takes {abs(r):.2f} ± {offset.readout_sigma:.2g} frames {word} from its first row to its last than the "
-        f"reference view (rolling shutter); the rays of moving points there miss by up to {offset.rolling_px:.1f} px.",
-        "Use a mode that reads the sensor faster, or cameras of one kind, held level; what moves fast is best kept at middle height.",
+        Cause.ROLLING_SHUTTER,
+        f"The rolling shutter of view {offset.view} takes {abs(r):.2f} ± {offset.readout_sigma:.2g} frames {word} from first to last "
+        f"row than that of the reference view; the rays of moving points there miss by up to {offset.rolling_px:.1f} px.",
+        "Use a mode that reads the sensor faster, or cameras of one kind, held level; keep fast movements at middle height.",
         readout_frames=r,
         readout_sigma_frames=offset.readout_sigma,
     )
 
 
-def _lonely(name: str) -> Finding:
+def _unmatched(name: str) -> Finding:
     return doubtful(
-        "nothing in common",
-        f"View {name} has almost nothing in common with any other view.",
-        "Neighbouring cameras should stand at most 30° apart, look at the same place and show it in like size.",
+        Cause.NO_MATCHES,
+        f"View {name} has almost no matches in any other view.",
+        "Neighbouring cameras should be at most 30° apart, look at the same place and show it at a similar size.",
     )

@@ -1,7 +1,7 @@
-"""Points that look alike in two views, found without the rig: what the rig says of them shows whether it belongs to the footage.
+"""Points matched between two views without the rig; their distances from the rig's epipolar lines show whether it belongs to the footage.
 
-SIFT's keypoints (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) with his ratio test, kept where both directions agree. On cloth of
-3.6 mm a pixel, cameras 10° apart, a hundred to four hundred are found in a pair of pictures and 95 to 99 % of them are right.
+SIFT keypoints (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) with his ratio test, mutual nearest neighbours only. On cloth at 3.6 mm
+a pixel, cameras 10° apart, a pair of images gives one to four hundred matches, 95 to 99 % of them correct.
 """
 
 from collections.abc import Sequence
@@ -15,56 +15,57 @@ from ..geometry.camera import Camera
 from ..geometry.rotation import cross_matrix
 from ..images.interlace import RowGrid
 
-MOST_FEATURES, LONGEST_SIDE_PX = 3000, 1600
-RATIO = 0.8
+MOST_FEATURES = 3000  # of an image
+LONGEST_SIDE_PX = 1600  # larger images are reduced
+RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor (Lowe 2004, §7.1)
 INLIER_PX = 2.0  # distance from a fundamental matrix
-DEFINE = 7  # matches that a fundamental matrix fits whatever they are
-INLIER_SHARE = 0.6  # of the others
-FEWEST_MATCHES = 24  # different ones, of a pair
+MINIMAL_MATCHES = 7  # that a fundamental matrix always fits
+INLIER_SHARE = 0.6  # of the other matches
+FEWEST_MATCHES = 24  # distinct ones, of a pair
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Features:
-    """Keypoints of one picture: `xy` (N, 2) in the picture's rows, and their descriptors (N, 128)."""
+    """Keypoints of one image: `xy` (N, 2) in the measured rows, and their descriptors (N, 128)."""
 
     xy: np.ndarray
     descriptors: np.ndarray
 
 
 def eight_bits(grey: np.ndarray) -> np.ndarray:
-    """A picture (h, w) as uint8, stretched to its own range, so that dark footage has features as well."""
+    """An image (h, w) as uint8, its range stretched so that dark footage has features, too."""
     low, high = np.percentile(grey, [0.5, 99.5])
     scale = 235.0 / max(float(high - low), 8.0)
     return np.clip((grey - low) * scale + 10, 0, 255).astype(np.uint8)
 
 
 def find_features(grey: np.ndarray) -> Features:
-    """Keypoints of the measured rows (h, w) of a picture. A large picture is looked at in a smaller size."""
+    """Keypoints of the measured rows (h, w) of an image; a large image is reduced first."""
     step = max(1.0, max(grey.shape) / LONGEST_SIDE_PX)
-    picture = eight_bits(grey)
+    reduced = eight_bits(grey)
     if step > 1:
-        picture = cv2.resize(picture, (round(grey.shape[1] / step), round(grey.shape[0] / step)), interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=MOST_FEATURES).detectAndCompute(picture, None)
+        reduced = cv2.resize(reduced, (round(grey.shape[1] / step), round(grey.shape[0] / step)), interpolation=cv2.INTER_AREA)
+    keypoints, descriptors = cv2.SIFT_create(nfeatures=MOST_FEATURES).detectAndCompute(reduced, None)
     if not keypoints:
         return Features(xy=np.zeros((0, 2)), descriptors=np.zeros((0, 128), np.float32))
-    scale = np.array(grey.shape[::-1]) / np.array(picture.shape[::-1])
+    scale = np.array(grey.shape[::-1]) / np.array(reduced.shape[::-1])
     return Features(xy=(np.array([k.pt for k in keypoints]) + 0.5) * scale - 0.5, descriptors=descriptors)
 
 
-def alike(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (m,) of `a` and (m,) of `b` that look alike, and alike to nothing else."""
+def match_pair(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (m,) of `a` and (m,) of `b` whose descriptors match unambiguously, in both directions."""
     if len(a.xy) < 2 or len(b.xy) < 2:
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    there = matcher.knnMatch(a.descriptors, b.descriptors, 2)
+    forward = matcher.knnMatch(a.descriptors, b.descriptors, 2)
     back = {m.queryIdx: m.trainIdx for m in matcher.match(b.descriptors, a.descriptors)}
-    kept = [(m.queryIdx, m.trainIdx) for m, n in there if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
-    pairs = np.array(kept, dtype=int).reshape(-1, 2)
+    matched = [(m.queryIdx, m.trainIdx) for m, n in forward if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
+    pairs = np.array(matched, dtype=int).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
 
 
-def epipolar_miss_px(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndarray) -> np.ndarray:
-    """Signed distance (m,) [px] of full-frame points (m, 2) of cameras a and b from each other's epipolar lines, the mean of both.
+def epipolar_distance_px(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndarray) -> np.ndarray:
+    """Signed distance (m,) [px] of full-frame points (m, 2) of cameras a and b from each other's epipolar lines, the mean of both images.
 
     With y_b ~ R y_a + t and E = [t]× R:  e = y_bᵀ E y_a / √(½ |E y_a|² / f_b² + ½ |Eᵀ y_b|² / f_a²), the lengths without the third
     component: √2 times Sampson's distance.
@@ -78,7 +79,7 @@ def epipolar_miss_px(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndarray)
 
 
 def in_front(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndarray) -> np.ndarray:
-    """(m,) whether the rays come nearest to each other before both cameras."""
+    """(m,) whether the rays come closest to each other in front of both cameras."""
     da, db = a.rays(xa_px), b.rays(xb_px)
     base = b.centre_m - a.centre_m
     aa, bb, ab = (da * da).sum(axis=1), (db * db).sum(axis=1), (da * db).sum(axis=1)
@@ -89,7 +90,7 @@ def in_front(a: Camera, b: Camera, xa_px: np.ndarray, xb_px: np.ndarray) -> np.n
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PairMatches:
-    """What looks alike in views i and j in some frames: full-frame pixels (m, 2) each."""
+    """Matches of views i and j in some frames: full-frame pixels (m, 2) each."""
 
     i: int
     j: int
@@ -97,13 +98,13 @@ class PairMatches:
     xj_px: np.ndarray
 
     def agreeing(self, cameras: Sequence[Camera], limit_px: float) -> np.ndarray:
-        """(m,) whose rays, with cameras[i] and cameras[j], pass within `limit_px` of each other before the cameras."""
+        """(m,) whether the rays of cameras[i] and cameras[j] pass within `limit_px` of each other, in front of both."""
         a, b = cameras[self.i], cameras[self.j]
-        return (np.abs(self.miss_px(cameras)) < limit_px) & in_front(a, b, self.xi_px, self.xj_px)
+        return (np.abs(self.epipolar_distance_px(cameras)) < limit_px) & in_front(a, b, self.xi_px, self.xj_px)
 
-    def miss_px(self, cameras: Sequence[Camera]) -> np.ndarray:
-        """(m,) signed distances [px] of the rays."""
-        return epipolar_miss_px(cameras[self.i], cameras[self.j], self.xi_px, self.xj_px)
+    def epipolar_distance_px(self, cameras: Sequence[Camera]) -> np.ndarray:
+        """(m,) signed distances [px] from the epipolar lines."""
+        return epipolar_distance_px(cameras[self.i], cameras[self.j], self.xi_px, self.xj_px)
 
     def inliers(self) -> np.ndarray | None:
         """Rows (n,) of the matches that agree with one fundamental matrix, whatever the rig; None if most do not, or there are too few.
@@ -115,7 +116,7 @@ class PairMatches:
             return None
         xi, xj = np.ascontiguousarray(self.xi_px[rows]), np.ascontiguousarray(self.xj_px[rows])
         F, inlier = cv2.findFundamentalMat(xi, xj, cv2.USAC_MAGSAC, INLIER_PX, 0.999, 4000)
-        if F is None or inlier is None or inlier.sum() - DEFINE < INLIER_SHARE * (len(xi) - DEFINE):
+        if F is None or inlier is None or inlier.sum() - MINIMAL_MATCHES < INLIER_SHARE * (len(xi) - MINIMAL_MATCHES):
             return None
         return rows[inlier.ravel() > 0]
 
@@ -125,17 +126,17 @@ class PairMatches:
         return None if rows is None else PairMatches(i=self.i, j=self.j, xi_px=self.xi_px[rows], xj_px=self.xj_px[rows])
 
 
-def match_views(pictures: Sequence[Sequence[np.ndarray]], rows: RowGrid) -> list[PairMatches]:
-    """The matches of every pair of views over some frames; `pictures[t][k]` are the measured rows of view k."""
-    return match_features([[find_features(picture) for picture in frame] for frame in pictures], rows)
+def match_views(images: Sequence[Sequence[np.ndarray]], rows: RowGrid) -> list[PairMatches]:
+    """The matches of every pair of views over some frames; `images[t][k]` are the measured rows of view k."""
+    return match_features([[find_features(image) for image in frame] for frame in images], rows)
 
 
-def match_features(found: Sequence[Sequence[Features]], rows: RowGrid) -> list[PairMatches]:
-    """The matches of every pair of views over some frames; `found[t][k]` are the features of view k."""
+def match_features(features: Sequence[Sequence[Features]], rows: RowGrid) -> list[PairMatches]:
+    """The matches of every pair of views over some frames; `features[t][k]` are those of view k."""
     pairs = []
-    for i, j in combinations(range(len(found[0])), 2):
-        matched = [alike(frame[i], frame[j]) for frame in found]
-        xi = np.concatenate([frame[i].xy[m] for frame, (m, _) in zip(found, matched)])
-        xj = np.concatenate([frame[j].xy[m] for frame, (_, m) in zip(found, matched)])
+    for i, j in combinations(range(len(features[0])), 2):
+        matched = [match_pair(frame[i], frame[j]) for frame in features]
+        xi = np.concatenate([frame[i].xy[m] for frame, (m, _) in zip(features, matched)])
+        xj = np.concatenate([frame[j].xy[m] for frame, (_, m) in zip(features, matched)])
         pairs.append(PairMatches(i=i, j=j, xi_px=rows.to_frame(xi), xj_px=rows.to_frame(xj)))
     return pairs

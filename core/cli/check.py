@@ -1,4 +1,4 @@
-"""`tricap check`: says in sentences what is wrong or doubtful about a take, a rig or a result. Exit code 0: nothing, 1: something."""
+"""`tricap check`: what is wrong or doubtful about a take, a rig or a result. Exit code 0: nothing, 1: something."""
 
 import argparse
 import json
@@ -23,7 +23,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Check; the lines to show. The command's exit code becomes 1 if there is something to say.
+    """Check; the lines to show. The exit code of the command becomes 1 if there are findings.
 
     Raises:
         InputError: it is neither a take, nor a result, nor a rig.
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def check(subject: Path, monitor: Monitor) -> Checked:
-    """The findings about a take, a result or a rig, told apart by what lies there.
+    """The findings about a take, a result or a rig, distinguished by their files.
 
     Raises:
         InputError: it is none of them.

@@ -14,7 +14,7 @@ from ..body.shape import write_body
 from ..body.skin.contour_skin import body_skin
 from ..body.skin.extremities import shape_for_skin
 from ..checking.fit_check import check_fit
-from ..checking.take_check import causes_of_failure, doubts, with_cause
+from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
 from ..fitting.inputs.fit_input import FitInput
 from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, known_silhouettes
@@ -64,7 +64,7 @@ def measure(run: Run, monitor: Monitor) -> None:
         return _no_surface(run, error, monitor)
     summaries.sort(key=lambda summary: summary.frame)
     run.measured = MeasuredFrames(footage=run.footage, results=run.results, summaries=tuple(summaries))
-    run.warn(*doubts(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor))
+    run.warn(*check_clouds(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor))
     run.finish_stage("measure", began, **surface_figures(summaries, foreground))
 
 

@@ -20,5 +20,5 @@ def test_an_elbow_clicked_at_the_wrist_is_told_and_a_child_is_not(model: str) ->
         lengths = shape.lengths_m.copy()
         lengths[upper] *= times
         (said,) = odd_limbs(replace(shape, lengths_m=lengths))
-        assert said.startswith(f"{long} came out ") and "elbow.R" in said
+        assert said.startswith(f"{long} is ") and "elbow.R" in said
         assert odd_limbs(replace(shape, lengths_m=lengths, model="a model of one's own")) == [said]

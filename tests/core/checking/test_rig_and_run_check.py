@@ -52,6 +52,10 @@ RIGS: dict[str, tuple[Rig, str]] = {
     "principal point of a crop": (with_first(matrix=scaled(CAMERAS[0].matrix, shift_px=300)), "odd camera"),
     "distortion that folds": (with_first(distortions=np.array([-6.0, 0.0, 0.0, 0.0, 0.0])), "odd camera"),
     "poor by its own word": (Rig(cameras=CAMERAS, metadata={"verdict": "Poor: points within 20 mm."}), "poor calibration"),
+    "red without a word for it": (
+        Rig(cameras=CAMERAS, metadata={"verdict": "The adjustment did not converge.", "light": "red"}),
+        "poor calibration",
+    ),
     "large residuals": (Rig(cameras=CAMERAS, metadata={"sigma0_px": 2.5}), "poor calibration"),
 }
 

@@ -10,7 +10,7 @@ import pytest
 
 from tricap.core.checking.rig_check import clicked_pairs, rig_findings, stale_finding
 from tricap.core.checking.take_check import check_take
-from tricap.core.checking.timing import _fit, _Followed
+from tricap.core.checking.timing import _fit, _Tracked
 from tricap.core.checking.view_matches import PairMatches
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
@@ -72,7 +72,7 @@ def test_false_matches_of_views_from_different_sides_are_no_foreign_rig() -> Non
 def test_matches_by_chance_have_no_geometry_of_their_own(count: int) -> None:
     assert chance(0, 1, count).consistent() is None
     pair = both(seen(0, 1, 3 * count), chance(0, 1, count)).consistent()
-    assert pair is not None and np.mean(np.abs(pair.miss_px(cameras())) < 3) > 0.9
+    assert pair is not None and np.mean(np.abs(pair.epipolar_distance_px(cameras())) < 3) > 0.9
 
 
 def test_what_rests_counts_once() -> None:
@@ -104,27 +104,27 @@ def test_clicks_of_all_frames_by_pairs_of_views() -> None:
     assert (len(pairs[0, 1].xi_px), pairs[1, 2].xi_px.tolist()) == (1, [[9, 10]])
 
 
-def mismatched(own: list[Camera], *, share: float) -> list[_Followed]:
+def mismatched(own: list[Camera], *, share: float) -> list[_Tracked]:
     """Matches of three frames, a `share` of them false, whose points move fast along their rows (stills far apart in time)."""
     frames = []
     for t in range(3):
         right, false = seen(0, 1, 60 + t), chance(0, 1, int(60 * share / (1 - share)))
         pair = both(right, false)
         rate = np.random.default_rng(t).normal(0, 30, len(pair.xi_px))
-        miss = pair.miss_px(own)
-        misses = np.stack([miss - rate, miss, miss + rate, pair.xj_px[:, 1] / SIZE[1] - 0.5], axis=1)
-        frames.append(_Followed(matches=pair, misses=misses))
+        miss = pair.epipolar_distance_px(own)
+        distances = np.stack([miss - rate, miss, miss + rate, pair.xj_px[:, 1] / SIZE[1] - 0.5], axis=1)
+        frames.append(_Tracked(matches=pair, distances=distances))
     return frames
 
 
 def test_the_rigs_own_miss_survives_mismatches() -> None:
     """Smooth skin gives few right matches and many false ones; a rig that is 0.5° off is still reported."""
     right = _fit(mismatched(cameras(), share=0.3), 0, "C")
-    assert right is not None and right.miss_px < 0.7 and not stale_finding({"C": right.miss_px})
+    assert right is not None and right.distance_px < 0.7 and not stale_finding({"C": right.distance_px})
     knocked = _fit(mismatched(turned(0.5), share=0.3), 0, "C")
-    assert knocked is not None and knocked.miss_px > 3 and stale_finding({"C": knocked.miss_px})
+    assert knocked is not None and knocked.distance_px > 3 and stale_finding({"C": knocked.distance_px})
     nothing = _fit(mismatched(cameras(), share=0.6), 0, "C")
-    assert nothing is None or np.isnan(nothing.miss_px), "most matches agree with nothing: there is nothing to judge by"
+    assert nothing is None or np.isnan(nothing.distance_px), "most matches agree with nothing: there is nothing to judge by"
     assert not stale_finding({"C": np.nan})
 
 

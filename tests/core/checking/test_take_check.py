@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tricap.core.checking.findings import Checked
-from tricap.core.checking.take_check import check_take, doubts, sudden_step, timing_finding
+from tricap.core.checking.take_check import check_clouds, check_take, sudden_step, timing_finding
 from tricap.core.checking.timing import Film, TimeOffset, _between, energy_lags, estimate_offsets, lag_sigmas
 from tricap.core.cli import main
 from tricap.core.foundation.errors import InputError
@@ -316,9 +316,9 @@ def test_every_run_tells_a_variable_frame_rate(arm_recording: Record, tmp_path: 
     writer.release()
     said = take / "take.toml"
     said.write_text(said.read_text(encoding="utf-8").replace('images = "R/*.png"', 'movie = "r.mp4"'), encoding="utf-8")
-    assert not [s for s in doubts(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "frame rate" in s]
+    assert not [s for s in check_clouds(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "frame rate" in s]
     (take / "r.mp4").write_bytes(with_a_pause((take / "r.mp4").read_bytes()))
-    assert [s for s in doubts(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "View R has a variable frame rate" in s]
+    assert [s for s in check_clouds(open_take(read_take(take)), [0], [9], [0.1], Monitor()) if "View R has a variable frame rate" in s]
 
 
 def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.checking.fit_check import clicks_not_kept, limits_not_kept
+from tricap.core.checking.fit_check import beyond_limits, far_from_clicks
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages.sequence import fit_sequence
@@ -45,10 +45,10 @@ def test_joints_that_do_not_lie_where_they_were_clicked_are_told(make_scene) -> 
     scene = make_scene(frames=3)
     given = given_of(scene, {0: scene.clicks, 2: projected(scene, 2, "wrist.R")})
     fit = fit_sequence(given, SETTINGS)
-    assert clicks_not_kept(given, fit.motion, 5.0) == []
+    assert far_from_clicks(given, fit.motion, 5.0) == []
     joints = fit.motion.joints_m.copy()
     joints[2, 2] += (0.1, 0.0, 0.0)
-    (said,) = clicks_not_kept(given, replace(fit.motion, joints_m=joints), 5.0)
+    (said,) = far_from_clicks(given, replace(fit.motion, joints_m=joints), 5.0)
     off = scene.rig["C"].project(joints[2, 2]) - given.clicks[2]["wrist.R"]["C"]
     assert f"wrist.R by {np.linalg.norm(off):.0f} px in frame 2" in said and "frame 0" not in said
 
@@ -57,10 +57,10 @@ def test_joints_that_are_bent_too_far_are_told(make_scene) -> None:
     scene = make_scene(frames=3)
     given = given_of(scene, {0: scene.clicks})
     fit = fit_sequence(given, SETTINGS)
-    assert limits_not_kept(given, fit.motion) == []
+    assert beyond_limits(given, fit.motion) == []
     values, flexion = fit.motion.values.copy(), fit.motion.dof_names.index("elbow.R flexion")
     values[1, flexion] = np.radians(226.0)
-    (said,) = limits_not_kept(given, replace(fit.motion, values=values))
+    (said,) = beyond_limits(given, replace(fit.motion, values=values))
     assert "elbow.R flexion by up to 76° (frame 1)" in said
     wider = replace(given, limits={"elbow.R flexion": (0.0, np.radians(230.0))})
-    assert limits_not_kept(wider, replace(fit.motion, values=values)) == []
+    assert beyond_limits(wider, replace(fit.motion, values=values)) == []

@@ -97,5 +97,5 @@ def test_trajectories_that_no_run_wrote(tmp_path: Path, name: str, array: np.nda
     store.save(tmp_path / "trajectories_raw.npz", arrays, {})
     assert read_tracks(tmp_path) is not None
     store.save(tmp_path / "trajectories_raw.npz", {n: a for n, a in (arrays | {name: array}).items() if a is not None}, {})
-    with pytest.raises(InputError, match="trajectories_raw.npz (is damaged|holds no)"):
+    with pytest.raises(InputError, match="trajectories_raw.npz (is damaged|has no)"):
         read_tracks(tmp_path)
