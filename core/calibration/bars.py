@@ -1,9 +1,9 @@
-"""Where the bar was, as seen by cameras that are known roughly: intersection that survives wrong rays, and which end is which.
+"""Image points of the reference bar, and its positions from roughly calibrated cameras: robust intersection, and the order of the ends.
 
-Σ (I − d dᵀ)(X − C) = 0                                                    (1)   where the rays of an end pass each other closest
-end in two cameras, the same or the other: Sampson's distance, and | |A − B| / L − 1 |   (2)   truncated, summed over pairs of cameras
+Some image points are missing, some wrong, and the ends may be swapped between cameras.
 
-What the cameras saw of the reference bar: two image points per camera and position, some missing, some wrong, ends perhaps mixed up.
+    Σ (I − d dᵀ)(X − C) = 0                                                         (1)   the point closest to the rays of an end
+    cost of an order of the ends: Sampson's distance, and | |A − B| / L − 1 |        (2)   truncated, summed over pairs of cameras
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,18 @@ from ..geometry.small_matrices import invert_spd
 from .bundle import Network
 from .epipolar import sampson
 
+TOLERANCE_PX = 4.0  # distance of an image point from the image of its end
+LENGTH_TOLERANCE = 0.05  # of the length of the bar
+MAX_FLIPPED_CAMERAS = 9  # with more cameras, each order is compared with the first camera only
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BarObservations:
-    """N positions of a bar of known length before C cameras. `labelled`: end 0 is the same end in all cameras of a position."""
+    """N positions of a bar of known length in C cameras. `labelled`: end 0 is the same end in all cameras of a position."""
 
     names: tuple[str, ...]
     size_px: np.ndarray  # (C, 2) width, height
-    xy_px: np.ndarray  # (N, C, 2 ends, 2) full-frame pixels, NaN: not seen
+    xy_px: np.ndarray  # (N, C, 2 ends, 2) full-frame pixels, NaN: not visible
     length_m: float
     frames: np.ndarray  # (N,) frame numbers
     labelled: bool = True
@@ -37,14 +41,14 @@ class BarObservations:
         object.__setattr__(self, "frames", frozen(self.frames, (len(self.xy_px),), np.int64, "frames"))
 
     @property
-    def seen(self) -> np.ndarray:
-        """(N, C, 2) whether an end was seen."""
+    def visible(self) -> np.ndarray:
+        """(N, C, 2) whether an end is visible."""
         return np.isfinite(self.xy_px).all(axis=-1)
 
     @property
     def complete(self) -> np.ndarray:
-        """(N, C) whether both ends were seen."""
-        return self.seen.all(axis=-1)
+        """(N, C) whether both ends are visible."""
+        return self.visible.all(axis=-1)
 
     def part(self, positions: np.ndarray | Sequence[int]) -> "BarObservations":
         """Some of the positions: indices or a mask (N,)."""
@@ -62,43 +66,38 @@ class BarObservations:
         )
 
 
-DOUBTFUL_PX = 4.0
-LENGTH_TOLERANCE = 0.05
-MAX_FLIPPED_CAMERAS = 9  # beyond this many cameras orders are compared with the first camera's only
-
-
-def with_bars(network: Network, observations: BarObservations, tolerance_px: float = DOUBTFUL_PX) -> tuple[Network, np.ndarray]:
+def with_bars(network: Network, observations: BarObservations, tolerance_px: float = TOLERANCE_PX) -> tuple[Network, np.ndarray]:
     """The cameras of `network` with the bar positions of `observations`, and which image points (N, C, 2) fit them.
 
-    As `met_ends`; a bar of a wrong length loses the end that fewer rays agree on, or both.
+    As `met_ends`; a bar of the wrong length loses the end with fewer rays, or both.
     """
     ends, used = met_ends(network.cameras(observations.names, observations.size_px), observations, tolerance_px)
     return _bars(network, ends, _of_right_length(ends, used, network.length_m))
 
 
 def met_ends(cameras: tuple[Camera, ...], observations: BarObservations, tolerance_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the rays of the ends meet (N, 2, 3), and which image points (N, C, 2) lie within the tolerance, whatever the length.
+    """The intersections (N, 2, 3) of the rays of the ends, and which image points (N, C, 2) lie within the tolerance, whatever the length.
 
-    An end that fewer than two cameras see takes no part. Ends that the cameras disagree on are intersected from the pair of cameras that
-    most of the others agree with.
+    An end visible to fewer than two cameras is not used. Where the cameras disagree, an end is intersected from the pair of cameras with
+    which most of the others agree.
     """
-    seen = observations.seen
-    used = seen & (seen.sum(axis=1, keepdims=True) >= 2)
-    N = len(seen)
+    visible = observations.visible
+    used = visible & (visible.sum(axis=1, keepdims=True) >= 2)
+    N = len(visible)
     rays = [_rays(camera, observations.xy_px[:, c].reshape(-1, 2)) for c, camera in enumerate(cameras)]
     centres = np.stack([c.centre_m for c in cameras])
     flat = np.moveaxis(used, 1, 2).reshape(2 * N, -1)  # (2 N, C)
     X = _meeting_points(centres, rays, flat)
     cost = _cost(cameras, observations, X, flat, tolerance_px)
-    doubtful = np.flatnonzero((cost > 1.0) & (flat.sum(axis=1) >= 3))
-    for pair in combinations(range(len(cameras)), 2) if len(doubtful) else ():
-        only = np.zeros_like(flat[doubtful])
-        only[:, pair] = flat[doubtful][:, pair]
+    disputed = np.flatnonzero((cost > 1.0) & (flat.sum(axis=1) >= 3))
+    for pair in combinations(range(len(cameras)), 2) if len(disputed) else ():
+        only = np.zeros_like(flat[disputed])
+        only[:, pair] = flat[disputed][:, pair]
         only[only.sum(axis=1) < 2] = False
-        trial = _meeting_points(centres, [r[doubtful] for r in rays], only)
-        trial_cost = np.where(only.any(axis=1), _cost(cameras, observations, trial, flat, tolerance_px, doubtful), np.inf)
-        better = trial_cost < cost[doubtful]
-        X[doubtful[better]], cost[doubtful[better]] = trial[better], trial_cost[better]
+        trial = _meeting_points(centres, [r[disputed] for r in rays], only)
+        trial_cost = np.where(only.any(axis=1), _cost(cameras, observations, trial, flat, tolerance_px, disputed), np.inf)
+        better = trial_cost < cost[disputed]
+        X[disputed[better]], cost[disputed[better]] = trial[better], trial_cost[better]
     ends = X.reshape(N, 2, 3)
     return ends, _fitting(cameras, observations, ends, used, tolerance_px)
 
@@ -130,16 +129,16 @@ def _cost(
     total = np.zeros(len(X))
     for c, camera in enumerate(cameras):
         xy = observations.xy_px[:, c].reshape(-1, 2)
-        xy, seen = (xy, used[:, c]) if rows is None else (xy[rows], used[rows, c])
+        xy, counts = (xy, used[:, c]) if rows is None else (xy[rows], used[rows, c])
         square = np.sum((xy - camera.project(X)) ** 2, axis=1) / width_px**2
-        total += np.where(seen, np.where(np.isfinite(square), np.minimum(square, 1.0), 1.0), 0.0)
+        total += np.where(counts, np.where(np.isfinite(square), np.minimum(square, 1.0), 1.0), 0.0)
     return total
 
 
 def _fitting(
     cameras: tuple[Camera, ...], observations: BarObservations, ends: np.ndarray, used: np.ndarray, tolerance_px: float
 ) -> np.ndarray:
-    """The image points (N, C, 2) that lie within the tolerance of the ends' images, where at least two do."""
+    """The image points (N, C, 2) within the tolerance of the projected ends, where there are at least two."""
     near = np.stack([np.linalg.norm(observations.xy_px[:, c] - camera.project(ends), axis=-1) for c, camera in enumerate(cameras)], axis=1)
     with np.errstate(invalid="ignore"):
         return enough_rays(used & (near < tolerance_px))
@@ -155,12 +154,12 @@ def _of_right_length(ends: np.ndarray, used: np.ndarray, length_m: float) -> np.
 
 
 def enough_rays(used: np.ndarray) -> np.ndarray:
-    """Without the ends that fewer than two cameras see."""
+    """`used` (N, C, 2) without the ends that fewer than two cameras show."""
     return used & (used.sum(axis=1, keepdims=True) >= 2)
 
 
 def _bars(network: Network, ends: np.ndarray, used: np.ndarray) -> tuple[Network, np.ndarray]:
-    """Middles and directions of ends (N, 2, 3); of a bar with one end known the other is put anywhere."""
+    """Middles and directions of ends (N, 2, 3); where only one end is known, the direction is arbitrary."""
     known = used.any(axis=1)  # (N, 2)
     difference = ends[:, 0] - ends[:, 1]
     difference[~known.all(axis=1)] = [1.0, 0.0, 0.0]
@@ -173,7 +172,7 @@ def _bars(network: Network, ends: np.ndarray, used: np.ndarray) -> tuple[Network
 
 
 def labelled_ends(network: Network, observations: BarObservations, tolerance_px: float) -> BarObservations:
-    """The observations with the ends in the same order in all cameras, by the order (2) that fits the cameras best at each position."""
+    """The observations with the ends in the same order in all cameras: at each position the order that fits the cameras best.  (2)"""
     cameras = network.cameras(observations.names, observations.size_px)
     C, N = len(cameras), len(observations.xy_px)
     pairs = {(i, j): _pair_cost(cameras, observations, i, j, tolerance_px) for i, j in combinations(range(C), 2)}
@@ -189,19 +188,19 @@ def labelled_ends(network: Network, observations: BarObservations, tolerance_px:
 
 
 def _pair_cost(cameras: tuple[Camera, ...], observations: BarObservations, i: int, j: int, tolerance_px: float) -> np.ndarray:
-    """Cost (N, 2) of the same and the other order of the ends in camera j.  (2)"""
+    """Cost (N, 2) of the same and of the swapped order of the ends in camera j.  (2)"""
     a, b = cameras[i], cameras[j]
-    seen = observations.seen
+    visible = observations.visible
     R = b.R_cam_world @ a.R_cam_world.T
     t = b.t_cam_world_m - R @ a.t_cam_world_m
     E = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ R
-    xi, xj = (np.where(seen[:, c, :, None], observations.xy_px[:, c], np.asarray(cameras[c].size_px) / 2) for c in (i, j))
+    xi, xj = (np.where(visible[:, c, :, None], observations.xy_px[:, c], np.asarray(cameras[c].size_px) / 2) for c in (i, j))
     ni, nj = a.directions(xi), b.directions(xj)
     focal = np.sqrt(a.focal_px * b.focal_px)
     cost = np.zeros((len(xi), 2))
     for other in (0, 1):
-        mj, seen_j = (nj[:, ::-1], seen[:, j, ::-1]) if other else (nj, seen[:, j])
-        both = seen[:, i] & seen_j
+        mj, visible_j = (nj[:, ::-1], visible[:, j, ::-1]) if other else (nj, visible[:, j])
+        both = visible[:, i] & visible_j
         distance = np.minimum(sampson(E, ni[..., :2], mj[..., :2]) * focal / tolerance_px, 1.0) ** 2
         cost[:, other] = np.sum(np.where(both, distance, 0.0), axis=1)
         off = np.abs(_lengths(ni @ R.T, mj, t) / observations.length_m - 1) / LENGTH_TOLERANCE
@@ -210,7 +209,7 @@ def _pair_cost(cameras: tuple[Camera, ...], observations: BarObservations, i: in
 
 
 def _lengths(hi: np.ndarray, hj: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Lengths (N,) of bars whose ends lie on rays (N, 2, 3) of two cameras; huge if a ray would have to run backwards."""
+    """Lengths (N,) of bars whose ends lie on rays (N, 2, 3) of two cameras; huge where a depth is negative."""
     aa, bb, ab = np.sum(hi * hi, -1), np.sum(hj * hj, -1), np.sum(hi * hj, -1)
     determinant = np.maximum(aa * bb - ab * ab, 1e-15)
     depth_i = (ab * (hj @ t) - bb * (hi @ t)) / determinant

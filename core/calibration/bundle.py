@@ -9,10 +9,10 @@ A bar position i is a middle M_i and a unit vector d_i; its length L holds exact
     S = V − Σ Y_iᵀ Y_i ,   S Δc = g_c − Σ Y_iᵀ L_i⁻¹ g_i                       (4)
     (S + μ G Gᵀ) Δc = …                                                        (5)   G: turning and shifting the whole (free network)
 
-The second sum of (2) are pseudo-observations of the interior unknowns: what a lens can be (see `Pseudo`); s is the image points' sigma.
-The scale comes from L, so G has six columns. All normal equations are float64; one step costs O(N C²). Inside, positions are the last
-axis of every array, and a stretch of them is worked on at a time: the small products of (3) and (4) then run over them, which is several
-times as fast as block by block, and in memory that is at hand already.
+The second sum of (2) is the prior of the interior unknowns, as pseudo-observations (`reference_bar.lens_prior`); s is the sigma of the
+image points. The scale comes from L, so G has six columns. All normal equations are float64; one step costs O(N C²). Internally, positions
+are the last axis of every array and are processed in blocks: the small products of (3) and (4) then run over many positions at once, which
+is several times as fast as one position after the other.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,10 +24,13 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from ..geometry.camera import INTERIOR, Camera, camera_of, columns_of_derivatives, columns_of_exterior, image_of, interior_of
 from ..geometry.rotation import cross_matrix, rotation_from_vector
 
-STRETCH = 256  # positions
+BLOCK = 256  # positions
 BEHIND_PX = 1e4  # residual of a point behind the camera
-DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
-CONVERGED = 1e-4  # a step that lowers the sum of squares by less than this part of σ0² per unknown changes nothing
+NEAREST_M = 1e-3  # in front of the camera; points that are nearer count as behind it
+DAMPING = 1e-3  # of the first step, relative to the diagonal of the normal matrix
+MIN_DAMPING = 1e-9
+MAX_DAMPING = 1e6  # no step lowers the sum of squares any more
+CONVERGED = 1e-4  # decrease of the sum of squares in units of σ0² per unknown
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -54,14 +57,14 @@ class Network:
             for name, size, p, R, t in zip(names, size_px, self.interior, self.R, self.t)
         )
 
-    def stretches(self) -> Iterator[tuple[slice, "Network"]]:
-        """The positions in stretches, each with its part of the network."""
-        for start in range(0, len(self.middle), STRETCH):
-            at = slice(start, start + STRETCH)
+    def blocks(self) -> Iterator[tuple[slice, "Network"]]:
+        """Blocks of positions, each with its part of the network."""
+        for start in range(0, len(self.middle), BLOCK):
+            at = slice(start, start + BLOCK)
             yield at, replace(self, middle=self.middle[at], direction=self.direction[at])
 
     def with_cameras(self, cameras: Sequence[Camera]) -> "Network":
-        """The same positions before other cameras."""
+        """The same positions with other cameras."""
         return replace(
             self,
             interior=np.stack([interior_of(c) for c in cameras]),
@@ -72,11 +75,11 @@ class Network:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Unknowns:
-    """Which interior unknowns are free (10,) in all cameras, and what is known of them beforehand (C, 10): value and sigma."""
+    """Which interior unknowns are free in all cameras, and their prior."""
 
-    free: np.ndarray
-    expected: np.ndarray
-    sigma: np.ndarray
+    free: np.ndarray  # (10,)
+    expected: np.ndarray  # (C, 10)
+    sigma: np.ndarray  # (C, 10) of the expected values
 
     @property
     def columns(self) -> np.ndarray:
@@ -84,7 +87,7 @@ class Unknowns:
         return np.concatenate([np.flatnonzero(self.free), np.arange(10, 16)])
 
     def only(self, *names: str) -> "Unknowns":
-        """The same with other unknowns free."""
+        """The same prior with only these unknowns free."""
         return replace(self, free=np.array([name in names for name in INTERIOR]))
 
 
@@ -101,7 +104,7 @@ class Normals:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Adjusted:
-    """A network after adjustment. `residual_px` (N, C, 2, 2) observed − computed; `weight` (N, C, 2), 0: not used."""
+    """An adjusted network. `residual_px` (N, C, 2, 2) observed − computed; `weight` (N, C, 2), 0: not used."""
 
     network: Network
     residual_px: np.ndarray
@@ -111,10 +114,19 @@ class Adjusted:
     converged: bool
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LevenbergMarquardt:
+    """When the iteration of `adjust` stops, and the damping with which it starts."""
+
+    max_iterations: int = 15
+    tolerance: float = CONVERGED
+    damping: float = DAMPING
+
+
 def residuals(network: Network, xy_px: np.ndarray) -> np.ndarray:
-    """Observed − computed (N, C, 2, 2); NaN where nothing was observed, huge where a point lies behind its camera."""
+    """Observed − computed (N, C, 2, 2); NaN where there is no observation, huge where a point lies behind its camera."""
     p = _in_cameras(network)
-    ahead = p[:, 2:] > 1e-3
+    ahead = p[:, 2:] > NEAREST_M
     image = image_of(network.interior, np.moveaxis(np.where(ahead, p, 1.0), 1, 2))  # (C, 2 N, 2)
     image = np.where(ahead[:, 0, :, None], image, BEHIND_PX).reshape(len(p), 2, -1, 2)
     with np.errstate(invalid="ignore"):
@@ -122,13 +134,13 @@ def residuals(network: Network, xy_px: np.ndarray) -> np.ndarray:
 
 
 def _in_cameras(network: Network) -> np.ndarray:
-    """The ends in each camera's frame (C, 3, 2 N): first the one end of all bars, then the other.  (1)"""
+    """The ends in each camera's frame (C, 3, 2 N): end 0 of all bars, then end 1.  (1)"""
     middle, half = network.middle.T, network.direction.T * (network.length_m / 2)
     return network.R @ np.concatenate([middle + half, middle - half], axis=1) + network.t[..., None]
 
 
 def weights_of(residual_px: np.ndarray, cauchy_px: float | None, used: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weights (N, C, 2) of the image points and their part of the sum (2), Cauchy's if a width is given (Huber 1981)."""
+    """Weights (N, C, 2) of the image points and their part of the sum (2); Cauchy's weights if a width is given (Huber 1981)."""
     square = np.where(used, np.sum(np.nan_to_num(residual_px) ** 2, axis=-1), 0.0)
     if cauchy_px is None:
         return used.astype(np.float64), float(square.sum())
@@ -137,7 +149,7 @@ def weights_of(residual_px: np.ndarray, cauchy_px: float | None, used: np.ndarra
 
 
 def tangents(direction: np.ndarray) -> np.ndarray:
-    """Two unit vectors (2, 3, N) across each direction (N, 3), and each other (Duff & al. 2017)."""
+    """Two unit vectors (2, 3, N) perpendicular to each direction (N, 3) and to each other (Duff et al. 2017)."""
     x, y, z = direction.T
     sign = np.copysign(1.0, z)
     a = -1 / (sign + z)
@@ -146,11 +158,11 @@ def tangents(direction: np.ndarray) -> np.ndarray:
 
 
 def design(network: Network, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image points (C, 2, 2, N) — x and y, ends, positions — and their derivatives to the free camera unknowns (C, p, 2, 2, N) and to
-    the bar's (C, 5, 2, 2, N)."""
+    """Image points (C, 2, 2, N) (x and y, ends, positions) and their derivatives to the free camera unknowns (C, p, 2, 2, N) and to
+    those of the bar (C, 5, 2, 2, N)."""
     p = _in_cameras(network)
     C, N = len(p), len(network.middle)
-    p = np.where(p[:, 2:] > 1e-3, p, [[0.0], [0.0], [1e3]])
+    p = np.where(p[:, 2:] > NEAREST_M, p, [[0.0], [0.0], [1e3]])
     image, J_interior, G = columns_of_derivatives(network.interior, p)
     J = np.concatenate([J_interior[:, np.flatnonzero(unknowns.free)], columns_of_exterior(G, p)], axis=1)
     GR = (network.R.transpose(0, 2, 1)[:, None] @ G).reshape(C, 2, 3, 2, N).swapaxes(1, 2)
@@ -167,7 +179,7 @@ def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarr
     C, N, p = len(network.R), len(network.middle), len(unknowns.columns)
     V, g_c = np.zeros((C, p, p)), np.zeros((C, p))
     U, g_b, W = np.empty((5, 5, N)), np.empty((5, N)), np.empty((5, C, p, N))
-    for at, part in network.stretches():
+    for at, part in network.blocks():
         J, B, v = _weighted(part, residual_px[at], weight[at], unknowns)
         flat = J.reshape(C, p, -1)
         V += flat @ flat.swapaxes(1, 2)
@@ -181,7 +193,7 @@ def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarr
 
 
 def _weighted(network: Network, residual_px: np.ndarray, weight: np.ndarray, unknowns: Unknowns) -> tuple[np.ndarray, ...]:
-    """Derivatives (C, p, 4, N), (C, 5, 4, N) and residuals (C, 4, N), times the roots of the weights."""
+    """Derivatives (C, p, 4, N), (C, 5, 4, N) and residuals (C, 4, N), times the square roots of the weights."""
     _, J, B = design(network, unknowns)
     root = np.sqrt(weight.transpose(1, 2, 0))[:, None]  # (C, 1, 2, N)
     v = np.where(weight[..., None] > 0, residual_px, 0.0).transpose(1, 3, 2, 0) * root
@@ -208,7 +220,7 @@ def pseudo_cost(network: Network, unknowns: Unknowns, unit_px: float) -> float:
 
 
 def free_network(network: Network, unknowns: Unknowns) -> np.ndarray:
-    """The changes (C p, 6) of the camera unknowns when everything is turned and shifted as a whole, which no image shows."""
+    """The changes (C p, 6) of the camera unknowns when the whole network is rotated and shifted, which leaves all images unchanged."""
     free = int(unknowns.free.sum())
     C = len(network.R)
     G = np.zeros((C, free + 6, 6))
@@ -218,11 +230,11 @@ def free_network(network: Network, unknowns: Unknowns) -> np.ndarray:
 
 
 def reduce_to_cameras(normals: Normals, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """S and its right side (4), and L⁻¹ (5, 5, N) that the bars' own steps need."""
+    """S and its right side (4), and L⁻¹ (5, 5, N), from which the steps of the bars follow."""
     inverse = inverse_factors(normals.U * (1 + damping * np.eye(5)[..., None]))
     S, rhs = normals.V.copy(), normals.g_c.copy()
-    for start in range(0, normals.U.shape[-1], STRETCH):
-        at = slice(start, start + STRETCH)
+    for start in range(0, normals.U.shape[-1], BLOCK):
+        at = slice(start, start + BLOCK)
         z = np.einsum("jkn,kn->jn", inverse[..., at], normals.g_b[:, at])
         for Y_j, z_j in zip(eliminated(inverse[..., at], normals.W[..., at]), z):
             S -= Y_j @ Y_j.T
@@ -236,7 +248,7 @@ def eliminated(inverse: np.ndarray, W: np.ndarray) -> np.ndarray:
 
 
 def inverse_factors(U: np.ndarray) -> np.ndarray:
-    """L⁻¹ (n, n, N) of N matrices U = L Lᵀ (n, n, N), all at once: for many small blocks much faster than one after the other."""
+    """L⁻¹ (n, n, N) of N matrices U = L Lᵀ (n, n, N), all at once, which is much faster than one small matrix after the other."""
     A, n = U.copy(), len(U)  # becomes L column by column
     B = np.zeros_like(A)  # becomes L⁻¹ row by row
     for j in range(n):
@@ -260,7 +272,7 @@ def solve_step(network: Network, normals: Normals, unknowns: Unknowns, damping: 
 
 
 def _solved(A: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """x of A x = rhs; the smallest one where A is singular, as before a camera that sees nothing."""
+    """x of A x = rhs; of minimum norm where A is singular, as with a camera that has no image points."""
     try:
         return np.asarray(cho_solve(cho_factor(A), rhs))
     except np.linalg.LinAlgError:
@@ -294,16 +306,14 @@ def adjust(
     *,
     cauchy_px: float | None = None,
     unit_px: float = 0.1,
-    max_iterations: int = 15,
-    tolerance: float = CONVERGED,
-    damping: float = DAMPING,
+    iteration: LevenbergMarquardt = LevenbergMarquardt(),  # noqa: B008  frozen
 ) -> Adjusted:
-    """Levenberg–Marquardt on (2) from a start; `used` (N, C, 2) says which image points take part."""
-    iterations, converged = 0, False
+    """Minimise (2) by Levenberg–Marquardt from `network`, with the image points `used` (N, C, 2)."""
+    iterations, converged, damping = 0, False, iteration.damping
     v = residuals(network, xy_px)
     weight, cost = weights_of(v, cauchy_px, used)
     cost += pseudo_cost(network, unknowns, unit_px)
-    while iterations < max_iterations and not converged and damping < MAX_DAMPING:
+    while iterations < iteration.max_iterations and not converged and damping < MAX_DAMPING:
         iterations += 1
         normals = normal_equations(network, v, weight, unknowns, unit_px)
         while damping < MAX_DAMPING:
@@ -316,7 +326,7 @@ def adjust(
             damping *= 10
         else:
             break
-        converged = cost - cost_trial < tolerance * unit_px**2 * len(normals.g_c)
+        converged = cost - cost_trial < iteration.tolerance * unit_px**2 * len(normals.g_c)
         network, v, weight, cost = trial, v_trial, weight_trial, cost_trial
         damping = max(damping / 10, MIN_DAMPING)
     return Adjusted(network=network, residual_px=v, weight=weight, cost=cost, iterations=iterations, converged=converged)

@@ -1,6 +1,6 @@
 """The stage that calibrates: from a folder with the images of a waved reference bar to a rig with its report.
 
-BARDIR holds a folder of images or a movie per camera; their names are the cameras' names. Nothing else is required but the bar's length.
+BARDIR has a folder of images or a movie per camera; their names are the names of the cameras. Only the length of the bar is required.
 """
 
 import math
@@ -26,9 +26,10 @@ from .self_calibration import Calibration, calibrate
 from .targets import BarTrack, Targets, find_targets, moved_targets, track_bar
 from .world_frame import WorldChoice, frame_of_bar
 
-Note = Callable[[str, int, int], None]  # view, images looked at, images with both targets
+Note = Callable[[str, int, int], None]  # view, images searched, images with both targets
 MIN_POSITIONS = 12
-MIN_WAY = 0.02  # of the image width: a bar that moves less stands still
+MIN_PATH = 0.02  # of the image width: a bar that moves less is static
+MIN_STATIC = 4  # positions that show whether the bar moves
 LONGEST_BAR_M = 20.0
 
 
@@ -56,7 +57,7 @@ class BarFootage:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class MeasuredBar:
-    """What was found in the images: per view the track of the two targets, and the observations made of them."""
+    """The tracks of the two targets, one per view, and the observations made from them."""
 
     tracks: tuple[BarTrack, ...]
     observations: BarObservations
@@ -65,16 +66,16 @@ class MeasuredBar:
 def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, first_field: str = "odd") -> BarFootage:
     """Open the sequences in BARDIR: one folder of images, or one movie, per camera.
 
-    With `interlaced` "both" each image shows the bar at two instants, in the `first_field` at the first.
+    With `interlaced` "both" each image shows the bar at two instants; the `first_field` is the earlier one.
 
     `mask` is an image, black where no target can be, or a folder of such images named like the cameras that need one.
 
     Raises:
-        InputError: the folder is missing, holds fewer than two views, or views of different length; a mask belongs to no camera.
+        InputError: the folder is missing, has fewer than two views, or views of different length; a mask belongs to no camera.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; give the folder that holds one folder of images or one movie of the bar per camera.")
+        raise InputError(f"{folder} is no folder; give the folder that has one folder of images or one movie of the bar per camera.")
     names, sequences = [], []
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):
@@ -90,13 +91,13 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, f
             sequences.append(open_sequence(folder, images=None, movie=path.name, view=path.stem))
     if len(names) < 2:
         raise InputError(
-            f"{folder} holds {'no views' if not names else 'only the view ' + names[0]}; "
+            f"{folder} has {'no views' if not names else 'only the view ' + names[0]}; "
             "it needs a folder of images, or a movie, for each of at least two cameras."
         )
     counts = {name: s.count for name, s in zip(names, sequences)}
     if len(set(counts.values())) > 1:
-        said = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"The views in {folder} have different numbers of frames ({said}); trim them to the same instants.")
+        lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
     masks = () if mask is None else _masks(Path(mask), names)
     return BarFootage(
         folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, masks=masks, first_field=first_field
@@ -108,22 +109,22 @@ def _masks(path: Path, names: list[str]) -> tuple[np.ndarray | None, ...]:
         shown = read_image(path) > 0
         return (shown,) * len(names)
     found = {file.stem: file for file in sorted(path.iterdir()) if file.suffix.lower() in IMAGE_ENDINGS}
-    strangers = [name for name in found if name not in names]
-    if strangers or not found:
-        what = f"the mask {found[strangers[0]].name}, and there is no camera of that name" if strangers else "no image"
-        raise InputError(f"{path} holds {what}; name the masks as the cameras: {', '.join(names)}.")
+    unknown = [name for name in found if name not in names]
+    if unknown or not found:
+        what = f"the mask {found[unknown[0]].name}, and there is no camera of that name" if unknown else "no image"
+        raise InputError(f"{path} has {what}; give the masks the names of the cameras: {', '.join(names)}.")
     return tuple(read_image(found[name]) > 0 if name in found else None for name in names)
 
 
 def measure_bar(
     footage: BarFootage, length_m: float, monitor: Monitor, note: Note | None = None, diameter_m: float | None = None
 ) -> MeasuredBar:
-    """Find, measure and follow the bar's targets in all images; `note` hears how many images of a view showed two targets so far.
+    """Find, measure and track the targets of the bar in all images; `note` is called with the number of images of a view with two targets.
 
-    With the targets' diameter, pairs of spots that are too small for their distance, such as reflections, take no part.
+    With the diameter of the targets, pairs of spots that are too small for their distance, such as reflections, are not used.
 
     Raises:
-        InputError: the length or the diameter cannot be, images cannot be read, or the bar is not seen well enough to calibrate with.
+        InputError: the length or the diameter is impossible, images cannot be read, or the bar is not visible often enough.
     """
     if not (math.isfinite(length_m) and 0 < length_m < LONGEST_BAR_M):
         raise InputError(
@@ -184,17 +185,17 @@ def _check_view(footage: BarFootage, view: int, track: BarTrack, width_px: int) 
     name = footage.names[view]
     complete = np.isfinite(track.xy_px).all(axis=(1, 2))
     if not track.spots.any():
-        raise InputError(f"No bright target is seen in any image of view {name} in {footage.folder}; light the bar from beside the camera.")
+        raise InputError(f"No bright target is visible in any image of view {name} in {footage.folder}; light it from next to the camera.")
     if complete.sum() < 2:
         raise InputError(
-            f"View {name} in {footage.folder} never shows both targets of the bar; wave it where this camera sees both, "
-            "or leave the camera out."
+            f"View {name} in {footage.folder} never shows both targets of the bar; wave it where both are visible to "
+            "this camera, or leave the camera out."
         )
-    way = np.ptp(track.xy_px[complete], axis=0).max()
-    if complete.sum() > 3 and (track.still or way < MIN_WAY * width_px):
+    path_px = np.ptp(track.xy_px[complete], axis=0).max()
+    if complete.sum() >= MIN_STATIC and (track.static or path_px < MIN_PATH * width_px):
         raise InputError(
-            f"The bar stands still in view {name} in {footage.folder} (it moves {way:.1f} px), "
-            "or only lamps and reflections are seen there; wave it through the whole volume, in all directions."
+            f"The bar does not move in view {name} in {footage.folder} (only {path_px:.1f} px), "
+            "or only lamps and reflections are visible there; wave it through the whole volume, in all directions."
         )
 
 
@@ -202,14 +203,14 @@ def _check_positions(footage: BarFootage, observations: BarObservations) -> None
     shared = int((observations.complete.sum(axis=1) >= 2).sum())
     if shared < MIN_POSITIONS:
         raise InputError(
-            f"Only {shared} bar positions in {footage.folder} are seen whole by two cameras; at least {MIN_POSITIONS} are needed "
-            "and 100 or more are good: wave the bar longer, through the whole volume."
+            f"In only {shared} bar positions in {footage.folder} both ends are visible to two cameras; at least {MIN_POSITIONS} are needed "
+            "and 100 or more are good: wave the bar for longer, through the whole volume."
         )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class CalibratedRig:
-    """The cameras and all that is known of their quality."""
+    """The cameras and their quality."""
 
     rig: Rig
     calibration: Calibration
@@ -226,10 +227,10 @@ class CalibratedRig:
 def calibrate_rig(
     observations: BarObservations, monitor: Monitor, *, focal_px: float | None = None, world: WorldChoice | None = None
 ) -> CalibratedRig:
-    """Calibrate from what was seen of the bar, judge the result, and put it into the world's frame.
+    """Calibrate from the observations of the bar, judge the result, and put it into the world's frame.
 
     Raises:
-        InputError: the data cannot determine the rig, or not the world's frame; the sentence says what is missing.
+        InputError: the data do not determine the rig or the world's frame; the message names what is missing.
     """
     world = world or WorldChoice()
     calibration = calibrate(observations, monitor, focal_px)
@@ -255,10 +256,10 @@ def calibrate_rig(
 
 
 def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
-    """The calibration turned and shifted into the world's frame. Its covariance stays: the cameras' unknowns are in their own frames.
+    """The calibration in the world's frame. Its covariance does not change: the unknowns of the cameras are in their own frames.
 
     Raises:
-        InputError: what the frame is to be made of was not seen, or makes none.
+        InputError: what the frame is defined by is not visible, or does not determine it.
     """
     observations, network = calibration.observations, calibration.network
     cameras = network.cameras(observations.names, observations.size_px)

@@ -1,13 +1,13 @@
 """Relative orientation of two cameras from the bar alone, for many guesses of focal lengths and distortion at once.
 
-The focal length does not follow from the fundamental matrix when the cameras' axes meet or are parallel, as in any row of cameras
-(Sturm & al. 2005); it follows from the bar, whose length must come out the same everywhere. So every guess is tried:
+The focal length does not follow from the fundamental matrix when the axes of the cameras meet or are parallel, as in any row of cameras
+(Sturm et al. 2005); it follows from the bar, whose length must be the same everywhere. So every guess is tried:
 
     n = (x_u − c) / f ,   x_d = x_u (1 + κ r_u² / r_corner²)                     (1)   f and κ guessed
     n_jᵀ E n_i = 0 ,   Σ w (n_jᵀ E n_i)² → min , w: Cauchy on Sampson's distance   (2)   eight-point algorithm (Hartley 1997)
-    E = U diag(1, 1, 0) Vᵀ → (R, t) with the points before both cameras            (3)
+    E = U diag(1, 1, 0) Vᵀ → (R, t) with the points in front of both cameras       (3)
     scale = L / median |A − B|                                                    (4)
-    score = log CV(|A − B|) + ½ log(Sampson / px) − 4 log(fraction before both)      (5)   CV: robust coefficient of variation
+    score = log CV(|A − B|) + ½ log(Sampson / px) − 4 log(fraction in front of both) (5)   CV: robust coefficient of variation
 """
 
 from dataclasses import dataclass
@@ -17,28 +17,30 @@ import numpy as np
 
 from ..geometry.robust import mad_sigma
 
-REWEIGHTINGS = 4
-PAIR_TOLERANCE = 0.008  # of the image width: distortion is still inside the points
+REWEIGHTINGS = 4  # of (2)
+PAIR_TOLERANCE = 0.008  # of the image width: the points are still distorted
 MAGSAC_ITERATIONS = 6000
-MAX_POINTS = 400
+MAX_POINTS = 400  # of MAGSAC
+MIN_POINTS = 8
+UNDISTORT_STEPS = 6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PairGuesses:
-    """H guesses of a pair of cameras and what follows from each: x_j = R x_i + t."""
+    """H guesses of a pair of cameras, and the relative orientation x_j = R x_i + t that follows from each."""
 
-    score: np.ndarray  # (H,) smaller is better
+    score: np.ndarray  # (H,) of (5), smaller is better
     R: np.ndarray  # (H, 3, 3)
     t_m: np.ndarray  # (H, 3)
 
 
 def agreeing(xi: np.ndarray, xj: np.ndarray, width_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which of m points (m, 2) agree with one fundamental matrix, and that matrix (3, 3); none agree where there is none (MAGSAC++).
+    """Which of m points (m, 2) agree with one fundamental matrix, and that matrix (3, 3); none where there is no matrix (MAGSAC++).
 
-    What agrees may still have distortion in it: the tolerance is wide.
+    The tolerance is wide, because the points are distorted.
     """
     none = np.zeros(len(xi), dtype=bool), np.zeros((3, 3))
-    if len(xi) < 8:
+    if len(xi) < MIN_POINTS:
         return none
     some = np.unique(np.linspace(0, len(xi) - 1, MAX_POINTS).astype(int))
     tolerance = PAIR_TOLERANCE * width_px
@@ -59,11 +61,11 @@ def sampson(F: np.ndarray, xi: np.ndarray, xj: np.ndarray) -> np.ndarray:
 
 
 def undistorted(xy_px: np.ndarray, size_px: np.ndarray, kappa: float) -> np.ndarray:
-    """Points (…, 2) about the image's middle, freed of a radial distortion that is κ at the image's corner.  (1)"""
+    """Points (…, 2) relative to the image centre, without a radial distortion that is κ at the image corner.  (1)"""
     centred = xy_px - (size_px - 1) / 2
     corner2 = float(size_px @ size_px) / 4
     u = centred
-    for _ in range(6):
+    for _ in range(UNDISTORT_STEPS):
         u = centred / (1 + kappa * np.sum(u * u, axis=-1, keepdims=True) / corner2)
     return u
 
@@ -71,18 +73,18 @@ def undistorted(xy_px: np.ndarray, size_px: np.ndarray, kappa: float) -> np.ndar
 def try_guesses(ui: np.ndarray, uj: np.ndarray, bars: int, fi: np.ndarray, fj: np.ndarray, length_m: float) -> PairGuesses:
     """Evaluate H guesses fi, fj (H,) of the focal lengths; `ui`, `uj` (m, 2) are centred, undistorted points.
 
-    The first 2 `bars` of them are the ends of complete bars, one after the other; the rest are single ends.
+    The first 2 `bars` of them are the ends of complete bars, in pairs; the rest are single ends.
     """
     ni, nj = ui / fi[:, None, None], uj / fj[:, None, None]
     focal = np.sqrt(fi * fj)
     E, distance = _essential(ni, nj, focal)
-    R, t, depth_i, depth_j, before = _decomposed(E, ni, nj)
+    R, t, depth_i, depth_j, in_front = _decomposed(E, ni, nj)
     hi, hj = _homogeneous(ni), _homogeneous(nj)
     points = ((hi * depth_i[..., None]) @ R.transpose(0, 2, 1) + t[:, None] + hj * depth_j[..., None]) / 2
     lengths = np.linalg.norm(points[:, 0 : 2 * bars : 2] - points[:, 1 : 2 * bars : 2], axis=-1)
     median = np.maximum(np.median(lengths, axis=1), 1e-12)
     variation = mad_sigma(lengths - median[:, None], 1) / median
-    score = np.log(np.maximum(variation, 1e-5)) + 0.5 * np.log(np.maximum(distance, 0.02)) - 4 * np.log(np.maximum(before, 1e-3))
+    score = np.log(np.maximum(variation, 1e-5)) + 0.5 * np.log(np.maximum(distance, 0.02)) - 4 * np.log(np.maximum(in_front, 1e-3))
     return PairGuesses(score=score, R=R, t_m=t * (length_m / median)[:, None])
 
 
@@ -111,7 +113,7 @@ def _essential(ni: np.ndarray, nj: np.ndarray, focal: np.ndarray) -> tuple[np.nd
 
 
 def _decomposed(E: np.ndarray, ni: np.ndarray, nj: np.ndarray) -> tuple[np.ndarray, ...]:
-    """R, t of each E with most points before both cameras, their depths (H, m), and that fraction (H,).  (3)"""
+    """R, t of each E with most points in front of both cameras, their depths (H, m), and that fraction (H,).  (3)"""
     U, _, Vt = np.linalg.svd(E)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     candidates = []
@@ -122,14 +124,14 @@ def _decomposed(E: np.ndarray, ni: np.ndarray, nj: np.ndarray) -> tuple[np.ndarr
     R = np.stack([r for r, _ in candidates], axis=1)
     t = np.stack([s for _, s in candidates], axis=1)  # (H, 4, …)
     depth_i, depth_j = _depths(R, t, _homogeneous(ni)[:, None], _homogeneous(nj)[:, None])
-    before = ((depth_i > 0) & (depth_j > 0)).mean(axis=-1)
-    best = np.argmax(before, axis=1)
+    in_front = ((depth_i > 0) & (depth_j > 0)).mean(axis=-1)
+    best = np.argmax(in_front, axis=1)
     row = np.arange(len(E))
-    return R[row, best], t[row, best], depth_i[row, best], depth_j[row, best], before[row, best]
+    return R[row, best], t[row, best], depth_i[row, best], depth_j[row, best], in_front[row, best]
 
 
 def _depths(R: np.ndarray, t: np.ndarray, hi: np.ndarray, hj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depths with which λ_j h_j = λ_i R h_i + t holds best."""
+    """Depths that fit λ_j h_j = λ_i R h_i + t best."""
     a = hi @ np.swapaxes(R, -1, -2)
     t = t[..., None, :]
     aa, bb, ab = np.sum(a * a, -1), np.sum(hj * hj, -1), np.sum(a * hj, -1)

@@ -1,15 +1,15 @@
-"""What the adjustment says about space: covariance of the cameras in the free network, and the error it makes at points of a volume.
+"""Precision in space: covariance of the cameras in the free network, and the error that it causes at points of a volume.
 
     Q_c = (S + μ G Gᵀ)⁻¹ − G (Gᵀ G)⁻¹ μ⁻¹ … Gᵀ = S⁺                              (1)   minimum trace, cameras
-    X(c): ∂X/∂c = −(Σ G_cᵀ G_c)⁻¹ G_cᵀ J_c                                      (2)   a point intersected by the cameras that see it
-    ΔX_i − (τ + θ × X_i) → min over τ, θ                                         (3)   what no rigid motion of the whole explains
+    X(c): ∂X/∂c = −(Σ G_cᵀ G_c)⁻¹ G_cᵀ J_c                                      (2)   a point intersected by the cameras that show it
+    ΔX_i − (τ + θ × X_i) → min over τ, θ                                         (3)   errors beyond a rigid motion of the whole
 
     P = Q_r ⊕ 0 + [K; I] Σ [K; I]ᵀ ,   K = Q_rl Q_ll⁻¹                          (4)   l: unknowns that were left out, r: the others
     Σ = max(0, F − 1) Q_gg for each group g of them ,   F = xᵀ Q_gg⁻¹ x / m      (5)
 
-(4) is what a left-out unknown of covariance Σ does to the others (Schmidt 1966, "consider" parameters); with Σ = Q_ll it is the covariance
-of the adjustment in which all were free. As E F = 1 + λ / m, F − 1 in (5) is the unbiased estimate of what a group is beyond its own noise,
-its positive part the empirical Bayes variance (Efron & Morris 1973).
+(4) is the effect of left-out unknowns of covariance Σ on the others (Schmidt 1966, "consider" parameters); with Σ = Q_ll it is the
+covariance of the adjustment in which all are free. As E F = 1 + λ / m, F − 1 in (5) is the unbiased estimate of the size of a group beyond
+its noise, and its positive part the empirical Bayes variance (Efron & Morris 1973).
 
 Mapping through (3) is an S-transformation to the datum of the points themselves (Baarda 1973), so the figures do not depend on the datum.
 """
@@ -22,12 +22,12 @@ from scipy.linalg import block_diag
 
 from ..geometry.camera import INTERIOR, Camera, exterior_derivatives, image_with_derivatives, interior_of
 from ..geometry.rotation import cross_matrix
-from .bundle import Network, Normals, Unknowns, free_network, reduce_to_cameras
+from .bundle import NEAREST_M, Network, Normals, Unknowns, free_network, reduce_to_cameras
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PredictedError:
-    """Errors at points of space that come from the calibration alone (not from measuring the points), as standard deviations [m]."""
+    """Errors at points in space caused by the calibration alone (not by measuring the points), as standard deviations [m]."""
 
     xyz_m: np.ndarray  # (M, 3)
     sigma_m: np.ndarray  # (M,) root of the variance summed over x, y, z
@@ -49,7 +49,7 @@ def camera_covariance(network: Network, normals: Normals, unknowns: Unknowns) ->
 def group_of(
     off: np.ndarray, unknowns: Unknowns, covariance: np.ndarray, names: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a group of interior unknowns is beyond what was expected (m,), its covariance (m, m) and its columns (m,), all cameras together.
+    """A group of interior unknowns less the expected values (m,), its covariance (m, m) and its columns (m,), all cameras together.
 
     `off` (C, 10) are all interior unknowns less their expected values, `covariance` (C p, C p) that of the free ones.
     """
@@ -62,38 +62,38 @@ def group_of(
 def with_left_out(
     covariance: np.ndarray, unknowns: Unknowns, full: np.ndarray, off: np.ndarray, left_out: Sequence[Sequence[str]]
 ) -> np.ndarray:
-    """Covariance (16 C, 16 C) of all unknowns when groups of interior unknowns are kept at their expected values.  (4), (5)
+    """Covariance (16 C, 16 C) of all unknowns when groups of interior unknowns are fixed at their expected values.  (4), (5)
 
     `covariance` (C p, C p) and `unknowns` are those of the adjustment without the groups, `full` (16 C, 16 C) and `off` (C, 10), values
     less expected values, those of the adjustment with all unknowns free.
     """
     every = replace(unknowns, free=np.ones(len(INTERIOR), dtype=bool))
-    kept = (np.arange(len(off))[:, None] * 16 + unknowns.columns).ravel()
+    free = (np.arange(len(off))[:, None] * 16 + unknowns.columns).ravel()
     P = np.zeros_like(full)
-    P[np.ix_(kept, kept)] = covariance
+    P[np.ix_(free, free)] = covariance
     if not left_out:
         return P
     groups = [group_of(off, every, full, names) for names in left_out]
     index = np.concatenate([columns for _, _, columns in groups])
-    may_be = block_diag(*(max(0.0, x @ np.linalg.solve(Q, x) / len(x) - 1) * Q for x, Q, _ in groups))
+    excess = block_diag(*(max(0.0, x @ np.linalg.solve(Q, x) / len(x) - 1) * Q for x, Q, _ in groups))
     K = np.linalg.solve(full[np.ix_(index, index)], full[index]).T
-    return P + K @ may_be @ K.T
+    return P + K @ excess @ K.T
 
 
 def point_derivatives(cameras: Sequence[Camera], unknowns: Unknowns, xyz_m: np.ndarray) -> np.ndarray:
-    """Derivatives (M, 3, C p) of intersected points (M, 3) to the camera unknowns; NaN where fewer than two cameras see a point.  (2)"""
+    """Derivatives (M, 3, C p) of intersected points (M, 3) to the camera unknowns; NaN where fewer than two cameras show a point.  (2)"""
     M, p = len(xyz_m), len(unknowns.columns)
     A, N, rays = np.zeros((M, 3, len(cameras) * p)), np.zeros((M, 3, 3)), np.zeros(M)
     for c, camera in enumerate(cameras):
         q = camera.to_camera(xyz_m)
-        seen = (q[:, 2] > 1e-3) & camera.sees(camera.project(xyz_m))
-        q = np.where(seen[:, None], q, [0.0, 0.0, 1.0])
+        visible = (q[:, 2] > NEAREST_M) & camera.sees(camera.project(xyz_m))
+        q = np.where(visible[:, None], q, [0.0, 0.0, 1.0])
         _, J_interior, G = image_with_derivatives(interior_of(camera), q)
         J = np.concatenate([J_interior, exterior_derivatives(G, q)], axis=-1)[..., unknowns.columns]
-        GR = (G @ camera.R_cam_world) * seen[:, None, None]
+        GR = (G @ camera.R_cam_world) * visible[:, None, None]
         N += GR.transpose(0, 2, 1) @ GR
         A[:, :, c * p : (c + 1) * p] = GR.transpose(0, 2, 1) @ J
-        rays += seen
+        rays += visible
     D = np.full_like(A, np.nan)
     good = rays >= 2
     D[good] = -np.linalg.solve(N[good], A[good])
@@ -101,7 +101,7 @@ def point_derivatives(cameras: Sequence[Camera], unknowns: Unknowns, xyz_m: np.n
 
 
 def without_rigid_motion(D: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
-    """Derivatives (M, 3, q) less the rigid motion of the whole that fits them best.  (3)"""
+    """Derivatives (M, 3, q) less the best-fitting rigid motion of the whole.  (3)"""
     M = len(xyz_m)
     T = np.concatenate([np.broadcast_to(np.eye(3), (M, 3, 3)), -cross_matrix(xyz_m - xyz_m.mean(axis=0))], axis=-1).reshape(3 * M, 6)
     flat = D.reshape(3 * M, -1)
@@ -111,7 +111,7 @@ def without_rigid_motion(D: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
 def predicted_error(cameras: Sequence[Camera], unknowns: Unknowns, covariance: np.ndarray, pairs_m: np.ndarray) -> PredictedError:
     """The error at the ends of test bars (K, 2, 3) from the cameras' covariance (C p, C p).
 
-    Bars with an end that fewer than two cameras see are left out.
+    Bars with an end that fewer than two cameras show are left out.
     """
     points = pairs_m.reshape(-1, 3)
     D = point_derivatives(cameras, unknowns, points)

@@ -1,12 +1,12 @@
-"""How good a calibration is, in figures: what the covariance predicts over the volume, and what bars that took no part say.
+"""The quality of a calibration: the error predicted from the covariance over the volume, and the lengths of bars that were left out.
 
     predicted 3-D error      (`precision`) at a grid over the box in which the bar was waved
     held-out lengths         five times a fifth of the positions is left out, the rest adjusted, the left-out ends intersected    (1)
-                             of the bars that passed the test for blunders, and of all whose rays meet: the test knows the length
+                             for bars that passed data snooping, which uses the length, and for all bars whose rays meet
     direction scatter        eigenvalues of mean(d dᵀ); the smallest decides whether the focal lengths are determined            (2)
-    mirrored solution        depth reversed about the volume's middle and adjusted anew; it must fit much worse                   (3)
+    mirrored solution        depth reversed about the centre of the volume, and adjusted again; it must fit much worse            (3)
 
-A small residual in the images is no proof: it may hide errors a hundred times larger in space.
+Small residuals in the images prove nothing: they may hide errors a hundred times larger in space.
 """
 
 from dataclasses import dataclass, replace
@@ -18,21 +18,24 @@ from ..geometry.camera import INTERIOR, Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.robust import finite_median
 from .bars import BarObservations, met_ends
-from .bundle import Network, adjust
+from .bundle import LevenbergMarquardt, Network, adjust
 from .precision import PredictedError, predicted_error
 from .self_calibration import GROSS, Calibration
 
-FOLDS = 5
-CELLS = (8, 6)
+FOLDS = 5  # of (1)
+CELLS = (8, 6)  # of an image, for its coverage
 VOLUME_CELLS = 4  # along each side of the box
-GRID = 9
+GRID = 9  # test bars along each side of the box
+BOX_PERCENTILES = [1, 99]  # of the ends of the bar, along each side of the box
+DEPTH_PERCENTILES = (2, 98)  # of the depths of the ends, for their ratio
 MIRROR_POSITIONS = 80
 HIGH_CORRELATION = 0.95
+FEWEST_LENGTHS = 8  # for a drift
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Lengths:
-    """Bar lengths less the known length, from ends intersected without using it: (n,) [m], and where the bars were (n, 3)."""
+    """Bar lengths less the known length, from ends intersected without using it: (n,) [m], and the middles of the bars (n, 3)."""
 
     residual_m: np.ndarray
     middle_m: np.ndarray
@@ -55,8 +58,8 @@ class Lengths:
 
     @property
     def drift_m(self) -> np.ndarray:
-        """(3,) change of the length from one end of the volume to the other along x, y, z, by a regression."""
-        if len(self.residual_m) < 8:
+        """(3,) change of the length from one end of the volume to the other along x, y, z, by linear regression."""
+        if len(self.residual_m) < FEWEST_LENGTHS:
             return np.full(3, np.nan)
         A = np.concatenate([self.middle_m - self.middle_m.mean(axis=0), np.ones((len(self.middle_m), 1))], axis=1)
         return np.linalg.lstsq(A, self.residual_m, rcond=None)[0][:3] * np.ptp(self.middle_m, axis=0)
@@ -70,31 +73,31 @@ class Quality:
     box_m: np.ndarray  # (2, 3) smallest and largest corner
     used_lengths: Lengths
     held_out: Lengths
-    held_out_untested: Lengths  # with the bars that were taken for blunders though their rays meet
+    held_out_untested: Lengths  # with the bars rejected as outliers although their rays meet
     scatter: np.ndarray  # (3,) eigenvalues, ascending
-    missing_direction: np.ndarray  # (3,) world, along which the bar points least
+    missing_direction: np.ndarray  # (3,) world, in which the bar points least
     coverage: np.ndarray  # (C, 6, 8) image points in each cell
     depth_ratio: np.ndarray  # (C,) largest by smallest depth of the bar's ends
     rms_px: np.ndarray  # (C,) of image coordinates
-    shared: np.ndarray  # (C, C) bars that two cameras see whole
-    visited: float  # part of the box's cells through which an end of the bar came
-    seen_by_two: float  # part of the box that two cameras see; the predicted error is that of this part
-    rejected: int  # positions that two cameras saw whole and of which an end was taken for a blunder
-    mirror: float  # sum of squares of the mirrored solution by that of this one
+    shared: np.ndarray  # (C, C) bars with both ends visible to two cameras
+    visited: float  # part of the cells of the box that contain an end of the bar
+    seen_by_two: float  # part of the box visible to two cameras; the predicted error is that of this part
+    rejected: int  # positions complete in two cameras with an end rejected as an outlier
+    mirror: float  # sum of squares of the mirrored solution over that of this one
     correlations: tuple[tuple[str, str, str, float], ...]  # camera, unknown, unknown, correlation beyond HIGH_CORRELATION
 
     @property
     def covered(self) -> np.ndarray:
-        """(C,) part of each image's cells in which the bar was seen."""
+        """(C,) part of the cells of each image in which the bar is visible."""
         return (self.coverage > 0).mean(axis=(1, 2))
 
 
 def assess(calibration: Calibration, monitor: Monitor) -> Quality:
-    """Work out the figures. The calibration should be in its final world frame."""
+    """The quality of a calibration, which should be in its final world frame."""
     observations, network, used = calibration.observations, calibration.network, calibration.used
     cameras = network.cameras(observations.names, observations.size_px)
     ends = network.ends_m[used.any(axis=1)]
-    box = np.percentile(ends, [1, 99], axis=0)
+    box = np.percentile(ends, BOX_PERCENTILES, axis=0)
     values, axes = np.linalg.eigh(_scatter(network, used))
     monitor.step("quality", 0, 3)
     held_out, untested = held_out_lengths(calibration)
@@ -120,7 +123,7 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
         scatter=values,
         missing_direction=axes[:, 0],
         coverage=np.stack([_cells(observations.xy_px[:, c][used[:, c]], observations.size_px[c]) for c in range(len(cameras))]),
-        depth_ratio=np.array([np.percentile(d, 98) / np.percentile(d, 2) if len(d) else 1.0 for d in depth]),
+        depth_ratio=np.array([_ratio(d) for d in depth]),
         rms_px=np.sqrt(square / (2 * count)),
         shared=both.T @ both,
         mirror=mirror,
@@ -133,6 +136,12 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
 def _scatter(network: Network, used: np.ndarray) -> np.ndarray:
     d = network.direction[(used.sum(axis=1) >= 2).all(axis=1)]
     return d.T @ d / max(len(d), 1)
+
+
+def _ratio(depth: np.ndarray) -> float:
+    """The largest by the smallest depth, less the extremes; 1 without any."""
+    low, high = DEPTH_PERCENTILES
+    return float(np.percentile(depth, high) / np.percentile(depth, low)) if len(depth) else 1.0
 
 
 def _visited(ends_m: np.ndarray, box_m: np.ndarray) -> float:
@@ -150,18 +159,18 @@ def test_bars(box_m: np.ndarray, length_m: float) -> np.ndarray:
 
 
 def _lengths(observations: BarObservations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
-    """Lengths of the positions `which` (N,) from their ends' image points `used` (N, C, 2), each end intersected by itself.  (1)"""
+    """Lengths of the positions `which` (N,) from their ends' image points `used` (N, C, 2), each end intersected independently.  (1)"""
     rows = np.flatnonzero(which & (used.sum(axis=1) >= 2).all(axis=1))
     xy = np.where(used[rows][..., None], observations.xy_px[rows], np.nan)
     xy = np.moveaxis(xy, 2, 1).reshape(2 * len(rows), len(cameras), 2)
     ends = forward_intersection(cameras, xy, np.broadcast_to(np.eye(2), (*xy.shape, 2))).xyz_m.reshape(-1, 2, 3)
     residual = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) - observations.length_m
-    fine = np.isfinite(residual)
-    return Lengths(residual_m=residual[fine], middle_m=ends.mean(axis=1)[fine], frames=observations.frames[rows][fine])
+    finite = np.isfinite(residual)
+    return Lengths(residual_m=residual[finite], middle_m=ends.mean(axis=1)[finite], frames=observations.frames[rows][finite])
 
 
 def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
-    """Lengths of the positions, each from cameras adjusted without it: of those that are used, and of all whose rays meet.  (1)"""
+    """Lengths of the positions, each from cameras adjusted without it: of those used, and of all whose rays meet.  (1)"""
     observations = calibration.observations
     parts, untested = [], []
     for fold in range(FOLDS):
@@ -172,8 +181,7 @@ def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
             calibration.used[~out],
             calibration.unknowns,
             unit_px=calibration.sigma0_px,
-            max_iterations=6,
-            tolerance=1e-2,
+            iteration=LevenbergMarquardt(max_iterations=6, tolerance=1e-2),
         )
         cameras = done.network.cameras(observations.names, observations.size_px)
         parts.append(_lengths(observations, calibration.used, cameras, out))
@@ -196,7 +204,7 @@ def _of_positions(network: Network, positions: np.ndarray) -> Network:
 
 
 def mirrored(calibration: Calibration) -> float:
-    """Sum of squares of the solution with reversed depth, by that of this one: far above 1 where perspective tells them apart.  (3)"""
+    """Sum of squares of the solution with reversed depth over that of this one: far above 1 where perspective distinguishes them.  (3)"""
     some = np.unique(np.linspace(0, len(calibration.used) - 1, MIRROR_POSITIONS).astype(int))
     part, used = calibration.observations.part(some), calibration.used[some]
     network = _of_positions(calibration.network, some)
@@ -213,8 +221,8 @@ def mirrored(calibration: Calibration) -> float:
         direction=network.direction @ H,
     )
     unknowns, sigma = calibration.unknowns.only("f"), calibration.sigma0_px
-    other = adjust(start, part.xy_px, used, unknowns, unit_px=sigma, max_iterations=15, tolerance=1.0)
-    this = adjust(network, part.xy_px, used, calibration.unknowns, unit_px=sigma, max_iterations=2)
+    other = adjust(start, part.xy_px, used, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=15, tolerance=1.0))
+    this = adjust(network, part.xy_px, used, calibration.unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=2))
     return other.cost / max(this.cost, 1e-12)
 
 
@@ -226,11 +234,11 @@ def _cells(xy_px: np.ndarray, size_px: np.ndarray) -> np.ndarray:
 def _correlations(calibration: Calibration) -> tuple[tuple[str, str, str, float], ...]:
     free = np.flatnonzero(calibration.unknowns.free)
     p = len(calibration.unknowns.columns)
-    found = []
+    high = []
     for c, name in enumerate(calibration.observations.names):
         Q = calibration.covariance[c * p : c * p + len(free), c * p : c * p + len(free)]
         sigma = np.sqrt(np.maximum(np.diag(Q), 1e-30))
         rho = Q / np.outer(sigma, sigma)
         for i, j in zip(*np.nonzero(np.triu(np.abs(rho) > HIGH_CORRELATION, 1))):
-            found.append((name, INTERIOR[free[i]], INTERIOR[free[j]], float(rho[i, j])))
-    return tuple(found)
+            high.append((name, INTERIOR[free[i]], INTERIOR[free[j]], float(rho[i, j])))
+    return tuple(high)

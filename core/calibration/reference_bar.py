@@ -1,14 +1,12 @@
-"""Initial values from nothing but the image points and the bar's length: focal lengths, distortion, poses, scale, bar positions.
+"""Initial values from nothing but the image points and the length of the bar: focal lengths, distortion, poses, scale, bar positions.
 
-Pairs of cameras that share most complete bars form a tree. For every pair all guesses of the focal lengths (f_i on a geometric grid,
+The pairs of cameras that share most complete bars form a tree. For every pair all guesses of the focal lengths (f_i on a geometric grid,
 f_j up to two steps away) and of a common distortion κ are evaluated (`epipolar`); the best sum over the tree is found by dynamic
-programming, the best few are adjusted shortly with f, k1 and the poses free, and the one with the smallest robust sum of squares wins.
+programming, the best few are adjusted briefly with f, k1 and the poses free, and the one with the smallest robust sum of squares wins.
 
-What is known of a lens before it is calibrated: pseudo-observations that keep unknowns which the data do not determine where lenses are.
-
-The sigmas are generous (a tenth of them would be no surprise), in units that mean the same for every lens: displacement at the image's
-corner as a part of its distance from the middle. They matter only where the data say little (SCIENCE §3: "pseudo-observations on each
-additional parameter").
+`lens_prior` gives the pseudo-observations of the interior unknowns (D'Apuzzo et al. 2000, §2.2, and Brown 1971 for the parameters). They
+keep unknowns that the data do not determine within what lenses have. The sigmas are generous (a tenth of them is no surprise), in units
+that mean the same for every lens: displacement at the image corner relative to its distance from the centre.
 """
 
 from dataclasses import dataclass, replace
@@ -18,23 +16,38 @@ import numpy as np
 from ..foundation.errors import InputError
 from ..geometry.camera import INTERIOR
 from .bars import BarObservations, with_bars
-from .bundle import Adjusted, Network, Unknowns, adjust
+from .bundle import Adjusted, LevenbergMarquardt, Network, Unknowns, adjust
 from .epipolar import PAIR_TOLERANCE, PairGuesses, agreeing, sampson, try_guesses, undistorted
 
+FOCAL_GRID = np.geomspace(0.45, 3.2, 12)  # of the image width
+ROUGH_FOCALS = np.array([0.75, 0.87, 1.0, 1.15, 1.33])  # of a given rough focal length
+STEPS = (-2, -1, 0, 1, 2)  # of f_j on the grid, from f_i
+KAPPAS = (-0.12, -0.06, 0.0, 0.04)  # radial distortion at the image corner
+BARS_PER_PAIR = 60
+BARS_PER_TRIAL = 120
+CANDIDATES = 4  # starts that are adjusted
+MIN_BARS_PER_PAIR = 6
+ENOUGH_BARS = 0.6  # of the shared bars: no other order of the ends is tried
+COARSE_CAUCHY_PX = 3.0
+WIDE_GATE = 12.0  # of these widths: image points further off are not used in the first adjustment of a trial
+GATE = 4.0  # of these widths, in the second
+TILT = np.tan(np.radians(25))  # of a bar that is upright in the image
 RADIAL_SIGMA = (0.5, 0.3, 0.15)  # k1 ρ², k2 ρ⁴, k3 ρ⁶ at the corner, ρ in units of f
 DECENTRING_SIGMA = 0.01  # p ρ
 AFFINITY_SIGMA = 0.01
-MIDDLE_SIGMA = 0.08  # of the image width
+CENTRE_SIGMA = 0.08  # of the image width
 FOCAL_SIGMA = 1.5  # of f
 
+Guesses = dict[tuple[int, int, int], tuple[float, np.ndarray, np.ndarray]]  # (κ, f_i, f_j) by index: score, R, t
 
-def lens_knowledge(size_px: np.ndarray, focal_px: np.ndarray) -> Unknowns:
-    """Expected values and sigmas of the interior unknowns of C cameras; all ten free."""
+
+def lens_prior(size_px: np.ndarray, focal_px: np.ndarray) -> Unknowns:
+    """The prior of the interior unknowns of C cameras, with all ten free."""
     C = len(size_px)
     expected, sigma = np.zeros((C, len(INTERIOR))), np.ones((C, len(INTERIOR)))
     rho = np.linalg.norm(size_px, axis=1) / 2 / focal_px
     expected[:, 0], sigma[:, 0] = focal_px, FOCAL_SIGMA * focal_px
-    expected[:, 1:3], sigma[:, 1:3] = (size_px - 1) / 2, MIDDLE_SIGMA * size_px[:, :1]
+    expected[:, 1:3], sigma[:, 1:3] = (size_px - 1) / 2, CENTRE_SIGMA * size_px[:, :1]
     for n, part in enumerate(RADIAL_SIGMA):
         sigma[:, 3 + n] = part / rho ** (2 * n + 2)
     sigma[:, 6:8] = DECENTRING_SIGMA / rho[:, None]
@@ -42,24 +55,11 @@ def lens_knowledge(size_px: np.ndarray, focal_px: np.ndarray) -> Unknowns:
     return Unknowns(free=np.ones(len(INTERIOR), dtype=bool), expected=expected, sigma=sigma)
 
 
-FOCAL_GRID = np.geomspace(0.45, 3.2, 12)  # of the image width
-STEPS = (-2, -1, 0, 1, 2)  # f_j of a pair on the grid, from f_i
-KAPPAS = (-0.12, -0.06, 0.0, 0.04)
-BARS_PER_PAIR, BARS_PER_TRIAL = 60, 120
-CANDIDATES = 4
-MIN_BARS_PER_PAIR = 6
-COARSE_CAUCHY_PX = 3.0
-WIDE_GATE, GATE = 12.0, 4.0  # image points further off than this many of these widths take no part, first and then
-TILT = np.tan(np.radians(25))
-
-Guesses = dict[tuple[int, int, int], tuple[float, np.ndarray, np.ndarray]]  # (κ, f_i, f_j) by index: score, R, t
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Pair:
-    """Two cameras and the complete bars on which both agree: positions (m,) and whether camera j has the ends in the other order.
+    """Two cameras and the complete bars on which both agree: positions (m,), and whether the ends are swapped in camera j.
 
-    `singles` (q, 2) are position and end of ends that both see where the other end is missing or wrong.
+    `singles` (q, 2) are position and end of ends visible in both cameras where the other end is missing or wrong.
     """
 
     i: int
@@ -81,7 +81,7 @@ class Pair:
 
 
 def initial_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted:
-    """The best start, adjusted on a part of the positions: its cameras hold for all of them.
+    """The best start, adjusted on a part of the positions.
 
     Raises:
         InputError: the cameras share too few bars.
@@ -98,7 +98,7 @@ def initial_network(observations: BarObservations, focal_px: float | None = None
 
 
 def spanning_tree(observations: BarObservations) -> list[Pair]:
-    """The pairs that join all cameras and share most bars (Prim's algorithm).
+    """The pairs that connect all cameras and share most bars (Prim's algorithm).
 
     Raises:
         InputError: a camera shares too few bars with the others.
@@ -113,9 +113,9 @@ def spanning_tree(observations: BarObservations) -> list[Pair]:
         if count < MIN_BARS_PER_PAIR:
             alone = [observations.names[c] for c in range(C) if c not in joined]
             raise InputError(
-                f"Camera {', '.join(alone)} and the other cameras see too few of the same bar positions ({count} that agree, "
-                f"at least {MIN_BARS_PER_PAIR} are needed); wave the bar where several cameras see both of its ends, and check that "
-                "the sequences start at the same instant."
+                f"Camera {', '.join(alone)} shares too few bar positions with the other cameras ({count} that agree, "
+                f"at least {MIN_BARS_PER_PAIR} are needed); wave the bar where both of its ends are visible to several cameras, and check "
+                "that the sequences start at the same instant."
             )
         pair = pairs[i, j]
         if j in joined:
@@ -129,7 +129,7 @@ def shared_bars(observations: BarObservations, i: int, j: int) -> Pair:
     """The positions whose two ends agree with one epipolar geometry of cameras i and j, with the order of the ends resolved."""
     width = float(observations.size_px[[i, j], 0].max())
     if observations.labelled:
-        ok = observations.seen[:, i] & observations.seen[:, j]
+        ok = observations.visible[:, i] & observations.visible[:, j]
         ok[ok] = agreeing(observations.xy_px[:, i][ok], observations.xy_px[:, j][ok], width)[0]
         good = ok.all(axis=1)
         singles = np.argwhere(ok & ~good[:, None])
@@ -141,13 +141,13 @@ def shared_bars(observations: BarObservations, i: int, j: int) -> Pair:
         found = _ordered(xi, xj, subset, swapped, width)
         if len(found[0]) > len(best[0]):
             best = found
-        if len(best[0]) > 0.6 * len(both):
+        if len(best[0]) > ENOUGH_BARS * len(both):
             break
     return Pair(i=i, j=j, positions=both[best[0]], swapped=best[1], singles=np.zeros((0, 2), dtype=int))
 
 
 def _orders(xi: np.ndarray, xj: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Guesses which end in camera j is which in camera i: as they come; upper with upper; and for cameras on their side."""
+    """Guesses of the order of the ends in camera j: as they are; upper with upper; and for cameras turned on their side."""
     di, dj = xi[:, 0] - xi[:, 1], xj[:, 0] - xj[:, 1]
     orders = [(np.ones(len(di), dtype=bool), np.zeros(len(di), dtype=bool))]
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -158,7 +158,7 @@ def _orders(xi: np.ndarray, xj: np.ndarray) -> list[tuple[np.ndarray, np.ndarray
 
 
 def _ordered(xi: np.ndarray, xj: np.ndarray, subset: np.ndarray, swapped: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the bars that agree when `subset` is ordered by `swapped`, and the order of each, all bars tried both ways at the end."""
+    """Indices of the bars that agree when `subset` is ordered by `swapped`, and the order of each bar."""
     ordered = np.where(swapped[:, None, None], xj[:, ::-1], xj)
     ok, F = agreeing(xi[subset].reshape(-1, 2), ordered[subset].reshape(-1, 2), width)
     if not ok.any():
@@ -186,7 +186,7 @@ def _pair_guesses(observations: BarObservations, pair: Pair, focal_px: float | N
 
 def _grid(observations: BarObservations, focal_px: float | None) -> np.ndarray:
     if focal_px is not None:
-        return focal_px * np.array([0.75, 0.87, 1.0, 1.15, 1.33])
+        return focal_px * ROUGH_FOCALS
     return FOCAL_GRID * float(np.median(observations.size_px[:, 0]))
 
 
@@ -208,7 +208,7 @@ def _starts(
 def _best_below(
     tree: list[Pair], guesses: dict[tuple[int, int], Guesses], camera: int, k: int, a: int, grid: int, chosen: dict[int, int]
 ) -> float:
-    """Smallest sum of scores of the pairs below a camera whose focal length is a; what was chosen is noted."""
+    """Smallest sum of the scores of the pairs below a camera with focal length a; the choices are added to `chosen`."""
     total = 0.0
     for pair in (p for p in tree if p.i == camera):
         best, below = np.inf, {}
@@ -246,24 +246,32 @@ def _chained(
 
 
 def _trial(observations: BarObservations, tree: list[Pair], network: Network) -> Adjusted:
-    """A short robust adjustment of f, k1 and the poses on bars that the pairs of the tree agree on."""
+    """A short robust adjustment of f, k1 and the poses on bars on which the pairs of the tree agree."""
     part = trial_part(observations, tree)
-    knowledge = lens_knowledge(part.size_px, network.interior[:, 0]).only("f", "k1")
+    prior = lens_prior(part.size_px, network.interior[:, 0]).only("f", "k1")
     for gate in (WIDE_GATE, GATE):
         network, used = with_bars(network, part, gate * COARSE_CAUCHY_PX)
-        done = adjust(network, part.xy_px, used, knowledge, cauchy_px=COARSE_CAUCHY_PX, unit_px=0.3, max_iterations=8, tolerance=1e-2)
+        done = adjust(
+            network,
+            part.xy_px,
+            used,
+            prior,
+            cauchy_px=COARSE_CAUCHY_PX,
+            unit_px=0.3,
+            iteration=LevenbergMarquardt(max_iterations=8, tolerance=1e-2),
+        )
         network = done.network
-    left_out = int(part.seen.sum() - used.sum())  # what does not fit must not make a start look better
+    left_out = int(part.visible.sum() - used.sum())  # points that do not fit must not improve the cost of a start
     return replace(done, cost=done.cost + left_out * COARSE_CAUCHY_PX**2 * float(np.log1p(GATE**2)))
 
 
 def trial_part(observations: BarObservations, tree: list[Pair]) -> BarObservations:
-    """Labelled positions on which the pairs of the tree agree: `BARS_PER_TRIAL` that all cameras see, or what each pair sees besides.
+    """Labelled positions on which the pairs of the tree agree: `BARS_PER_TRIAL` visible to all cameras, else further ones of each pair.
 
-    The order of the ends is told along the tree from any camera that sees a position, so cameras need not have one position in common.
+    The order of the ends is passed along the tree from any camera that shows a position, so no position needs to be visible to all cameras.
     """
     N, C = len(observations.xy_px), len(observations.names)
-    joined_to = np.tile(np.arange(C), (N, 1))  # the first camera of the chain by which a position is seen
+    joined_to = np.tile(np.arange(C), (N, 1))  # the first camera of the chain in which a position is visible
     flipped = np.zeros((N, C), dtype=bool)
     for pair in tree:  # parents come before their children
         joined_to[pair.positions, pair.j] = joined_to[pair.positions, pair.i]
@@ -280,5 +288,5 @@ def trial_part(observations: BarObservations, tree: list[Pair]) -> BarObservatio
 
 
 def _spread(positions: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of the positions, evenly over the time."""
+    """At most `count` of the positions, evenly spread over time."""
     return positions[np.unique(np.linspace(0, len(positions) - 1, count).astype(int))] if len(positions) else positions

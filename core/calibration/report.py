@@ -1,8 +1,7 @@
-"""The account of a calibration: a page of text for people and the same figures as JSON for programs.
+"""The report of a calibration: a verdict with advice, a page of text, the same figures as JSON, and pictures.
 
-The verdict on a calibration, in sentences: what it will do, and the one thing to do better. Made from the predicted error in space.
-
-Pictures of a calibration: where each image was covered and what residuals are left, the map of the predicted error, the lengths.
+The verdict follows from the predicted error in space. The pictures show the coverage of each image with its residuals, a map of the
+predicted error, and the lengths of the bars that were left out.
 """
 
 from dataclasses import dataclass
@@ -18,17 +17,25 @@ from .precision import predicted_error
 from .quality import CELLS, Lengths, Quality
 from .self_calibration import Calibration
 
-GOOD_PART, FAIR_PART = 5e-4, 2e-3  # of the mean distance from the cameras: 1 mm and 4 mm at 2 m
-USELESS_PART = 8e-3
-FLAT_SCATTER, GOOD_SCATTER = 0.004, 0.05
-GOOD_POSITIONS, MIN_POSITIONS = 100, 10
-GOOD_COVERAGE, GOOD_DEPTH = 0.45, 1.15
-MIRROR = 4.0
-MIN_FITTING = 0.4
+GOOD_PART = 5e-4  # of the mean distance from the cameras: 1 mm at 2 m
+FAIR_PART = 2e-3  # of that distance: 4 mm at 2 m
+USELESS_PART = 8e-3  # of that distance
+FLAT_SCATTER = 0.004  # smallest eigenvalue of the bar's directions below which the focal lengths are not determined
+GOOD_SCATTER = 0.05
+MIN_POSITIONS = 10
+GOOD_POSITIONS = 100
+GOOD_COVERAGE = 0.45  # of the cells of an image
+GOOD_DEPTH = 1.15  # largest by smallest depth
+MIRROR = 4.0  # times the sum of squares: a mirrored rig must fit worse than that
+MIN_FITTING = 0.4  # of the image points
+INK, PALE, RED, GREEN, BLUE = (60, 60, 60), (225, 225, 225), (60, 60, 220), (90, 170, 80), (200, 120, 40)  # BGR
+PANEL_PX = 420
+MAP_CELLS = 28  # along each side of the error map
+FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Light(StrEnum):
-    """How good a calibration is."""
+    """Quality of a calibration."""
 
     GREEN = "green"
     YELLOW = "yellow"
@@ -53,17 +60,17 @@ def positions_used(calibration: Calibration) -> int:
 
 
 def refuse_if_useless(calibration: Calibration) -> None:
-    """Raise InputError if the adjustment itself failed: too little fits.
+    """Raise InputError if too few image points fit the adjustment.
 
     Raises:
         InputError: too few positions fit one rig, or a camera has none.
     """
-    seen, used = calibration.observations.seen, calibration.used
+    seen, used = calibration.observations.visible, calibration.used
     for c, name in enumerate(calibration.observations.names):
         if used[:, c].sum() < 2 * MIN_POSITIONS:
             raise InputError(
-                f"What camera {name} saw of the bar does not agree with the other cameras (only {int(used[:, c].sum())} of "
-                f"{int(seen[:, c].sum())} image points fit); check that its sequence starts at the same instant and shows the same bar."
+                f"The image points of camera {name} do not agree with the other cameras (only {int(used[:, c].sum())} of "
+                f"{int(seen[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same bar."
             )
     fits = used.sum() / max(seen.sum(), 1)
     if fits < MIN_FITTING or positions_used(calibration) < MIN_POSITIONS:
@@ -74,30 +81,29 @@ def refuse_if_useless(calibration: Calibration) -> None:
 
 
 def refuse_if_undetermined(calibration: Calibration, quality: Quality) -> None:
-    """Raise InputError if the data cannot determine the rig, with the motion that is missing.
+    """Raise InputError if the data do not determine the rig; the message names the missing motion of the bar.
 
     Raises:
         InputError: the bar's directions lie in a plane, the predicted error is useless, or a mirrored rig fits as well.
     """
     if quality.scatter[0] < FLAT_SCATTER:
         raise InputError(
-            f"The bar always kept {_kept(calibration, quality)} (smallest direction scatter {quality.scatter[0]:.3f}, "
+            f"The bar was always {_attitude(calibration, quality)} (smallest direction scatter {quality.scatter[0]:.3f}, "
             f"{GOOD_SCATTER} is good), so the focal lengths are not determined; {_tilt(calibration, quality)}."
         )
     if not quality.predicted.rms_m <= USELESS_PART * _distance(calibration):
         raise InputError(
-            f"These bar positions leave an error of about {1e3 * quality.predicted.rms_m:.0f} mm in space, which is useless; "
+            f"With these bar positions the error would be about {1e3 * quality.predicted.rms_m:.0f} mm in space, which is useless; "
             f"{advice(calibration, quality)}."
         )
     if quality.mirror < MIRROR:
         raise InputError(
-            "A rig seen in a mirror, with near and far exchanged, fits the images as well; "
-            "wave the bar nearer to the cameras and further away as well."
+            "A mirrored rig, with near and far swapped, fits the images as well; wave the bar closer to the cameras and further away, too."
         )
 
 
 def judge(calibration: Calibration, quality: Quality) -> Verdict:
-    """The verdict in one sentence, from the predicted error over the volume."""
+    """The verdict, from the predicted error over the volume."""
     error, distance = quality.predicted.rms_m, _distance(calibration)
     light = Light.GREEN if error <= GOOD_PART * distance else Light.YELLOW if error <= FAIR_PART * distance else Light.RED
     size = " × ".join(f"{s:.1f}" for s in np.ptp(quality.box_m, axis=0))
@@ -107,7 +113,7 @@ def judge(calibration: Calibration, quality: Quality) -> Verdict:
         f"{distance:.1f} m away; the length of bars left out is right within {_mm(tested.rms_m)}."
     )
     if not calibration.converged:
-        light, sentence = Light.RED, f"The adjustment did not settle, so its figures may be too good. {sentence}"
+        light, sentence = Light.RED, f"The adjustment did not converge, so its figures may be too good. {sentence}"
     return Verdict(light=light, sentence=sentence, advice=advice(calibration, quality))
 
 
@@ -115,20 +121,20 @@ def advice(calibration: Calibration, quality: Quality) -> str:
     """The one thing that would improve the calibration most."""
     names, used = calibration.observations.names, positions_used(calibration)
     worst = int(np.argmin(quality.covered))
-    wants = [
+    improvements = [
         (quality.scatter[0] / GOOD_SCATTER, _tilt(calibration, quality)),
-        (used / GOOD_POSITIONS, f"wave the bar longer: {used} positions were used, {GOOD_POSITIONS} or more are good"),
+        (used / GOOD_POSITIONS, f"wave the bar for longer: {used} positions were used, {GOOD_POSITIONS} or more are good"),
         (
             (quality.depth_ratio.min() - 1) / (GOOD_DEPTH - 1),
-            "wave the bar nearer to the cameras and further away as well",
+            "wave the bar closer to the cameras and further away, too",
         ),
         (
             quality.covered[worst] / GOOD_COVERAGE,
-            f"wave the bar {_empty_side(quality.coverage[worst])} of camera {names[worst]}'s image as well",
+            f"wave the bar {_empty_side(quality.coverage[worst])} of the image of camera {names[worst]}, too",
         ),
     ]
-    urgency, text = min(wants, key=lambda want: want[0])
-    return text if urgency < 1 else "nothing needs to be better; more positions would lower the error further"
+    urgency, text = min(improvements, key=lambda entry: entry[0])
+    return text if urgency < 1 else "nothing needs to be improved; more positions would reduce the error further"
 
 
 def _mm(metres: float) -> str:
@@ -144,12 +150,12 @@ def _distance(calibration: Calibration) -> float:
 
 
 def _missing(calibration: Calibration, quality: Quality) -> str:
-    """Along which direction the bar points least, as seen by the cameras: depth, upright or crosswise."""
+    """The direction in which the bar points least, from the cameras: depth, upright or crosswise."""
     axes = calibration.network.R.mean(axis=0)  # rows: right, down, forward
     return ("crosswise", "upright", "depth")[int(np.argmax(np.abs(axes @ quality.missing_direction)))]
 
 
-def _kept(calibration: Calibration, quality: Quality) -> str:
+def _attitude(calibration: Calibration, quality: Quality) -> str:
     return {
         "depth": "parallel to the image planes",
         "upright": "level",
@@ -159,14 +165,14 @@ def _kept(calibration: Calibration, quality: Quality) -> str:
 
 def _tilt(calibration: Calibration, quality: Quality) -> str:
     return {
-        "depth": "tilt the bar towards the cameras as well",
-        "upright": "hold the bar upright as well",
-        "crosswise": "hold the bar crosswise as well",
+        "depth": "tilt the bar towards the cameras, too",
+        "upright": "hold the bar upright, too",
+        "crosswise": "hold the bar crosswise, too",
     }[_missing(calibration, quality)]
 
 
 def _empty_side(cells: np.ndarray) -> str:
-    """The part of an image with fewest points."""
+    """The half of an image with the fewest points."""
     h, w = cells.shape
     halves = {
         "in the upper half": cells[: h // 2],
@@ -189,7 +195,7 @@ def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dic
         "bar_length_m": observations.length_m,
         "positions": len(observations.xy_px),
         "positions_used": positions_used(calibration),
-        "image_points": int(observations.seen.sum()),
+        "image_points": int(observations.visible.sum()),
         "image_points_used": int(calibration.used.sum()),
         "redundancy": calibration.redundancy,
         "sigma0_px": calibration.sigma0_px,
@@ -226,7 +232,7 @@ def _length_figures(lengths: Lengths) -> dict[str, Any]:
 
 
 def parameters(calibration: Calibration, camera: int) -> list[tuple[str, float, float]]:
-    """Name, value and sigma of a camera's interior unknowns; sigma 0 for those that were left out."""
+    """Name, value and sigma of the interior unknowns of a camera; sigma 0 for those that were left out."""
     columns = list(calibration.unknowns.columns)
     p = len(columns)
     sigma = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
@@ -237,14 +243,14 @@ def parameters(calibration: Calibration, camera: int) -> list[tuple[str, float, 
 
 
 def exterior_sigmas(calibration: Calibration, camera: int) -> dict[str, float]:
-    """Sigmas of a camera's pose about its own axes, in the free network: turn x … [rad], shift x … [m]."""
+    """Sigmas of the pose of a camera about its own axes, in the free network: turn x … [rad], shift x … [m]."""
     p = len(calibration.unknowns.columns)
     sigma = np.sqrt(np.maximum(np.diag(calibration.covariance)[camera * p : (camera + 1) * p], 0.0))
     return {name: float(value) for name, value in zip(EXTERIOR, sigma[-len(EXTERIOR) :])}
 
 
 def camera_sigmas(calibration: Calibration) -> dict[str, dict[str, float]]:
-    """Sigmas of all unknowns of the adjustment, by camera; those that were left out have none."""
+    """Sigmas of all unknowns of the adjustment, by camera, without those that were left out."""
     return {
         name: {n: sigma for n, _, sigma in parameters(calibration, c) if sigma} | exterior_sigmas(calibration, c)
         for c, name in enumerate(calibration.observations.names)
@@ -256,7 +262,7 @@ def _camera_figures(calibration: Calibration, quality: Quality, c: int) -> dict[
         "rms_px": float(quality.rms_px[c]),
         "covered": float(quality.covered[c]),
         "depth_ratio": float(quality.depth_ratio[c]),
-        "image_points": int(calibration.observations.seen[:, c].sum()),
+        "image_points": int(calibration.observations.visible[:, c].sum()),
         "image_points_used": int(calibration.used[:, c].sum()),
         "bars_shared": {name: int(n) for name, n in zip(calibration.observations.names, quality.shared[c])},
         "pose_sigma": exterior_sigmas(calibration, c),
@@ -268,22 +274,22 @@ def _camera_figures(calibration: Calibration, quality: Quality, c: int) -> dict[
 
 
 def page(calibration: Calibration, quality: Quality, verdict: Verdict) -> str:
-    """The account as text."""
+    """The report as text."""
     observations = calibration.observations
     lines = [
         verdict.sentence,
-        f"To do better: {verdict.advice}.",
+        f"To improve: {verdict.advice}.",
         "",
         f"{positions_used(calibration)} of {len(observations.xy_px)} bar positions, {int(calibration.used.sum())} of "
-        f"{int(observations.seen.sum())} image points; sigma0 {calibration.sigma0_px:.4f} px, redundancy {calibration.redundancy:.0f}.",
+        f"{int(observations.visible.sum())} image points; sigma0 {calibration.sigma0_px:.4f} px, redundancy {calibration.redundancy:.0f}.",
         f"Predicted error in space {1e3 * quality.predicted.rms_m:.3f} mm RMS, largest {1e3 * quality.predicted.sigma_m.max():.3f} mm; "
         f"of a bar's length {1e3 * quality.predicted.length_rms_m:.3f} mm.",
         _length_line("Bars left out of the adjustment", quality.held_out),
-        _length_line("The same with bars that were taken for blunders though their rays meet", quality.held_out_untested),
+        _length_line("The same with bars that were rejected as outliers although their rays meet", quality.held_out_untested),
         _length_line("Bars of the adjustment", quality.used_lengths),
-        f"{quality.rejected} bars that two cameras saw whole were rejected as blunders.",
-        f"Two cameras at least see {100 * quality.seen_by_two:.0f} % of the volume; "
-        f"the bar came through {100 * quality.visited:.0f} % of it.",
+        f"{quality.rejected} bars with both ends visible to two cameras were rejected as outliers.",
+        f"{100 * quality.seen_by_two:.0f} % of the volume is visible to two cameras or more; "
+        f"the bar reached {100 * quality.visited:.0f} % of it.",
         f"Scatter of the bar's directions {quality.scatter.round(3).tolist()} (smallest: 0.05 is good, 0 fails); "
         f"a mirrored rig fits {quality.mirror:.3g} times worse.",
         *(f"{decision[0].upper()}{decision[1:]}." for decision in calibration.decisions),
@@ -315,12 +321,6 @@ def _camera_lines(calibration: Calibration, quality: Quality, c: int) -> list[st
     return [*lines, f"    its pose about its own axes: ± {turn}° turned, ± {shift} mm shifted", ""]
 
 
-INK, PALE, RED, GREEN, BLUE = (60, 60, 60), (225, 225, 225), (60, 60, 220), (90, 170, 80), (200, 120, 40)
-PANEL_PX = 420
-MAP_CELLS = 28
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-
-
 def pictures(calibration: Calibration, quality: Quality) -> dict[str, np.ndarray]:
     """File names and BGR pictures."""
     return {
@@ -337,7 +337,7 @@ def _panel(title: str, width: int, height: int) -> np.ndarray:
 
 
 def _coverage(calibration: Calibration, quality: Quality, c: int) -> np.ndarray:
-    """Cells that the bar reached, its image points, and the residuals as arrows."""
+    """The cells that the bar reached, its image points, and the residuals as arrows."""
     size = calibration.observations.size_px[c]
     scale = PANEL_PX / size[0]
     height = round(size[1] * scale)
@@ -359,7 +359,7 @@ def _coverage(calibration: Calibration, quality: Quality, c: int) -> np.ndarray:
 
 
 def _error_map(calibration: Calibration, quality: Quality) -> np.ndarray:
-    """Predicted error in a level and an upright section through the middle of the volume."""
+    """Predicted error in a horizontal and a vertical section through the middle of the volume."""
     panels = []
     box = quality.box_m
     for title, (a, b) in (("from above", (0, 1)), ("from the front", (0, 2))):
@@ -382,7 +382,7 @@ def _section(box: np.ndarray, a: int, b: int) -> tuple[np.ndarray, tuple[int, in
 
 
 def _index_of(points: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Indices of the points that are found, which stand in the same order."""
+    """Indices of the points that are among `found`, which has the same order."""
     return np.flatnonzero((np.abs(points[:, None] - found[None]).max(axis=2) < 1e-9).any(axis=1))
 
 
@@ -397,7 +397,7 @@ def _heat_panel(title: str, mm: np.ndarray) -> np.ndarray:
 
 
 def _lengths(quality: Quality) -> np.ndarray:
-    """Length of every bar that was left out, less the known length, over the frames."""
+    """Length of every bar that was left out, minus the known length, over the frames."""
     width, height = 2 * PANEL_PX, PANEL_PX // 2
     mm, frames = quality.held_out.residual_m * 1e3, quality.held_out.frames
     if not len(mm):

@@ -1,17 +1,14 @@
-"""Self-calibration from image points of a waved bar: start, robust adjustment, blunders, selection of the lens's unknowns, precision.
+"""Self-calibration from image points of a waved bar: start, robust adjustment, outliers, selection of lens parameters, precision.
 
 1  initial values from nothing (`reference_bar`), on a part of the positions;
 2  f, k1 → + principal point, k2, p1, p2 → all unknowns, robustly, on that part;
 3  all positions: order of the ends, intersection, robust adjustment;
-4  least squares; Baarda's test w = v / (σ0 √q_vv) per image point, the worst of each bar is taken out, until nothing is        (1)
-5  unknowns of the lens that are not significant are left out, one group at a time (Wald's test of the group):
-   F = xᵀ Q_xx⁻¹ x / (m σ0²) < F_{1−α}(m, r)                                                                                  (2)
-6  the precision that is foretold counts what an unknown that was left out may still be (`precision.with_left_out`).
-
-Redundancy of every image coordinate, for Baarda's test (Baarda 1968: data snooping).
-
-q_vv = 1 − a Q_c aᵀ − b U⁻¹ bᵀ ,   a = j − b U⁻¹ Wᵀ                          (1)   j, b: the coordinate's rows of the design matrix
-Σ q_vv = number of observations − number of unknowns = redundancy           (2)
+4  least squares; data snooping (Baarda 1968): the worst image point of each bar is removed until no test exceeds its limit,
+   w = v / (σ0 √q_vv) ,   q_vv = 1 − a Q_c aᵀ − b U⁻¹ bᵀ ,   a = j − b U⁻¹ Wᵀ                                                 (1)
+   j, b: rows of the design matrix;   Σ q_vv = number of observations − number of unknowns = redundancy                         (2)
+5  lens parameters that are not significant are left out, one group at a time (Wald's test of the group):
+   F = xᵀ Q_xx⁻¹ x / (m σ0²) < F_{1−α}(m, r)                                                                                    (3)
+6  the predicted precision accounts for parameters that were left out (`precision.with_left_out`).
 """
 
 from dataclasses import dataclass, replace
@@ -23,47 +20,24 @@ from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR
 from ..geometry.robust import mad_sigma
 from .bars import BarObservations, enough_rays, labelled_ends, with_bars
-from .bundle import Adjusted, Network, Unknowns, adjust, design, eliminated, inverse_factors, normal_equations
+from .bundle import Adjusted, LevenbergMarquardt, Network, Unknowns, adjust, design, eliminated, inverse_factors, normal_equations
 from .precision import camera_covariance, group_of, with_left_out
-from .reference_bar import COARSE_CAUCHY_PX, initial_network, lens_knowledge
+from .reference_bar import COARSE_CAUCHY_PX, initial_network, lens_prior
 
-
-def redundant_parts(network: Network, used: np.ndarray, unknowns: Unknowns, unit_px: float) -> np.ndarray:
-    """q_vv (N, C, 2, 2) of all image coordinates for weight 1; of those not used, it is 1."""
-    zero = np.zeros((*used.shape, 2))
-    normals = normal_equations(network, zero, used.astype(np.float64), unknowns, unit_px)
-    root = _root(camera_covariance(network, normals, unknowns)).T
-    C, N = len(network.R), len(network.middle)
-    parts = np.ones((C, 4, N))
-    for at, some in network.stretches():
-        _, J, B = design(some, unknowns)
-        rows = J.reshape(C, -1, J[0, 0].size)  # (C, p, 4 n)
-        inverse = inverse_factors(normals.U[..., at])
-        by_cameras = root @ eliminated(inverse, normals.W[..., at])  # (5, q, n)
-        b = np.einsum("jkn,ckrn->cjrn", inverse, B.reshape(C, 5, 4, -1))  # L⁻¹ bᵀ
-        for c, of in enumerate(np.split(root, C, axis=1)):
-            a = (of @ rows[c]).reshape(len(root), 4, -1) - np.einsum("jrn,jqn->qrn", b[c], by_cameras)
-            parts[c, :, at] -= np.einsum("qrn,qrn->rn", a, a) + np.einsum("jrn,jrn->rn", b[c], b[c])
-    return np.where(used[..., None], parts.reshape(C, 2, 2, N).transpose(3, 0, 2, 1), 1.0)
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
-
-
-GROUPS = (("k3",), ("b1", "b2"), ("p1", "p2"), ("k2",), ("cx", "cy"), ("k1",))  # in the order in which they are doubted
-SIGNIFICANCE = 0.05  # α of (2)
+GROUPS = (("k3",), ("b1", "b2"), ("p1", "p2"), ("k2",), ("cx", "cy"), ("k1",))  # of lens parameters that are tested together
+SIGNIFICANCE = 0.05  # α of (3)
 CRITICAL_W = 4.1  # |w| beyond it: 1 good point in 5000 (two coordinates)
-PART = 400
-GROSS = 6.5  # sigmas
-ROUNDS = 15
+SMALLEST_Q = 0.02  # of q_vv in (1)
+PART = 400  # positions of the refined start
+GROSS = 6.5  # sigmas of an image point that does not fit the intersection
+ROUNDS = 15  # of data snooping
+RETRIED_ROUNDS = 2  # in which all image points are tested again
 MIN_SIGMA_PX = 0.004
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Calibration:
-    """An adjusted network and all that is needed to judge it."""
+    """An adjusted network, and what its quality is judged by."""
 
     observations: BarObservations  # with the ends in order
     network: Network
@@ -73,7 +47,7 @@ class Calibration:
     sigma0_px: float
     redundancy: float
     covariance: np.ndarray  # (C p, C p) of the camera unknowns, times sigma0², free network
-    considered: np.ndarray  # (16 C, 16 C) of all sixteen unknowns per camera, with what the left-out ones may still be
+    considered: np.ndarray  # (16 C, 16 C) of all sixteen unknowns per camera, the uncertainty of those left out included
     decisions: tuple[str, ...]  # why unknowns were left out
     converged: bool
 
@@ -94,23 +68,37 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     monitor.step("calibration", 1, 5)
     network, labelled, sigma = refined_start(start.network, observations)
     monitor.step("calibration", 2, 5)
-    knowledge = lens_knowledge(observations.size_px, network.interior[:, 0])
+    prior = lens_prior(observations.size_px, network.interior[:, 0])
     network, used = with_bars(network, labelled, max(10 * sigma, 1.0))
-    first = adjust(network, labelled.xy_px, used, knowledge, cauchy_px=3 * sigma, unit_px=sigma, max_iterations=8, tolerance=0.05)
+    first = adjust(
+        network,
+        labelled.xy_px,
+        used,
+        prior,
+        cauchy_px=3 * sigma,
+        unit_px=sigma,
+        iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.05),
+    )
     monitor.step("calibration", 3, 5)
-    return without_insignificant(*without_blunders(first, labelled, used, knowledge), labelled, monitor)
+    return without_insignificant(*without_outliers(first, labelled, used, prior), labelled, monitor)
 
 
 def refined_start(network: Network, observations: BarObservations) -> tuple[Network, BarObservations, float]:
-    """The cameras with all unknowns adjusted on a part of the positions, all observations with their ends in order, and sigma [px]."""
-    knowledge = lens_knowledge(observations.size_px, network.interior[:, 0])
+    """The cameras, adjusted with all unknowns on a part of the positions; all observations with their ends in order; sigma [px]."""
+    prior = lens_prior(observations.size_px, network.interior[:, 0])
     some = np.unique(np.linspace(0, len(observations.xy_px) - 1, PART).astype(int))
     cauchy = COARSE_CAUCHY_PX
     for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR, INTERIOR):
         part = _ordered(network, observations.part(some), 2 * cauchy)
         network, used = with_bars(network, part, 3 * cauchy)
         done = adjust(
-            network, part.xy_px, used, knowledge.only(*names), cauchy_px=cauchy, unit_px=0.3 * cauchy, max_iterations=8, tolerance=0.1
+            network,
+            part.xy_px,
+            used,
+            prior.only(*names),
+            cauchy_px=cauchy,
+            unit_px=0.3 * cauchy,
+            iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.1),
         )
         network, sigma = done.network, robust_sigma(done.residual_px, used)
         cauchy = float(np.clip(3 * sigma, 0.3, cauchy))
@@ -122,21 +110,47 @@ def _ordered(network: Network, observations: BarObservations, tolerance_px: floa
 
 
 def robust_sigma(residual_px: np.ndarray, used: np.ndarray) -> float:
-    """Sigma of an image coordinate from the median of the residuals [px], untouched by a third of blunders."""
+    """Sigma of an image coordinate from the median of the residuals [px]; a third of outliers does not affect it."""
     return max(MIN_SIGMA_PX, float(mad_sigma(residual_px[used]))) if used.any() else 1.0
 
 
-def without_blunders(
+def redundant_parts(network: Network, used: np.ndarray, unknowns: Unknowns, unit_px: float) -> np.ndarray:
+    """q_vv (N, C, 2, 2) of all image coordinates of weight 1; 1 for those that are not used.  (1), (2)"""
+    zero = np.zeros((*used.shape, 2))
+    normals = normal_equations(network, zero, used.astype(np.float64), unknowns, unit_px)
+    root = _root(camera_covariance(network, normals, unknowns)).T
+    C, N = len(network.R), len(network.middle)
+    parts = np.ones((C, 4, N))
+    for at, block in network.blocks():
+        _, J, B = design(block, unknowns)
+        rows = J.reshape(C, -1, J[0, 0].size)  # (C, p, 4 n)
+        inverse = inverse_factors(normals.U[..., at])
+        by_cameras = root @ eliminated(inverse, normals.W[..., at])  # (5, q, n)
+        b = np.einsum("jkn,ckrn->cjrn", inverse, B.reshape(C, 5, 4, -1))  # L⁻¹ bᵀ
+        for c, of in enumerate(np.split(root, C, axis=1)):
+            a = (of @ rows[c]).reshape(len(root), 4, -1) - np.einsum("jrn,jqn->qrn", b[c], by_cameras)
+            parts[c, :, at] -= np.einsum("qrn,qrn->rn", a, a) + np.einsum("jrn,jrn->rn", b[c], b[c])
+    return np.where(used[..., None], parts.reshape(C, 2, 2, N).transpose(3, 0, 2, 1), 1.0)
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def without_outliers(
     first: Adjusted, observations: BarObservations, used: np.ndarray, unknowns: Unknowns
 ) -> tuple[Adjusted, np.ndarray, float, float]:
-    """Least squares with blunders tested out: the adjustment, what is used, sigma0 and the redundancy.  (1)"""
+    """Least squares with data snooping: the adjustment, the image points used, sigma0 and the redundancy.  (1)"""
     state, keep = first, used
     sigma = robust_sigma(first.residual_px, used)
     for number in range(ROUNDS):
         network = state.network
-        if number < 2:  # anew, so that what did not fit before the cameras were good comes back
+        if number < RETRIED_ROUNDS:  # image points that did not fit the cameras of the start are used again
             network, keep = with_bars(network, observations, GROSS * sigma)
-        state = adjust(network, observations.xy_px, keep, unknowns, unit_px=sigma, max_iterations=10, tolerance=1e-2)
+        state = adjust(
+            network, observations.xy_px, keep, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
+        )
         parts = redundant_parts(state.network, keep, unknowns, sigma)
         square = np.sum(np.where(keep[..., None], state.residual_px, 0.0) ** 2)
         redundancy = max(1.0, float(parts[keep].sum()))
@@ -151,36 +165,38 @@ def without_blunders(
 
 def _tested(residual_px: np.ndarray, parts: np.ndarray, sigma: float) -> np.ndarray:
     """w (N, C, 2) of the image points, the larger of both coordinates."""
-    w = np.abs(residual_px) / (sigma * np.sqrt(np.maximum(parts, 0.02)))
+    w = np.abs(residual_px) / (sigma * np.sqrt(np.maximum(parts, SMALLEST_Q)))
     return np.nan_to_num(w.max(axis=-1))
 
 
 def without_insignificant(
     state: Adjusted, keep: np.ndarray, sigma: float, redundancy: float, observations: BarObservations, monitor: Monitor
 ) -> Calibration:
-    """Leave out the groups of interior unknowns that are not significant, adjusting anew after each.  (2)"""
-    unknowns = lens_knowledge(observations.size_px, state.network.interior[:, 0])
+    """Leave out the groups of lens parameters that are not significant, with a new adjustment after each.  (3)"""
+    unknowns = lens_prior(observations.size_px, state.network.interior[:, 0])
     decisions: list[str] = []
     first, all_free = state.network, unknowns
     full = covariance = _covariance(state, keep, unknowns, sigma)
-    doubted = list(GROUPS)
-    while doubted:
-        tests = [(wald(state.network, unknowns, covariance, group, redundancy), group) for group in doubted]
+    tested_groups = list(GROUPS)
+    while tested_groups:
+        tests = [(wald(state.network, unknowns, covariance, group, redundancy), group) for group in tested_groups]
         probability, group = max(tests, key=lambda entry: entry[0])
         if probability <= SIGNIFICANCE:
             break
-        doubted.remove(group)
+        tested_groups.remove(group)
         decisions.append(f"{', '.join(group)} left out: not significant (p = {probability:.2g})")
         unknowns = replace(unknowns, free=unknowns.free & ~np.isin(INTERIOR, group))
         interior = np.where(unknowns.free, state.network.interior, unknowns.expected)
         fixed = replace(state.network, interior=interior)
-        state = adjust(fixed, observations.xy_px, keep, unknowns, unit_px=sigma, max_iterations=10, tolerance=1e-2)
+        state = adjust(
+            fixed, observations.xy_px, keep, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
+        )
         covariance = _covariance(state, keep, unknowns, sigma)
     monitor.step("calibration", 5, 5)
     square = float(np.sum(state.residual_px[keep] ** 2))
     sigma = float(np.sqrt(square / redundancy))
     covariance = _covariance(state, keep, unknowns, sigma)
-    left_out = tuple(group for group in GROUPS if group not in doubted)
+    left_out = tuple(group for group in GROUPS if group not in tested_groups)
     return Calibration(
         observations=observations,
         network=state.network,
@@ -202,6 +218,6 @@ def _covariance(state: Adjusted, keep: np.ndarray, unknowns: Unknowns, sigma: fl
 
 
 def wald(network: Network, unknowns: Unknowns, covariance: np.ndarray, group: tuple[str, ...], redundancy: float) -> float:
-    """Probability of values as large as those of a group in all cameras if they were as expected.  (2)"""
+    """Probability of values as large as those of a group in all cameras if their true values were the expected ones.  (3)"""
     x, Q = group_of(network.interior - unknowns.expected, unknowns, covariance, group)[:2]
     return float(f_distribution.sf(x @ np.linalg.solve(Q, x) / len(x), len(x), redundancy))

@@ -1,21 +1,19 @@
-"""Bright targets in an image: found as blobs, measured by their grey values' centre of gravity, then by least squares matching.
+"""Bright targets of the bar in an image, measured by least squares matching, and tracked through the images of a view.
 
-    x̄ = Σ (g − T) x / Σ (g − T)                                                (1)   over the blob (D'Apuzzo et al. 2000, §2.2)
+    x̄ = Σ (g − T) x / Σ (g − T)                                                (1)   centroid of a blob (D'Apuzzo et al. 2000, §2.2)
     q = | B (x − c) | ,   g(x) + e = g0 + g1 Φ(ρ (1 − q))                       (2)   an ellipse with a soft edge, Φ: normal distribution
 
 (2) is matched by Gauss–Newton with an analytic Jacobian for many targets at once; unknowns c (2), B (3, symmetric), ρ, g0, g1. A saturated
-target only has a flat top, which (2) has as well. The sigma of c comes from the adjustment.
+target only has a flat top, which (2) models as well. The sigma of c comes from the adjustment. Images are those of `images.sequence`: grey
+values 0…255. Coordinates are pixels of the given image.
 
-Images are those of `images.sequence`: grey values 0…255. Coordinates are pixels of the image given.
+Which two of the bright spots are the targets is decided over the whole sequence by dynamic programming (Viterbi 1967). A state of a frame
+is an ordered pair of spots, or none; the cheapest sequence of states wins:
 
-Which two of an image's bright spots are the bar's targets: followed through the sequence by dynamic programming.
+    cost of a state = difference of the areas + area below the largest          (3)
+    cost of a step  = (path of both targets / expected path)², at most a jump   (4)
 
-A state of a frame is an ordered pair of spots, or none; the cheapest sequence of states is found (Viterbi 1967):
-
-    cost of a state = unlike areas + smaller spots than the largest             (1)
-    cost of a step  = (way of both targets / expected way)², at most a jump     (2)
-
-Spots that stay where they are while others move are reflections and lamps. Where only one target is seen, it keeps its place in the pair.
+Spots that stay in place while others move are reflections and lamps. Where only one target is visible, it keeps its place in the pair.
 """
 
 from collections.abc import Sequence
@@ -31,28 +29,53 @@ from ..foundation.arrays import frozen
 from ..geometry.robust import MAD_TO_SIGMA, mad_sigma
 
 MIN_CONTRAST = 30.0  # grey values between a target's peak and the background
-RELATIVE_THRESHOLD = 0.5  # of a blob's own contrast, where its outline is
-HIGHER_THRESHOLDS = (0.65, 0.8, 0.9)  # of what is not compact there: targets that a bright bar joins
-BRIGHTNESS = 0.35  # a target has at least this part of the contrast of the brightest blob
-MIN_AREA, MAX_AREA_PART = 4, 0.02  # pixels; part of the image
-MIN_FILL, MAX_ELONGATION = 0.72, 3.5
-MOST_BLOBS, MOST_PARTS = 64, 8
-WINDOW_SIDES = (9, 13, 19, 27, 39, 57, 83, 121)
-ITERATIONS, CONVERGED_PX = 16, 1e-3
-SETTLED = 5  # iterations after which the target's outline is known
-SECTORS, RING_PX, BESIDE, MOST_BESIDE = 24, 3.0, 0.015, 0.4
+FIRST_CONTRAST = 0.7  # of MIN_CONTRAST: lowest threshold above the background
+RELATIVE_THRESHOLD = 0.5  # of a blob's contrast, at which it is outlined
+HIGHER_THRESHOLDS = (0.65, 0.8, 0.9)  # where the blob is not compact: targets joined by a bright bar
+BRIGHTNESS = 0.35  # of the contrast of the brightest blob that a target has at least
+MIN_AREA = 4  # px
+MAX_AREA_PART = 0.02  # of the image
+MIN_FILL = 0.72  # of the ellipse with the same second moments
+MAX_ELONGATION = 3.5
+PEAK_PX = 5  # brightest pixels of a blob, whose mean is its peak
+MOST_BLOBS = 64  # of an image
+MOST_PARTS = 8  # of a blob
+WINDOW_SIDES = (9, 13, 19, 27, 39, 57, 83, 121)  # px
+ITERATIONS = 16
+CONVERGED_PX = 1e-3  # step of the centre
+MOST_STEP_PX = 1.5  # of the centre
+SETTLED = 5  # iterations after which the outline of the target is known
+SECTORS = 24  # of a ring around the target
+RING_PX = 3.0  # width of the ring
+TOUCHES = 0.015  # of g1: a sector that is brighter than the background by more touches something, such as the bar
+MOST_TOUCHED = 0.4  # of the sectors; more means another background
 ROBUST = 3.0  # sigmas of the grey values
 LEAST_NOISE = 0.3 * MAD_TO_SIGMA  # grey values; the MAD of rounding to whole ones is 0.25
 MAX_MISFIT = 0.08  # RMS of the grey values as a part of g1
 
+MOST_SPOTS = 6  # of a frame
+STATIC_PX = 1.5  # a spot at the same place within this distance …
+STATIC_PART = 0.5  # … in more than this part of the frames is static
+STATIC_TARGETS = 0.2  # part of the frames with two moving spots below which the bar itself is static
+MIN_STATIC_FRAMES = 8
+STATIC_SAMPLES = 80  # frames that are compared, however long the sequence is
+EXPECTED_PATH = 0.05  # of the image width, from frame to frame
+SMALLEST_WIDTH = 0.6  # of the targets' expected width
+JUMP = 6.0  # cost of (4) at most
+NO_PAIR = 8.0  # cost of a frame without a pair
+LIKE_AREAS = 1.0  # weight of the difference of the areas in (3)
+LARGE = 1.0  # weight of the areas below the largest in (3)
+GATE = 0.03  # of the image width: distance of a single target from its expected position
+MOST_GAP = 3  # frames over which a position is interpolated
+
 
 class TargetStatus(IntEnum):
-    """Why a target's position can be used or not."""
+    """Whether the position of a target can be used, and why not."""
 
     OK = 0
-    CROPPED = 1  # its window leaves the image
+    CROPPED = 1  # its window extends beyond the image
     NOT_CONVERGED = 2
-    NO_DISC = 3  # it does not look like one: merged with another, hidden in part
+    NO_DISC = 3  # it is no disc: merged with another one, or partly occluded
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -84,7 +107,7 @@ class Blobs:
 
 
 def find_targets(image: np.ndarray, mask: np.ndarray | None = None) -> Targets:
-    """Find and measure the bright round targets of an image (h, w) float32 0…255; `mask` (h, w) is False where none can be."""
+    """Find and measure the bright round targets of an image (h, w) float32 0…255; `mask` (h, w) is False where there can be none."""
     background = background_of(image)
     return match_discs(image, find_blobs(image if mask is None else np.where(mask, image, np.float32(background))))
 
@@ -101,7 +124,7 @@ def find_blobs(image: np.ndarray) -> Blobs:
     highest = float(smooth.max()) - background
     rows = []
     if highest >= MIN_CONTRAST:
-        threshold = background + max(0.7 * MIN_CONTRAST, RELATIVE_THRESHOLD * BRIGHTNESS * highest)
+        threshold = background + max(FIRST_CONTRAST * MIN_CONTRAST, RELATIVE_THRESHOLD * BRIGHTNESS * highest)
         count, labels, statistics, _ = cv2.connectedComponentsWithStats((smooth > threshold).astype(np.uint8), connectivity=8)
         by_area = 1 + np.argsort(-statistics[1:count, cv2.CC_STAT_AREA])[: 4 * MOST_BLOBS]
         for n in by_area[statistics[by_area, cv2.CC_STAT_AREA] <= MAX_AREA_PART * image.size]:
@@ -114,7 +137,7 @@ def find_blobs(image: np.ndarray) -> Blobs:
 
 
 def _outlines(grey: np.ndarray, inside: np.ndarray, background: float) -> list[tuple[float, ...]]:
-    """What is compact within a bright area: itself, or at a higher threshold the parts into which it falls."""
+    """The compact parts of a bright area: the area itself, or its parts at a higher threshold."""
     whole = _outlined(grey, inside, background, RELATIVE_THRESHOLD)
     if whole is not None:
         return [whole]
@@ -130,7 +153,7 @@ def _outlines(grey: np.ndarray, inside: np.ndarray, background: float) -> list[t
 
 def _outlined(grey: np.ndarray, inside: np.ndarray, background: float, threshold: float) -> tuple[float, ...] | None:
     """Centroid x y, widths along x and y, contrast and area within the outline at that part of the contrast; None if not compact.  (1)"""
-    peak = np.sort(grey[inside])[-min(5, int(inside.sum())) :].mean()
+    peak = np.sort(grey[inside])[-min(PEAK_PX, int(inside.sum())) :].mean()
     contrast = float(peak) - background
     core = inside & (grey > background + threshold * contrast)
     area = int(core.sum())
@@ -174,31 +197,31 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
         [start[:, 0], start[:, 1], B[:, 0], B[:, 0] * 0, B[:, 1], 1.4 / B.mean(axis=1), np.full(m, background), start[:, 4]], axis=1
     )
     reach = np.hypot((grid[:, 0] - p[:, 0, None]) * p[:, 2, None], (grid[:, 1] - p[:, 1, None]) * p[:, 4, None])
-    near = reach < 1.12 + 1.5 / np.sqrt(p[:, 5, None])  # what lies further out, such as the other target, takes no part
+    near = reach < 1.12 + 1.5 / np.sqrt(p[:, 5, None])  # pixels further out, such as those of the other target, are not used
     active, converged = np.arange(m), np.zeros(m, dtype=bool)
     covariance, sigma0, misfit = np.full((m, 2), np.inf), np.full(m, np.inf), np.full(m, np.inf)
     for iteration in range(ITERATIONS):
         if iteration == SETTLED:
-            near &= ~_beside_something(p, grid, grey)
+            near &= ~_touched(p, grid, grey)
             active, converged[:] = np.flatnonzero(np.isfinite(p).all(axis=1)), False
         v, J = _disc(p[active], grid, grey[active])
         misfit[active] = np.sqrt(np.sum(v * v * near[active], axis=1) / np.maximum(near[active].sum(axis=1) - 8, 1))
         noise = np.maximum(mad_sigma(v, 1, near[active]), LEAST_NOISE)[:, None]
-        weight = near[active] / (1 + (v / (ROBUST * noise)) ** 2)  # the bar takes no part
+        weight = near[active] / (1 + (v / (ROBUST * noise)) ** 2)  # outliers: the bar
         J *= weight[:, :, None] ** 0.5
         v *= weight**0.5
         N = J.transpose(0, 2, 1) @ J
         N = N + np.eye(8) * (1e-4 * np.einsum("mii->mi", N)[:, :, None] + 1e-9)
         step = np.linalg.solve(N, np.einsum("mki,mk->mi", J, v)[..., None])[..., 0]
-        step[:, :2] = np.clip(step[:, :2], -1.5, 1.5)
+        step[:, :2] = np.clip(step[:, :2], -MOST_STEP_PX, MOST_STEP_PX)
         p[active] += step
         p[active, 5] = np.maximum(p[active, 5], 0.3)
         freedom = np.maximum(near[active].sum(axis=1) - 8, 1)
         sigma0[active] = np.sqrt(np.sum(v * v, axis=1) / freedom)
         covariance[active] = np.einsum("mii->mi", np.linalg.inv(N))[:, :2]
-        still = np.abs(step[:, :2]).max(axis=1) >= CONVERGED_PX
-        converged[active[~still]] = True
-        active = active[still & np.isfinite(p[active]).all(axis=1)]
+        moving = np.abs(step[:, :2]).max(axis=1) >= CONVERGED_PX
+        converged[active[~moving]] = True
+        active = active[moving & np.isfinite(p[active]).all(axis=1)]
         if not len(active) and iteration >= SETTLED:
             break
     bad = ~converged | (np.abs(p[:, :2] - start[:, :2]) > 0.25 * start[:, 2:4] + 1.0).any(axis=1)
@@ -206,8 +229,8 @@ def _matched(windows: np.ndarray, start: np.ndarray, background: float) -> tuple
     return np.where(bad[:, None], start[:, :2], p[:, :2]), sigma0 * np.sqrt(covariance.mean(axis=1)), status.astype(np.int8)
 
 
-def _beside_something(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> np.ndarray:
-    """Pixels (m, k) in the directions in which something bright touches the target, such as the bar, which would draw its centre there.
+def _touched(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> np.ndarray:
+    """Pixels (m, k) in the directions in which something bright touches the target, such as the bar, and would shift its centre.
 
     The directions are those in which a ring outside the target is brighter than the background.
     """
@@ -220,11 +243,11 @@ def _beside_something(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> np.n
     flat = (np.arange(len(p))[:, None] * SECTORS + sector)[ring]
     count = np.bincount(flat, minlength=len(p) * SECTORS).reshape(-1, SECTORS)
     total = np.bincount(flat, weights=(grey - p[:, 6, None])[ring], minlength=len(p) * SECTORS).reshape(-1, SECTORS)
-    mean = np.nan_to_num(total / np.maximum(count, 1))  # a match that ran away has none
+    mean = np.nan_to_num(total / np.maximum(count, 1))  # NaN of a match that diverged
     level = np.median(mean, axis=1, keepdims=True)
     spread = mad_sigma(mean - level, 1)[:, None]
-    bright = (count > 0) & (mean - level > np.maximum(BESIDE * p[:, 7, None], 4 * spread))
-    bright[bright.mean(axis=1) > MOST_BESIDE] = False
+    bright = (count > 0) & (mean - level > np.maximum(TOUCHES * p[:, 7, None], 4 * spread))
+    bright[bright.mean(axis=1) > MOST_TOUCHED] = False
     bright |= np.roll(bright, 1, axis=1) | np.roll(bright, -1, axis=1)
     return np.take_along_axis(bright, sector, axis=1) & (q > 0.5)
 
@@ -246,24 +269,13 @@ def _disc(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> tuple[np.ndarray
     return grey - (g0 + g1 * inside), J
 
 
-MOST_SPOTS = 6
-STILL_PX, STILL_PART = 1.5, 0.5  # a spot within STILL_PX in more than this part of the frames stands still
-MIN_STILL_FRAMES, FRAMES_ASKED = 8, 80  # so many frames tell what stands still, however long the sequence is
-EXPECTED_WAY = 0.05  # of the image width, from frame to frame
-SMALLEST_WIDTH = 0.6  # of the targets' expected width
-JUMP, NOTHING = 6.0, 8.0  # costs
-LIKE_AREAS, LARGE = 1.0, 1.0  # weights of (1)
-GATE = 0.03  # of the image width: a single target lies this near to where it is expected
-MOST_GAP = 3  # frames over which a place is expected
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BarTrack:
-    """The bar's targets in one view: `xy_px` (T, 2, 2), NaN: not seen; the order of the two holds over time but not between views."""
+    """The targets of the bar in one view: `xy_px` (T, 2, 2), NaN: not visible; in the same order over time, not between views."""
 
     xy_px: np.ndarray
     spots: np.ndarray  # (T,) number of spots found
-    still: bool  # the spots do not move
+    static: bool  # the spots do not move
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xy_px", frozen(self.xy_px, (None, 2, 2), name="xy_px"))
@@ -271,46 +283,46 @@ class BarTrack:
 
 
 def track_bar(frames: Sequence[Targets], width_px: float, diameter: float = 0.0) -> BarTrack:
-    """Follow the bar's two targets through the frames of one view.
+    """The two targets of the bar through the frames of one view.
 
-    `diameter` of the targets as a part of the bar's length: what is foreshortened is the bar, so no true pair is smaller for its distance.
+    `diameter` of the targets relative to the length of the bar: only the bar is foreshortened, so no true pair is smaller.
     """
     spots = np.array([len(t.xy_px) for t in frames])
     usable = [np.flatnonzero(t.status == TargetStatus.OK) for t in frames]
     moving = _moving(frames, usable)
     two = np.mean([len(m) >= 2 for m in moving]) if len(frames) else 0.0
-    still = bool(two < 0.2 * np.mean([len(u) >= 2 for u in usable])) if len(frames) else False
-    chosen = usable if still else moving
+    static = bool(two < STATIC_TARGETS * np.mean([len(u) >= 2 for u in usable])) if len(frames) else False
+    chosen = usable if static else moving
     xy = [t.xy_px[c[:MOST_SPOTS]] for t, c in zip(frames, chosen)]
     area = [t.area_px[c[:MOST_SPOTS]] for t, c in zip(frames, chosen)]
     track = _in_one_order(_best_sequence(xy, area, width_px, diameter))
-    return BarTrack(xy_px=_with_singles(track, xy, width_px), spots=spots, still=still)
+    return BarTrack(xy_px=_with_singles(track, xy, width_px), spots=spots, static=static)
 
 
 def moved_targets(frames: Sequence[Targets]) -> int:
-    """How many targets of the last of the frames were not at their place in the one before."""
+    """How many targets of the last frame have moved since the frame before."""
     xy = frames[-1].xy_px[frames[-1].status == TargetStatus.OK]
     if len(frames) < 2 or not len(frames[-2].xy_px):
         return len(xy)
-    return int((np.linalg.norm(xy[:, None] - frames[-2].xy_px[None], axis=2).min(axis=1) >= STILL_PX).sum())
+    return int((np.linalg.norm(xy[:, None] - frames[-2].xy_px[None], axis=2).min(axis=1) >= STATIC_PX).sum())
 
 
 def _moving(frames: Sequence[Targets], usable: list[np.ndarray]) -> list[np.ndarray]:
-    """Indices of the spots that do not stand still in most frames."""
-    if len(frames) < MIN_STILL_FRAMES:
+    """Indices of the spots that are not static."""
+    if len(frames) < MIN_STATIC_FRAMES:
         return usable
     points = np.concatenate([t.xy_px[u] for t, u in zip(frames, usable)])
     counts = np.zeros(len(points), dtype=int)
-    asked = np.unique(np.linspace(0, len(frames) - 1, FRAMES_ASKED).astype(int))
-    for xy in (frames[n].xy_px[usable[n]] for n in asked):
+    sampled = np.unique(np.linspace(0, len(frames) - 1, STATIC_SAMPLES).astype(int))
+    for xy in (frames[n].xy_px[usable[n]] for n in sampled):
         if len(xy):
-            counts += ((points[:, None] - xy[None]) ** 2).sum(axis=2).min(axis=1) < STILL_PX**2
-    stands = np.split(counts > STILL_PART * len(asked), np.cumsum([len(u) for u in usable])[:-1])
-    return [u[~s] for u, s in zip(usable, stands)]
+            counts += ((points[:, None] - xy[None]) ** 2).sum(axis=2).min(axis=1) < STATIC_PX**2
+    static = np.split(counts > STATIC_PART * len(sampled), np.cumsum([len(u) for u in usable])[:-1])
+    return [u[~s] for u, s in zip(usable, static)]
 
 
 def _best_sequence(xy: list[np.ndarray], area: list[np.ndarray], width_px: float, diameter: float) -> np.ndarray:
-    """The cheapest ordered pairs (T, 2, 2), NaN where there is none.  (1), (2)"""
+    """The cheapest ordered pairs (T, 2, 2), NaN where there is none.  (3), (4)"""
     states = [_pairs(points, size, diameter) for points, size in zip(xy, area)]
     total = np.zeros(1)
     back: list[np.ndarray] = []
@@ -318,11 +330,11 @@ def _best_sequence(xy: list[np.ndarray], area: list[np.ndarray], width_px: float
     for points, size, pairs in zip(xy, area, states):
         here = points[np.array(pairs, dtype=int).reshape(-1, 2)]
         step = np.full((len(before) + 1, len(here) + 1), JUMP / 2)
-        way = np.linalg.norm(before[:, None] - here[None], axis=3) / (EXPECTED_WAY * width_px)
-        step[:-1, :-1] = np.minimum(np.sum(way**2, axis=2), JUMP)
+        path = np.linalg.norm(before[:, None] - here[None], axis=3) / (EXPECTED_PATH * width_px)
+        step[:-1, :-1] = np.minimum(np.sum(path**2, axis=2), JUMP)
         cost = total[:, None] + step
         back.append(np.argmin(cost, axis=0))
-        total = cost.min(axis=0) + np.append(_own_cost(size, pairs), NOTHING)
+        total = cost.min(axis=0) + np.append(_own_cost(size, pairs), NO_PAIR)
         before = here
     track = np.full((len(xy), 2, 2), np.nan)
     state = int(np.argmin(total))
@@ -334,7 +346,7 @@ def _best_sequence(xy: list[np.ndarray], area: list[np.ndarray], width_px: float
 
 
 def _pairs(xy: np.ndarray, area: np.ndarray, diameter: float) -> list[tuple[int, int]]:
-    """Ordered pairs of spots that are not too small for their distance, for targets of that part of the bar's length."""
+    """Ordered pairs of spots that are not too small for their distance, for targets of that part of the length of the bar."""
     width = 2 * np.sqrt(area / np.pi)
     return [
         (i, j)
@@ -344,7 +356,7 @@ def _pairs(xy: np.ndarray, area: np.ndarray, diameter: float) -> list[tuple[int,
 
 
 def _in_one_order(track: np.ndarray) -> np.ndarray:
-    """The track with its pairs turned round where that is the shorter way across a gap."""
+    """The track with pairs swapped where that makes the path across a gap shorter."""
     ordered = track.copy()
     known = np.flatnonzero(np.isfinite(track).all(axis=(1, 2)))
     for before, n in zip(known[:-1], known[1:]):
@@ -362,7 +374,7 @@ def _own_cost(size: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _with_singles(track: np.ndarray, xy: list[np.ndarray], width_px: float) -> np.ndarray:
-    """The track with single targets where the other one is not seen, if they lie where they are expected."""
+    """The track with single targets added near their expected positions where the other target is not visible."""
     full = np.isfinite(track).all(axis=(1, 2))
     known = np.flatnonzero(full)
     filled = track.copy()

@@ -1,11 +1,11 @@
-"""The world's frame: metres, Z up. A calibration is free to turn and shift; here it is put where the user wants it.
+"""The world's frame: metres, Z up. A calibration is free to rotate and shift; here it is put where the user wants it:
+
+on the floor under the bar, level with the bar, through three clicked points, or where another rig is.
 
     X' = R X + s ,   R_cam' = R_cam Rᵀ ,   t_cam' = t_cam − R_cam' s               (1)
 
-Without anything known, up is where the cameras' tops are, the cameras look along +Y (a person who faces them faces −Y), and the origin is
-the middle of the volume in which the bar was waved.
-
-Where the user wants the world's frame: on the floor under the bar, level with a bar, through three clicked points, or another rig's.
+Without such a choice, up is the mean direction of the cameras' tops, the cameras look along +Y (a person who faces them faces −Y), and the
+origin is the middle of the volume in which the bar was waved.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,8 +19,12 @@ from ..geometry.camera import Camera
 from ..geometry.intersection import clicks_contradict, intersect_clicks
 from ..geometry.rig import Rig
 
-LEAST_ARM_M, OTHERWISE = 0.1, 0.3  # length to which directions count; a rig that differs by more than this part of it is another
-MIN_FLOOR_SPREAD = 0.02  # of the largest extent: points nearer to one line than this have no plane
+LEAST_ARM_M = 0.1  # at which directions of cameras are compared, at least
+OTHER_RIG = 0.3  # of that arm: rigs that differ by more are not the same
+MIN_FLOOR_SPREAD = 0.02  # of the largest extent: points that are closer to a line have no plane
+MIN_LEVEL_SPREAD = 0.02  # ratio of the second to the largest eigenvalue: bars that spread less are parallel
+PARALLEL = 1e-3  # sine of the angle between directions that count as parallel
+POINTS = ("origin", "x", "y")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -45,21 +49,21 @@ class WorldFrame:
 
 
 def frame_of_cameras(cameras: Sequence[Camera], points_m: np.ndarray) -> WorldFrame:
-    """The frame that needs nothing but the cameras: their tops are up, they look along +Y, the origin is the middle of the points."""
+    """The frame from the cameras alone: their tops are up, they look along +Y, the origin is the middle of the points."""
     up = -np.mean([c.R_cam_world[1] for c in cameras], axis=0)
     return upright(up, cameras, np.median(points_m.reshape(-1, 3), axis=0))
 
 
 def frame_like(cameras: Sequence[Camera], there: Sequence[Camera]) -> WorldFrame:
-    """The frame in which the cameras stand as nearly as can be where cameras of the same names are: centres and axes, without scale.
+    """The frame in which the cameras fit those of the same names best, in centres and axes, without a change of scale.
 
     Raises:
-        InputError: no name is the same, or the cameras stand otherwise to each other.
+        InputError: no name is the same, or the relative positions of the cameras differ.
     """
     other = {camera.name: camera for camera in there}
     pairs = [(camera, other[camera.name]) for camera in cameras if camera.name in other]
     if not pairs:
-        raise InputError(f"None of the cameras {', '.join(c.name for c in cameras)} is among {', '.join(other)}; name them alike.")
+        raise InputError(f"None of the cameras {', '.join(c.name for c in cameras)} is among {', '.join(other)}; give them the same names.")
     centres = np.array([camera.centre_m for camera, _ in pairs])
     arm = max(float(np.linalg.norm(np.ptp(centres, axis=0))), LEAST_ARM_M)
     A, B = (np.concatenate([c.centre_m + arm * np.vstack([np.zeros(3), c.R_cam_world]) for c in each]) for each in zip(*pairs))
@@ -67,8 +71,8 @@ def frame_like(cameras: Sequence[Camera], there: Sequence[Camera]) -> WorldFrame
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     frame = WorldFrame(R=R, shift_m=B.mean(axis=0) - R @ A.mean(axis=0))
     off = np.linalg.norm(frame.points(A) - B, axis=1).max()
-    if off > OTHERWISE * arm:
-        raise InputError(f"The cameras stand otherwise than those of the same names, by {1e3 * off:.0f} mm; were they moved or swapped?")
+    if off > OTHER_RIG * arm:
+        raise InputError(f"The cameras differ from those of the same names by {1e3 * off:.0f} mm; were they moved or swapped?")
     return frame
 
 
@@ -77,7 +81,7 @@ def upright(up: np.ndarray, cameras: Sequence[Camera], origin_m: np.ndarray) -> 
     z = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     view = np.mean([c.R_cam_world[2] for c in cameras], axis=0)
     y = view - z * (z @ view)
-    if np.linalg.norm(y) < 1e-3:  # the cameras look straight down or up
+    if np.linalg.norm(y) < PARALLEL:  # the cameras look straight down or up
         y = -np.mean([c.R_cam_world[1] for c in cameras], axis=0)
         y -= z * (z @ y)
     y /= np.linalg.norm(y)
@@ -108,7 +112,7 @@ def frame_of_level_bar(directions: np.ndarray, cameras: Sequence[Camera], origin
         InputError: all bars were parallel.
     """
     values, axes = np.linalg.eigh(directions.T @ directions)
-    if len(directions) < 2 or values[1] < 0.02 * values[2]:
+    if len(directions) < 2 or values[1] < MIN_LEVEL_SPREAD * values[2]:
         raise InputError("The level bars are parallel; hold the bar level in two directions across each other.")
     tops = -np.mean([c.R_cam_world[1] for c in cameras], axis=0)
     return upright(axes[:, 0] * np.sign(axes[:, 0] @ tops), cameras, origin_m)
@@ -122,49 +126,46 @@ def frame_of_points(origin_m: np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> W
     """
     x, across = x_m - origin_m, y_m - origin_m
     z = np.cross(x, across)
-    if np.linalg.norm(z) < 1e-3 * np.linalg.norm(x) * np.linalg.norm(across) or not np.linalg.norm(x):
-        raise InputError("The origin, the point on X and the point towards Y lie on one line; choose a third one beside it.")
+    if np.linalg.norm(z) < PARALLEL * np.linalg.norm(x) * np.linalg.norm(across) or not np.linalg.norm(x):
+        raise InputError("The origin, the point on X and the point towards Y lie on one line; choose a third one off that line.")
     x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
     R = np.stack([x, np.cross(z, x), z])
     return WorldFrame(R=R, shift_m=-R @ origin_m)
 
 
-POINTS = ("origin", "x", "y")
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WorldChoice:
-    """One of the four, or nothing: then up is where the cameras' tops are."""
+    """At most one of the four; without any, the cameras' tops are up."""
 
     floor_frames: tuple[int, ...] = ()  # in which the bar lies on the floor
     level_frames: tuple[int, ...] = ()  # in which the bar is held level
     points: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)  # "origin", "x", "y": pixels [x, y] by view
-    like: Rig | None = None  # cameras of the same names, which stay where they are there
+    like: Rig | None = None  # cameras of the same names stay where they are in this rig
 
     def __post_init__(self) -> None:
         if sum(map(bool, (self.floor_frames, self.level_frames, self.points, self.like))) > 1:
-            raise InputError("The world's frame is given twice; choose the floor, level bars, three points, or another rig's.")
+            raise InputError("The world's frame is given twice; choose the floor, level bars, three points, or another rig.")
 
     @property
     def on_floor(self) -> bool:
-        """Whether z = 0 is the floor, or the plane that the user's points lie in."""
+        """Whether z = 0 is the floor, or the plane of the user's points."""
         return bool(self.floor_frames or self.points or (self.like is not None and self.like.metadata.get("floor") is True))
 
 
 def frame_of_bar(choice: WorldChoice, cameras: Sequence[Camera], frames: np.ndarray, ends_m: np.ndarray) -> WorldFrame:
-    """The frame that was chosen, from the bar's ends (T, 2, 3) in the frames (T,) in which they were measured.
+    """The chosen frame, from the ends of the bar (T, 2, 3) in the frames (T,) in which they were measured.
 
     Raises:
-        InputError: the frames do not show the bar, or what they show makes no frame.
+        InputError: the chosen frames do not show the bar, or do not determine a frame.
     """
     if choice.like is not None:
         return frame_like(cameras, choice.like.cameras)
     if choice.points:
         return frame_of_clicks(cameras, choice.points)
     for wanted, doing in ((choice.floor_frames, "to lie on the floor"), (choice.level_frames, "to be level")):
-        unseen = sorted(set(wanted) - set(frames.tolist()))
-        if unseen:
-            raise InputError(f"Frame {unseen[0]}, in which the bar is said {doing}, does not show both of its ends; choose another.")
+        missing = sorted(set(wanted) - set(frames.tolist()))
+        if missing:
+            raise InputError(f"Frame {missing[0]}, in which the bar is supposed {doing}, does not show both of its ends; choose another.")
     if choice.floor_frames:
         return frame_on_floor(ends_m[np.isin(frames, choice.floor_frames)].reshape(-1, 3), cameras)
     if choice.level_frames:

@@ -30,9 +30,9 @@ def add_command(commands: Any) -> None:
         "--interlaced",
         choices=(*INTERLACE, BOTH),
         default="none",
-        help="which lines to keep of interlaced video; both: as two frames, the odd lines' and the even lines'",
+        help="the lines of interlaced video to use; both: two frames per image, one of the odd lines and one of the even lines",
     )
-    parser.add_argument("--first-field", choices=("odd", "even"), default="odd", help="of both: which lines were exposed first")
+    parser.add_argument("--first-field", choices=("odd", "even"), default="odd", help="with both: the lines that were exposed first")
     parser.add_argument(
         "--mask", type=Path, metavar="PATH", help="image that is black where no target can be, or a folder of them named like the cameras"
     )
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Calibrate or convert; the lines to show.
 
     Raises:
-        InputError: the arguments or the recording need mending.
+        InputError: the arguments or the recording are faulty.
     """
     if (args.bar is None) == (args.source is None):
         raise InputError("Give either the folder of the bar's images, or --import with another tool's calibration.")
@@ -102,7 +102,7 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         written.append(write_bar(args.out, result.rig, *result.bar))
     if args.json:
         return [json.dumps(report.figures(result.calibration, result.quality, result.verdict), indent=1, ensure_ascii=False)]
-    return [result.verdict.sentence, f"To do better: {result.verdict.advice}.", f"Written: {', '.join(map(str, written))}"]
+    return [result.verdict.sentence, f"To improve: {result.verdict.advice}.", f"Written: {', '.join(map(str, written))}"]
 
 
 def _world(args: argparse.Namespace) -> WorldChoice:

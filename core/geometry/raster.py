@@ -1,11 +1,11 @@
-"""Triangle meshes seen by a camera: a z-buffer in numpy, exact to the last edge.
+"""Triangle meshes rendered in a camera's image: a z-buffer in numpy, with exact edges.
 
 Vertices go through the full camera model (distortion and affinity); edges between them are straight in the image. Filling is
 by scan lines with half-open spans (Foley, van Dam, Feiner, Hughes 1990, §3.6): a sample belongs to the triangle when
 
     y_top ≤ y < y_bottom   and   x_left(y) ≤ x < x_right(y)                    (1)
 
-and an edge gives the same x(y) to both of its triangles, so that neighbours leave no crack and share no sample. Inverse depth
+and an edge has the same x(y) for both of its triangles, so that neighbours leave no gap and share no sample. Inverse depth
 is linear in the image, which gives the perspective-correct weights of the corners (Heckbert & Moreton 1991):
 
     1/z = Σ b_i / z_i ,   w_i = (b_i / z_i) / Σ (b_j / z_j)                    (2)
@@ -18,14 +18,14 @@ import numpy as np
 from ..foundation.arrays import frozen
 from .camera import Camera
 
-NEAR_M = 0.01  # what is nearer than this to the camera is cut off
-FIELD_MARGIN = 1.5  # distortion polynomials are trusted up to this multiple of the frame corner's radius
+NEAR_M = 0.01  # near plane of the camera
+FIELD_MARGIN = 1.5  # times the radius of the frame's corners: the distortion polynomials are used up to there
 SLIVER = 1e-9  # twice the area [samples²] below which a triangle has no slope of depth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Pieces:
-    """Triangles in the image, and where each comes from: the near plane cuts a triangle of the mesh into up to two."""
+    """Triangles in the image and their sources: the near plane cuts a triangle of the mesh into at most two pieces."""
 
     xy_px: np.ndarray  # (M, 3, 2)
     inverse_z: np.ndarray  # (M, 3)
@@ -58,7 +58,7 @@ class Pieces:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Raster:
-    """The samples of a grid that meet a mesh, in scan order; N of them. Weights are worked out when they are asked for."""
+    """The N samples of a grid that a mesh covers, in scan order. Weights are computed on request."""
 
     x_px: np.ndarray  # (W,) full-frame x of the grid's columns
     y_px: np.ndarray  # (H,) full-frame y of the grid's rows
@@ -94,21 +94,21 @@ class Raster:
         return np.stack([self.x_px[self.sample % len(self.x_px)], self.y_px[self.sample // len(self.x_px)]], axis=1)
 
     def interpolate(self, values: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """Values at the vertices (V, …) of the mesh with `triangles` (F, 3), carried to the samples (N, …)."""
+        """Values at the vertices (V, …) of the mesh with `triangles` (F, 3), interpolated at the samples (N, …)."""
         return self.interpolate_at(np.arange(len(self.sample)), self.xy_px, values, triangles)
 
     def interpolate_at(self, which: np.ndarray, xy_px: np.ndarray, values: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """Values of the triangles seen by the samples `which` (K,), at pixels (K, 2) beside those samples: (K, …)."""
+        """Values of the triangles at the samples `which` (K,), interpolated at pixels (K, 2) next to those samples: (K, …)."""
         piece, values = self.piece[which], np.asarray(values)
         corners, weights = np.asarray(triangles)[self.pieces.source[piece]], self.pieces.weights(piece, xy_px)
         across = (slice(None), *[None] * (values.ndim - 1))
         return sum(weights[:, i][across] * values[corners[:, i]] for i in range(3))  # type: ignore[return-value]
 
     def image(self, values: np.ndarray, background: float = np.nan) -> np.ndarray:
-        """Values at the samples (N,) as a picture (H, W)."""
-        picture = np.full(self.shape, background, dtype=np.result_type(np.asarray(values), type(background)))
-        picture.reshape(-1)[self.sample] = values
-        return picture
+        """Values at the samples (N,) as an image (H, W)."""
+        image = np.full(self.shape, background, dtype=np.result_type(np.asarray(values), type(background)))
+        image.reshape(-1)[self.sample] = values
+        return image
 
 
 def rasterize(
@@ -120,22 +120,21 @@ def rasterize(
     factor: int = 1,
     back_faces: bool = False,
 ) -> Raster:
-    """Find the triangle that each sample of the picture shows.
+    """The triangle that is visible at each sample of the image.
 
     `vertices_m` (V, 3) world, `triangles` (F, 3) counter-clockwise seen from outside. `rows`: increasing full-frame rows to
     fill (one field of an interlaced frame), default all. `factor`² samples are spread evenly over each pixel.
-    `back_faces`: whether triangles seen from behind are drawn. What reaches out of the picture, behind the camera or nearer than
-    1 cm is cut off. About 0.1 s for 10,000 triangles that fill 768 × 576 samples.
+    `back_faces`: whether triangles that face away are drawn. Parts outside the image, behind the camera or nearer than 1 cm are cut
+    off. About 0.1 s for 10,000 triangles that fill 768 × 576 samples.
     """
     width, height = camera.size_px
     offsets = (np.arange(factor) + 0.5) / factor - 0.5
-    kept = np.arange(height, dtype=np.float64) if rows is None else np.asarray(rows, dtype=np.float64)
+    lines = np.arange(height, dtype=np.float64) if rows is None else np.asarray(rows, dtype=np.float64)
     x_px = (np.arange(width)[:, None] + offsets).reshape(-1)
-    y_px = (kept[:, None] + offsets).reshape(-1)
+    y_px = (lines[:, None] + offsets).reshape(-1)
     pieces = _pieces(camera, np.asarray(vertices_m, dtype=np.float64), np.asarray(triangles), back_faces)
     column = (pieces.xy_px[..., 0] - x_px[0]) * factor
-    line, part, start, stop = _spans(column, pieces.xy_px[..., 1], y_px, len(x_px))
-    sample, owner, depth = _nearest(column, pieces, line, part, start, stop, y_px, len(x_px))
+    sample, owner, depth = _nearest(column, pieces, _spans(column, pieces.xy_px[..., 1], y_px, len(x_px)), y_px, len(x_px))
     return Raster(x_px=x_px, y_px=y_px, sample=sample, piece=owner, depth_m=depth, pieces=pieces)
 
 
@@ -157,7 +156,7 @@ def _pieces(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, back_
 
 
 def _cut(points: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The parts beyond the near plane of triangles (M, 3, 3) that reach across it: their sources and corner weights (K, 3, 3)."""
+    """The parts beyond the near plane of triangles (M, 3, 3) that cross it: their sources and corner weights (K, 3, 3)."""
     ahead = points[..., 2] >= NEAR_M
     single = ahead.sum(axis=1) == 1
     odd = np.where(single, ahead.argmax(axis=1), (~ahead).argmax(axis=1))  # the corner that is alone on its side
@@ -165,7 +164,7 @@ def _cut(points: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray
     z = np.take_along_axis(points[..., 2], order, axis=1)
     unit = np.eye(3)[order]  # (M, 3 corners from the odd one on, 3 weights)
     share = ((z[:, :1] - NEAR_M) / (z[:, :1] - z[:, 1:]))[..., None]
-    edge = unit[:, :1] * (1 - share) + unit[:, 1:] * share  # where the two edges from the odd corner pass the plane
+    edge = unit[:, :1] * (1 - share) + unit[:, 1:] * share  # where the two edges from the odd corner cross the plane
     tips = np.stack([unit[:, 0], edge[:, 0], edge[:, 1]], axis=1)[single]
     a = np.stack([edge[:, 0], unit[:, 1], unit[:, 2]], axis=1)[~single]
     b = np.stack([edge[:, 0], unit[:, 2], edge[:, 1]], axis=1)[~single]
@@ -196,8 +195,18 @@ def _doubled_area(xy: np.ndarray) -> np.ndarray:
     return area
 
 
-def _spans(column: np.ndarray, y: np.ndarray, y_px: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The scan lines of all triangles: line, triangle, first column, column after the last.  (1)"""
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Spans:
+    """Spans (S,) of the pieces on scan lines."""
+
+    line: np.ndarray  # row of the grid
+    piece: np.ndarray
+    start: np.ndarray  # first column
+    stop: np.ndarray  # column after the last
+
+
+def _spans(column: np.ndarray, y: np.ndarray, y_px: np.ndarray, width: int) -> _Spans:
+    """The spans of all pieces, whose corners are at `column` (M, 3) of the grid and y (M, 3) [px].  (1)"""
     order = np.argsort(y, axis=1, kind="stable")
     y, x = np.take_along_axis(y, order, axis=1), np.take_along_axis(column, order, axis=1)
     first, last = np.searchsorted(y_px, y[:, 0]), np.searchsorted(y_px, y[:, 2])
@@ -212,26 +221,18 @@ def _spans(column: np.ndarray, y: np.ndarray, y_px: np.ndarray, width: int) -> t
     short_x = x[part, lower] + (at - y[part, lower]) * slope[part, lower]
     start = np.clip(np.ceil(np.minimum(long_x, short_x)), 0, width).astype(np.intp)
     stop = np.clip(np.ceil(np.maximum(long_x, short_x)), 0, width).astype(np.intp)
-    return line, part, start, stop
+    return _Spans(line=line, piece=part, start=start, stop=stop)
 
 
 def _expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Runs first[i], first[i]+1, … of count[i] numbers, one after the other: the run's index and the number."""
+    """Runs first[i], first[i]+1, … of count[i] numbers, concatenated: the index of the run, and the number."""
     run = np.repeat(np.arange(len(count)), count)
     return run, np.arange(len(run)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
-def _nearest(
-    column: np.ndarray,
-    pieces: Pieces,
-    line: np.ndarray,
-    part: np.ndarray,
-    start: np.ndarray,
-    stop: np.ndarray,
-    y_px: np.ndarray,
-    width: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The z-buffer: flat sample indices (N,), increasing, with their triangle and depth."""
+def _nearest(column: np.ndarray, pieces: Pieces, spans: _Spans, y_px: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The z-buffer: flat sample indices (N,), increasing, with their pieces and depths."""
+    line, part, start, stop = spans.line, spans.piece, spans.start, spans.stop
     along_x, along_y = _depth_slopes(column, pieces)
     at_start = (
         pieces.inverse_z[part, 0] + (start - column[part, 0]) * along_x[part] + (y_px[line] - pieces.xy_px[part, 0, 1]) * along_y[part]
@@ -270,7 +271,7 @@ def vertex_normals(vertices_m: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def shade(camera: Camera, vertices_m: np.ndarray, triangles: np.ndarray, *, factor: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """A mesh as a smooth grey body lit from above the camera: grey (H, W) in 0…1, and coverage (H, W) in 0…1 for blending,
 
-        picture = (1 - alpha · coverage) · footage + alpha · coverage · grey        alpha: the opacity that you choose
+        picture = (1 - alpha · coverage) · footage + alpha · coverage · grey        alpha: the chosen opacity
 
     float32 both, the size of the camera's frame; `factor`² samples per pixel smooth the outline.
     """

@@ -27,11 +27,11 @@ sys.path.insert(0, str(HERE.parent / "core" / "calibration"))
 from truth import TEST_BARS, bound, error_m, observed, rigid
 
 from tricap.core.calibration.bars import enough_rays, with_bars
-from tricap.core.calibration.bundle import Network, adjust
+from tricap.core.calibration.bundle import LevenbergMarquardt, Network, adjust
 from tricap.core.calibration.precision import predicted_error
 from tricap.core.calibration.reference_bar import (
     initial_network,
-    lens_knowledge,
+    lens_prior,
 )
 from tricap.core.calibration.self_calibration import GROSS, PART, calibrate
 from tricap.core.calibration.targets import find_blobs, find_targets
@@ -160,14 +160,29 @@ def same_steps(waved: WavedBar, start: Network, sigma: float) -> dict[str, float
     then least squares on all, trimmed, and again."""
     seconds = time.process_time()
     observations = observed(waved)
-    unknowns = lens_knowledge(observations.size_px, start.interior[:, 0])
+    unknowns = lens_prior(observations.size_px, start.interior[:, 0])
     unknowns = unknowns.only(*(name for name in INTERIOR if name != "k3"))
     part = observations.part(np.unique(np.linspace(0, len(waved.xy_px) - 1, PART // 2).astype(int)))
     network, keep = with_bars(start, part, 30.0)
-    done = adjust(network, part.xy_px, keep, unknowns, cauchy_px=3 * sigma, unit_px=sigma, max_iterations=30, tolerance=1.0)
+    done = adjust(
+        network,
+        part.xy_px,
+        keep,
+        unknowns,
+        cauchy_px=3 * sigma,
+        unit_px=sigma,
+        iteration=LevenbergMarquardt(max_iterations=30, tolerance=1.0),
+    )
     network, keep = with_bars(done.network, observations, GROSS * sigma)
     for tolerance in (1.0, 1e-3):  # the first only has to tell the blunders that the bars' own intersection did not
-        done = adjust(network, waved.xy_px, keep, unknowns, unit_px=sigma, max_iterations=30, tolerance=tolerance, damping=NEAR)
+        done = adjust(
+            network,
+            waved.xy_px,
+            keep,
+            unknowns,
+            unit_px=sigma,
+            iteration=LevenbergMarquardt(max_iterations=30, tolerance=tolerance, damping=NEAR),
+        )
         network = done.network
         keep = enough_rays(keep & (np.abs(np.nan_to_num(done.residual_px, nan=np.inf)).max(axis=-1) < 6 * sigma))
     seconds = time.process_time() - seconds

@@ -5,7 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.calibration.bundle import Unknowns, adjust, design, free_network, moved, normal_equations, reduce_to_cameras, residuals
+from tricap.core.calibration.bundle import (
+    LevenbergMarquardt,
+    Unknowns,
+    adjust,
+    design,
+    free_network,
+    moved,
+    normal_equations,
+    reduce_to_cameras,
+    residuals,
+)
 from tricap.core.calibration.self_calibration import redundant_parts
 from tricap.core.geometry.camera import EXTERIOR, INTERIOR, camera_of, image_with_derivatives, interior_of
 from tricap.core.synthetic.bar import BarNoise, benchmark_cameras, random_cameras, waved_bar
@@ -70,7 +80,7 @@ def test_it_finds_the_truth_without_noise(waved) -> None:
     rng = np.random.default_rng(1)
     step = rng.normal(0, 1, (3, 16)) * [5, 3, 3, 0.01, 0.01, 0.001, 1e-4, 1e-4, 1e-4, 1e-4, *[0.003] * 6]
     start = moved(network, unknowns, step.ravel(), rng.normal(0, 0.01, (5, 60)))
-    done = adjust(start, waved.xy_px, used, unknowns, unit_px=1e-4, max_iterations=30)
+    done = adjust(start, waved.xy_px, used, unknowns, unit_px=1e-4, iteration=LevenbergMarquardt(max_iterations=30))
     assert done.converged and np.abs(done.residual_px[used]).max() < 1e-5
     assert np.abs(done.network.interior[:, :3] - network.interior[:, :3]).max() < 0.02
 

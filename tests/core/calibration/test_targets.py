@@ -97,7 +97,7 @@ def test_tracks_leave_out_reflections_and_keep_the_order() -> None:
         seen = [(600.0, 50.0), b, a] if t % 2 else [a, b, (600.0, 50.0)]
         frames.append(spots(*([(600.0, 50.0)] if t == 12 else [a, (600.0, 50.0)] if t == 5 else seen)))
     track = track_bar(frames, 768.0)
-    assert not track.still and np.isnan(track.xy_px[12]).all()
+    assert not track.static and np.isnan(track.xy_px[12]).all()
     ends = track.xy_px[[t for t in range(30) if t not in (5, 12)]]
     assert (np.linalg.norm(np.diff(ends, axis=0), axis=2) < 40).all()
     assert np.isfinite(track.xy_px[5]).all(axis=1).sum() == 1
@@ -139,7 +139,7 @@ def test_reflections_alone_are_no_bar(tmp_path: Path) -> None:
     hidden = replace(waved, xy_px=np.full_like(waved.xy_px, np.nan))
     write_bar_folder(tmp_path / "bar", hidden, BarPictures(bar=14.0, reflections=4))
     counts: list[int] = []
-    with pytest.raises(InputError, match="or only lamps and reflections are seen there"):
+    with pytest.raises(InputError, match="or only lamps and reflections are visible there"):
         measure_bar(open_bar(tmp_path / "bar"), 0.5, Monitor(), lambda name, frames, whole: counts.append(whole))
     assert max(counts) <= 1  # what stands still is not counted; the first image has none before it
 
@@ -205,8 +205,8 @@ def test_the_recorded_bar(shared_takes: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("three", "Only 3 bar positions"),
-        ("static", "stands still"),
+        ("three", "In only 3 bar positions"),
+        ("static", "does not move"),
         ("unseen", "view R"),
         ("black", "No bright target"),
         ("one view", "only the view"),

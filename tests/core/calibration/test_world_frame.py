@@ -61,7 +61,7 @@ def test_cameras_stay_where_others_of_their_names_are(count: int) -> None:
     check_rigid(frame)
     np.testing.assert_allclose(frame.R, moved.R, atol=1e-9)
     np.testing.assert_allclose(frame.shift_m, moved.shift_m, atol=1e-9)
-    with pytest.raises(InputError, match="name them alike"):
+    with pytest.raises(InputError, match="give them the same names"):
         frame_like(CAMERAS, [replace(there[0], name="X")])
     if count > 1:
         with pytest.raises(InputError, match="moved or swapped"):

@@ -55,7 +55,7 @@ def test_recent_pictures_are_not_decoded_again() -> None:
 
 def test_a_view_late_by_frames_is_told_to_be_shifted_first(tmp_path: Path) -> None:
     make_arm_take(tmp_path / "take", ArmTakeSettings(width_px=320, frames=8, interlaced="none", late_frames=1.3))
-    with pytest.raises(InputError, match=r"View R is .1.[23]\d frames late, too much to interpolate; add -1"):
+    with pytest.raises(InputError, match=r"View R has a time offset of .1.[23]\d frames, too large to correct; add -1"):
         synchronised(open_take(read_take(tmp_path / "take")), Monitor())
 
 

@@ -197,7 +197,7 @@ def test_the_fault_is_named(fault: tuple[Checked, str]) -> None:
 
 
 def test_a_sound_recording_passes(arm_recording: Record) -> None:
-    assert check_take(arm_recording(), Monitor()).lines()[0].endswith("nothing to complain about.")
+    assert check_take(arm_recording(), Monitor()).lines()[0].endswith("no problems found.")
 
 
 @pytest.mark.parametrize("take", [pytest.param(p, id=p.name) for p in (SHARED / "dev_arm", SHARED / "dev_walk")])
@@ -240,7 +240,7 @@ def told(a: np.ndarray, b: np.ndarray, *, degrees: float = 20.0) -> TimeOffset:
     """What is said of views, so far apart, in which nothing can be followed, by how much moves in them when."""
     beside = Camera(name="R", size_px=(9, 9), matrix=np.eye(3), R_cam_world=rotation_from_vector(np.array([0, np.radians(degrees), 0])))
     seen = SimpleNamespace(energy=np.stack([a, b]))
-    film = SimpleNamespace(seen=seen, cameras=(replace(beside, name="C", R_cam_world=np.eye(3)), beside), frames=list)
+    film = SimpleNamespace(survey=seen, cameras=(replace(beside, name="C", R_cam_world=np.eye(3)), beside), frames=list)
     return _between(cast(Film, film), 0, 1, "R", Monitor())
 
 
@@ -288,8 +288,8 @@ def test_exit_codes_and_json(arm_recording: Record, tmp_path: Path, capsys: pyte
     assert main.main(["check", str(tmp_path / "nothing")]) == 2
 
 
-MEASURED = {black: "View L is black", identical: "show the same picture", swapped: "L and R are swapped",
-            foreign_rig: "rig.toml", no_texture: "is blank", frozen: "View R shows the same picture",
+MEASURED = {black: "View L is black", identical: "show the same image", swapped: "L and R are swapped",
+            foreign_rig: "rig.toml", no_texture: "is blank", frozen: "View R shows the same image",
             seed_on_the_wall: "Surface seed 1"}  # fmt: skip
 
 
@@ -331,7 +331,7 @@ def test_a_frame_that_a_view_lost_in_mid_clip_is_told(arm_recording: Record, tmp
         shots = pictures(take, "R")
         for here, there in zip(shots[4:], shots[5:]):
             shutil.copyfile(there, here)
-    assert not said["sound"] and len(said["lost"]) == 1 and said["lost"][0].startswith("From frame 4 on the rays"), said
+    assert not said["sound"] and len(said["lost"]) == 1 and said["lost"][0].startswith("From frame 4 on, the rays"), said
 
 
 def test_steps_that_are_none() -> None:
