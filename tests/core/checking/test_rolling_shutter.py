@@ -57,7 +57,7 @@ def test_the_readout_is_found_with_its_sigma_beside_an_offset(tmp_path: Path) ->
         assert abs(offset.delay_frames - late) < 0.03, offset
     assert found["C"].readout_frames == 0.0 and not found["C"].rolls
     said = rolling_finding(found["R"])
-    assert "view R takes 0.5" in said.sentence and "longer from its first row to its last" in said.sentence and not said.certain
+    assert "view R takes 0.5" in said.sentence and "longer from first to last row" in said.sentence and not said.certain
     assert "shorter" in rolling_finding(found["L"]).sentence
 
 
