@@ -1,12 +1,12 @@
-"""The one error that a user can mend. Everything else that is raised is a bug of ours."""
+"""The error that a user can correct. Any other exception is a bug."""
 
-LONGEST = 1500
+LONGEST = 1500  # characters of a message
 
 
 class InputError(Exception):
-    """The input needs mending. The message is one sentence: what is wrong, which input it is, and what to do.
+    """The input is faulty. The message is one sentence: what is wrong, which input it is, and what to do.
 
-    What it quotes from a damaged or foreign file is made fit for a terminal: no control characters, no endless lines.
+    Quotations from damaged files are made safe for a terminal: no control characters, no endless lines.
     """
 
     def __init__(self, message: str = "") -> None:

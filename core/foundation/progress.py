@@ -1,15 +1,15 @@
-"""Progress and cancelling: one object, given to every function that can take longer than a blink."""
+"""Progress and cancellation: one object, passed to every function that can take longer than 0.2 s."""
 
 import threading
 from collections.abc import Callable
 
 
 class Cancelled(Exception):
-    """The user asked to stop. What was finished is kept; the message says what that is."""
+    """The user asked to stop. Finished results are kept; the message lists them."""
 
 
 class Monitor:
-    """Reports how far a stage is, and raises `Cancelled` as soon as somebody has asked to stop.
+    """Reports the progress of a stage, and raises `Cancelled` once somebody has asked to stop.
 
     `report(stage, done, total)` is called from the thread that computes; `cancel()` may be called from any thread.
     """
@@ -24,7 +24,7 @@ class Monitor:
         self.task = task
 
     def step(self, stage: str, done: float, total: float) -> None:
-        """Say that `done` of `total` parts of `stage` are finished.
+        """Report that `done` of `total` parts of `stage` are finished.
 
         Raises:
             Cancelled: `cancel()` was called.
@@ -35,7 +35,7 @@ class Monitor:
             self._report(stage, done, total)
 
     def check(self) -> None:
-        """Nothing new is to be said, but somebody may have asked to stop; for loops within a step.
+        """Raise if somebody has asked to stop, without a report; for loops within a step.
 
         Raises:
             Cancelled: `cancel()` was called.
@@ -44,7 +44,7 @@ class Monitor:
             raise Cancelled("Stopped.")
 
     def part(self, stage: str, index: int, total: int) -> "Monitor":
-        """A monitor for part `index` of `total`: what it reports counts as a fraction of that part, and it is cancelled with this one."""
+        """A monitor for part `index` of `total`: its progress is a fraction of that part, and it is cancelled with this one."""
         return _Part(self, stage, index, total)
 
     def cancel(self) -> None:
@@ -63,7 +63,7 @@ class _Part(Monitor):
         self._whole, self._stage, self._index, self._total, self._reached = whole, stage, index, total, 0.0
 
     def step(self, stage: str, done: float, total: float) -> None:
-        self._reached = max(self._reached, min(1.0, done / total if total else 1.0))  # a part's own steps may begin anew
+        self._reached = max(self._reached, min(1.0, done / total if total else 1.0))  # the steps of a part may start again
         self._whole.step(self._stage, self._index + self._reached, self._total)
 
     def cancel(self) -> None:

@@ -1,6 +1,6 @@
 """Results on disk: numpy arrays and a JSON header in one .npz, written atomically, read without pickle.
 
-A file appears under its name only when it is complete: everything is written beside it first and then moved over.
+A file appears under its name only when it is complete: it is written under a temporary name and then renamed.
 """
 
 import hashlib
@@ -21,8 +21,9 @@ from .errors import InputError
 
 HEADER = "header_json"
 STORE_VERSION = 1
-LARGEST_BOMB, LARGEST_RATIO = 400_000_000, 100  # bytes that a file may unpack to, whatever its size; and times its size
-DAMAGED = (  # what numpy, zipfile and zlib raise for a file with wrong bytes, or for another kind of file
+LARGEST_UNPACKED = 400_000_000  # bytes to which any file may unpack
+LARGEST_RATIO = 100  # times its size, for larger files
+DAMAGED = (  # raised by numpy, zipfile and zlib for a damaged file, or for another kind of file
     OSError,
     ValueError,
     KeyError,
@@ -36,7 +37,7 @@ DAMAGED = (  # what numpy, zipfile and zlib raise for a file with wrong bytes, o
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file so that it is either there in full or not at all.
+    """Write a file completely or not at all.
 
     Raises:
         InputError: the folder cannot be written to, or the disk is full.
@@ -47,7 +48,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 @contextmanager
 def written(path: Path) -> Iterator[BinaryIO]:
-    """A file to be written piece by piece; it has its name once the block has ended well, and is not there otherwise.
+    """A file to be written piece by piece; it gets its name when the block ends without an error, and does not exist otherwise.
 
     Raises:
         InputError: the folder cannot be written to, or the disk is full.
@@ -71,10 +72,10 @@ def written(path: Path) -> Iterator[BinaryIO]:
 
 
 def try_writing(path: Path) -> None:
-    """Make the folder of a file that somebody else is to write, and see that it can be written there.
+    """Make the folder of a file that another program will write, and test that it can be written there.
 
     Raises:
-        OSError: it cannot.
+        OSError: it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()
@@ -144,8 +145,8 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def check_layout(path: Path, arrays: Mapping[str, np.ndarray], **layout: tuple[str, str]) -> None:
-    """Each array is there, of one of the kinds (numpy's letters), and has the sides, as in `frames=("iu", "T"), xyz_m=("f", "TN3")`:
-    a digit is a length, a letter the same length wherever it stands.
+    """Check that each array exists, with one of the kinds (numpy's letters) and the shape, as in `frames=("iu", "T"), xyz_m=("f", "TN3")`:
+    a digit is a length, a letter the same length everywhere.
 
     Raises:
         InputError: one is missing or of another layout.
@@ -154,7 +155,7 @@ def check_layout(path: Path, arrays: Mapping[str, np.ndarray], **layout: tuple[s
     for name, (kinds, sides) in layout.items():
         array = arrays.get(name)
         if array is None:
-            raise InputError(f"{path} holds no {name}; run the stage that writes it again.")
+            raise InputError(f"{path} has no {name}; run the stage that writes it again.")
         fits = array.dtype.kind in kinds and array.ndim == len(sides)
         for side, length in zip(sides, array.shape):
             fits = fits and length == (int(side) if side.isdecimal() else lengths.setdefault(side, length))
@@ -163,10 +164,10 @@ def check_layout(path: Path, arrays: Mapping[str, np.ndarray], **layout: tuple[s
 
 
 def _refuse_bomb(path: Path) -> None:
-    """A small archive may not unpack to gigabytes."""
+    """Refuse a small archive that would unpack to gigabytes."""
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(info.file_size for info in archive.infolist())
-    if unpacked > max(LARGEST_BOMB, LARGEST_RATIO * path.stat().st_size):
+    if unpacked > max(LARGEST_UNPACKED, LARGEST_RATIO * path.stat().st_size):
         raise InputError(f"{path} would unpack to {unpacked / 1e9:.1f} GB, which no result of its size does; remove it and run again.")
 
 
@@ -192,7 +193,7 @@ def _bytes(data: bytes) -> Iterator[bytes]:
 
 
 def _file(path: Path) -> Iterator[bytes]:
-    """The same of a file's content, in pieces."""
+    """The size and the content of a file, in pieces."""
     with path.open("rb") as file:
         yield os.fstat(file.fileno()).st_size.to_bytes(8, "little")
         while piece := file.read(1 << 20):

@@ -1,29 +1,29 @@
-"""Work on arrays, shared between a few threads. How it is divided does not depend on how many there are, and so neither do the results."""
+"""Array computations in a few threads. The pieces, and so the results, do not depend on the number of threads."""
 
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import scipy.linalg  # noqa: F401  so that its library is loaded when it is told
+import scipy.linalg  # noqa: F401  its BLAS must be loaded before its threads can be limited
 from threadpoolctl import threadpool_limits
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
-_SHARE = os.environ.get("TRICAP_THREADS", "")  # `tricap batch` gives each worker its own
+_SHARE = os.environ.get("TRICAP_THREADS", "")  # `tricap batch` sets it for each worker
 THREADS = int(_SHARE) if _SHARE.isdecimal() and int(_SHARE) > 0 else 2
 
 
 def one_thread_in_linear_algebra() -> threadpool_limits:
     """A context in which the BLAS and LAPACK of numpy and scipy, in the whole process, use one thread.
 
-    On more threads they add up in another order, which changes the last digits, and wait busily over small matrices beside ours.
+    With more threads the order of summation varies, which changes the last digits, and small matrices keep threads busy waiting.
     """
     return threadpool_limits(1, user_api="blas")
 
 
 def in_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """The results of all parts, in their order. Each thread takes the next part as soon as it is free."""
+    """The results of all parts, in their order; each free thread takes the next part."""
     if THREADS == 1 or len(parts) < 2:
         return [work(part) for part in parts]
     with ThreadPoolExecutor(min(THREADS, len(parts))) as pool:
@@ -31,7 +31,7 @@ def in_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Re
 
 
 def equal_pieces(n: int, largest: int, shared_from: int) -> list[slice]:
-    """An even number of equal pieces of n rows, none larger than `largest`; one alone below `shared_from` rows, empty where n is 0."""
+    """An even number of equal pieces of n rows, none larger than `largest`; a single one below `shared_from` rows, empty if n is 0."""
     if n < max(2, shared_from) and n <= largest:
         return [slice(0, n)]
     count = 2 * -(-n // (2 * largest))

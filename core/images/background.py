@@ -1,9 +1,8 @@
-"""The still background of a view: what each pixel shows most of the time, or when nobody is known to be near, and where an image shows it
-again.
+"""The static background of a view: the median of each pixel over time, or over the times at which nobody is near it.
 
-A pixel shows the background when the images around it differ from the background's by no more than the noise. That noise is found from the
-differences of the images that the background is made of, since most of them is background (Rousseeuw & Croux 1993, the median of
-absolute differences). An image that is black, or lit otherwise, shows the background nowhere.
+An image shows the background at a pixel where the two differ by no more than the noise in a window around it. The noise is estimated from
+the images that the background is made from, most of whose pixels are background (median of absolute differences, Rousseeuw & Croux 1993).
+An image that is black, or in another light, shows the background nowhere.
 """
 
 from collections.abc import Sequence
@@ -15,20 +14,21 @@ import numpy as np
 from ..foundation.arrays import frozen
 from ..geometry.robust import mad_sigma
 
-FEWEST, FEWEST_BARE = 5, 3  # images that tell what stands still, and of these without anybody near
-ROWS = 64
+FEWEST = 5  # images for a background
+FEWEST_BARE = 3  # of these, without anybody near the pixel
+ROWS = 64  # processed at a time
 WINDOW_PX = 7  # side of the window in which two images are compared
 LOOSE = 1.6  # times the noise: a window of 7×7 has a root mean square of 1.0 ± 0.1 times it
 QUANTISED = 0.5  # grey values: what rounding adds
-EMPTY_SHARE = 0.25  # of a picture shows the background, whoever stands before it
-OTHER_ROOM = 20.0  # grey values: an image that differs by more from the background does not show it
+EMPTY_SHARE = 0.25  # of an image that shows the background, whoever is in front of it
+OTHER_ROOM = 20.0  # grey values: noise of an image that does not show this background
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Background:
-    """The still background (h, w) of a view and the standard deviation of an image against it, in grey values.
+    """The static background (h, w) of a view, and the standard deviation of an image from it, in grey values.
 
-    `bare` (h, w): where it was seen with nobody near; None if nobody's places were known.
+    `bare` (h, w): where it was visible with nobody near; None if positions of persons are not known.
     """
 
     grey: np.ndarray
@@ -45,22 +45,22 @@ class Background:
 
 
 def empty_view(grey: np.ndarray, image: np.ndarray) -> Background:
-    """The background of which an image (h, w) was taken, with its noise from another `image`, a quarter of which shows it at least."""
+    """A given image of the background (h, w), with its noise from another `image` of which at least a quarter shows it."""
     difference = image.astype(np.float32) - grey.astype(np.float32)
     square = cv2.blur(difference**2, (WINDOW_PX, WINDOW_PX), borderType=cv2.BORDER_REFLECT_101)
     return Background(grey=grey, noise=float(np.sqrt(np.quantile(square, EMPTY_SHARE))))
 
 
 def known_background(grey: np.ndarray, images: Sequence[np.ndarray]) -> Background | None:
-    """The background of which an image (h, w) was taken, with its noise from those of the `images` that show it; None if none does."""
+    """A given image of the background (h, w), with its noise from those of the `images` that show it; None if none does."""
     noise = [n for n in (empty_view(grey, image).noise for image in images) if n <= OTHER_ROOM]
     return Background(grey=grey, noise=float(np.median(noise)), bare=np.ones(grey.shape, dtype=bool)) if noise else None
 
 
 def still_background(images: Sequence[np.ndarray], near: Sequence[np.ndarray] | None = None) -> Background | None:
-    """The median of images (h, w) spread over time; None if they are too few to tell.
+    """The median of images (h, w) spread over time; None if there are too few.
 
-    `near` (h, w) of each: where somebody is known to be near. Pixels that were seen often enough without are made of these images alone.
+    `near` (h, w) of each: where somebody is near. Pixels that are bare in enough images are taken from these images alone.
     """
     if len(images) < FEWEST:
         return None

@@ -1,17 +1,17 @@
-"""Wallis enhancement: the same local mean and contrast everywhere, for poor texture (Wallis 1976; D'Apuzzo et al. 2000, §2.2; SCIENCE §6).
+"""Wallis enhancement: the same local mean and contrast everywhere, for poor texture (Wallis 1976; D'Apuzzo et al. 2000, §2.2).
 
     g' = (g − m) c s_t / (c s + (1 − c) s_t) + b m_t + (1 − b) m                                          (1)
 
-m, s are mean and standard deviation in a window about the pixel, m_t and s_t their targets, c and b how far they are forced. In an image of
-one field the window has half as many rows, so that it covers the same area. Where the contrast is the sensor's own noise, (1) would only
-show that noise, so s is not taken below the noise: s ← max(s, NOISE_SIGMAS σ_n).
+m, s are mean and standard deviation in a window around the pixel, m_t and s_t their target values, c and b the weights of the targets. In
+an image of one field the window has half as many rows, so that it covers the same area. Where the contrast is only sensor noise, (1) would
+only amplify that noise, so s is not taken below the noise: s ← max(s, NOISE_SIGMAS σ_n).
 
-"auto" asks the image: the noise from its second differences (Immerkær 1996, doi:10.1006/cviu.1996.0060), and the texture's energy per
+"auto" decides by the image: the noise from its second differences (Immerkær 1996, doi:10.1006/cviu.1996.0060), and the texture's energy per
 noise energy of the gradients in the textured half of the image,
 
     ρ = median over the textured half of Σ|∇g|² / (n σ_∇²)                                                   (2)
 
-which says how many times stronger the gradients are than noise would make them.
+how many times stronger the gradients are than those of noise alone.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,9 @@ import numpy as np
 from ..foundation.settings import knob
 from .sampling import noise_sigma
 
-NOISE_SIGMAS = 2.0
+NOISE_SIGMAS = 2.0  # least s in (1), in sigmas of the noise
+SMOOTHING_PX = 1.0  # of the gradients in (2)
+WINDOW_PX = 21  # of the texture in (2)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,26 +33,26 @@ class EnhanceSettings:
 
     wallis: str = knob(
         "off",
-        "Local contrast enhancement: off, on, or auto (where the texture is weak against the image's noise).",
+        "Local contrast enhancement: off, on, or auto (where the texture is weak compared with the noise of the image).",
         choices=("off", "auto", "on"),
     )
     window_px: int = knob(31, "Side of the window of local mean and contrast.", unit="px", low=5, high=201)
-    mean: float = knob(127.0, "Mean grey value to aim at.", low=0.0, high=255.0)
-    contrast: float = knob(55.0, "Standard deviation of the grey values to aim at.", low=1.0, high=120.0)
-    contrast_share: float = knob(0.75, "How far the local contrast is forced to that value.", low=0.0, high=1.0)
-    mean_share: float = knob(0.95, "How far the local mean is forced to that value.", low=0.0, high=1.0)
+    mean: float = knob(127.0, "Target of the local mean grey value.", low=0.0, high=255.0)
+    contrast: float = knob(55.0, "Target of the local standard deviation of the grey values.", low=1.0, high=120.0)
+    contrast_share: float = knob(0.75, "Weight of that contrast against the image's own.", low=0.0, high=1.0)
+    mean_share: float = knob(0.95, "Weight of that mean against the image's own.", low=0.0, high=1.0)
     weak_texture: float = knob(6.0, "Auto enhances images whose gradients are less than this many times those of noise.", low=0.0, high=1e4)
 
 
 def wallis(image: np.ndarray, settings: EnhanceSettings, *, row_step: int = 1) -> np.ndarray:
     """The enhanced image (h, w) float32 of grey values (h, w).  (1)
 
-    `row_step` 2 says that the image is a field of an interlaced frame. Values are not clipped. Cost: about 8 ns per pixel, for any window.
+    `row_step` is 2 for a field of an interlaced frame. Values are not clipped. Cost: about 8 ns per pixel, for any window.
     """
     g = np.asarray(image, dtype=np.float32)
     size = (settings.window_px | 1, max(3, round(settings.window_px / row_step)) | 1)
     centre = np.float32(g.mean())
-    d = g - centre  # squares of small numbers keep their digits in single precision
+    d = g - centre  # squares of small numbers are exact enough in single precision
     m = cv2.blur(d, size, borderType=cv2.BORDER_REFLECT_101)
     variance = cv2.sqrBoxFilter(d, cv2.CV_32F, size, borderType=cv2.BORDER_REFLECT_101) - m * m
     s = np.sqrt(np.maximum(variance, (NOISE_SIGMAS * noise_sigma(g)) ** 2))
@@ -62,18 +64,18 @@ def wallis(image: np.ndarray, settings: EnhanceSettings, *, row_step: int = 1) -
 def texture_strength(image: np.ndarray, *, row_step: int = 1) -> float:
     """ρ of (2): the energy of the gradients as a multiple of what the noise gives them, in the textured half of the image."""
     g = np.asarray(image, dtype=np.float32)
-    smooth = cv2.GaussianBlur(g, (0, 0), sigmaX=1.0, sigmaY=max(0.5, 1.0 / row_step))
+    smooth = cv2.GaussianBlur(g, (0, 0), sigmaX=SMOOTHING_PX, sigmaY=max(0.5, SMOOTHING_PX / row_step))
     fx, fy = (cv2.Sobel(smooth, cv2.CV_32F, *axis, ksize=1, scale=0.5) for axis in ((1, 0), (0, 1)))
-    local = cv2.blur(fx * fx + fy * fy, (21, max(3, round(21 / row_step)) | 1))
+    local = cv2.blur(fx * fx + fy * fy, (WINDOW_PX, max(3, round(WINDOW_PX / row_step)) | 1))
     noise = noise_sigma(g) ** 2 * _gradient_gain(row_step)
     strong = local[local >= np.median(local)]
     return float(np.median(strong)) / noise
 
 
 def enhanced(images: list[np.ndarray], settings: EnhanceSettings, *, row_step: int = 1) -> list[np.ndarray]:
-    """The images of all views of one instant, enhanced as the settings say; all views alike, or they would not look alike.
+    """The images of all views of one frame, enhanced by the settings: all or none, so that they remain similar.
 
-    With "auto" all are enhanced when any of them has weak texture.
+    With "auto" all are enhanced if any of them has weak texture.
     """
     if settings.wallis == "auto":
         weak = min(texture_strength(image, row_step=row_step) for image in images) < settings.weak_texture
@@ -86,5 +88,5 @@ def _gradient_gain(row_step: int) -> float:
     """Energy of the smoothed image's gradients for white noise of variance 1."""
     impulse = np.zeros((33, 33), dtype=np.float32)
     impulse[16, 16] = 1.0
-    smooth = cv2.GaussianBlur(impulse, (0, 0), sigmaX=1.0, sigmaY=max(0.5, 1.0 / row_step))
+    smooth = cv2.GaussianBlur(impulse, (0, 0), sigmaX=SMOOTHING_PX, sigmaY=max(0.5, SMOOTHING_PX / row_step))
     return float(sum(np.sum(cv2.Sobel(smooth, cv2.CV_32F, *axis, ksize=1, scale=0.5) ** 2) for axis in ((1, 0), (0, 1))))

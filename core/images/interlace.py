@@ -1,11 +1,10 @@
-"""Video fields: an interlaced frame holds two instants, one in its even rows and one in its odd rows.
+"""Interlaced video: an image has two fields, exposed one after the other: one in its even rows and one in its odd rows.
 
-Matching works on the rows of one field; every coordinate that leaves this package is in FULL-FRAME pixels
-(D'Apuzzo et al. 1999, §2.1: only odd lines are kept; SCIENCE: field row r is frame row 2 r or 2 r + 1).
+Matching works on the rows of one field; every coordinate that leaves this package is in FULL-FRAME pixels. Field row r is frame row 2 r or
+2 r + 1 (D'Apuzzo et al. 1999, §2.1, use the odd lines only).
 
-Pictures of single fields, for programs that show footage frame by frame: picture n is field n, its missing rows interpolated.
-
-They are made once: a file beside them says what they were made from.
+`field_pictures` writes images of single fields for programs that show footage frame by frame, with the missing rows interpolated. They are
+written once; a file next to them records the footage that they were made from.
 """
 
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from ..foundation.progress import Monitor
 from .sequence import ImageSequence
 
 INTERLACE = ("none", "odd", "even")
-BOTH = "both"  # fields, one after the other
+BOTH = "both"  # fields, as two frames of an image
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +43,7 @@ class RowGrid:
         return (np.asarray(xy, dtype=np.float64) - (0.0, self.offset)) / (1.0, self.step)
 
     def whole(self, frame: np.ndarray) -> np.ndarray:
-        """The frame (h, w) with the rows that this grid does not have, of another instant, interpolated."""
+        """The frame (h, w) with the rows of the other field replaced by interpolation."""
         if self.step == 1:
             return frame
         filled = frame.copy()
@@ -55,34 +54,34 @@ class RowGrid:
         return filled
 
     def covariance_to_frame(self, covariance: np.ndarray) -> np.ndarray:
-        """Covariances (…, 2, 2) of coordinates in the rows' image, as of full-frame pixels."""
+        """Covariances (…, 2, 2), in full-frame pixels, of coordinates in the rows' image."""
         scale = np.array([1.0, self.step])
         return covariance * scale[:, None] * scale[None, :]
 
 
 @dataclass(frozen=True, slots=True)
 class FieldLayout:
-    """Which image, and which of its rows, show instant n of a recording: one instant an image, or two where both fields are measured."""
+    """Which image, and which of its rows, show frame n of a recording: one frame per image, or two where both fields are measured."""
 
     first: RowGrid = RowGrid()
     second: RowGrid | None = None
 
     @property
     def per_image(self) -> int:
-        """FieldLayout in an image, 1 or 2."""
+        """Frames per image, 1 or 2."""
         return 1 if self.second is None else 2
 
-    def rows(self, instant: int) -> RowGrid:
+    def rows(self, frame: int) -> RowGrid:
         """The rows that show it."""
-        return self.first if self.second is None or instant % 2 == 0 else self.second
+        return self.first if self.second is None or frame % 2 == 0 else self.second
 
-    def image(self, instant: int) -> int:
+    def image(self, frame: int) -> int:
         """Number of the image that shows it."""
-        return instant // self.per_image
+        return frame // self.per_image
 
 
 def field_layout(interlaced: str, first_field: str = "odd") -> FieldLayout:
-    """The instants of footage of which one field is kept, or "both", of which `first_field` was exposed first."""
+    """The layout of footage of which all rows ("none"), one field, or "both" are measured; `first_field` of both was exposed first."""
     if interlaced != BOTH:
         return FieldLayout(row_grid(interlaced))
     odd, even = row_grid("odd"), row_grid("even")
@@ -90,7 +89,7 @@ def field_layout(interlaced: str, first_field: str = "odd") -> FieldLayout:
 
 
 def row_grid(interlaced: str) -> RowGrid:
-    """The grid of rows to keep: "odd" keeps the 1st, 3rd, … line (rows 0, 2, …), "even" the others, "none" all."""
+    """The grid of the rows that are measured: "odd" has the 1st, 3rd, … line (rows 0, 2, …), "even" the others, "none" all."""
     return {"none": RowGrid(1, 0), "odd": RowGrid(2, 0), "even": RowGrid(2, 1)}[interlaced]
 
 
@@ -107,14 +106,14 @@ MADE_FROM = "made_from.json"
 
 
 def field_pictures(sequence: ImageSequence, fields: FieldLayout, folder: Path, monitor: Monitor | None = None) -> tuple[Path, ...]:
-    """FOLDER/000000.png …, a picture of every field of a sequence, made where they are not there yet.
+    """FOLDER/000000.png …, an image of every field of a sequence, written unless they exist.
 
     Raises:
         InputError: an image cannot be read, or the folder cannot be written to.
-        Cancelled: the monitor was cancelled; the pictures are made anew when they are asked for again.
+        Cancelled: the monitor was cancelled; the next call writes all images.
     """
     paths = tuple(folder / f"{n:06d}.png" for n in range(fields.per_image * sequence.count))
-    source, record = _said(sequence, fields), folder / MADE_FROM
+    source, record = _identity(sequence, fields), folder / MADE_FROM
     if record.is_file() and store.read_json(record) == source and all(path.is_file() for path in paths):
         return paths
     try:
@@ -131,7 +130,7 @@ def field_pictures(sequence: ImageSequence, fields: FieldLayout, folder: Path, m
     return paths
 
 
-def _said(sequence: ImageSequence, fields: FieldLayout) -> dict[str, object]:
-    """What identifies the pictures: names, sizes and dates of the footage, and which field is first."""
+def _identity(sequence: ImageSequence, fields: FieldLayout) -> dict[str, object]:
+    """What identifies the images: names, sizes and dates of the footage, and which field is first."""
     files = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in sequence.files()]
     return {"files": files, "count": sequence.count, "first_row": fields.first.offset}

@@ -1,10 +1,11 @@
-"""Pictures of a view that was exposed early or late, put to the moment of the other views: every pixel goes back along its own way.
+"""Images of a view with a time offset, interpolated to the moment of the other views along the motion of every pixel.
 
     d(x) = −τ (f₊ − f₋) / 2 + τ² (f₊ + f₋) / 2 ,   J(x + d(x)) = I(x)                          (1)
 
-f₊, f₋: optical flow from the picture to the next and to the one before (Kroeger et al. 2016, doi:10.1007/978-3-319-46493-0_29); τ: how many
-frames too late the picture I is, |τ| ≤ ½ or so; the parabola through three places allows for acceleration. At the recording's ends the
-flow that there is goes straight on. What is uncovered between two pictures cannot be known; it is at outlines, where nothing is measured.
+f₊, f₋: optical flow from the image I to the next one and to the one before (Kroeger et al. 2016, doi:10.1007/978-3-319-46493-0_29); τ:
+delay of I in frames, |τ| ≤ ½ or so; the parabola through three positions models acceleration. At the ends of the recording the only flow is
+extrapolated linearly. Surfaces that are uncovered between two images cannot be interpolated; they are at outlines, where nothing is
+measured.
 """
 
 from collections import OrderedDict
@@ -18,28 +19,28 @@ from ..foundation.settings import knob
 from .sampling import SplineImage
 from .sequence import ImageSequence
 
-LARGEST = 0.75  # frames
+LARGEST = 0.75  # frames: larger offsets are not corrected
 STEPS = 4  # of the inversion of (1)
-KEPT = 4  # pictures
+CACHED = 4  # images
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TimingSettings:
-    """Views that were not exposed at the same instants."""
+    """Views that are not synchronised."""
 
     correct: bool = knob(
-        False, "Find by how much of a frame each view is late, and put its pictures to the others' moment along the motion."
+        False, "Estimate the time offset of each view, and interpolate its images to the moment of the others along the motion."
     )
 
 
-def retimed(grey: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, late_frames: float) -> np.ndarray:
-    """The picture (h, w) float32 as it would have been `late_frames` earlier; `before` and `after` are its neighbours in time.  (1)"""
+def retimed(grey: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, delay_frames: float) -> np.ndarray:
+    """The image (h, w) float32 as it was `delay_frames` earlier; `before` and `after` are its neighbours in time.  (1)"""
     forward, back = (None if other is None else _flow(grey, other) for other in (after, before))
     if forward is None or back is None:
         only = forward if forward is not None else -back if back is not None else np.zeros((*grey.shape, 2), np.float32)
-        d = -late_frames * only
+        d = -delay_frames * only
     else:
-        d = -late_frames * (forward - back) / 2 + late_frames**2 * (forward + back) / 2
+        d = -delay_frames * (forward - back) / 2 + delay_frames**2 * (forward + back) / 2
     h, w = grey.shape
     y, x = np.mgrid[0:h, 0:w].astype(np.float32)
     u, v = x, y
@@ -52,22 +53,22 @@ def retimed(grey: np.ndarray, before: np.ndarray | None, after: np.ndarray | Non
 def _flow(here: np.ndarray, there: np.ndarray) -> np.ndarray:
     low, high = np.percentile(here, [0.5, 99.5])
     scale = 255.0 / max(float(high - low), 1.0)
-    pictures = [np.clip((p - low) * scale, 0, 255).astype(np.uint8) for p in (here, there)]
+    eight_bits = [np.clip((p - low) * scale, 0, 255).astype(np.uint8) for p in (here, there)]
     method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     method.setFinestScale(0)
-    return np.asarray(method.calc(pictures[0], pictures[1], None))
+    return np.asarray(method.calc(eight_bits[0], eight_bits[1], None))
 
 
 class Recent:
-    """A sequence that keeps its last pictures, so that neighbours in time are not decoded again."""
+    """A sequence that caches its last images, so that neighbours in time are not decoded again."""
 
     def __init__(self, sequence: ImageSequence) -> None:
         self._sequence = sequence
-        self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._cache: OrderedDict[int, np.ndarray] = OrderedDict()
 
     @property
     def behind(self) -> ImageSequence:
-        """The sequence that is read."""
+        """The underlying sequence."""
         return self._sequence
 
     @property
@@ -86,8 +87,8 @@ class Recent:
 
     def read(self, index: int) -> np.ndarray:
         """Grey values (h, w) float32 of frame `index`."""
-        if index not in self._kept:
-            self._kept[index] = self._sequence.read(index)
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
-        return self._kept[index]
+        if index not in self._cache:
+            self._cache[index] = self._sequence.read(index)
+            while len(self._cache) > CACHED:
+                self._cache.popitem(last=False)
+        return self._cache[index]

@@ -2,8 +2,8 @@
 
 Prepared once per image (`noise` is the standard deviation of its grey values' noise): the exact spline on a grid four times as fine.
 A sample is a bilinear look-up in that grid. On real speckle (DIC Challenge, sample 5) matching has a bias of 0.0009 px with it, 0.0027 px
-with the cubic spline, which takes as long to prepare. OpenCV 4 rounds the place of a look-up to 1/32 of the fine grid, at most 0.0039 px;
-a patch of samples at unlike places averages that away. OpenCV 5, which ships, is exact.
+with the cubic spline, which takes as long to prepare. OpenCV 4 rounds the position of a look-up to 1/32 of the fine grid, at most
+0.0039 px, which averages out over a patch. OpenCV 5, which ships, is exact.
 """
 
 import cv2
@@ -14,15 +14,17 @@ from scipy.ndimage import spline_filter1d
 
 from ..geometry.robust import mad_sigma
 
-FINENESS, ORDER = 4, 5
+FINENESS = 4  # of the grid, per pixel
+ORDER = 5  # of the spline
 IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6  # unit response to white noise
 MIN_NOISE = 0.3  # grey values: rounding alone
-SATURATED = 0.02
-LONGEST_LOOK_UP = 32_000  # OpenCV looks up at most 32,766 rows at once
+SATURATED = 0.02  # of 255: grey values this close to black or white
+FEWEST_PIXELS = 100  # for an estimate of the noise
+LONGEST_LOOK_UP = 32_000  # rows; OpenCV takes at most 32,766
 
 
 class SplineImage:
-    """An image ready to be sampled between its pixels. `shape` is (h, w), `smoothing` (2,) what `smoothed` did to its columns and rows."""
+    """An image that can be sampled between its pixels. `shape` is (h, w), `smoothing` (2,) the sigmas of its smoothing in x and y."""
 
     def __init__(self, image: np.ndarray, *, smoothing: tuple[float, float] = (0.0, 0.0)) -> None:
         grey = np.ascontiguousarray(image, dtype=np.float32)
@@ -31,7 +33,7 @@ class SplineImage:
         self.shape: tuple[int, int] = (grey.shape[0], grey.shape[1])
         self.noise = noise_sigma(grey)
         self._fine = _refine(_refine(grey, axis=1), axis=0)
-        self._pixels: np.ndarray | None = None  # (3, h, w) grey values and gradients, when they are asked for
+        self._pixels: np.ndarray | None = None  # (3, h, w) grey values and gradients, on request
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Grey values (n, m) float32 at columns x and rows y (n, m) float32; beyond the border the image is mirrored.
@@ -60,7 +62,7 @@ class SplineImage:
     def around(self, xy: np.ndarray, half: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Upright patches (N, n) float32 about whole pixels (N, 2), and their gradients by fourth-order central differences.
 
-        `half` (w, h) is half their size. A patch that does not lie in the image is moved into it; the image holds at least one.
+        `half` (w, h) is half their size. A patch that extends beyond the image is moved into it.
         """
         if self._pixels is None:
             grey = np.ascontiguousarray(self._fine[::FINENESS, ::FINENESS])
@@ -74,7 +76,7 @@ class SplineImage:
         return f, fx, fy
 
     def smoothed(self, sigma_px: float, row_step: int) -> "SplineImage":
-        """The image after a Gaussian of `sigma_px` full-frame pixels (a field's rows are `row_step` of them); kept for the next call."""
+        """The image after a Gaussian of `sigma_px` full-frame pixels (a field's rows are `row_step` of them); cached."""
         sigma = (sigma_px, sigma_px / row_step)
         if sigma not in self._smoothed:
             size = (_width(sigma[0]), _width(sigma[1]))
@@ -107,8 +109,8 @@ def difference(values: np.ndarray, step: int) -> np.ndarray:
 def correlated_noise(fx: np.ndarray, fy: np.ndarray, smoothing: tuple[float, float]) -> np.ndarray:
     """(N,) how many times larger the variance of a match with gradients fx, fy (N, h, w) is for smoothed noise than for white noise.
 
-    Smoothed noise has the autocorrelation R of the Gaussian's kernel, about exp(−|Δ|²/(4 σ²)): the sandwich (AᵀA)⁻¹ AᵀRA (AᵀA)⁻¹ (SCIENCE
-    §4), by the trace of its middle.
+    Smoothed noise has the autocorrelation R of the Gaussian's kernel, about exp(−|Δ|²/(4 σ²)): the covariance is the sandwich (AᵀA)⁻¹ AᵀRA
+    (AᵀA)⁻¹, taken by the trace of its middle.
     """
     if not any(smoothing):
         return np.ones(len(fx))
@@ -132,16 +134,16 @@ def _width(sigma_px: float) -> int:
 
 
 def noise_sigma(image: np.ndarray) -> float:
-    """Standard deviation of the sensor's noise [grey values], from what a plane does not explain; at least that of rounding.
+    """Standard deviation of the sensor's noise [grey values], from residuals of a local plane; at least that of rounding.
 
-    Second differences (Immerkær 1996, doi:10.1006/cviu.1996.0060); their median keeps texture out, as long as half of the image is smooth
+    Second differences (Immerkær 1996, doi:10.1006/cviu.1996.0060); their median excludes texture as long as half of the image is smooth
     at the scale of a pixel. Saturated pixels have no noise.
     """
     g = np.asarray(image, dtype=np.float32)
     inner = g[1:-1, 1:-1]
     usable = (inner > SATURATED * 255) & (inner < max(255.0, float(g.max())) - SATURATED * 255)
     residual = cv2.filter2D(g, cv2.CV_32F, IMMERKAER)[1:-1, 1:-1][usable]
-    return max(MIN_NOISE, float(mad_sigma(residual))) if residual.size > 100 else MIN_NOISE
+    return max(MIN_NOISE, float(mad_sigma(residual))) if residual.size > FEWEST_PIXELS else MIN_NOISE
 
 
 def _refine(image: np.ndarray, axis: int) -> np.ndarray:

@@ -138,7 +138,7 @@ def test_the_layout_of_what_is_read(tmp_path: Path) -> None:
     for name, wrong in zip(("xyz_m", "xyz_m", "frames", "frames"), wrong_ones):
         with pytest.raises(InputError, match="a.npz is damaged: .* has the shape"):
             store.check_layout(tmp_path / "a.npz", sound | {name: wrong}, **layout)
-    with pytest.raises(InputError, match="a.npz holds no frames"):
+    with pytest.raises(InputError, match="a.npz has no frames"):
         store.check_layout(tmp_path / "a.npz", {"xyz_m": sound["xyz_m"]}, **layout)
 
 
