@@ -27,8 +27,9 @@ import numpy as np
 from ..foundation.arrays import frozen
 from .rotation import cross_matrix
 
-UNDISTORT_STEPS = 12
-UNDISTORT_TOLERANCE = 1e-12
+UNDISTORT_STEPS = 12  # of Newton's method
+UNDISTORT_TOLERANCE = 1e-12  # of normalised coordinates
+NEAREST_M = 1e-6  # in front of the camera
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -63,7 +64,7 @@ class Camera:
         return np.asarray(xyz_m, dtype=np.float64) @ self.R_cam_world.T + self.t_cam_world_m
 
     def project(self, xyz_m: np.ndarray) -> np.ndarray:
-        """Pixels (…, 2) of world points (…, 3); NaN for points that do not lie before the camera."""
+        """Pixels (…, 2) of world points (…, 3); NaN for points that are not in front of the camera."""
         return self._image(_ahead(self.to_camera(xyz_m)))
 
     def project_with_jacobian(self, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +141,7 @@ class Camera:
 
 
 def _ahead(p: np.ndarray) -> np.ndarray:
-    return np.where(p[..., 2:] > 1e-6, p, np.nan)
+    return np.where(p[..., 2:] > NEAREST_M, p, np.nan)
 
 
 INTERIOR = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
@@ -184,14 +185,14 @@ def image_of(interior: np.ndarray, xyz_cam_m: np.ndarray) -> np.ndarray:
 def image_with_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels (…, M, 2), their derivatives to the interior unknowns (…, M, 2, 10) and to the points (…, M, 2, 3), analytic.
 
-    `interior` (…, 10), `xyz_cam_m` (…, M, 3) before the cameras (z > 0).
+    `interior` (…, 10), `xyz_cam_m` (…, M, 3) in front of the cameras (z > 0).
     """
     image, J, G = columns_of_derivatives(interior, np.moveaxis(xyz_cam_m, -1, -2))
     return np.moveaxis(image, -1, -2), np.moveaxis(J, -1, -3).swapaxes(-1, -2), np.moveaxis(G, -1, -3)
 
 
 def columns_of_derivatives(interior: np.ndarray, xyz_cam_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same with the points last, so that all work runs over them: from (…, 3, M) the pixels (…, 2, M), (…, 10, 2, M), (…, 2, 3, M)."""
+    """The same with the points last, for vectorisation: from (…, 3, M) the pixels (…, 2, M), (…, 10, 2, M), (…, 2, 3, M)."""
     f, cx, cy, k1, k2, k3, p1, p2, b1, b2 = np.moveaxis(interior, -1, 0)[..., None]
     w = 1 / xyz_cam_m[..., 2, :]
     a, b = xyz_cam_m[..., 0, :] * w, xyz_cam_m[..., 1, :] * w

@@ -1,4 +1,4 @@
-"""Forward intersection: the point in space that the rays of its images agree on best, with its covariance.
+"""Forward intersection: the point in space that fits its image points best, with its covariance.
 
 Σ_k (x_k − F_k(X))ᵀ K_k⁻¹ (x_k − F_k(X)) → min                             (1)   F_k: camera k (collinearity)
 N = Σ J_kᵀ K_k⁻¹ J_k ,   X ← X + N⁻¹ Σ J_kᵀ K_k⁻¹ v_k ,   K_X = N⁻¹         (2)
@@ -13,20 +13,20 @@ import numpy as np
 from .camera import Camera
 from .small_matrices import invert_spd
 
-STEPS = 4
-CONVERGED_M = 1e-7
+STEPS = 4  # of (2), at most
+CONVERGED_M = 1e-7  # step
 CLICK_SIGMA_PX = 5.0  # of a click, unless the knob fitting.click_sigma_px sets another
 MOST_MISS_SIGMAS = 3.0  # of the clicks, their root mean square; by chance one in 45 000 (two views) or 170 000 (three) misses by more
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Intersection:
-    """N points in space. A point that fewer than two rays meet is NaN in every array."""
+    """N points in space. A point with fewer than two rays is NaN in every array."""
 
     xyz_m: np.ndarray  # (N, 3) world
     covariance_m2: np.ndarray  # (N, 3, 3) from the a priori covariances of the image points
     residual_px: np.ndarray  # (N, K, 2) image point − projection; NaN where not observed
-    sigma0: np.ndarray  # (N,) root of (3)
+    sigma0: np.ndarray  # (N,) square root of (3)
     rays: np.ndarray  # (N,) number of rays
 
     @property
@@ -39,23 +39,23 @@ class Intersection:
 def forward_intersection(cameras: Sequence[Camera], xy_px: np.ndarray, covariance_px2: np.ndarray) -> Intersection:
     """Intersect the rays of N points in K cameras.
 
-    `xy_px` (N, K, 2) full-frame pixels, NaN where a camera does not see the point; `covariance_px2` (N, K, 2, 2).
+    `xy_px` (N, K, 2) full-frame pixels, NaN where a point is not visible; `covariance_px2` (N, K, 2, 2).
     """
     n = len(xy_px)
-    seen = np.isfinite(xy_px).all(axis=2)
-    rays = seen.sum(axis=1)
+    visible = np.isfinite(xy_px).all(axis=2)
+    rays = visible.sum(axis=1)
     P = np.zeros((n, len(cameras), 2, 2))
-    P[seen] = invert_spd(covariance_px2[seen])
+    P[visible] = invert_spd(covariance_px2[visible])
     X = np.full((n, 3), np.nan)
     good = rays >= 2
-    X[good] = _meeting_points(cameras, xy_px[good], seen[good])
+    X[good] = _closest_points(cameras, xy_px[good], visible[good])
     for _ in range(STEPS):
-        N, rhs, _ = _normal_equations(cameras, X, xy_px, P, seen)
+        N, rhs, _ = _normal_equations(cameras, X, xy_px, P, visible)
         step = _solve(N, rhs)
         X += step
         if np.nanmax(np.abs(step), initial=0.0) < CONVERGED_M:
             break
-    N, _, v = _normal_equations(cameras, X, xy_px, P, seen)
+    N, _, v = _normal_equations(cameras, X, xy_px, P, visible)
     K = np.full((n, 3, 3), np.nan)
     usable = np.isfinite(N).all(axis=(1, 2)) & good
     K[usable] = invert_spd(N[usable] + np.eye(3) * 1e-9)
@@ -91,33 +91,33 @@ def doubtful_view(cameras: Sequence[Camera], xy_px: np.ndarray) -> int:
     return int(np.argmin(np.nan_to_num(intersect_clicks(cameras, without).rms_residual_px, nan=np.inf)))
 
 
-def _meeting_points(cameras: Sequence[Camera], xy: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Where the rays pass each other closest (N, 3): Σ (I − d dᵀ)(X − C) = 0."""
+def _closest_points(cameras: Sequence[Camera], xy: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """The points closest to the rays (N, 3): Σ (I − d dᵀ)(X − C) = 0."""
     A, b = np.zeros((len(xy), 3, 3)), np.zeros((len(xy), 3))
     for k, camera in enumerate(cameras):
-        d = camera.rays(np.where(seen[:, k, None], xy[:, k], 0.0))
+        d = camera.rays(np.where(visible[:, k, None], xy[:, k], 0.0))
         d /= np.linalg.norm(d, axis=1, keepdims=True)
-        across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * seen[:, k, None, None]
+        across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * visible[:, k, None, None]
         A += across
         b += across @ camera.centre_m
     return _solve(A + np.eye(3) * 1e-12, b)
 
 
 def _normal_equations(
-    cameras: Sequence[Camera], X: np.ndarray, xy: np.ndarray, P: np.ndarray, seen: np.ndarray
+    cameras: Sequence[Camera], X: np.ndarray, xy: np.ndarray, P: np.ndarray, visible: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     N, rhs, v = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3)), np.full(xy.shape, np.nan)
     for k, camera in enumerate(cameras):
         image, J = camera.project_with_jacobian(X)
-        v[:, k] = np.where(seen[:, k, None], xy[:, k] - image, np.nan)
-        JP = np.where(seen[:, k, None, None], J.transpose(0, 2, 1) @ P[:, k], 0.0)
-        N += JP @ np.where(seen[:, k, None, None], J, 0.0)
-        rhs += np.einsum("nij,nj->ni", JP, np.where(seen[:, k, None], v[:, k], 0.0))
+        v[:, k] = np.where(visible[:, k, None], xy[:, k] - image, np.nan)
+        JP = np.where(visible[:, k, None, None], J.transpose(0, 2, 1) @ P[:, k], 0.0)
+        N += JP @ np.where(visible[:, k, None, None], J, 0.0)
+        rhs += np.einsum("nij,nj->ni", JP, np.where(visible[:, k, None], v[:, k], 0.0))
     return N, rhs, v  # (2)
 
 
 def _solve(N: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """x of N x = rhs for many positive definite 3×3 systems; NaN where it cannot be solved."""
+    """x of N x = rhs for many positive definite 3×3 systems; NaN where there is no solution."""
     with np.errstate(invalid="ignore", over="ignore"):
         x = np.einsum("nij,nj->ni", invert_spd(N), rhs)
     x[~np.isfinite(x).all(axis=1)] = np.nan

@@ -22,9 +22,9 @@ UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Rig:
-    """Calibrated cameras, found by name. `metadata` is what the calibration said of itself, `sigmas` what of each camera's unknowns:
+    """Calibrated cameras, accessed by name. `metadata` is the quality that the calibration reported.
 
-    standard deviations by camera and unknown (f, cx, cy in px; k1 …; turn [rad] and shift [m] about the camera's own axes).
+    `sigmas`: standard deviations by camera and unknown (f, cx, cy in px; k1 …; turn [rad] and shift [m] about the camera's own axes).
     """
 
     cameras: tuple[Camera, ...]
@@ -37,7 +37,7 @@ class Rig:
                 return camera
         raise InputError(
             f"The rig has no camera “{name}”.{nearest_name(name, [c.name for c in self.cameras])}"
-            " Name the views in take.toml as the cameras in rig.toml."
+            " Give the views in take.toml the names of the cameras in rig.toml."
         )
 
 
@@ -50,7 +50,9 @@ def read_rig(path: Path) -> Rig:
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise InputError(f"Cannot read the rig {path}: {error.strerror or error}. Calibrate first, or mend `rig` in take.toml.") from error
+        raise InputError(
+            f"Cannot read the rig {path}: {error.strerror or error}. Calibrate first, or correct `rig` in take.toml."
+        ) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"The rig {path} is not a TOML file: {error}.") from error
     metadata = table.get("metadata", {})
@@ -62,7 +64,7 @@ def read_rig(path: Path) -> Rig:
         raise InputError(f"The rig {path} has no cameras; it needs tables [cam_0], [cam_1], …")
     names = [c.name for c in cameras]
     if len(set(names)) < len(names):
-        raise InputError(f"The rig {path} names two cameras alike ({', '.join(names)}); give each its own name.")
+        raise InputError(f"The rig {path} has two cameras of the same name ({', '.join(names)}); give each its own name.")
     tables = [entry for key, entry in table.items() if key.startswith("cam")]
     sigmas = {c.name: sigmas_of(entry["sigma"], c.name, path) for c, entry in zip(cameras, tables) if "sigma" in entry}
     return Rig(cameras=cameras, metadata=metadata, sigmas=sigmas)
@@ -159,7 +161,7 @@ def _numbers(array: np.ndarray) -> str:
 
 
 def _number(value: float) -> str:
-    """A number as TOML has it; numpy's own numbers show their type in their repr."""
+    """A number in TOML; the repr of numpy's numbers includes their type."""
     return repr(int(value)) if isinstance(value, int) else repr(float(value))
 
 

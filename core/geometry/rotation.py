@@ -1,7 +1,4 @@
-"""Rotations: Rodrigues vectors and matrices about the coordinate axes. Radians, right-handed.
-
-Rotations in bulk: matrices (…, 3, 3) and quaternions (…, 4), w x y z, for whole motions at once.
-"""
+"""Rotations: Rodrigues vectors, matrices (…, 3, 3) and quaternions (…, 4), w x y z. Radians, right-handed."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -58,7 +55,7 @@ EULER_MODES = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (…, 3) of length one; a vector of no length stays zero."""
+    """Vectors (…, 3) of length one; zero vectors stay zero."""
     v = np.asarray(vectors, dtype=np.float64)
     length = np.linalg.norm(v, axis=-1, keepdims=True)
     return np.divide(v, length, out=np.zeros_like(v), where=length > 1e-12)
@@ -75,7 +72,7 @@ def transposed(R: np.ndarray) -> np.ndarray:
 
 
 def shortest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotations (…, 3, 3) that take the directions a (…, 3) to b (…, 3). Opposite directions turn about some normal."""
+    """The smallest rotations (…, 3, 3) that take the directions a (…, 3) to b (…, 3). Opposite directions are rotated about any normal."""
     a, b = np.broadcast_arrays(unit(a), unit(b))
     cosine = np.sum(a * b, axis=-1, keepdims=True)
     q = np.concatenate([1.0 + cosine, np.cross(a, b)], axis=-1)
@@ -95,7 +92,7 @@ def about(axis: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
 
 
 def between(R0: np.ndarray, R1: np.ndarray, part: float | np.ndarray) -> np.ndarray:
-    """The rotation that is `part` (0…1) of the way from R0 (…, 3, 3) to R1, the shorter way round."""
+    """The rotation at the fraction `part` (0…1) between R0 (…, 3, 3) and R1, along the shorter arc."""
     step = vector_from_matrix(transposed(R0) @ R1)
     return R0 @ matrix_from_vector(step * np.asarray(part)[..., None])
 
@@ -130,7 +127,7 @@ def vector_from_matrix(R: np.ndarray) -> np.ndarray:
 
 
 def matrix_from_vector(v: np.ndarray) -> np.ndarray:
-    """Matrices (…, 3, 3) of Rodrigues vectors (…, 3) [rad], which may be read-only (older scipy wants its own)."""
+    """Matrices (…, 3, 3) of Rodrigues vectors (…, 3) [rad], which may be read-only (older scipy needs a copy)."""
     return Rotation.from_rotvec(np.array(v, dtype=np.float64).reshape(-1, 3)).as_matrix().reshape(*np.shape(v)[:-1], 3, 3)
 
 
@@ -147,7 +144,7 @@ def twist_about(R: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def continuous(q: np.ndarray) -> np.ndarray:
-    """Quaternions (T, …, 4) with signs such that none jumps to its negative from one frame to the next."""
+    """Quaternions (T, …, 4) with signs chosen so that none flips from one frame to the next."""
     q = np.array(q, dtype=np.float64)
     if len(q) > 1:
         flips = np.sum(q[1:] * q[:-1], axis=-1) < 0

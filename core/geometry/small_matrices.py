@@ -7,9 +7,9 @@ import numpy as np
 
 
 def invert_spd(matrices: np.ndarray) -> np.ndarray:
-    """Inverses (N, k, k) of symmetric positive definite matrices (N, k, k), by sweeping one pivot after the other, without pivoting.
+    """Inverses (N, k, k) of symmetric positive definite matrices (N, k, k), by sweep operations, without pivoting.
 
-    Only the lower triangles are worked on. A singular matrix gives inf or NaN in its own rows only. Scale the unknowns alike before.
+    Only the lower triangles are used. A singular matrix gives inf or NaN in its own rows only. The unknowns should have similar scales.
     """
     M = np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.float64)  # (k, k, N): every step runs over the matrices
     k = len(M)
@@ -27,7 +27,7 @@ def invert_spd(matrices: np.ndarray) -> np.ndarray:
 
 
 def sandwich(A: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """A K Aᵀ (N, 2, 2) of symmetric K (N, 2, 2); numpy's product takes longer for matrices so small."""
+    """A K Aᵀ (N, 2, 2) of symmetric K (N, 2, 2); faster than numpy's product for such small matrices."""
     left = [[A[:, i, 0] * K[:, 0, j] + A[:, i, 1] * K[:, 1, j] for j in range(2)] for i in range(2)]
     out = np.empty_like(A)
     out[:, 0, 0], out[:, 1, 1] = (left[i][0] * A[:, i, 0] + left[i][1] * A[:, i, 1] for i in range(2))

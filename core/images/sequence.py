@@ -1,8 +1,7 @@
-"""Reading a camera's sequence: image files or a movie, grey values as float32 in the range 0…255.
+"""Image sequences of a camera: image files or a movie, with grey values as float32 in the range 0…255.
 
-Files are read when they are needed, so a long sequence costs no more memory than a short one.
-
-The size that an image file claims, read from its head before anything is decoded: a small file must not unpack to gigabytes.
+Files are read on demand, so a long sequence needs no more memory than a short one. The size of an image is read from its header before it
+is decoded, because a small file must not unpack to gigabytes.
 """
 
 import re
@@ -15,13 +14,13 @@ import numpy as np
 
 from ..foundation.errors import InputError
 
-JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # the markers that carry the size
+JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # the markers with the size
 TIFF_KINDS = {1: ("B", 1), 3: ("H", 2), 4: ("I", 4), 16: ("Q", 8)}
-MOST_ENTRIES = 4096
+MOST_ENTRIES = 4096  # of a TIFF directory
 
 
 def claimed_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) of an image file's bytes; None where its head is damaged or of no known kind."""
+    """(width, height) in the header of an image file; None if it is damaged or of an unknown kind."""
     for first, reader in READERS:
         if data.startswith(first):
             try:
@@ -32,7 +31,7 @@ def claimed_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _png(data: bytes) -> tuple[int, int] | None:
-    """OpenCV makes room for what a chunk claims to hold, so the claims are added up."""
+    """OpenCV allocates the claimed length of each chunk, so the chunks must lie within the file."""
     w, h = struct.unpack(">II", data[16:24])
     at = 8
     while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IEND":
@@ -80,7 +79,7 @@ def _webp(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff(data: bytes) -> tuple[int, int] | None:
-    """Of classic and of big TIFF, the first directory; the largest size that any entry claims."""
+    """The largest size in the first directory of a classic or big TIFF."""
     order = "<" if data[:1] == b"I" else ">"
     big = struct.unpack(order + "H", data[2:4])[0] == 43
     at = struct.unpack(order + ("Q" if big else "I"), data[8:16] if big else data[4:8])[0]
@@ -104,7 +103,8 @@ READERS = (
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".exr")
 MOVIE_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".webm", ".m4v")
-MAX_PIXELS, MAX_SIDE_PX = 36_000_000, 8191  # 8K video; the side: four times as many are still looked up by OpenCV
+MAX_PIXELS = 36_000_000  # of 8K video
+MAX_SIDE_PX = 8191  # OpenCV looks up four times as many
 SIGNATURES = (
     b"\x89PNG\r\n\x1a\n",
     b"\xff\xd8\xff",
@@ -120,7 +120,7 @@ SIGNATURES = (
 )
 OPEN_EXR = b"\x76\x2f\x31\x01"
 MOVIE_SIGNATURES = (b"RIFF", b"\x1a\x45\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"\x47")  # AVI, Matroska, MPEG: program, video, transport
-MOVIE_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")  # of which the first begins an MP4 or QuickTime file
+MOVIE_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")  # one of them begins an MP4 or QuickTime file
 NO_MOVIE = "{path} is not a movie that can be decoded; convert it to H.264 in .mp4, or to PNG files."
 WHITES = (1023.0, 4095.0, 16383.0, 65535.0)  # of 10, 12, 14 and 16 bits
 KINDS = ("uint8", "uint16", "float32", "float64")
@@ -158,7 +158,7 @@ class ImageFiles:
 
     @property
     def source(self) -> str:
-        """The pattern that found the files."""
+        """The pattern of the files."""
         return self._source
 
     def files(self) -> tuple[Path, ...]:
@@ -174,20 +174,20 @@ class ImageFiles:
         return read_image(self._paths[index], self._white())
 
     def _white(self) -> float:
-        """The grey value of white: cameras of 10 or 12 bits often write 16 bits without filling them."""
+        """The grey value of white: cameras of 10 or 12 bits often write files of 16 bits."""
         if self._top is None:
-            some = sorted({0, len(self._paths) // 2, len(self._paths) - 1})
+            samples = sorted({0, len(self._paths) // 2, len(self._paths) - 1})
             first = decoded(self._paths[0])
             if first.dtype != np.uint16:
                 self._top = 0.0
             else:
-                brightest = max(int(decoded(self._paths[i]).max()) for i in some)
+                brightest = max(int(decoded(self._paths[i]).max()) for i in samples)
                 self._top = float(next(white for white in WHITES if brightest <= white))
         return self._top
 
 
 class Movie:
-    """A movie file, decoded frame by frame; reading in order is quick, going back starts again."""
+    """A movie file, decoded frame by frame; reading in order is fast, reading backwards starts again."""
 
     def __init__(self, path: Path) -> None:
         _check_movie(path)
@@ -204,7 +204,7 @@ class Movie:
 
     @property
     def count(self) -> int:
-        """Number of frames that the movie's header promises."""
+        """Number of frames in the movie's header."""
         return self._count
 
     @property
@@ -217,7 +217,7 @@ class Movie:
         return (self._path,)
 
     def read(self, index: int) -> np.ndarray:
-        """Grey values (h, w) float32 of frame `index`; the frame read last need not be decoded again.
+        """Grey values (h, w) float32 of frame `index`; the last frame is cached.
 
         Raises:
             InputError: the movie ends before that frame.
@@ -234,8 +234,8 @@ class Movie:
                 ok, image = self._capture.read()
             if not ok:
                 raise InputError(
-                    f"Frame {index} of {self._path} cannot be decoded; it promises {self._count} frames. "
-                    "Set `frames` in take.toml to leave the end out, or convert the movie again."
+                    f"Frame {index} of {self._path} cannot be decoded, although its header has {self._count} frames. "
+                    "Leave out the end with `frames` in take.toml, or convert the movie again."
                 )
             self._shown_ms[self._next] = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
             self._next += 1
@@ -244,12 +244,12 @@ class Movie:
 
     @property
     def shown(self) -> int:
-        """Of how many frames the moment is known: those that were decoded so far."""
+        """Number of frames decoded so far, whose time stamps are known."""
         return len(self._shown_ms)
 
     @property
     def unevenness(self) -> float:
-        """By how many frames the moments of the frames decoded so far differ from an even rate, at most; 0 where that is not known."""
+        """Largest deviation, in frames, of the time stamps decoded so far from an even rate; 0 if not known."""
         frames = np.array(sorted(self._shown_ms), dtype=np.float64)
         shown = np.array([self._shown_ms[int(f)] for f in frames])
         if len(frames) < 4 or not np.ptp(shown) > 0:
@@ -259,7 +259,7 @@ class Movie:
 
 
 def _capture(path: Path) -> Any:
-    """A decoder that turns pictures as the movie's header says; OpenCV 4 must be asked to."""
+    """A decoder that applies the orientation in the movie's header, which OpenCV 4 does on request only."""
     capture = cv2.VideoCapture(str(path))
     if capture.isOpened():
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
@@ -270,27 +270,27 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
     """The sequence of one view of the take in `folder`.
 
     Raises:
-        InputError: nothing is found, or a path leaves the folder.
+        InputError: there is no such footage, or a path leads out of the folder.
     """
     pattern = images if images is not None else movie or ""
     if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
         raise InputError(f"View {view} reads “{pattern}”, which lies outside the take {folder}; move or link the footage into the take.")
     link = folder / movie if movie is not None else (folder / pattern).parent
     if link.is_symlink() and not link.exists():
-        raise InputError(f"The footage of view {view} is not at {link.resolve()} any more; move it back, or mend the link {link}.")
+        raise InputError(f"The footage of view {view} is not at {link.resolve()} any more; move it back, or correct the link {link}.")
     if movie is not None:
         path = folder / movie
         if not path.is_file():
-            raise InputError(f"The movie {path} of view {view} is missing; mend `movie` in take.toml.")
+            raise InputError(f"The movie {path} of view {view} is missing; correct `movie` in take.toml.")
         return Movie(path)
     try:
         paths = tuple(sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_ENDINGS and p.name[0] != "."), key=natural))
-    except (ValueError, IndexError, NotImplementedError):  # what pathlib raises for a pattern that is none
+    except (ValueError, IndexError, NotImplementedError):  # raised by pathlib for an invalid pattern
         paths = ()
     if not paths:
         inside = pattern and (folder / pattern).is_dir()
-        hint = f"“{pattern}” is a folder; write “{pattern.rstrip('/')}/*.png” for its PNG files." if inside else "Mend `images` there."
-        raise InputError(f"View {view} has no images: nothing in {folder} agrees with “{pattern}”, as take.toml has it. {hint}")
+        hint = f"“{pattern}” is a folder; write “{pattern.rstrip('/')}/*.png” for its PNG files." if inside else "Correct `images` there."
+        raise InputError(f"View {view} has no images: nothing in {folder} matches “{pattern}” of take.toml. {hint}")
     _check_numbering(paths, view)
     for path in paths:
         _check_signature(path)
@@ -307,10 +307,10 @@ def read_image(path: Path, white: float = 0.0) -> np.ndarray:
 
 
 def decoded(path: Path) -> np.ndarray:
-    """An image file's own pixels (h, w) or (h, w, channels).
+    """The pixels of an image file (h, w) or (h, w, channels).
 
     Raises:
-        InputError: the file is missing, is not an image, is larger than 36 megapixels or 8191 pixels a side, or of a strange kind.
+        InputError: the file is missing, is not an image, is too large (MAX_PIXELS, MAX_SIDE_PX), or has an unsupported type of pixels.
     """
     try:
         data = np.fromfile(path, dtype=np.uint8)
@@ -323,16 +323,16 @@ def decoded(path: Path) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None:
-        raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
+        raise InputError(f"{path} is not a readable image; replace it, or remove it from the sequence.")
     _refuse_size(image.shape[1::-1], path)
     if image.dtype.name not in KINDS:
-        raise InputError(f"{path} holds {image.dtype.name} pixels; save it with 8 or 16 bits a channel.")
+        raise InputError(f"{path} has {image.dtype.name} pixels; save it with 8 or 16 bits per channel.")
     return np.asarray(image)
 
 
 def _refuse_size(size_px: tuple[int, int] | None, path: Path) -> None:
     if size_px is None or min(size_px) < 1:
-        raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
+        raise InputError(f"{path} is not a readable image; replace it, or remove it from the sequence.")
     if size_px[0] * size_px[1] > MAX_PIXELS or max(size_px) > MAX_SIDE_PX:
         raise InputError(f"{path} has {size_px[0]}×{size_px[1]} pixels, more than can be measured; scale the footage down.")
 
@@ -351,9 +351,9 @@ def grey(image: np.ndarray, white: float = 0.0) -> np.ndarray:
 
 
 def _check_movie(path: Path) -> None:
-    """Only what holds its pictures itself is given to the decoder: playlists and scripts would make it open other files, even URLs."""
+    """Only files with their own images are decoded: playlists and scripts would make the decoder open other files, even URLs."""
     if path.suffix.lower() not in MOVIE_ENDINGS:
-        raise InputError(f"The movie {path} is of no kind that is read here ({', '.join(MOVIE_ENDINGS)}); convert it to H.264 in .mp4.")
+        raise InputError(f"The movie {path} is of an unsupported kind ({', '.join(MOVIE_ENDINGS)}); convert it to H.264 in .mp4.")
     first = _first_bytes(path, "movie")
     if not (first.startswith(MOVIE_SIGNATURES) or first[4:8] in MOVIE_BOXES):
         raise InputError(NO_MOVIE.format(path=path))
@@ -361,7 +361,7 @@ def _check_movie(path: Path) -> None:
 
 def _refuse_open_exr(first: bytes, path: Path) -> None:
     if first.startswith(OPEN_EXR):
-        raise InputError(f"{path} is an OpenEXR image, which is not read here; save the sequence as PNG or TIFF of 16 bits.")
+        raise InputError(f"{path} is an OpenEXR image, which is not supported; save the sequence as PNG or TIFF of 16 bits.")
 
 
 def _first_bytes(path: Path, what: str) -> bytes:
@@ -378,13 +378,13 @@ def _first_bytes(path: Path, what: str) -> bytes:
 
 
 def _check_signature(path: Path) -> None:
-    """What is no image by its first bytes is told before anything is computed, not when its turn comes."""
+    """Refuse files that are no images by their first bytes, before anything is computed."""
     first = _first_bytes(path, "image")
     _refuse_open_exr(first, path)
     if first.startswith(b"version "):
-        raise InputError(f"{path} is a placeholder that Git LFS left for the image; fetch the images themselves with `git lfs pull`.")
+        raise InputError(f"{path} is a Git LFS placeholder of the image; fetch the images with `git lfs pull`.")
     if not first.startswith(SIGNATURES):
-        raise InputError(f"{path} is not an image that can be read; replace it, or take it out of the sequence.")
+        raise InputError(f"{path} is not a readable image; replace it, or remove it from the sequence.")
 
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
@@ -393,7 +393,7 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 
 
 def _check_numbering(paths: tuple[Path, ...], view: str) -> None:
-    """A gap in the numbers is a missing image, where most of the numbers count by the same step."""
+    """Refuse a gap in the numbers, a missing image, if most of the numbers have the same step."""
     numbers = [[int(n) for n in re.findall(r"\d+", p.stem)] for p in paths]
     if len(paths) < 3 or not numbers[0] or len({len(n) for n in numbers}) > 1:
         return
@@ -407,5 +407,5 @@ def _check_numbering(paths: tuple[Path, ...], view: str) -> None:
         if step > usual and step % usual == 0:
             raise InputError(
                 f"View {view} lacks the image(s) between {paths[i].name} and {paths[i + 1].name}; "
-                "restore them, or renumber the files of all views alike."
+                "restore them, or renumber the files of all views in the same way."
             )

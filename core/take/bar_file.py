@@ -1,9 +1,9 @@
-"""Where the reference bar of a calibration was, beside the rig that it gave: rig.toml has rig_bar.csv.
+"""The positions of the reference bar of a calibration, next to its rig: rig.toml has rig_bar.csv.
 
     frame, 1 from L x, 1 from L y, 1 from L z, 2 from L x, …, 1 from C x, …
 
-Both ends [m], as every camera has them in its own frame: they stay right when the world's frame is moved, and a rig that has other
-cameras by now is found out, since its cameras disagree on where the bar was.
+Both ends [m] in the frame of every camera: they remain valid when the world's frame changes, and a rig with other cameras is detected,
+because its cameras disagree on the positions.
 """
 
 import csv
@@ -17,16 +17,16 @@ from ..foundation.errors import InputError
 from ..geometry.rig import Rig
 from ..motion.formats.markers import read_points_csv
 
-AGREE_M = 1e-3  # cameras of the rig that the bar gave put its ends at the same place but for rounding
+AGREE_M = 1e-3  # between the positions from all cameras of the right rig, which differ by rounding only
 
 
 def bar_path(rig_path: Path) -> Path:
-    """The bar's file of a rig's file."""
+    """The file of the bar of a rig's file."""
     return rig_path.with_name(f"{rig_path.stem}_bar.csv")
 
 
 def write_bar(rig_path: Path, rig: Rig, frames: np.ndarray, ends_m: np.ndarray) -> Path:
-    """Write the bar's ends (T, 2, 3) [m] in the world, at frames (T,) of its recording, beside the rig's file; the path.
+    """Write the bar's ends (T, 2, 3) [m] in the world, at frames (T,) of its recording, next to the rig's file; the path.
 
     Raises:
         InputError: the file cannot be written.
@@ -41,7 +41,7 @@ def write_bar(rig_path: Path, rig: Rig, frames: np.ndarray, ends_m: np.ndarray) 
 
 
 def read_bar(rig_path: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray] | None:
-    """Frames (T,) and ends (T, 2, 3) [m] in the world of the bar that gave the rig; None if no bar is known.
+    """Frames (T,) and ends (T, 2, 3) [m] in the world of the bar of a rig; None if there is no such file.
 
     Raises:
         InputError: the file is damaged, or of another calibration.

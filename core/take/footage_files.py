@@ -1,5 +1,4 @@
-"""Which files are a camera's footage, and what the views are called: guessed from the names that cameras and people give. Where footage
-is now that was moved."""
+"""The footage of the cameras: its files, names of the views guessed from the names of the files, and footage that was moved."""
 
 import re
 import shutil
@@ -13,7 +12,7 @@ from .sources import PERSON_SOURCES
 from .take import read_take
 from .writing import make_take, read_table
 
-SIDES = {  # words for the sides, in the order in which the cameras stand
+SIDES = {  # words for the sides, in the order of the cameras
     "L": ("l", "left", "links", "gauche", "izquierda", "sinistra"),
     "C": ("c", "centre", "center", "middle", "mid", "m", "mitte", "centro", "milieu"),
     "R": ("r", "right", "rechts", "droite", "derecha", "destra"),
@@ -22,12 +21,12 @@ SIDE_OF = {word: side for side, words in SIDES.items() for word in words}
 
 
 def find_footage(folder: Path, names: Sequence[str]) -> list[Path]:
-    """The movies and image folders that a user means who chose files `names` in `folder`; none chosen: all that the folder holds.
+    """The movies and image folders chosen as files `names` in `folder`; without names, all in the folder.
 
-    An image stands for the folder in which it lies.
+    An image stands for its folder.
 
     Raises:
-        InputError: there is no footage, or a file is none.
+        InputError: there is no footage, or a file is not footage.
     """
     folder = Path(folder)
     chosen = [folder / name for name in names if name]
@@ -51,7 +50,7 @@ def find_footage(folder: Path, names: Sequence[str]) -> list[Path]:
 
 
 def name_views(sources: Sequence[Path], taken: Sequence[str] = ()) -> list[tuple[str, Path]]:
-    """Names for footage, in the order in which the cameras stand: L, C, R where the files tell the side, else what tells them apart."""
+    """Names for footage, in the order of the cameras: L, C, R if the file names contain the side, else the parts in which they differ."""
     sides = [_side(path.stem if path.is_file() else path.name) for path in sources]
     if all(sides) and len({*sides, *taken}) == len(sides) + len(taken):
         named = list(zip([str(side) for side in sides], sources))
@@ -108,24 +107,23 @@ def _in_folder(folder: Path, patterns: Sequence[str]) -> list[Path]:
 
 
 def find_moved(links: Mapping[str, Path], place: Path) -> dict[Path, Path]:
-    """Where the footage is now whose links in the take lead nowhere: link → movie or folder of images.
+    """The present place of footage whose links in the take are broken: link → movie or folder of images.
 
-    `links` are all of them, by view. Footage is looked for under the name that it had, in the folder `place` and in those beside and
-    below it.
+    `links` are all links, by view. The footage is searched for by its former name, in the folder `place`, its parent and its subfolders.
 
     Raises:
-        InputError: some is not there.
+        InputError: some is not found.
     """
     lost = {view: link for view, link in links.items() if not link.exists()}
     found = {view: _moved(link, place) for view, link in lost.items()}
     if missing := [view for view, path in found.items() if path is None]:
         names = ", ".join(_former(lost[view]) for view in missing)
-        raise InputError(f"{place} does not hold {names} (the footage of {', '.join(missing)}); choose the folder in which that lies now.")
+        raise InputError(f"{place} does not contain {names} (the footage of {', '.join(missing)}); choose the folder where it is now.")
     return {lost[view]: path for view, path in found.items() if path is not None}
 
 
 def _former(link: Path) -> str:
-    """What the footage was called for which a link stands."""
+    """The former name of the footage of a link."""
     return link.readlink().name if link.is_symlink() else link.name
 
 
@@ -140,14 +138,14 @@ def _moved(link: Path, place: Path) -> Path | None:
 
 
 def _side(stem: str) -> str | None:
-    """L, C or R if exactly one side is said in a file's name."""
+    """L, C or R if a file's name contains exactly one side."""
     words = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", stem).lower())
     found = {SIDE_OF[word] for word in words if word in SIDE_OF}
     return found.pop() if len(found) == 1 else None
 
 
 def _different_parts(stems: Sequence[str]) -> list[str]:
-    """The names without the whole words that all of them have in common; as they are where nothing remains."""
+    """The names without the words that all of them have in common; unchanged if that leaves nothing."""
     words = [re.findall(r"[^\W_]+", stem) for stem in stems]
     common = set(words[0]).intersection(*words[1:]) if len(words) > 1 else set()
     short = ["_".join(w for w in each if w not in common) for each in words]

@@ -1,8 +1,7 @@
-"""What take.toml says of where a view shows the person: a mask, a mask for every image, or an image of the empty background.
+"""Values of take.toml, checked as they are read; every refusal is an InputError in one sentence.
 
-[[keypoints]] of take.toml: files in which another system says where joints are, in the pixels of a view or in space.
-
-Values of take.toml, checked as they are read; every refusal is an InputError in one sentence.
+Person sources of a view: a mask, a mask for every image, or an image of the empty background. [[keypoints]]: files with the joints from
+another system, in the pixels of a view or in space.
 """
 
 import glob
@@ -21,7 +20,7 @@ from ..images.sequence import read_image
 
 
 def frame_pair(value: Any, where: str) -> tuple[int, int] | None:
-    """`frames`, half-open, or None where it is not there."""
+    """`frames`, half-open, or None without it."""
     if value is None:
         return None
     if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, int) for v in value) or not 0 <= value[0] < value[1]:
@@ -37,7 +36,7 @@ def inside(folder: Path, name: Any, where: str, key: str = "rig") -> Path:
 
 
 def table_of(table: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
-    """A table of a table, empty where it is not there."""
+    """A table of a table, empty if it is missing."""
     value = table.get(key, {})
     if not isinstance(value, dict):
         raise InputError(f"[{key}] of {where} must be a table.")
@@ -45,7 +44,7 @@ def table_of(table: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any
 
 
 def tables_of(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
-    """A list of tables, empty where it is not there."""
+    """A list of tables, empty if it is missing."""
     value = table.get(key, [])
     if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
         raise InputError(f"`{key}` of {where} must be written as [[{key}]] tables.")
@@ -53,7 +52,7 @@ def tables_of(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[st
 
 
 def check_keys(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
-    """Refuse a key that is not known."""
+    """Refuse unknown keys."""
     for key in table:
         if key not in known:
             raise InputError(f"{where} has an unknown key “{key}”.{nearest_name(str(key), known)}")
@@ -69,21 +68,21 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-PERSON_SOURCES = ("mask", "masks", "background")  # keys of [[views]]; a view has one of them at most
+PERSON_SOURCES = ("mask", "masks", "background")  # keys of [[views]]; a view has at most one of them
 
 
 def person_source(entry: Mapping[str, Any], label: str) -> dict[str, str]:
     """The key and the file, or the pattern of files, of a view's table.
 
     Raises:
-        InputError: there are several, or one is no file inside the take.
+        InputError: there are several, or one is not inside the take.
     """
-    said = {key: entry[key] for key in PERSON_SOURCES if key in entry}
-    if len(said) > 1:
-        raise InputError(f"The {label} has {' and '.join(f'`{key}`' for key in said)}; keep one of them.")
-    for key, name in said.items():
+    sources = {key: entry[key] for key in PERSON_SOURCES if key in entry}
+    if len(sources) > 1:
+        raise InputError(f"The {label} has {' and '.join(f'`{key}`' for key in sources)}; keep one of them.")
+    for key, name in sources.items():
         inside(Path(), name, label, key)
-    return said
+    return sources
 
 
 def read_picture(path: Path, view: str, size_px: tuple[int, int]) -> np.ndarray:
@@ -95,14 +94,14 @@ def read_picture(path: Path, view: str, size_px: tuple[int, int]) -> np.ndarray:
     image = read_image(path)
     if image.shape[::-1] != size_px:
         size = f"{image.shape[1]}×{image.shape[0]} pixels, the view {size_px[0]}×{size_px[1]}"
-        raise InputError(f"{path} of view {view} has {size}; make it of the view's own size.")
+        raise InputError(f"{path} of view {view} has {size}; make it the size of the view.")
     return image
 
 
 def person_files(folder: Path, view: str, kind: str, picture: Path) -> tuple[str, tuple[Path, Path]]:
-    """What [[views]] says of a mask or background, or of the masks beside which `picture` lies, and the link into the take's folder.
+    """The value in [[views]] for a mask or background, or for the folder of masks with `picture`, and the link into the take's folder.
 
-    What is there under the same name and is something else stays; the link gets a number.
+    Another file of the same name stays, and the link gets a number.
     """
     source, ending = (picture.parent, "") if kind == "masks" else (picture, picture.suffix)
     for number in count(1):
@@ -113,8 +112,10 @@ def person_files(folder: Path, view: str, kind: str, picture: Path) -> tuple[str
 
 
 KEYS = ("files", "view", "offset_frames", "sigma", "names", "axes")
-PIXELS, SPACE = (".json",), (".trc", ".c3d", ".csv")
-SIGMA_PX, SIGMA_M = 8.0, 0.02
+PIXELS = (".json",)  # files of keypoints in pixels
+SPACE = (".trc", ".c3d", ".csv")  # files of keypoints in space
+SIGMA_PX = 8.0
+SIGMA_M = 0.02
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -123,19 +124,19 @@ class KeypointSource:
 
     files: str
     view: str = ""  # of keypoints in pixels
-    offset_frames: int = 0  # the file's frame of take frame t is t + offset_frames (and the view's own offset)
+    offset_frames: int = 0  # take frame t is frame t + offset_frames of the file (plus the offset of the view)
     sigma: float = SIGMA_PX  # px, or m in space
     names: Mapping[str, str] = field(default_factory=dict)  # the file's name -> our joint
-    axes: str | None = None  # of a file in space; None: what such files usually have
+    axes: str | None = None  # of a file in space; None: the usual axes of its format
 
 
 def keypoint_sources(
     tables: Sequence[Mapping[str, Any]], views: Sequence[str], joints: Sequence[str], where: str
 ) -> tuple[KeypointSource, ...]:
-    """The sources that a take.toml names.
+    """The keypoint sources of a take.toml.
 
     Raises:
-        InputError: a key, view or joint is unknown, or a value cannot be.
+        InputError: a key, view or joint is unknown, or a value is impossible.
     """
     return tuple(_source(table, views, joints, f"[[keypoints]] of {where}") for table in tables)
 
@@ -157,7 +158,7 @@ def _source(table: Mapping[str, Any], views: Sequence[str], joints: Sequence[str
         raise InputError(f'`names` of a {where} must be a table, such as {{ RKnee = "knee.R" }}.')
     for joint in names.values():
         if joint not in joints:
-            raise InputError(f"A {where} has the joint {joint!r}, which is none.{nearest_name(str(joint), tuple(joints))}")
+            raise InputError(f"A {where} has an unknown joint {joint!r}.{nearest_name(str(joint), tuple(joints))}")
     offset, sigma, axes = table.get("offset_frames", 0), table.get("sigma", SIGMA_PX if view else SIGMA_M), table.get("axes")
     if not isinstance(offset, int) or not isinstance(sigma, (int, float)) or not 0 < sigma < 1e4 or not isinstance(axes, str | None):
         raise InputError(f"The {where} with “{files}” needs a whole `offset_frames`, a positive `sigma` and a name as `axes`.")

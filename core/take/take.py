@@ -1,6 +1,6 @@
-"""A take: one recording of a person and what the user said about it. take.toml, in the folder that holds the footage.
+"""A take: one recording of a person, described by take.toml in the folder of the footage.
 
-Joint and view names, and every key, are checked when the file is read; the images are not touched.
+Joint and view names, and every key, are checked when the file is read; the images are not read.
 """
 
 import re
@@ -35,8 +35,8 @@ from .sources import (
 
 FORMAT, VERSION = "tricap-take", 1
 MOST_FRAMES = 100_000_000
-SIDES = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
-JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDES for s in "LR"))
+SIDED = ("clavicle", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
+JOINTS = ("pelvis", "spine", "chest", "neck", "head", *(f"{j}.{s}" for j in SIDED for s in "LR"))
 KEYS = (
     "format",
     "version",
@@ -57,7 +57,7 @@ KEYS = (
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 NO_BODY = "none"  # `model` under [body]
-UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name becomes a part of file names
+UNFIT_FOR_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]|^\.+$')  # a view's name is used in file names
 Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 
 
@@ -65,7 +65,7 @@ Clicks = Mapping[str, np.ndarray]  # view name -> (2,) full-frame pixels
 class View:
     """One camera's footage: image files (a pattern) or a movie. Image 0 of the take is its number `offset_frames`.
 
-    One of `mask`, `masks` (a pattern, an image for every image) and `background` may say where the person is.
+    One of `mask`, `masks` (a pattern, an image for every image) and `background` may give the silhouette of the person.
     """
 
     name: str
@@ -79,7 +79,7 @@ class View:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FrameClicks:
-    """What the user clicked, in full-frame pixels: surface points and joints, in one frame."""
+    """The clicks of one frame, in full-frame pixels: surface seeds and joints."""
 
     frame: int = 0
     surface: tuple[Clicks, ...] = ()
@@ -98,10 +98,10 @@ class FrameClicks:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Correction:
-    """What the user saw to be wrong in one view, in full-frame pixels.
+    """An error that the user marked in one view, in full-frame pixels.
 
     "trajectory": the trajectory nearest to `xy_px` (1, 2) in frame `frames.start` is removed.
-    "region": what is measured inside the polygon `xy_px` (n, 2), during `frames`, is left out.
+    "region": measurements inside the polygon `xy_px` (n, 2) are left out in `frames`.
     """
 
     kind: str
@@ -115,13 +115,13 @@ class Correction:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Take:
-    """A recording. `folder` holds take.toml and the footage; `frames` is half-open, None means all.
+    """A recording. `folder` has take.toml and the footage; `frames` is half-open, None means all.
 
-    A frame of the take is an instant: an image, or one of its two fields where `interlaced` is "both".
+    A frame of the take is an image, or one of its two fields where `interlaced` is "both".
     """
 
     folder: Path
-    fps: float  # instants per second
+    fps: float  # frames per second
     views: tuple[View, ...]
     rig_path: Path
     interlaced: str = "none"
@@ -130,7 +130,7 @@ class Take:
     frames: tuple[int, int] | None = None
     body_model: str | None = None  # the name of one of ours, or the absolute path of the take's own; None: no body
     no_body: bool = False  # the take asks for surface and tracks only: model = "none"
-    locked: tuple[str, ...] = ()  # degrees of freedom that are held at their rest value
+    locked: tuple[str, ...] = ()  # degrees of freedom fixed at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by degree of freedom, in degrees
     clicks: FrameClicks = field(default_factory=FrameClicks)
     keyframes: tuple[FrameClicks, ...] = ()  # clicked joints of further frames, one entry per frame
@@ -140,7 +140,7 @@ class Take:
 
     @property
     def field_layout(self) -> FieldLayout:
-        """Where in the images the take's frames are."""
+        """Which rows of which images are the frames of the take."""
         return field_layout(self.interlaced, self.first_field)
 
     def time_s(self, frames: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ class Take:
         return self.field_layout.rows(frame)
 
     def single(self) -> "Take":
-        """This take with one frame an image: of both fields the first, which then has the clicks of both."""
+        """This take with one frame per image: of both fields the first, with the clicks of both."""
         if self.interlaced != BOTH:
             return self
         clicks, *keys = (replace(s, frame=self.field_layout.image(s.frame)) for s in (self.clicks, *self.keyframes))
@@ -174,14 +174,14 @@ class Footage:
     sequences: tuple[ImageSequence, ...]
     frames: range
     click_sigma_px: float = CLICK_SIGMA_PX  # of the take's clicks
-    delay_images: tuple[float, ...] = ()  # by which each view's pictures are put back to the moment of the others; none: as they are
+    delay_images: tuple[float, ...] = ()  # time offset by which the images of each view are interpolated; empty: none
 
     def number(self, view: int, frame: int) -> int:
         """The number of the image in a view's sequence that shows a frame of the take."""
         return self.take.field_layout.image(frame) + self.take.views[view].offset_frames
 
     def single(self) -> "Footage":
-        """The footage with one frame an image, for what is asked of images and not of instants."""
+        """The footage with one frame per image."""
         take, per = self.take.single(), self.take.field_layout.per_image
         return replace(self, take=take, frames=range(self.frames.start // per, -(-self.frames.stop // per)))
 
@@ -201,7 +201,7 @@ class Footage:
         return images
 
     def files(self, frame: int) -> list[Path]:
-        """The files behind one frame, a movie standing for all of its frames."""
+        """The files of one frame; a movie is the file of all of its frames."""
         return [f[self.number(k, frame)] if len(f := s.files()) > 1 or s.count == 1 else f[0] for k, s in enumerate(self.sequences)]
 
 
@@ -209,29 +209,29 @@ def read_take(folder: Path) -> Take:
     """Read FOLDER/take.toml.
 
     Raises:
-        InputError: the file is missing or broken, has an unknown key, or a value that cannot be.
+        InputError: the file is missing or damaged, or has an unknown key or an impossible value.
     """
     folder = Path(folder)
     path = folder / "take.toml" if folder.name != "take.toml" else folder
     try:
         return take_of_text(path.read_text(encoding="utf-8-sig"), path)
     except OSError as error:
-        said = f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
-        raise InputError(said) from error
+        message = f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
+        raise InputError(message) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a text in UTF-8 ({error}); save it as UTF-8 (in Notepad under “Encoding”).") from error
 
 
 def take_of_text(text: str, path: Path) -> Take:
-    """The take that a take.toml of this text at `path` describes.
+    """The take described by this text of a take.toml at `path`.
 
     Raises:
-        InputError: the text is no TOML, has an unknown key, or a value that cannot be.
+        InputError: the text is no TOML, or has an unknown key or an impossible value.
     """
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a TOML file: {error}; mend that place.") from error
+        raise InputError(f"{path} is not a TOML file: {error}; correct that place.") from error
     return _take(table, path.parent.resolve(), str(path))
 
 
@@ -253,26 +253,26 @@ def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *,
 
 
 def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
-    """The frames of a take that are measured, by its own numbers.
+    """The frames of a take that are measured.
 
     Raises:
-        InputError: the views have no frames in common, or not those that the take names.
+        InputError: the views have no common frames, or not those in the take.
     """
     per = take.field_layout.per_image
     counts = [per * (s.count - v.offset_frames) for s, v in zip(sequences, take.views)]
     first = per * max(0, *(-v.offset_frames for v in take.views))
     if take.frames is None:
         if len(set(counts)) > 1:
-            said = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
-            mend = "Trim them, or set `offset_frames` or `frames` in take.toml."
-            raise InputError(f"The views of {take.folder.name} are not equally long: {said} frames. {mend}")
+            lengths = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
+            advice = "Trim them, or set `offset_frames` or `frames` in take.toml."
+            raise InputError(f"The views of {take.folder.name} are not equally long: {lengths} frames. {advice}")
         if counts[0] <= first:
-            raise InputError(f"With these `offset_frames` the views of {take.folder.name} have no frame in common; mend them in take.toml.")
+            raise InputError(f"With these `offset_frames` the views of {take.folder.name} have no common frame; correct them in take.toml.")
         return range(first, counts[0])
     start, stop = take.frames
     if start < first or stop > min(counts):
         has = f"the footage has frames {first} to {min(counts)} (half-open)"
-        raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but {has}; mend it in take.toml.")
+        raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but {has}; correct it in take.toml.")
     return range(start, stop)
 
 
@@ -300,8 +300,8 @@ def _check_inside(footage: Footage, label: str, at: Clicks) -> None:
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
     check_keys(table, KEYS, where)
     if table.get("format") != FORMAT or table.get("version") != VERSION:
-        says = f"it says {table.get('format')!r} and {table.get('version')!r}"
-        raise InputError(f'{where} must say format = "{FORMAT}" and version = {VERSION}; {says}.')
+        present = f"it has {table.get('format')!r} and {table.get('version')!r}"
+        raise InputError(f'{where} must have format = "{FORMAT}" and version = {VERSION}; {present}.')
     views = _views(table.get("views"), where)
     names = tuple(v.name for v in views)
     reference = table.get("reference_view", names[len(names) // 2])
@@ -312,7 +312,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         raise InputError(f"`interlaced` of {where} is {interlaced!r}; write one of: {', '.join((*INTERLACE, BOTH))}.")
     first_field = table.get("first_field", "odd")
     if first_field not in ("odd", "even") or ("first_field" in table and interlaced != BOTH):
-        raise InputError(f'`first_field` of {where} is {first_field!r}; write "odd" or "even", and only beside interlaced = "both".')
+        raise InputError(f'`first_field` of {where} is {first_field!r}; write "odd" or "even", and only with interlaced = "both".')
     fps = table.get("fps")
     if not is_number(fps) or not 0.1 <= float(fps) <= 10_000:
         raise InputError(f"`fps` of {where} is {fps!r}; write the frames per second, such as 25.0.")
@@ -356,7 +356,7 @@ def _views(entries: Any, where: str) -> tuple[View, ...]:
         if isinstance(offset, bool) or not isinstance(offset, int) or abs(offset) > MOST_FRAMES:
             raise InputError(f"`offset_frames` of {label} is {str(offset)[:40]}; write a whole number of frames, such as -2.")
         if UNFIT_FOR_NAMES.search(entry["name"]):
-            raise InputError(f'The {label} has a character in its name that file names cannot have; choose a plain name such as "L".')
+            raise InputError(f'The {label} has a character in its name that is not allowed in file names; choose a plain name such as "L".')
         if (isinstance(entry.get("images"), str)) == (isinstance(entry.get("movie"), str)):
             raise InputError(f'The {label} needs either `images` (a pattern such as "{entry["name"]}/*.png") or `movie` (a file).')
         files = {key: entry.get(key) for key in ("images", "movie")} | person_source(entry, label)
@@ -435,7 +435,7 @@ def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
 def _settings(table: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str, Any]]:
     for name, group in table.items():
         if not isinstance(group, dict):
-            raise InputError(f"[settings] of {where} holds tables such as [settings.matching]; “{name}” is none.")
+            raise InputError(f"[settings] of {where} must contain tables such as [settings.matching]; “{name}” is not a table.")
     return table
 
 

@@ -1,6 +1,6 @@
-"""Making and changing take.toml: written whole or not at all, checked before it is written, and left alone where nothing changes.
+"""Making and changing take.toml: it is checked, then written completely or not at all, and not written where nothing changes.
 
-What is edited is the table that TOML reads; whatever an editor does not touch (comments excepted) stays as it is.
+Editors change the table of the file; keys that they do not change stay, but comments are lost.
 """
 
 import glob
@@ -17,9 +17,9 @@ from ..geometry.rig import Rig, write_rig
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS
 from .take import FORMAT, VERSION, Take, take_of_text
 
-Link = tuple[Path, Path]  # where in the take's folder, and the footage that it stands for
+Link = tuple[Path, Path]  # its path in the take's folder, and the footage that it leads to
 Table = dict[str, Any]
-DEFAULTS = {"interlaced": "none", "first_field": "odd", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # a file may leave them out
+DEFAULTS = {"interlaced": "none", "first_field": "odd", "rig": "rig.toml", "frame": 0, "offset_frames": 0}  # that a file may leave out
 
 
 def new_table(views: Sequence[Table], *, fps: float = 25.0, interlaced: str = "none", model: str | None = None) -> Table:
@@ -29,7 +29,7 @@ def new_table(views: Sequence[Table], *, fps: float = 25.0, interlaced: str = "n
 
 
 def read_table(folder: Path) -> Table:
-    """The table in FOLDER/take.toml, checked; empty where there is no such file.
+    """The table in FOLDER/take.toml, checked; empty if there is no such file.
 
     Raises:
         InputError: the file cannot be read or is no take.
@@ -46,30 +46,30 @@ def read_table(folder: Path) -> Table:
 
 
 def take_of_table(folder: Path, table: Table) -> Take:
-    """The take that FOLDER/take.toml with this table describes.
+    """The take described by this table of FOLDER/take.toml.
 
     Raises:
-        InputError: a key is unknown, or a value cannot be.
+        InputError: a key is unknown, or a value is impossible.
     """
     return take_of_text(toml_text(table), Path(folder) / "take.toml")
 
 
 def write_table(folder: Path, table: Table) -> bool:
-    """Write FOLDER/take.toml; gives False where the file says that already, and leaves it alone.
+    """Write FOLDER/take.toml; returns False, without writing, if the file has the same content already.
 
     Raises:
-        InputError: the table is no take, or the file cannot be written; the file is as it was.
+        InputError: the table is no take, or the file cannot be written; it is unchanged then.
     """
     take_of_table(folder, table)
     path = Path(folder) / "take.toml"
-    if path.exists() and _said(read_table(folder)) == _said(table):
+    if path.exists() and _essential(read_table(folder)) == _essential(table):
         return False
     store.write_text(path, toml_text(table))
     return True
 
 
 def renumbered(table: Table, per_image: int, before: int) -> Table:
-    """A take's table whose images have `per_image` frames instead of `before`, with every frame's number changed to suit."""
+    """A take's table for images of `per_image` frames instead of `before`, with all frame numbers converted."""
 
     def first(frame: int) -> int:
         return frame * per_image // before
@@ -92,10 +92,10 @@ def renumbered(table: Table, per_image: int, before: int) -> Table:
 
 
 def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
-    """What [[views]] says of footage, a movie or a folder of images, and the link into the take's folder that it needs.
+    """The entry of [[views]] for footage, a movie or a folder of images, and the link into the take's folder that it needs.
 
     Raises:
-        InputError: the footage is missing, or something else has its place in the folder.
+        InputError: the footage is missing, or another file has its name in the folder.
     """
     if not source.exists():
         whole = f" (for a pattern give its folder, {source.parent})" if "*" in source.name else ""
@@ -104,7 +104,7 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
         endings = sorted({p.suffix for p in source.iterdir() if p.suffix.lower() in IMAGE_ENDINGS})
         if len(endings) != 1:
             raise InputError(
-                f"The folder {source} of view {name} holds {'no images' if not endings else 'images of several kinds'}; it needs one kind."
+                f"The folder {source} of view {name} has {'no images' if not endings else 'images of several kinds'}; it needs one kind."
             )
         entry, target = {"name": name, "images": f"{glob.escape(name)}/*{endings[0]}"}, folder / name
     elif source.suffix.lower() not in MOVIE_ENDINGS:
@@ -112,7 +112,7 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
     else:
         entry, target = {"name": name, "movie": name + source.suffix}, folder / f"{name}{source.suffix}"
     if target.exists() and not target.samefile(source):
-        raise InputError(f"{target} is there already and is not the footage {source}; choose another folder or another name for the view.")
+        raise InputError(f"{target} exists and is not the footage {source}; choose another folder or another name for the view.")
     return entry, (target, source)
 
 
@@ -120,7 +120,7 @@ def make_take(folder: Path, table: Table, links: Sequence[Link], rig: Rig | None
     """Make a take's folder: its footage linked, or copied where links cannot be made, take.toml, and rig.toml.
 
     Raises:
-        InputError: something cannot be written; what was made goes again.
+        InputError: something cannot be written; everything made so far is removed.
     """
     take_of_table(folder, table)
     made = link_footage(folder, links)
@@ -134,10 +134,10 @@ def make_take(folder: Path, table: Table, links: Sequence[Link], rig: Rig | None
 
 
 def link_footage(folder: Path, links: Sequence[Link]) -> list[Path]:
-    """Link footage into a take's folder; gives what was made.
+    """Link footage into a take's folder; returns the new links.
 
     Raises:
-        InputError: the folder cannot be written to; what was made goes again.
+        InputError: the folder cannot be written to; the new links are removed.
     """
     made: list[Path] = []
     try:
@@ -153,7 +153,7 @@ def link_footage(folder: Path, links: Sequence[Link]) -> list[Path]:
 
 
 def relink_footage(moved: Mapping[Path, Path]) -> None:
-    """Let links in a take's folder stand for footage elsewhere (`footage_files.find_moved`).
+    """Let links in a take's folder lead to footage elsewhere (`footage_files.find_moved`).
 
     Raises:
         InputError: the folder cannot be written to.
@@ -167,7 +167,7 @@ def relink_footage(moved: Mapping[Path, Path]) -> None:
 
 
 def toml_text(table: Table) -> str:
-    """A table as TOML: plain values, then [tables] and [[lists of tables]]; what lies deeper than two levels stands in one line."""
+    """A table as TOML: plain values, then [tables] and [[lists of tables]]; deeper levels are written in one line."""
     return "\n".join(_lines(table, ())).lstrip("\n") + "\n"
 
 
@@ -184,13 +184,13 @@ def _lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
             yield from _lines(each, (*path, key, "") if isinstance(value, list) else (*path, key))
 
 
-def _said(value: Any) -> Any:
-    """A table without what a file may as well leave out."""
+def _essential(value: Any) -> Any:
+    """A table without the values that a file may leave out."""
     if isinstance(value, list):
-        return [_said(each) for each in value]
+        return [_essential(each) for each in value]
     if not isinstance(value, Mapping):
         return value
-    pairs = ((key, _said(each)) for key, each in value.items())
+    pairs = ((key, _essential(each)) for key, each in value.items())
     return {key: each for key, each in pairs if each not in ({}, [], "") and not (key in DEFAULTS and each == DEFAULTS[key])}
 
 
@@ -219,7 +219,7 @@ def _value(value: Any) -> str:
 
 
 def _text(text: str) -> str:
-    """A TOML basic string; JSON's escapes are a part of TOML's."""
+    """A TOML basic string; JSON's escapes are valid in TOML."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -231,7 +231,7 @@ def _link(target: Path, source: Path) -> None:
 
 
 def unlink_footage(made: Sequence[Path]) -> None:
-    """Remove what `link_footage` made; what the links stand for stays."""
+    """Remove the links that `link_footage` made; the footage stays."""
     for target in made:
         if target.is_dir() and not target.is_symlink():
             shutil.rmtree(target, ignore_errors=True)

@@ -478,7 +478,7 @@ def test_moved_footage_is_found_again(blender: ModuleType, words: Words, why: An
     (tmp_path / "film").rename(tmp_path / "other film")
     assert words().startswith("failed") and why("footage").endswith("Move it back, or press Find Footage.")
     assert str(tmp_path / "film" / "L") in why("footage"), "where it was, not the link in the project"
-    with pytest.raises(RuntimeError, match="does not hold L, C, R"):
+    with pytest.raises(RuntimeError, match="does not contain L, C, R"):
         blender.ops.tricap.find_footage(directory=str(tmp_path / "shot_tricap"))
     assert blender.ops.tricap.find_footage(directory=str(tmp_path / "other film")) == {"FINISHED"}
     assert words().startswith("done") and len(scene.tricap.views) == 3

@@ -59,7 +59,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "rig lacks a view": (lambda t: edit(t, 'name = "R"', 'name = "X"', "rig.toml"), "The rig has no camera “R”"),
     "rig with NaN": (lambda t: edit(t, "translation = [", "translation = [nan, 1.0, 2.0] # ", "rig.toml"), "must be 3 finite numbers"),
     "unknown key": (lambda t: edit(t, "fps", "fqs"), "unknown key “fqs”. Did you mean “fps”?"),
-    "wrong version": (lambda t: edit(t, "version = 1", "version = 7"), "version = 1; it says 'tricap-take' and 7"),
+    "wrong version": (lambda t: edit(t, "version = 1", "version = 7"), "version = 1; it has 'tricap-take' and 7"),
     "a folder for a pattern": (lambda t: edit(t, "L/*.png", "L"), "“L” is a folder; write “L/*.png”"),
     "offset true": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = true\n'), "`offset_frames` of view 'L' of"),
     "offset in parts": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = 1.5\n'), "is 1.5; write a whole number"),
@@ -74,7 +74,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda t: click(t, '[seeds.joints]\n"elbow.R" = { L = [40, 1], C = [40, 70] }\n'),
         "“elbow.R” miss each other by",
     ),
-    "text named png": (lambda t: (t / "C" / "0000.png").write_text("hello"), "0000.png is not an image that can be read"),
+    "text named png": (lambda t: (t / "C" / "0000.png").write_text("hello"), "0000.png is not a readable image"),
     "nothing to measure": (lambda t: None, "No surface could be measured in frame 0"),
 }
 
@@ -383,7 +383,7 @@ def test_new_does_not_touch_what_is_there(take: Path, tmp_path: Path, capfd: Cap
     (made / "C" / "mine.png").write_text("x")
     views = ["--views", f"L={take / 'L'}", f"C={take / 'C'}"]
     assert main.main(["new", str(made), *views]) == 2
-    assert "is there already and is not the footage" in capfd.readouterr().err
+    assert "exists and is not the footage" in capfd.readouterr().err
     assert [p.name for p in made.iterdir()] == ["C"]
     (tmp_path / "file").write_text("x")
     assert main.main(["new", str(tmp_path / "file"), *views]) == 2

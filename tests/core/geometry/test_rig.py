@@ -84,7 +84,7 @@ FAULTS = {
     "unit is a list": (text({}, metadata="[metadata]\nunit = [1]"), "unknown unit"),
     "metadata is a number": ("metadata = 3\n" + text({}), "unknown unit"),
     "camera is a number": ("cam_0 = 3\n", "is not a table"),
-    "two alike": (text({}, {}), "names two cameras alike \\(L, L\\)"),
+    "two alike": (text({}, {}), "has two cameras of the same name \\(L, L\\)"),
     "lacks size": (text({"size": None}), "Camera “L” of the rig .*lacks “size”"),
     "lacks matrix": (text({"matrix": None}), "lacks “matrix”"),
     "lacks rotation": (text({"rotation": None}), "lacks “rotation”"),

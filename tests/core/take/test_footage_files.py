@@ -67,7 +67,7 @@ def test_moved_footage_is_found_by_the_names_that_it_had(tmp_path: Path) -> None
     found = {links["L"]: tmp_path / "new" / "shot 1" / "left.mp4", links["C"]: tmp_path / "new" / "shot 1" / "C"}
     for place in ("new", "new/shot 1", "new/shot 1/C"):
         assert {link: path.resolve() for link, path in find_moved(links, tmp_path / place).items()} == found
-    with pytest.raises(InputError, match=r"take does not hold left.mp4, C \(the footage of L, C\)"):
+    with pytest.raises(InputError, match=r"take does not contain left.mp4, C \(the footage of L, C\)"):
         find_moved(links, take)
     with pytest.raises(InputError, match="view L is not at .*old/left.mp4 any more"):
         open_sequence(take, images=None, movie="L.mp4", view="L")

@@ -111,9 +111,9 @@ TRAJECTORY = REGION.replace("region", "trajectory").replace("frames = [2, 9]", "
 SEED, JOINT = "[seeds]\n", "[seeds.joints]\n"
 FAULTS = {
     "not TOML": ("fps = \n", "is not a TOML file"),
-    "no format": (text(dict(format=None)), 'must say format = "tricap-take"'),
-    "another format": (text(dict(format='"x"')), "it says 'x' and 1"),
-    "newer version": (text(dict(version="2")), "and version = 1; it says 'tricap-take' and 2"),
+    "no format": (text(dict(format=None)), 'must have format = "tricap-take"'),
+    "another format": (text(dict(format='"x"')), "it has 'x' and 1"),
+    "newer version": (text(dict(version="2")), "and version = 1; it has 'tricap-take' and 2"),
     "unknown key": (text(dict(interlace='"odd"')), "unknown key “interlace”. Did you mean “interlaced”?"),
     "unknown key of a view": (text(views=VIEWS + "ofset_frames = 1\n"), "unknown key “ofset_frames”. Did you mean “offset_frames”?"),
     "unknown key of the body": (text(more='[body]\nmodle = "arm.R"\n'), "unknown key “modle”. Did you mean “model”?"),
@@ -128,7 +128,7 @@ FAULTS = {
     "fps infinite": (text(dict(fps="inf")), "`fps` of .* is inf"),
     "interlaced": (text(dict(interlaced='"od"')), "`interlaced` of .* is 'od'; write one of: none, odd, even, both"),
     "first_field": (text(dict(interlaced='"both"', first_field='"top"')), '`first_field` of .* is \'top\'; write "odd" or "even"'),
-    "first_field alone": (text(dict(interlaced='"odd"', first_field='"even"')), 'only beside interlaced = "both"'),
+    "first_field alone": (text(dict(interlaced='"odd"', first_field='"even"')), 'only with interlaced = "both"'),
     "interlaced true": (text(dict(interlaced="true")), "`interlaced` of .* is True"),
     "reference view": (text(dict(reference_view='"M"')), "`reference_view` of .* is 'M'"),
     "frames a number": (text(dict(frames="3")), "`frames` of .* is 3; write"),
@@ -176,7 +176,7 @@ FAULTS = {
     "region of a keyframe": (text(more=REGION + "frame = 3\n"), "unknown key “frame”"),
     "trajectory without pixel": (text(more=TRAJECTORY), "a frame and xy"),
     "settings a word": (text(dict(settings='"x"')), "\\[settings\\] of .* must be a table"),
-    "setting outside a group": (text(more="[settings]\npatch_px = 13\n"), "such as \\[settings.matching\\]; “patch_px” is none"),
+    "setting outside a group": (text(more="[settings]\npatch_px = 13\n"), "such as \\[settings.matching\\]; “patch_px” is not a table"),
 }
 
 
@@ -237,7 +237,7 @@ def test_offsets_bring_views_into_step(footage: Path) -> None:
 
 def test_offsets_beyond_the_footage(footage: Path) -> None:
     views = VIEWS.replace('.png"\n', '.png"\noffset_frames = 5\n')
-    with pytest.raises(InputError, match="no frame in common"):
+    with pytest.raises(InputError, match="no common frame"):
         open_take(rewrite(footage, None, views))
 
 
@@ -258,7 +258,7 @@ def test_a_missing_image_is_named_also_where_the_lengths_agree(footage: Path) ->
 def test_a_rig_that_lacks_a_view(footage: Path) -> None:
     rig = footage / "rig.toml"
     rig.write_text(rig.read_text().replace('name = "C"', 'name = "centre"'))
-    with pytest.raises(InputError, match="The rig has no camera “C”.* Name the views in take.toml as the cameras in rig.toml"):
+    with pytest.raises(InputError, match="The rig has no camera “C”.* Give the views in take.toml the names of the cameras in rig.toml"):
         open_take(rewrite(footage))
     rig.unlink()
     with pytest.raises(InputError, match="Cannot read the rig .*rig.toml"):
@@ -294,7 +294,7 @@ def test_images_of_another_size_than_the_camera(footage: Path) -> None:
 
 def test_a_text_file_named_png(footage: Path) -> None:
     (footage / "L" / "0001.png").write_text("hello")
-    with pytest.raises(InputError, match="0001.png is not an image that can be read"):
+    with pytest.raises(InputError, match="0001.png is not a readable image"):
         open_take(rewrite(footage)).read(1)
 
 
