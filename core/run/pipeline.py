@@ -64,7 +64,9 @@ def measure(run: Run, monitor: Monitor) -> None:
         return _no_surface(run, error, monitor)
     summaries.sort(key=lambda summary: summary.frame)
     run.measured = MeasuredFrames(footage=run.footage, results=run.results, summaries=tuple(summaries))
-    run.warn(*check_clouds(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor))
+    run.warn(
+        *check_clouds(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor)
+    )
     run.finish_stage("measure", began, **surface_figures(summaries, foreground))
 
 
