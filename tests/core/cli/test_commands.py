@@ -354,7 +354,7 @@ NEW_FAULTS = {
     "missing": (["L={t}/L", "C={t}/missing.mp4"], [], "missing.mp4 of view C is missing"),
     "pattern": (["L={t}/L", "C={t}/C/*.png"], [], "for a pattern give its folder"),
     "twice": (["L={t}/L", "C={t}/C/../L"], [], "View L has the same footage as another"),
-    "no images": (["L={t}/L", "C={t}"], [], "holds no images"),
+    "no images": (["L={t}/L", "C={t}"], [], "has no images"),
     "one view": (["L={t}/L"], [], "needs at least two"),
     "two alike": (["L={t}/L", "L={t}/C"], [], "have the same name"),
     "name leaves the folder": (["L={t}/L", "../C={t}/C"], [], "a character in its name"),
