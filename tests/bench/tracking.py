@@ -1,4 +1,4 @@
-"""Tracking beside its peers: the same points of a turning, shifting film by our 2-D mode (there and back, and with key templates),
+"""Tracking and its peers: the same points of a turning, shifting film by our 2-D mode (forwards and backwards, with key templates),
 cv2.calcOpticalFlowPyrLK, a loop over cv2.findTransformECC and Blender's own tracker; then the whole step in three views against the number
 of points, and the 2-D mode against the number of frames.
 
@@ -139,7 +139,7 @@ def three_views(frames: list[np.ndarray], start: np.ndarray) -> float:
 
 
 def in_turns(frames: list[np.ndarray], many: np.ndarray, few: np.ndarray) -> dict[str, float]:
-    """The step's speed and its ratios to the peers': medians of seven rounds in which each is timed beside the others."""
+    """The step's speed and its ratios to the peers': medians of seven rounds in which each is timed in turn."""
     rounds = []
     for _ in range(7):
         before = three_views(frames, many)

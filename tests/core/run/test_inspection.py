@@ -1,4 +1,4 @@
-"""What is read back of a run to be looked at: the points where they were matched, their patches, tails, outlines."""
+"""Results read back for inspection: the matched points, their patches, tails, outlines."""
 
 import shutil
 from pathlib import Path

@@ -36,7 +36,7 @@ def circle(centre: tuple[float, float], radius: float, count: int = 90) -> np.nd
 @pytest.mark.parametrize(("noise", "contrast", "texture"), [(1, 90, 10), (2, 40, 5), (4, 90, 10), (4, 40, 5), (8, 90, 10)])
 @pytest.mark.parametrize("radius", [20.0, 50.0])
 def test_a_rough_start_finds_the_outline(noise: float, contrast: float, texture: float, radius: float) -> None:
-    """A start 4 px too large and 2 px off: found without bias, with honest sigmas. Over 40 discs z is 0.91 to 1.18."""
+    """A start 4 px too large and 2 px off: the outline is found without bias, with calibrated sigmas. Over 40 discs z is 0.91 to 1.18."""
     z, away = [], []
     for seed in range(20):
         image = textured_disc((119.3, 100.6), radius, noise, contrast, texture, seed)
@@ -72,7 +72,7 @@ def textured_disc(centre: tuple[float, float], radius: float, noise: float, cont
 
 @pytest.mark.parametrize("image", ["black", "noise"])
 def test_without_an_edge_the_contour_stays(image: str) -> None:
-    """Ten frames of nothing: said so in every one, and the contour neither shrinks nor wanders."""
+    """Ten frames without an edge: none is reported, and the contour neither shrinks nor wanders."""
     random, start = np.random.default_rng(0), circle((120, 100), 50)
     xy = start
     for _ in range(10):
@@ -85,7 +85,7 @@ def test_without_an_edge_the_contour_stays(image: str) -> None:
 
 
 def test_points_inside_carry_the_contour() -> None:
-    """The left half moves by 12 px, the right stands; points outside the contour are not asked."""
+    """The left half moves by 12 px, the right is still; points outside the contour have no influence."""
     random = np.random.default_rng(0)
     before = random.uniform((75, 55), (165, 145), (400, 2))
     shift = np.where(before[:, :1] < 120, (12.0, -3.0), (0.0, 0.0))
@@ -97,8 +97,8 @@ def test_points_inside_carry_the_contour() -> None:
     assert np.array_equal(predict_contour(x_ := circle((9, 9), 5), np.zeros((0, 2)), np.zeros((0, 2))), x_)
 
 
-def test_a_disc_is_followed_through_frames() -> None:
-    """It jumps by 9 px a frame, far beyond what a snake alone can follow: the points inside carry it."""
+def test_a_disc_is_tracked_through_frames() -> None:
+    """It jumps by 9 px a frame, far beyond the range of a snake alone: the points inside predict it."""
     contour, centre = circle((60, 100), 40), np.array([60.0, 100.0])
     inner = circle((60, 100), 20)
     for i in range(8):
@@ -122,7 +122,7 @@ def test_masks_become_contours() -> None:
     assert mask_of_points(points, (240, 200), 5).sum() == pytest.approx(79**2, rel=0.06)
 
 
-def test_normals_point_outwards_either_way() -> None:
+def test_normals_point_outwards_in_both_orientations() -> None:
     ring: Any = circle((0, 0), 10)
     for way in (ring, ring[::-1]):
         assert (np.einsum("ni,ni->n", outward_normals(way), way) > 9.9).all()

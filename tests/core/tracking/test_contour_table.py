@@ -1,4 +1,4 @@
-"""contours/VIEW.csv is read frame by frame, and only what is asked for."""
+"""contours/VIEW.csv is read frame by frame, on access."""
 
 import tracemalloc
 from pathlib import Path
@@ -33,7 +33,7 @@ APART = "1,0,1,2,0,1,0.2,1\n2,0,1,2,0,1,0.2,1\n1,1,1,2,0,1,0.2,1"
 
 
 @pytest.mark.parametrize("row", [HUGE, "1,0,nan,2,0,1,0.2,1", "1,0,1e300,2,0,1,0.2,1", "1,0,\0,2,0,1,0.2,1", "1,2", APART])
-def test_damage_is_told(tmp_path: Path, row: str) -> None:
+def test_damage_is_reported(tmp_path: Path, row: str) -> None:
     (tmp_path / "C.csv").write_text(f"{HEAD}{row}\n")
     with pytest.raises(InputError, match="damaged"):
         list(ContourTable(tmp_path / "C.csv").values())
@@ -42,7 +42,7 @@ def test_damage_is_told(tmp_path: Path, row: str) -> None:
         ContourTable(tmp_path / "C.csv")
 
 
-def test_no_frame_is_kept(tmp_path: Path) -> None:
+def test_no_frame_stays_in_memory(tmp_path: Path) -> None:
     path, many = tmp_path / "C.csv", 100
     rows = "".join(contour_rows(0, contour(0, many)).splitlines(keepends=True))
     path.write_text(HEAD + "".join(rows.replace("\n0,", f"\n{f},").replace("0,0,", f"{f},0,", 1) for f in range(300)))

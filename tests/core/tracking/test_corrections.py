@@ -43,7 +43,7 @@ def region(frames: range, x0: float, x1: float) -> Correction:
     return Correction(kind="region", view="C", frames=frames, xy_px=np.array([[x0, 140], [x1, 140], [x1, 160], [x0, 160]], dtype=float))
 
 
-def test_a_clicked_trajectory_goes_whole() -> None:
+def test_a_clicked_trajectory_is_removed_entirely() -> None:
     clicks = [click(147, 152, 3), click(10, 10, 3)]  # column 2 is at 146
     filtered, hit = corrected_tracks(row(), clicks, RIG, SETTINGS, Monitor())
     assert filtered.source.tolist() == [0, 1, 3, 4, 5, 6, 7, 8] and filtered.kept.visible.all()
@@ -54,7 +54,7 @@ def test_a_clicked_trajectory_goes_whole() -> None:
     assert not corrected_tracks(row(), clicks, RIG, SETTINGS, Monitor(), range(4, FRAMES))[1]  # rows that do not hold the clicks' frame
 
 
-def test_a_region_leaves_gaps_and_takes_the_points_of_the_clouds() -> None:
+def test_a_region_leaves_gaps_and_removes_the_points_of_the_clouds() -> None:
     take_out = [region(range(4, 7), 135, 165)]
     raw = row()
     filtered, hit = corrected_tracks(raw, take_out, RIG, SETTINGS, Monitor())

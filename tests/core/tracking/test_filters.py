@@ -84,7 +84,7 @@ def test_planted_false_trajectories_are_caught(kind: str) -> None:
 
 
 def test_sigmas_that_do_not_show_in_motion_hide_nothing() -> None:
-    """What is alike in all frames makes a sigma large, and no motion; how much shows, the other points tell."""
+    """An error common to all frames enlarges a sigma but not the motion; the part that does is estimated from all points."""
     random = np.random.default_rng(3)
     x, which, _ = planted("slide", legs(random), random)
     raw = recording(x, random)
@@ -95,7 +95,7 @@ def test_sigmas_that_do_not_show_in_motion_hide_nothing() -> None:
 
 
 def test_the_published_voxels_keep_true_ones_and_miss_slow_ones() -> None:
-    """Why they are not the default: within a voxel the velocities of a rotating limb differ by more than that of what slides on it."""
+    """Why voxels are not the default: on a rotating limb, velocities within a voxel differ by more than that of a sliding point."""
     random = np.random.default_rng(0)
     x, which, false = planted("slide", legs(random), random)
     raw = recording(x, random)
@@ -109,7 +109,7 @@ def test_the_published_voxels_keep_true_ones_and_miss_slow_ones() -> None:
     assert (against_voxels(raw.xyz_m, raw.velocity_m_s, SETTINGS) == TrackStatus.NOT_UNIFORM).any(axis=0).sum() >= 23
 
 
-def test_what_is_left_of_a_jump_are_two_pieces() -> None:
+def test_a_jump_leaves_two_pieces() -> None:
     random = np.random.default_rng(0)
     true = limb(random, 100, np.array([0, 0, 1.4]), np.array([1.0, 0, 0]), 0.0, np.array([0.5, 0.0, 0.2]))
     true[12:, 7] += (0.0, 0.03, 0.0)
@@ -122,7 +122,7 @@ def test_what_is_left_of_a_jump_are_two_pieces() -> None:
     assert long_only.visible.shape[1] == 100
 
 
-def test_few_points_are_not_held_against_each_other() -> None:
+def test_few_points_are_not_compared_with_each_other() -> None:
     """Key points far apart have no neighbours: nothing is removed, whatever they do."""
     random = np.random.default_rng(0)
     t = np.arange(FRAMES)[:, None, None] * DT
@@ -130,8 +130,8 @@ def test_few_points_are_not_held_against_each_other() -> None:
     assert filter_trajectories(recording(x, random), SETTINGS).kept.visible.all()
 
 
-def test_thresholds_stand_above_the_noise() -> None:
-    """Still points whose noise alone would break the limit of acceleration stay; real speed goes."""
+def test_the_noise_is_added_to_the_thresholds() -> None:
+    """Still points whose noise alone exceeds the limit of acceleration stay; fast ones are removed."""
     random = np.random.default_rng(0)
     settings = replace(SETTINGS, max_acceleration=1.0, max_speed=0.5, uniformity="off")
     still = recording(np.zeros((FRAMES, 50, 3)), random)

@@ -29,7 +29,7 @@ def follow(
     shown: Callable[[int, str, np.ndarray], np.ndarray] = lambda frame, view, image: image,
     **settings: Any,
 ) -> tuple[KeyPoints, np.ndarray]:
-    """Five points of a turning plane; `shown` makes of the pictures what the cameras gave."""
+    """Five points of a turning plane; `shown` changes the pictures of the cameras."""
     rig = scenes.three_cameras()
     plane = scenes.Body(half_m=(0.24, 0.18), R=rotation_from_vector(np.array([0.1, tilt, 0.0])))
     bodies = [plane.moved(rotation_from_vector(np.array([0.0, 0.01, 0.03]) * i), [0.008 * i, -0.003 * i, 0.002 * i]) for i in range(FRAMES)]
@@ -69,7 +69,7 @@ def test_a_steep_surface(scenes: Any) -> None:
 
 @pytest.mark.parametrize("missing", [(3,), (3, 4, 5)])
 def test_black_frames_are_bridged(scenes: Any, missing: tuple[int, ...]) -> None:
-    """The reference view is black: the points say so and go on after it; where nothing may be bridged or waited for, they end."""
+    """The reference view is black: the points report it and resume after it; without bridging and waiting they end."""
 
     def black(frame: int, view: str, image: np.ndarray) -> np.ndarray:
         return image * np.float32(frame not in missing or view != "C")
@@ -83,8 +83,8 @@ def test_black_frames_are_bridged(scenes: Any, missing: tuple[int, ...]) -> None
     assert (ended.status[missing[-1] + 1 :] != TrackStatus.MEASURED).all()
 
 
-def test_a_hidden_point_waits(scenes: Any) -> None:
-    """Something passes before the point in the middle for two frames: it goes on under its name in its place, or ends without waiting."""
+def test_an_occluded_point_resumes(scenes: Any) -> None:
+    """The point in the middle is occluded for two frames: it resumes under its name in its place, or ends without waiting."""
 
     def hidden(frame: int, view: str, image: np.ndarray) -> np.ndarray:
         if frame in (3, 4) and view == "C":
@@ -101,7 +101,7 @@ def test_a_hidden_point_waits(scenes: Any) -> None:
 
 
 def test_retroreflective_markers(scenes: Any) -> None:
-    """Two bright blobs before the dark, clicked roughly: their middles are followed to 0.1 mm across and 0.5 mm along the line of sight."""
+    """Two bright blobs on a dark ground, clicked roughly: their centres are tracked to 0.1 mm across and 0.5 mm along the line of sight."""
     rig = scenes.three_cameras()
     truth = np.array([[[-0.1 + 0.012 * i, 0.02 * np.sin(i / 2), 2.1 + 0.004 * i], [0.05, -0.08 + 0.01 * i, 2.2]] for i in range(10)])
 

@@ -34,7 +34,7 @@ def test_sigmas_are_the_observed_scatter(frames: int) -> None:
         assert there.sum() >= 11 and np.allclose(np.sqrt((z[there] ** 2).mean(axis=1)), 1.0, atol=0.05)
 
 
-def test_smoothing_pays() -> None:
+def test_smoothing_reduces_noise() -> None:
     """Seven frames instead of three: a fifth of the acceleration's noise."""
     sigma = np.full((15, 1), 1e-3)
     x = np.zeros((15, 1, 3))

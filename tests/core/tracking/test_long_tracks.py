@@ -1,4 +1,4 @@
-"""Long recordings: filtered stretch after stretch, with the same result as in one table; columns are shared where it is too small."""
+"""Long recordings: filtering in stretches gives the same result as in one table; columns are shared where the table is too small."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ FIELDS = ("xyz_m", "sigma_m", "velocity_m_s", "acceleration_m_s2")
 
 
 def life(identity: int) -> range:
-    """The frames in which a point is seen: few live long."""
+    """The frames in which a point is visible: most are short."""
     first = identity // NEW
     return range(first, min(FRAMES, first + (90 if identity % 20 == 0 else 2 + identity % 11)))
 
@@ -42,7 +42,7 @@ def decide(raw: Trajectories, rows: range) -> tuple[Filtered, np.ndarray]:
     return filter_trajectories(raw, SETTINGS), np.zeros(0, dtype=np.int64)
 
 
-def test_stretches_overlap_and_decide_on_each_frame_once(steps: list[TrackedFrame]) -> None:
+def test_stretches_overlap_and_own_each_frame_once(steps: list[TrackedFrame]) -> None:
     stretches = list(in_stretches(iter(steps), MARGIN_FRAMES, 1500))
     own = [stretch.frames[t].frame for stretch in stretches for t in stretch.own]
     assert own == list(range(FRAMES)) and len(stretches) > 2 and not any(s.whole for s in stretches)
@@ -84,7 +84,7 @@ def test_columns_are_shared_where_the_table_has_no_room(steps: list[TrackedFrame
     assert kept.visible.sum() > 2 * sum(len(life(i)) for i in longest)  # which alone would not fill twelve columns of their own
 
 
-def test_what_the_user_takes_out_goes_from_all_stretches(steps: list[TrackedFrame]) -> None:
+def test_what_the_user_removes_is_removed_from_all_stretches(steps: list[TrackedFrame]) -> None:
     def without_one(raw: Trajectories, rows: range) -> tuple[Filtered, np.ndarray]:
         filtered = filter_trajectories(raw, SETTINGS)
         at = np.flatnonzero(np.abs(np.nanmedian(raw.xyz_m[..., 0], axis=0) - 0.4) < 1e-3)

@@ -54,18 +54,18 @@ def follow(frames: list[np.ndarray], **settings: Any) -> PlanarTracks:
 
 @pytest.mark.slow
 def test_drift_over_a_hundred_frames() -> None:
-    """Less than 0.3 px with the key templates, honest sigmas; without them several times as much."""
+    """Less than 0.3 px with the key templates, with calibrated sigmas; without them several times as much."""
     frames = film(100)
     truth = np.stack([POINTS @ place(i)[0].T + place(i)[1] for i in range(100)])
-    held, free = (follow(frames, drift_correlation=c) for c in (0.8, 1.0))
-    off = [np.linalg.norm(t.xy_px - truth, axis=2) for t in (held, free)]
-    assert (held.status == TrackStatus.MEASURED).all()
+    controlled, free = (follow(frames, drift_correlation=c) for c in (0.8, 1.0))
+    off = [np.linalg.norm(t.xy_px - truth, axis=2) for t in (controlled, free)]
+    assert (controlled.status == TrackStatus.MEASURED).all()
     assert np.percentile(off[0][-1], 95) < 0.3 and np.median(off[0][-1]) < 0.1 < np.median(off[1][-1])
-    z = off[0][5:] / held.sigma_px[5:]
+    z = off[0][5:] / controlled.sigma_px[5:]
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
 
 
-def test_a_hidden_point_is_taken_up_again() -> None:
+def test_an_occluded_point_is_reacquired() -> None:
     """A patch covers four points for three frames: they end with a reason, and return where they are."""
     frames = film(9)
     for i in (3, 4, 5):
@@ -133,7 +133,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["track2d", str(tmp_path / "none.mp4"), "--points", str(table), "--out", str(out), "--quiet"]) == 2
 
 
-def test_tables_that_are_none(tmp_path: Path) -> None:
+def test_files_that_are_no_tables(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     for data in (b"\xff\xfe\x00", b"x,y\n1,2\n", b"a,b\n1,2\n3,4\n5,6\n"):
         path.write_bytes(data)

@@ -1,4 +1,4 @@
-"""The step as published: it follows a plane, finds what accelerates by its second box and no more, and does not know drift."""
+"""The published step: it tracks a plane, finds accelerating points within its second box only, and does not control drift."""
 
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,8 @@ from tricap.core.tracking.tracked import TrackedFrame, born
 PUBLISHED = {"scheme": "published", "spacing_px": 12, "regenerate_every": 0}
 
 
-def test_a_turning_plane_is_followed(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
-    """Four frames: four points in five are there at the end, none is false, the median strays by hundredths of a pixel a frame."""
+def test_a_turning_plane_is_tracked(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
+    """Four frames: four points in five last to the end, none is false, the median drifts by hundredths of a pixel per frame."""
     plane = scenes.Body(half_m=(0.26, 0.2), R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
     bodies = [plane.moved(rotation_from_vector(np.array([0.0, 0.0, 0.026 * i])), [0.007 * i, -0.003 * i, 0.0]) for i in range(4)]
     steps = scenes.track(plane_take, tmp_path / "out", scenes.measure(plane_take, tmp_path / "out"), {"tracking": PUBLISHED})
@@ -52,7 +52,7 @@ def frame(number: int, xyz: list[list[float]], cameras: Any) -> TrackedFrame:
 
 
 def test_prediction_and_box(scenes: Any) -> None:
-    """Each image goes on by itself, over missing frames too; a new point goes as its neighbours; boxes grow with dt² and nearness."""
+    """Each view predicts on its own, also over missing frames; a new point moves with its neighbours; boxes grow with dt² and nearness."""
     cameras = scenes.three_cameras().cameras
     view = TrackingView(
         cameras=cameras, reference=1, field_layout=FieldLayout(), matching=MatchingSettings(), tracking=TrackingSettings(), limit_px=0.7,

@@ -46,7 +46,7 @@ def detected(images: list[np.ndarray]) -> dict[int, dict[int, np.ndarray]]:
 
 
 def side_errors_m(points: KeyPoints, numbers: list[int]) -> np.ndarray:
-    """By how much neighbouring corners' distances differ from the squares' side, wherever both were seen."""
+    """Differences of neighbouring corners' distances from the squares' side, where both are visible."""
     across = SQUARES[0] - 1
     pairs = [(i, j) for i, a in enumerate(numbers) for j, b in enumerate(numbers) if b == a + across or (b == a + 1 and b % across)]
     seen = points.status == TrackStatus.MEASURED
@@ -97,8 +97,8 @@ def windows(folder: Path, about_m: np.ndarray) -> tuple[list[Camera], list[list[
 
 
 @pytest.mark.slow
-def test_a_cylinder_under_load_is_followed_through_its_steps(shared_takes: Path) -> None:
-    """It shrinks by 0.4 to 0.5 mm a step, and its points stay on it; followed back they return to where they were."""
+def test_a_cylinder_under_load_is_tracked_through_its_steps(shared_takes: Path) -> None:
+    """It shrinks by 0.4 to 0.5 mm a step, and its points stay on it; tracked back they return to their start."""
     angle, z = np.meshgrid(np.radians(np.linspace(45, 105, 15)), np.linspace(0.06, 0.15, 13))
     about = np.stack([RADIUS_M * np.cos(angle), RADIUS_M * np.sin(angle), z], axis=-1).reshape(-1, 3)
     cameras, images = windows(shared_takes / "cylinder_2cam_multidic", about)
@@ -119,7 +119,7 @@ def test_a_cylinder_under_load_is_followed_through_its_steps(shared_takes: Path)
 
 @pytest.mark.slow
 def test_points_of_a_desk_stay_while_a_hand_passes(shared_takes: Path, tmp_path: Path) -> None:
-    """The 2-D mode on one camera: what is seen of the desk rests, and what the hand covers is told to be lost, not taken along."""
+    """The 2-D mode on one camera: visible points of the desk rest, and points under the hand are lost, not moved along."""
     movie, first, last = shared_takes / "arm_hand_2cam_handpose3d" / "cam0_test.mp4", 110, 126
     video = cv2.VideoCapture(str(movie))
     image = [cv2.cvtColor(video.read()[1], cv2.COLOR_BGR2GRAY) for _ in range(first + 1)][-1]

@@ -25,7 +25,7 @@ def same(a: TrackedFrame, b: TrackedFrame) -> None:
 
 @pytest.fixture(scope="module")
 def surfaces(plane_take: Path, tmp_path_factory: pytest.TempPathFactory, scenes: Any) -> Path:
-    """The results of measuring alone; do not change them, copy them."""
+    """The results of measuring alone; copy them before changing them."""
     out: Path = tmp_path_factory.mktemp("surfaces") / "out"
     scenes.measure(plane_take, out)
     return out
@@ -33,7 +33,7 @@ def surfaces(plane_take: Path, tmp_path_factory: pytest.TempPathFactory, scenes:
 
 @pytest.fixture(scope="module")
 def whole(plane_take: Path, surfaces: Path, tmp_path_factory: pytest.TempPathFactory, scenes: Any) -> Path:
-    """The results of measuring and tracking in one go; do not change them, copy them."""
+    """The results of measuring and tracking in one run; copy them before changing them."""
     out = Path(shutil.copytree(surfaces, tmp_path_factory.mktemp("whole") / "out"))
     scenes.track(plane_take, out, scenes.measure(plane_take, out))
     return out
@@ -77,10 +77,8 @@ def test_what_changes_is_tracked_again(plane_take: Path, whole: Path, tmp_path: 
         same(a, b)
 
 
-def test_filters_ask_for_no_new_tracking(
-    plane_take: Path, whole: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Other knobs of the filters: every checkpoint is used again, and the result is that of a fresh run. A knob of the step tracks anew."""
+def test_filters_need_no_new_tracking(plane_take: Path, whole: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other settings of the filters: every checkpoint is used, the result is that of a fresh run. A setting of the step tracks again."""
     other = {"tracking": {"max_speed": 8.0, "max_acceleration": 90.0, "uniformity": "voxels", "max_sigma_ratio": 2.0, "min_length": 3,
                           "smooth_frames": 5}}  # fmt: skip
     assert set(other["tracking"]) == set(FILTER_KNOBS)
@@ -109,8 +107,8 @@ def test_frames_without_a_surface(tmp_path: Path, scenes: Any) -> None:
     assert steps[8].identity.min() > steps[0].identity.max()
 
 
-def test_the_tracks_follow_enhanced_images(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
-    """What was measured in enhanced images is tracked in them; the keys tell the two apart."""
+def test_enhanced_images_are_tracked(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
+    """A surface measured in enhanced images is tracked in them; the keys of the two differ."""
     take = Path(shutil.copytree(plane_take, tmp_path / "take"))
     text = (take / "take.toml").read_text()
     (take / "take.toml").write_text(text.replace("[[views]]", "frames = [0, 2]\n[[views]]", 1))

@@ -1,4 +1,4 @@
-"""Tracking against exact motion: drift, sigma, false ones, fields, new points; trajectories, their kinematics and their filter."""
+"""Tracking against exact motion: drift, sigma, false points, fields, new points; trajectories, their kinematics and their filters."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ def moving_plane(scenes: Any, frames: int, half_m: tuple[float, float] = (0.24, 
 
 
 def errors(bodies: list[Any], tracks: Trajectories, margin_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Position (T, N, 3) less where the material point of each trajectory's first position has gone, and which started on the plane."""
+    """Position (T, N, 3) minus the material point of each trajectory's first position, and which started on the plane."""
     T, N = tracks.visible.shape
     first = tracks.visible.argmax(axis=0)
     own = np.stack([(tracks.xyz_m[first[n], n] - bodies[first[n]].t) @ bodies[first[n]].R for n in range(N)])
@@ -34,7 +34,7 @@ def errors(bodies: list[Any], tracks: Trajectories, margin_m: float) -> tuple[np
 
 @pytest.mark.parametrize(("interlaced", "noise"), [("none", 1.0), ("odd", 1.0)])
 def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced: str, noise: float) -> None:
-    """Ten frames: nothing is lost in the middle, nothing is false, and what drifts does so by less than 0.3 px across the line of sight."""
+    """Ten frames: no point is lost in the middle, none is false, and the drift is less than 0.3 px across the line of sight."""
     bodies, rig = moving_plane(scenes, FRAMES), scenes.three_cameras()
     take = scenes.write_take(tmp_path / "take", rig, [[b] for b in bodies], noise=noise, interlaced=interlaced)
     measured = scenes.measure(take, tmp_path / "out")
@@ -54,7 +54,7 @@ def test_a_turning_and_travelling_plane(tmp_path: Path, scenes: Any, interlaced:
     assert seen.sum(axis=0).max() == FRAMES
 
 
-def test_both_fields_follow_the_plane_at_twice_the_rate(tmp_path: Path, scenes: Any) -> None:
+def test_both_fields_track_the_plane_at_twice_the_rate(tmp_path: Path, scenes: Any) -> None:
     """Points of one field are found in the other, half a line away: no jitter from field to field."""
     bodies = moving_plane(scenes, 4)
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0, interlaced="both")
@@ -106,8 +106,8 @@ def test_new_points_start_where_the_surface_has_none(tmp_path: Path, scenes: Any
         assert set(before.identity) - set(after.identity) == set(after.ended)
 
 
-def test_a_point_that_is_covered_ends_and_says_why(tmp_path: Path, scenes: Any) -> None:
-    """A second body hides half of the plane from one frame to the next: its points end, and none jumps onto the other texture."""
+def test_an_occluded_point_ends_with_a_reason(tmp_path: Path, scenes: Any) -> None:
+    """A second body occludes half of the plane from one frame to the next: its points end, and none jumps onto the other texture."""
     plane = scenes.Body(half_m=(0.24, 0.18))
     hider = scenes.Body(half_m=(0.12, 0.3), t=np.array([0.15, 0.0, 1.8]), seed=5)
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[plane], [plane], [plane, hider]], noise=1.0)
@@ -121,8 +121,8 @@ def test_a_point_that_is_covered_ends_and_says_why(tmp_path: Path, scenes: Any) 
     assert moved.max() < 0.3 * scenes.pixel_m
 
 
-def test_lost_points_wait_and_go_on_under_their_identity(tmp_path: Path, scenes: Any) -> None:
-    """A bar passes before a travelling plane in one frame: what it hid is taken up again in its place, and without waiting it is not."""
+def test_lost_points_resume_under_their_identity(tmp_path: Path, scenes: Any) -> None:
+    """A bar occludes part of a travelling plane in one frame: its points resume in their places, but not without waiting."""
     bodies = [scenes.Body(half_m=(0.24, 0.18)).moved(np.eye(3), [0.004 * i, 0.002 * i, 0.0]) for i in range(4)]
     bar = scenes.Body(half_m=(0.01, 0.3), t=np.array([0.0, 0.0, 1.95]), seed=5)
     shown = [[b, bar] if i == 2 else [b] for i, b in enumerate(bodies)]
@@ -141,7 +141,7 @@ def test_lost_points_wait_and_go_on_under_their_identity(tmp_path: Path, scenes:
 
 
 class Traveller:
-    """A guide that knows a plane's exact way: one bone, all points on it."""
+    """A guide with the exact motion of a plane: one bone with all points on it."""
 
     longest_frames = 50
 
@@ -160,8 +160,8 @@ class Traveller:
         return np.full(len(xyz_m), self.in_sight)
 
 
-def test_a_guide_carries_lost_points_longer_than_neighbours_may(tmp_path: Path, scenes: Any) -> None:
-    """Hidden for two frames where one may be waited: only a guide brings the points back, to their places, and not where it hides them."""
+def test_a_guide_carries_lost_points_longer_than_neighbours(tmp_path: Path, scenes: Any) -> None:
+    """Occluded for two frames with a wait of one: only a guide brings the points back, to their places, and not where it occludes them."""
     bodies = [scenes.Body(half_m=(0.24, 0.18)).moved(np.eye(3), [0.004 * i, 0.002 * i, 0.0]) for i in range(5)]
     bar = scenes.Body(half_m=(0.01, 0.3), t=np.array([0.0, 0.0, 1.95]), seed=5)
     shown = [[b, bar] if i in (2, 3) else [b] for i, b in enumerate(bodies)]
@@ -181,7 +181,7 @@ def test_a_guide_carries_lost_points_longer_than_neighbours_may(tmp_path: Path, 
 
 
 def step(frame: int, identity: list[int], xyz: object, ended: list[int] | None = None) -> Any:
-    """What `assemble` reads of a tracked frame."""
+    """The part of a tracked frame that `assemble` reads."""
     n, gone = len(identity), ended or []
     return SimpleNamespace(frame=frame, identity=np.array(identity, dtype=np.int64), xyz_m=np.array(xyz, dtype=float).reshape(n, 3),
                            covariance_m2=np.tile(np.eye(3) * 1e-6, (n, 1, 1)), ended=np.array(gone, dtype=np.int64),
@@ -211,7 +211,7 @@ def test_kinematics_are_exact_for_a_parabola() -> None:
 
 
 def test_a_black_frame_is_bridged(tmp_path: Path, scenes: Any) -> None:
-    """One view is black in frame 2: the points go on in frame 3 under the same identity, in the right places."""
+    """One view is black in frame 2: the points resume in frame 3 under the same identity, in the right places."""
     bodies = moving_plane(scenes, 5)
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), [[b] for b in bodies], noise=1.0)
     black = cv2.imencode(".png", np.zeros((150, 200), np.uint8))[1].tobytes()

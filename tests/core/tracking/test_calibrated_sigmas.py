@@ -1,4 +1,4 @@
-"""Sigmas of what is tracked in three views against exact motion, and what a hundred frames do to a point."""
+"""Sigmas of points tracked in three views against exact motion, and the drift over a hundred frames."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ def waving(scenes: Any, i: int) -> Any:
 @pytest.mark.parametrize("frames", [12, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("noise", [1.5, 4.0])
 def test_chosen_points(scenes: Any, frames: int, noise: float) -> None:
-    """Twenty-four points are seen in every frame, drift by less than 0.3 px across the line of sight, and have honest sigmas in space."""
+    """Twenty-four points stay visible, drift by less than 0.3 px across the line of sight, and have calibrated sigmas in space."""
     rig = scenes.three_cameras(width=128, height=96, focal=FOCAL_PX)
     bodies = [waving(scenes, i) for i in range(frames)]
     x, y = np.meshgrid(np.linspace(-0.15, 0.15, 6), np.linspace(-0.1, 0.1, 4))
