@@ -74,3 +74,12 @@ def test_every_stage_has_its_knobs_on_the_scene(blender: ModuleType) -> None:
     for name, settings in properties.stages().items():
         assert properties.snapshot(getattr(blender.context.scene.tricap, name), settings) == settings()
     assert properties.overrides(blender.context.scene) == {}
+
+
+def test_a_knob_under_its_earlier_name_is_shown(blender: ModuleType) -> None:
+    """A take.toml of an earlier version sets tracking.markers; the panel has it as key_points.markers, and unsets it with the next take."""
+    scene, properties = blender.context.scene, importlib.import_module("bl_ext.user_default.tricap.addon.properties")
+    properties.show_settings(scene, {"tracking": {"markers": True, "box_px": 9}})
+    assert properties.overrides(scene) == {"tracking": {"box_px": 9}, "key_points": {"markers": True}}
+    properties.show_settings(scene, {})
+    assert properties.overrides(scene) == {}
