@@ -1,11 +1,11 @@
-"""What one click says about the other views: the epipolar curve, and the place that looks alike on it.
+"""Proposals for the other views from one click: the epipolar curve, and the matching point on it.
 
 A pixel's ray X(w) = C + d / w (w: inverse depth) is a straight line in another camera's undistorted image,
 
     (a, b)(w) = (p_x w + q_x, p_y w + q_y) / (p_z w + q_z) ,   p = R' C + t' ,  q = R' d                                (1)
 
-which the lens bends into a curve (camera.py, (3)–(5)). Along it the click's patch is looked for by the plane sweep of the seeds (Collins
-1996), and the winner is refined by least squares matching (Gruen 1985). Where texture is too poor or repeats, nothing is proposed.
+which the lens bends into a curve (camera.py, (3)–(5)). Along it the click's patch is searched by the plane sweep of the seeds (Collins
+1996), and the best match is refined by least squares matching (Gruen 1985). Where texture is too poor or repeats, nothing is proposed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,14 +19,15 @@ from .least_squares import MatchingSettings, SearchImage, TemplatePoints, match_
 from .seeds import approximations_at_depth, sweep_ray
 from .views import Views
 
-CURVE_STEP_PX = 6.0
-NEAREST_M = 0.05  # of the ray, when nothing is known
+CURVE_STEP_PX = 6.0  # px between corners of the polyline
+NEAREST_M = 0.05  # m, nearest depth of a ray without a depth range
 FIELD_MARGIN = 1.05  # of the frame corner's radius: the lens is not calibrated further out
 LARGEST_PATCH_PX = 51  # side of a patch, the limit of its knob
 PIXEL_SIGMA_PX = 0.1  # of the clicked pixel itself in an intersection with matches of it: it defines the point
-LARGER_PX = (0, 8, 16)  # patches tried one after the other
-DEPTH_SHARE = 0.4  # of a joint's depth below the skin is unknown: bodies differ
-MAX_MISS_PX = 2.5  # distance of a match from its epipolar curve
+LARGER_PX = (0, 8, 16)  # px by which patches are larger, tried one after the other
+DEPTH_SHARE = 0.4  # of a joint's depth below the skin, its sigma: bodies differ
+UNMATCHED_SIGMA_PX = 0.5  # px, sigma of a point below the surface in views without a match
+MAX_MISS_PX = 2.5  # px, largest distance of a match from its epipolar curve
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -35,7 +36,7 @@ class Proposal:
 
     xy_px: np.ndarray  # (2,)
     sigma_px: float  # along the worse axis
-    correlation: float  # of the patches; the smallest of those that tell the place
+    correlation: float  # of the patches; the smallest of those that define the place
 
 
 def epipolar_curve(camera: Camera, xy_px: np.ndarray, other: Camera, depth_range_m: tuple[float, float] | None = None) -> np.ndarray:
@@ -118,7 +119,7 @@ def propose(
 
 
 def where_rays_meet(cameras: Sequence[Camera], clicks: Mapping[int, np.ndarray], sigma_px: float) -> tuple[Proposal | None, ...]:
-    """Where the point clicked in two views or more (view number → pixel (2,)) lies in the others; None in views that cannot see it.
+    """Where the point clicked in two views or more (view number → pixel (2,)) lies in the others; None where it lies outside the image.
 
     The clicks' sigma enters the proposals' sigmas.
     """
@@ -130,10 +131,10 @@ def where_rays_meet(cameras: Sequence[Camera], clicks: Mapping[int, np.ndarray],
 def below_surface(
     cameras: Sequence[Camera], view: int, xy_px: np.ndarray, surface: Sequence[Proposal | None], depth_m: float
 ) -> tuple[Proposal | None, ...]:
-    """Where a point lies that was clicked at `xy_px` (2,) in view number `view`, `depth_m` behind the surface that was found there.
+    """Where a point lies that was clicked at `xy_px` (2,) in view number `view`, `depth_m` behind the surface that was matched there.
 
-    A joint is clicked on what is seen, but lies inside the limb: seen from aside, not where the surface's texture is. The proposals' sigmas
-    hold DEPTH_SHARE of that depth, for nobody knows it better.
+    A joint is clicked on the visible surface, but lies inside the limb; from another side it is not where the surface's texture is. The
+    proposals' sigmas contain DEPTH_SHARE of that depth, which is not known better.
     """
     known = {k: place for k, place in enumerate(surface) if place is not None}
     if not known:
@@ -145,9 +146,9 @@ def below_surface(
     sure, found = min(p.correlation for p in known.values()), []
     for k, camera in enumerate(cameras):
         at, J = camera.project_with_jacobian(X)
-        sigma = np.hypot(np.linalg.norm(J @ ray) * DEPTH_SHARE * depth_m, known[k].sigma_px if k in known else 0.5)
-        seen = k != view and bool(camera.sees(at))
-        found.append(Proposal(xy_px=at, sigma_px=float(sigma), correlation=sure) if seen else None)
+        sigma = np.hypot(np.linalg.norm(J @ ray) * DEPTH_SHARE * depth_m, known[k].sigma_px if k in known else UNMATCHED_SIGMA_PX)
+        visible = k != view and bool(camera.sees(at))
+        found.append(Proposal(xy_px=at, sigma_px=float(sigma), correlation=sure) if visible else None)
     return tuple(found)
 
 

@@ -2,8 +2,8 @@
 
     D(a, b) = D0 + Da a + Db b + ½ Daa a² + Dab a b + ½ Dbb b² ,   a, b in full-frame pixels of the reference image        (1)
 
-It gives the normal, tells points that disagree with their neighbours, and the curvature that an affine patch averages away: a patch is
-matched at the mean of (1) over its texture, so a round body is measured too flat; with the variances s_a², s_b² of the texture's energy
+It gives the normal, the outliers among the neighbours, and the curvature that an affine patch averages away: a patch is matched at the mean
+of (1) over its texture, so that a round body is measured too flat. With the variances s_a², s_b² of the texture's energy
 
     D0 − D̄ = −½ (Daa s_a² + Dbb s_b²)                                                                                       (2)
 """
@@ -19,8 +19,7 @@ from ..matching.region_growing import MatchedField
 from ..matching.views import RADIUS_CELLS
 
 LARGEST = 512  # points whose neighbours stay in the cache
-MIN_NEIGHBOURS = 8
-MIN_SCALE = 0.15  # of the spacing on the surface: finer scatter than this is not told from the surface's own shape
+MIN_SCALE = 0.15  # of the spacing on the surface: smaller scatter is not distinguished from the surface's own shape
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -57,7 +56,7 @@ def curvatures(field: MatchedField, camera: Camera, reference: int, rows: np.nda
 
 
 def _quadrics(field: MatchedField, camera: Camera, reference: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(1) about these rows: coefficients (n, 6), the neighbours' scatter (n,) about it and how many support it (n,)."""
+    """(1) about these rows: coefficients (n, 6), the neighbours' scatter (n,) about it and their number (n,)."""
     depth, at = camera.to_camera(field.xyz_m)[:, 2], field.grid.rows.to_frame(field.xy[:, reference])
     neighbour = field.grid.neighbours(field.cell, field.cell[rows])
     spacing_m = field.grid.spacing_px * depth / camera.focal_px

@@ -1,7 +1,7 @@
-"""Where clicks lie in space, and the surface seeds that they give.
+"""The points in space that clicks define, and the surface seeds from clicks.
 
-A click is good to a few pixels; the depth at which its rays meet may be wrong by more than matching reaches. So the ray of the reference
-view is swept about that depth, as far as the clicks' own sigma says, and the seed starts where the views look most alike.
+A click is precise to a few pixels; the depth at which its rays meet may be wrong by more than the range of convergence of matching. The ray
+of the reference view is therefore swept about that depth, within the clicks' own sigma, and the seed starts where the views correlate best.
 """
 
 from dataclasses import fields
@@ -27,7 +27,7 @@ def clicked_depth(footage: Footage, name: str, at: Clicks) -> float:
 
 
 def clicked_point(footage: Footage, name: str, at: Clicks) -> Intersection:
-    """Where the rays of a click in several views meet (one point), before the reference camera.
+    """The intersection of the rays of a click in several views (one point), in front of the reference camera.
 
     Raises:
         InputError: it was clicked in fewer than two views, or its rays miss each other.
@@ -36,10 +36,10 @@ def clicked_point(footage: Footage, name: str, at: Clicks) -> Intersection:
     xy = np.array([[at.get(c.name, np.full(2, np.nan)) for c in cameras]])
     point = intersect_clicks(cameras, xy, footage.click_sigma_px)
     if not 0 < cameras[footage.take.reference].to_camera(point.xyz_m)[0, 2] < np.inf:
-        raise InputError(f"The click “{name}” is seen by {len(at)} view(s) and has no place in space; click it in two views at least.")
+        raise InputError(f"“{name}” is clicked in {len(at)} view(s) and has no position in space. Click it in two views at least.")
     if clicks_contradict(point, footage.click_sigma_px)[0]:
         raise InputError(
-            f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px; click the same spot in every view, "
+            f"The clicks of “{name}” miss each other by {point.rms_residual_px[0]:.0f} px. Click the same spot in every view, "
             "and check that rig.toml belongs to this footage."
         )
     return point

@@ -312,7 +312,7 @@ def test_a_click_that_contradicts_itself_is_told_at_its_step(blender: ModuleType
     scene = opened(blender, sample, tmp_path)
     marker = scene.tricap.views[0].clip.tracking.tracks["wrist.R"].markers[0]
     marker.co = (0.1, 0.1)
-    assert words().split()[2] == "failed" and "“wrist.R”" in why("clicks") and "click the same spot in every view" in why("clicks")
+    assert words().split()[2] == "failed" and "“wrist.R”" in why("clicks") and "Click the same spot in every view" in why("clicks")
     scene.tricap.fitting.click_sigma_px = 100.0
     assert words().split()[2] == "done"
 

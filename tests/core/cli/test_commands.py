@@ -69,7 +69,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "setting out of range": (lambda t: click(t, "[settings.matching]\npatch_px = 1000\n"), "it must lie between 5 and 51"),
     "unknown group": (lambda t: click(t, "[settings.matchin]\npatch_px = 13\n"), "There is no group of settings “matchin” in "),
     "seed outside": (lambda t: click(t, '[seeds.joints]\n"elbow.R" = { L = [96.0, 3], C = [3, 3] }\n'), "outside the image of 96×72"),
-    "seed in one view": (lambda t: click(t, '[seeds.joints]\n"elbow.R" = { L = [6, 3] }\n'), "click it in two views at least"),
+    "seed in one view": (lambda t: click(t, '[seeds.joints]\n"elbow.R" = { L = [6, 3] }\n'), "Click it in two views at least"),
     "contradicting clicks": (
         lambda t: click(t, '[seeds.joints]\n"elbow.R" = { L = [40, 1], C = [40, 70] }\n'),
         "“elbow.R” miss each other by",

@@ -209,9 +209,9 @@ def test_clicks_that_have_no_place_in_space(plane_take: Path, tmp_path: Path, sc
     line = '[seeds.joints]\n"elbow.R" = {}\n' if where == "joints" else "[seeds]\nsurface = [{}]\n"
     for i, (at, said) in enumerate(
         (
-            ("{ L = [100.0, 75.0] }", "is seen by 1 view.* click it in two views at least"),
-            ("{ L = [100.0, 60.0], C = [100.0, 95.0] }", "miss each other by .* px; click the same spot in every view"),
-            ("{ L = [0.0, 75.0], C = [199.0, 75.0] }", "has no place in space"),  # rays that diverge
+            ("{ L = [100.0, 75.0] }", "is clicked in 1 view.* Click it in two views at least"),
+            ("{ L = [100.0, 60.0], C = [100.0, 95.0] }", "miss each other by .* px. Click the same spot in every view"),
+            ("{ L = [0.0, 75.0], C = [199.0, 75.0] }", "has no position in space"),  # rays that diverge
         )
     ):
         take = changed(plane_take, tmp_path / f"take{i}", line.replace("{}", at))
