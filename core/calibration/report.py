@@ -65,14 +65,14 @@ def refuse_if_useless(calibration: Calibration) -> None:
     Raises:
         InputError: too few positions fit one rig, or a camera has none.
     """
-    seen, used = calibration.observations.visible, calibration.used
+    visible, used = calibration.observations.visible, calibration.used
     for c, name in enumerate(calibration.observations.names):
         if used[:, c].sum() < 2 * MIN_POSITIONS:
             raise InputError(
                 f"The image points of camera {name} do not agree with the other cameras (only {int(used[:, c].sum())} of "
-                f"{int(seen[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same bar."
+                f"{int(visible[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same bar."
             )
-    fits = used.sum() / max(seen.sum(), 1)
+    fits = used.sum() / max(visible.sum(), 1)
     if fits < MIN_FITTING or positions_used(calibration) < MIN_POSITIONS:
         raise InputError(
             f"Only {positions_used(calibration)} bar positions fit one rig ({100 * fits:.0f} % of the image points); check that the "

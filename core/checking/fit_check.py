@@ -21,7 +21,7 @@ def check_fit(given: FitInput, body: BodyFit, click_sigma_px: float) -> list[str
 
 
 def odd_limbs(shape: BodyShape) -> list[str]:
-    """A warning for each limb one part of which is far too long for the other."""
+    """A warning for each limb with one part far too long for the other."""
     usual = np.array([bone.nominal_length_m for bone in shape.skeleton.bones])
     names = [bone.name for bone in shape.skeleton.bones]
     relative = {name: float(ratio) for name, ratio in zip(names, shape.lengths_m / usual)}

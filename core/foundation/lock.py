@@ -1,8 +1,8 @@
-"""One run at a time in a folder of results: a lock that says who holds it, and that a crash cannot leave shut.
+"""One run at a time in a folder of results: a lock that names its owner and that no crash leaves locked.
 
-The file is locked by the operating system, which lets go of it when a process ends, however it ends; so neither a killed run nor a number
-that another process got later can keep anybody out. A file server may not pass such locks from machine to machine: therefore the holder
-also counts in the file, and who finds the count of another machine watches whether it goes on. Nobody's clock is asked.
+The file is locked by the operating system, which releases it when the process ends in any way, so neither a killed run nor a reused process
+number blocks others. A file server may not pass such locks between machines: therefore the owner also increments a count in the file, and a
+run that finds the count of another machine waits to see whether it increases. No clock is compared.
 """
 
 import errno
@@ -21,17 +21,18 @@ from typing import Any
 from .errors import InputError
 
 NAME = ".tricap-lock"
-BEAT_S, WATCH_S = 1.0, 8.0  # how often the holder counts, how long another machine's count may stand still
+BEAT_S = 1.0  # interval of the owner's count
+WATCH_S = 8.0  # after which an unchanged count of another machine is dead
 COUNT_DIGITS = 12
-BYTE = 1 << 30  # the byte that is locked on Windows, beyond the text, which others may read
+BYTE = 1 << 30  # the byte that is locked on Windows, beyond the text, which others must be able to read
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder, which exists; a lock that a killed run left is taken over.
+    """Lock an existing folder; the lock of a killed run is taken over.
 
     Raises:
-        InputError: another run holds it, or the folder cannot be written to.
+        InputError: another run has locked it, or the folder cannot be written to.
     """
     path = Path(folder) / NAME
     try:
@@ -50,12 +51,12 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _open(path: Path) -> int:
-    """The handle of the lock file, locked and with our name in it."""
+    """The handle of the lock file, locked, with this process as its owner."""
     while True:
         handle = _handle(path)
         try:
             system = _lock(handle)
-            if not _same_file(path, handle):  # its holder removed it between our opening and locking it
+            if not _same_file(path, handle):  # its owner removed it between our opening and locking it
                 os.close(handle)
                 continue
             _wait_for_a_standing_count(path, own=not system)
@@ -63,7 +64,7 @@ def _open(path: Path) -> int:
             return handle
         except BlockingIOError as error:
             os.close(handle)
-            raise InputError(_busy(path.parent, _holder(path))) from error
+            raise InputError(_busy(path.parent, _owner(path))) from error
         except BaseException:
             with suppress(OSError):
                 os.close(handle)
@@ -71,17 +72,17 @@ def _open(path: Path) -> int:
 
 
 def _handle(path: Path) -> int:
-    """The lock file opened, never what a link in its place leads to: that would be written over.
+    """The opened lock file; a link is never followed, because its target would be overwritten.
 
     Raises:
-        InputError: a link, or no file at all, is in its place.
+        InputError: it is a link, or no regular file.
         OSError: it cannot be opened.
     """
     flags = os.O_RDWR | os.O_CREAT
     for name in ("O_BINARY", "O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"):  # not every system has each
         flags |= getattr(os, name, 0)
     refused = InputError(f"{path} is a link, or no file; remove it, or choose another folder for the results.")
-    if path.is_symlink():  # Windows knows no O_NOFOLLOW
+    if path.is_symlink():  # Windows has no O_NOFOLLOW
         raise refused
     try:
         handle = os.open(path, flags, 0o644)
@@ -96,10 +97,10 @@ def _handle(path: Path) -> int:
 
 
 def _lock(handle: int) -> bool:
-    """Lock the file here and now; False where the file system knows no locks (there the count decides alone).
+    """Lock the file without waiting; False if the file system has no locks (then only the count decides).
 
     Raises:
-        BlockingIOError: another process, or another part of this one, holds it.
+        BlockingIOError: another process, or another part of this one, has locked it.
     """
     try:
         if sys.platform == "win32":
@@ -126,23 +127,23 @@ def _same_file(path: Path, handle: int) -> bool:
 
 
 def _wait_for_a_standing_count(path: Path, *, own: bool) -> None:
-    """Return when nobody on another machine (with `own`: on any) counts in the file.
+    """Return when the count of another machine (with `own`: of any) does not increase.
 
     Raises:
-        InputError: somebody does.
+        InputError: it does.
     """
-    found = _holder(path)
+    found = _owner(path)
     if "host" not in found or (found["host"] == platform.node() and not own):
-        return  # of this machine the operating system knows better
+        return  # on this machine the operating system's lock decides
     until = time.monotonic() + WATCH_S
     while time.monotonic() < until:
         time.sleep(BEAT_S / 2)
-        if _holder(path) != found:
+        if _owner(path) != found:
             raise InputError(_busy(path.parent, found))
 
 
-def _holder(path: Path) -> dict[str, Any]:
-    """What the file says of its holder; empty where it says nothing that can be understood."""
+def _owner(path: Path) -> dict[str, Any]:
+    """The owner in the file; empty if it cannot be parsed."""
     try:
         found = json.loads(path.read_bytes()[:1000])
     except (OSError, ValueError, RecursionError):
@@ -150,9 +151,9 @@ def _holder(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _busy(folder: Path, holder: dict[str, Any]) -> str:
-    who = f" (process {holder['pid']} on {holder['host']})" if {"pid", "host"} <= set(holder) else ""
-    return f"Another run{who} writes into {folder} just now; wait until it has ended, or choose another folder for the results."
+def _busy(folder: Path, owner: dict[str, Any]) -> str:
+    who = f" (process {owner['pid']} on {owner['host']})" if {"pid", "host"} <= set(owner) else ""
+    return f"Another run{who} is writing into {folder}; wait until it has finished, or choose another folder for the results."
 
 
 def _write(handle: int, count: int) -> None:
@@ -166,12 +167,12 @@ def _count(handle: int, ended: threading.Event) -> None:
     count = 0
     while not ended.wait(BEAT_S):
         count += 1
-        with suppress(OSError):  # a full disk is told by the run itself when it writes a result
+        with suppress(OSError):  # the run itself reports a full disk when it writes a result
             _write(handle, count)
 
 
 def _release(path: Path, handle: int) -> None:
-    """Remove the file while it is still ours; Windows removes no open file, there it goes after it was closed."""
+    """Remove the file while it is still ours; on Windows after it is closed, because an open file cannot be removed."""
     with suppress(OSError):
         if sys.platform != "win32" and _same_file(path, handle):
             path.unlink()

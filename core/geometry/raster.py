@@ -242,9 +242,9 @@ def _nearest(column: np.ndarray, pieces: Pieces, spans: _Spans, y_px: np.ndarray
     inverse_z = at_start[span] + (at - start[span]) * along_x[part[span]]
     buffer = np.zeros(len(y_px) * width)
     np.maximum.at(buffer, sample, inverse_z)
-    seen = np.flatnonzero(inverse_z == buffer[sample])
+    visible = np.flatnonzero(inverse_z == buffer[sample])
     owner = np.full(len(buffer), -1)
-    owner[sample[seen]] = part[span[seen]]
+    owner[sample[visible]] = part[span[visible]]
     hit = np.flatnonzero(owner >= 0)
     return hit, owner[hit], 1 / buffer[hit]
 

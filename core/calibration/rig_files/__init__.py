@@ -21,7 +21,7 @@ FOLDERS = ("colmap", "easymocap", "openptv")  # written as several files into a 
 
 
 def read_any(path: Path) -> Rig:
-    """Read another tool's calibration, told apart by the file's or folder's content.
+    """Read another tool's calibration, whose kind follows from the file or folder.
 
     Raises:
         InputError: it is missing, of no known kind, or damaged, or two of its cameras have one name.

@@ -3,7 +3,7 @@
     x' = x (1 + K1 r² + K2 r⁴ + K3 r⁶ + K4 r⁸) + P1 (r² + 2 x²) + 2 P2 x y ,   y' = y (…) + P2 (r² + 2 y²) + 2 P1 x y
     u = w/2 + cx + x' f + x' B1 + y' B2 ,   v = h/2 + cy + y' f
 
-so f = fy, B1 = b1 f, B2 = b2 f, P1 = p2, P2 = p1, cx = cx_ours + 1/2 − w/2: the one format that holds our affinity. A camera's transform is
+so f = fy, B1 = b1 f, B2 = b2 f, P1 = p2, P2 = p1, cx = cx_ours + 1/2 − w/2: the one format with our affinity. A camera's transform is
 16 numbers, camera → chunk, row by row; the chunk's own scale is 1 here (metres).
 """
 
@@ -45,7 +45,7 @@ def read(path: Path) -> Rig:
             raise InputError(f"Camera “{element.get('label')}” in {path} names a sensor that the file lacks.")
         cameras.append(_camera(path, str(element.get("label") or element.get("id")), sensor, transform, scale))
     if not cameras:
-        raise InputError(f"{path} holds no aligned camera; align the cameras in Metashape and export them as Agisoft XML.")
+        raise InputError(f"{path} has no aligned camera; align the cameras in Metashape and export them as Agisoft XML.")
     return Rig(cameras=tuple(cameras), metadata={} if scaled else {"scale": NO_UNIT})
 
 

@@ -46,7 +46,7 @@ def read(path: Path) -> Rig:
         names.append(image.parent / image.stem)
         cameras.append((size, matrix, distortions, R, values[4:]))
     if not cameras:
-        raise InputError(f"{folder / 'images.txt'} holds no posed image; export the finished model as text.")
+        raise InputError(f"{folder / 'images.txt'} has no posed image; export the finished model as text.")
     alike = len({name.name for name in names}) < len(names)  # such as cam1/0001.png and cam2/0001.png: the folders tell them apart
     named = ["_".join(name.parts) if alike else name.name for name in names]
     return Rig(cameras=tuple(make_camera(name, *camera) for name, camera in zip(named, cameras)), metadata={"scale": NO_UNIT})

@@ -72,7 +72,7 @@ class Nodes:
 
 
 def _of_yaml(text: str, path: Path) -> dict[str, Entry]:
-    """Blocks begin with “key:” at the margin; what is indented, or begins with “-”, belongs to the block before."""
+    """Blocks begin with “key:” at the margin; lines that are indented, or begin with “-”, belong to the block before."""
     blocks: dict[str, list[str]] = {}
     lines = text.splitlines()
     if len(lines) > MOST_LINES:
@@ -138,7 +138,7 @@ def _scalar(text: str) -> Entry:
 
 
 def read(path: Path) -> Rig:
-    """Read one camera, a stereo pair, a rig, or EasyMocap's intri.yml with extri.yml beside it.
+    """Read one camera, a stereo pair, a rig, or EasyMocap's intri.yml with extri.yml next to it.
 
     Raises:
         InputError: an entry is missing or damaged.
@@ -158,7 +158,7 @@ def read(path: Path) -> Rig:
 
 
 def _size(K: np.ndarray, width: float | None, height: float | None) -> tuple[float, float]:
-    """The image's size; if it is not said, the principal point is taken for the middle."""
+    """The image size; without one, the principal point is taken as the image centre."""
     return (width or round(2 * K[0, 2] + 1), height or round(2 * K[1, 2] + 1))
 
 
@@ -175,7 +175,7 @@ def _of_rig(nodes: Nodes, name: str) -> Camera:
 
 
 def _stereo(path: Path, nodes: Nodes) -> tuple[Camera, Camera]:
-    """M1 D1 M2 D2, and R T here or in extrinsics.yml beside it."""
+    """M1 D1 M2 D2, and R T here or in extrinsics.yml next to it."""
     pose = nodes if nodes.has("R") else Nodes(path.with_name("extrinsics" + path.suffix))
     width, height = nodes.number("image_width", "width"), nodes.number("image_height", "height")
     poses = ((np.eye(3), np.zeros(3)), (pose.matrix("R", (3, 3)), pose.matrix("T", (3,))))

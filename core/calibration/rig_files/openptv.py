@@ -1,4 +1,4 @@
-"""OpenPTV's .ori and .addpar (the ETH's particle tracking software), with the image's size from ptv.par beside them.
+"""OpenPTV's .ori and .addpar (the ETH's particle tracking software), with the image size from ptv.par next to them.
 
 .ori: X0 Y0 Z0 [mm] / omega phi kappa / the rotation Rx(omega) Ry(phi) Rz(kappa), its columns the camera's axes in the world / xh yh [mm] /
 camera constant [mm] / glass vector. .addpar: k1 k2 k3 p1 p2 scx she. The camera looks along −z with y up:
@@ -47,7 +47,7 @@ def read(path: Path) -> Rig:
     size, pixel_mm = _parameters(folder / "ptv.par")
     files = sorted(folder.glob("*.ori"))
     if not files:
-        raise InputError(f"{folder} holds no .ori file; choose the folder of OpenPTV's calibration.")
+        raise InputError(f"{folder} has no .ori file; choose the folder of OpenPTV's calibration.")
     return Rig(cameras=tuple(_camera(file, size, pixel_mm) for file in files))
 
 
@@ -103,7 +103,7 @@ def _rays(p: np.ndarray, size: tuple[int, int], pixel_mm: tuple[float, float]) -
 
 
 def _fit_ours(camera: Camera, rays: np.ndarray, xy_px: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interior unknowns (10,) and a turn with which our model gives these pixels, by Gauss–Newton with the camera's derivatives."""
+    """Interior unknowns (10,) and a turn with which our model reproduces these pixels, by Gauss–Newton with the camera's derivatives."""
     interior, turn = start.copy(), np.eye(3)
     for _ in range(12):
         points = rays @ turn.T
@@ -146,7 +146,7 @@ def write(folder: Path, rig: Rig) -> list[Path]:
 
 
 def _fitted(camera: Camera) -> tuple[np.ndarray, Camera]:
-    """Parameters (10,) of `image` with scx = 1, she = 0, and the camera turned a little with them."""
+    """Parameters (10,) of `image` with scx = 1, she = 0, and the camera rotated slightly to fit."""
     w, h = camera.size_px
     c = float(camera.matrix[1, 1]) * PIXEL_MM
     k1, k2, p1, p2, k3 = camera.distortions

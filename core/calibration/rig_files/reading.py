@@ -1,4 +1,4 @@
-"""What all readers of other tools' files need: text that is there, numbers that are numbers, and one sentence when they are not.
+"""Parsing shared by the readers of other tools' files: checked text and numbers, with a one-sentence error otherwise.
 
 A camera in another tool's model: the parameters with which that model comes closest to ours over the whole image.
 
@@ -48,7 +48,7 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} must be {'×'.join('n' if s < 0 else str(s) for s in shape)} numbers; the file is damaged.") from error
     if not np.isfinite(array).all():
-        raise InputError(f"{what} holds numbers that are not finite; the file is damaged.")
+        raise InputError(f"{what} has numbers that are not finite; the file is damaged.")
     return array
 
 
@@ -83,7 +83,7 @@ def make_camera(
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not 8 <= min(size_px) <= max(size_px) <= LARGEST_PX:
         raise InputError(f"Camera “{name}” has an impossible matrix or size; the file is damaged.")
     if np.abs(R_cam_world @ R_cam_world.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R_cam_world) < 0:
-        raise InputError(f"The rotation of camera “{name}” is none; the file is damaged or mirrored.")
+        raise InputError(f"The rotation of camera “{name}” is not a rotation; the file is damaged or mirrored.")
     return Camera(
         name=name,
         size_px=(round(size_px[0]), round(size_px[1])),

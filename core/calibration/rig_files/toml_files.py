@@ -23,7 +23,7 @@ UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 
 def read(path: Path) -> Rig:
-    """Read any of the three layouts; from rig.toml also what the calibration said of itself, and its sigmas.
+    """Read any of the three layouts; from rig.toml also the quality that the calibration reported, and its sigmas.
 
     Raises:
         InputError: it is none of them, or a camera is incomplete.
@@ -40,7 +40,7 @@ def read(path: Path) -> Rig:
     finished = {k: e for k, e in entries.items() if isinstance(e, dict) and "matrix" in e and e.get("rotation") is not None}
     cameras = {key: _camera(key, entry, path, UNITS_M[unit]) for key, entry in finished.items()}
     if not cameras:
-        raise InputError(f"{path} holds no calibrated camera with matrix, rotation and translation; choose the file of the finished rig.")
+        raise InputError(f"{path} has no calibrated camera with matrix, rotation and translation; choose the file of the finished rig.")
     sigmas = {cameras[k].name: sigmas_of(e["sigma"], cameras[k].name, path) for k, e in finished.items() if "sigma" in e}
     return Rig(cameras=tuple(cameras.values()), metadata=metadata if isinstance(metadata, dict) else {}, sigmas=sigmas)
 

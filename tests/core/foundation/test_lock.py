@@ -45,7 +45,7 @@ def test_it_is_free_again_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_two_processes_and_two_threads(tmp_path: Path, other: subprocess.Popen[str]) -> None:
-    with pytest.raises(InputError, match=rf"Another run \(process {other.pid} on .*\) writes into .*; wait until"), locked(tmp_path):
+    with pytest.raises(InputError, match=rf"Another run \(process {other.pid} on .*\) is writing into .*; wait until"), locked(tmp_path):
         pass
     os.kill(other.pid, signal.SIGKILL) if os.name == "posix" else other.kill()
     other.wait()
