@@ -102,7 +102,7 @@ class Epipolar:
 class SurfacePrior:
     """Pseudo-observations θ = value ± sigma of N points, in the unknowns of (1); an infinite sigma has no weight.
 
-    `error` is the standard deviation of the values, where it is better known than by the sigma that sets their weight.
+    `error` is the standard deviation of the values, where it differs from the sigma that sets their weight.
     """
 
     value: np.ndarray  # (N, P)
@@ -138,7 +138,7 @@ class SurfacePatch:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SurfaceStarts:
-    """N pieces of surface to be matched about points of the reference view, and what is known of them beforehand."""
+    """N pieces of surface to be matched about points of the reference view, with approximate values, priors and windows."""
 
     xy: np.ndarray  # (N, 2) rows' pixels of the reference view
     theta: np.ndarray  # (N, 3) or (N, 6) approximate θ of (1); the width chooses planes or quadrics

@@ -123,8 +123,8 @@ def where_rays_meet(cameras: Sequence[Camera], clicks: Mapping[int, np.ndarray],
 
     The clicks' sigma enters the proposals' sigmas.
     """
-    known = {k: Proposal(xy_px=np.asarray(xy, dtype=np.float64), sigma_px=sigma_px, correlation=1.0) for k, xy in clicks.items()}
-    found = _where_rays_meet(cameras, known, MOST_MISS_SIGMAS * sigma_px) if len(known) > 1 else known
+    given = {k: Proposal(xy_px=np.asarray(xy, dtype=np.float64), sigma_px=sigma_px, correlation=1.0) for k, xy in clicks.items()}
+    found = _where_rays_meet(cameras, given, MOST_MISS_SIGMAS * sigma_px) if len(given) > 1 else given
     return tuple(found.get(k) if k not in clicks else None for k in range(len(cameras)))
 
 
@@ -134,41 +134,41 @@ def below_surface(
     """Where a point lies that was clicked at `xy_px` (2,) in view number `view`, `depth_m` behind the surface that was matched there.
 
     A joint is clicked on the visible surface, but lies inside the limb; from another side it is not where the surface's texture is. The
-    proposals' sigmas contain DEPTH_SHARE of that depth, which is not known better.
+    proposals' sigmas contain DEPTH_SHARE of that depth, of which there is no better estimate.
     """
-    known = {k: place for k, place in enumerate(surface) if place is not None}
-    if not known:
+    given = {k: place for k, place in enumerate(surface) if place is not None}
+    if not given:
         return tuple(surface)
-    point = _intersected(cameras, {view: Proposal(xy_px=xy_px, sigma_px=PIXEL_SIGMA_PX, correlation=1.0), **known})
+    point = _intersected(cameras, {view: Proposal(xy_px=xy_px, sigma_px=PIXEL_SIGMA_PX, correlation=1.0), **given})
     depth = float(cameras[view].to_camera(point.xyz_m)[0, 2])
     ray = cameras[view].rays(np.asarray(xy_px, dtype=np.float64))
     X = cameras[view].centre_m + ray * (depth + depth_m)
-    sure, found = min(p.correlation for p in known.values()), []
+    sure, found = min(p.correlation for p in given.values()), []
     for k, camera in enumerate(cameras):
         at, J = camera.project_with_jacobian(X)
-        sigma = np.hypot(np.linalg.norm(J @ ray) * DEPTH_SHARE * depth_m, known[k].sigma_px if k in known else UNMATCHED_SIGMA_PX)
+        sigma = np.hypot(np.linalg.norm(J @ ray) * DEPTH_SHARE * depth_m, given[k].sigma_px if k in given else UNMATCHED_SIGMA_PX)
         visible = k != view and bool(camera.sees(at))
         found.append(Proposal(xy_px=at, sigma_px=float(sigma), correlation=sure) if visible else None)
     return tuple(found)
 
 
-def _where_rays_meet(cameras: Sequence[Camera], known: Mapping[int, Proposal], limit_px: float) -> dict[int, Proposal]:
-    """The known places, and those of their forward intersection in the other views if their rays miss each other by no more."""
-    point, found = _intersected(cameras, known), dict(known)
+def _where_rays_meet(cameras: Sequence[Camera], given: Mapping[int, Proposal], limit_px: float) -> dict[int, Proposal]:
+    """The given places, and those of their forward intersection in the other views if their rays miss each other by no more."""
+    point, found = _intersected(cameras, given), dict(given)
     if not point.rms_residual_px[0] <= limit_px:
         return found
-    for k in set(range(len(cameras))) - set(known):
+    for k in set(range(len(cameras))) - set(given):
         at, J = cameras[k].project_with_jacobian(point.xyz_m[0])
         if cameras[k].sees(at):
             sigma = np.sqrt(np.diag(J @ point.covariance_m2[0] @ J.T).max())
-            found[k] = Proposal(xy_px=at, sigma_px=float(sigma), correlation=min(p.correlation for p in known.values()))
+            found[k] = Proposal(xy_px=at, sigma_px=float(sigma), correlation=min(p.correlation for p in given.values()))
     return found
 
 
-def _intersected(cameras: Sequence[Camera], known: Mapping[int, Proposal]) -> Intersection:
-    """The point (one) that the known places (view number → place) agree on."""
+def _intersected(cameras: Sequence[Camera], given: Mapping[int, Proposal]) -> Intersection:
+    """The point (one) that the given places (view number → place) agree on."""
     xy, sigma = np.full((1, len(cameras), 2), np.nan), np.ones((1, len(cameras)))
-    for k, place in known.items():
+    for k, place in given.items():
         xy[0, k], sigma[0, k] = place.xy_px, place.sigma_px
     return intersect_clicks(cameras, xy, sigma)
 
