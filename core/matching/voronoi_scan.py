@@ -83,7 +83,7 @@ def voronoi_scan(
     foreground: Foreground,
     monitor: Monitor,
 ) -> MatchedField:
-    """The matched field by scanning the Voronoi regions of the seeds. Arguments and result as of `growing.grow_regions`.
+    """The matched field by scanning the Voronoi regions of the seeds. Arguments and result as of `region_growing.grow_regions`.
 
     Only points that the foreground allows, and whose rays meet, are accepted.
     """
