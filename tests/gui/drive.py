@@ -207,7 +207,7 @@ def buttons(area: bpy.types.Area, kind: str = "UI", until: str | None = None) ->
     With `until`, it ends at the first one whose command or data path contains that.
     """
     region, found = region_of(area, kind), {}
-    for part in (0.5, 0.25, 0.72):
+    for part in (0.5, 0.25, 0.72, 0.12):
         for y in range(region.y + region.height - 6, region.y + 4, -9):
             x = region.x + region.width * part
             yield from move(x, y)
