@@ -11,11 +11,10 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.geometry.rotation import angle_of, transposed
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.control_rig import controls_of
 from ...core.motion.retarget.mapping import MappedMotion, MappedRig, RigMap, apply_preset, find_map, read_preset
 from ...core.motion.retarget.measure import Figures, measure
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
-from ...core.motion.retarget.rig import Motion, Rig
+from ...core.motion.retarget.rig import Motion, Rig, controls_of
 from .programs import presets
 from .read import read_motion, read_rig, with_soles
 from .write import Written, store_residual_motion, write_action

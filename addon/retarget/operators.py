@@ -10,10 +10,9 @@ import bpy
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.keys import resampled
 from ...core.motion.retarget.mapping import MappedMotion, MappedRig
 from ...core.motion.retarget.retarget import Retargeted, RetargetSettings
-from ...core.motion.retarget.rig import Motion
+from ...core.motion.retarget.rig import Motion, resampled
 from ...core.motion.sources import read_motion_source
 from ..jobs import JobOperator
 from ..properties import snapshot

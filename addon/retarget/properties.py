@@ -9,9 +9,9 @@ import bpy
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import UNITS_M
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.control_rig import ControlRig
 from ...core.motion.retarget.mapping import RigMap
 from ...core.motion.retarget.retarget import RetargetSettings
+from ...core.motion.retarget.rig import ControlRig
 from ...core.motion.retarget.roles import ROLES
 from ..properties import group_class
 

@@ -7,9 +7,9 @@ import bpy
 import numpy as np
 
 from ...core.geometry.rotation import continuous, euler_from_matrix, quaternion_from_matrix, transposed
-from ...core.motion.retarget.keys import needed_keys
 from ...core.motion.retarget.residual_motion import ResidualMotion, to_text
 from ...core.motion.retarget.retarget import Retargeted
+from ...core.motion.retarget.rig import needed_keys
 from .read import RESIDUAL_KEY, keys_digest, scale_of, world_matrix
 
 CHANNEL = {"QUATERNION": ("rotation_quaternion", 4), "AXIS_ANGLE": ("rotation_axis_angle", 4)}

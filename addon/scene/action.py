@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone
-from ...core.motion.retarget.keys import needed_keys
+from ...core.motion.retarget.rig import needed_keys
 from . import armature
 
 NAME, SIMPLE_NAME = "Measured motion", "Simplified motion"

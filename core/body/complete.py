@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .bone_profile import BoneProfile, bone_profiles, chain_neighbours
 from .metaballs import STATIONS, VISIBLE, Metaballs, field
+from .parts import BoneProfile, bone_profiles, chain_neighbours
 from .shape import BodyShape, FieldSamples, root_of, with_radii_for
 from .skeleton import bone_frames
 

@@ -27,11 +27,11 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from .metaballs import THRESHOLD, Metaballs, local_points, squared_distances
+from .parts import Part, body_parts
 from .shape import BodyShape
 from .skeleton import bone_frames
 from .skin.contour_skin import body_skin
 from .skin.mesh import SkinSettings
-from .skin.parts import Part, body_parts
 from .skin.whole_surface import WholeSurface
 
 UPPER = 0.6  # fraction of a limb's first long bone: balls up to here count for the trunk's bone

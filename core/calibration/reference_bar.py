@@ -15,9 +15,8 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from ..geometry.camera import INTERIOR
-from .bars import BarObservations, with_bars
+from .bars import PAIR_TOLERANCE, BarObservations, PairGuesses, agreeing, sampson, try_guesses, undistorted, with_bars
 from .bundle import Adjusted, LevenbergMarquardt, Network, Unknowns, adjust
-from .epipolar import PAIR_TOLERANCE, PairGuesses, agreeing, sampson, try_guesses, undistorted
 
 FOCAL_GRID = np.geomspace(0.45, 3.2, 12)  # of the image width
 ROUGH_FOCALS = np.array([0.75, 0.87, 1.0, 1.15, 1.33])  # of a given rough focal length

@@ -28,10 +28,9 @@ from .observations import (
 )
 from .observations.self_collision import CollisionPairs
 from .observations.shape_priors import proportions
-from .robust import robust_weights
 from .segmentation import SegmentationCache, segment, soft_segment
 from .settings import FitSettings
-from .solve.problem import Problem, Smoothness
+from .solve.problem import Problem, Smoothness, robust_weights
 from .state import BodyState, ShapeParameters
 
 SUPPORT_SIGMA_M, SUPPORT_WIDTH = 0.005, 3.0  # of the weights by which poses are compared

@@ -4,7 +4,7 @@
     α_ij = π_ij N(d_ij; σ) max(0, n_i·n_j) / (Σ_k π_ik N(d_ik; σ) max(0, n_i·n_k) + π_0 / (2 gate))               (2)
     π_j = mean of α_ij over i ,   π_0 = 1 − Σ_j π_j ,   σ² = Σ α d² / Σ α , within 3 and 30 mm                    (3)
 
-Hard segmentation: the closest limb has the smallest distance (1) from its surface (`body.bone_profile`), not from its axis: a fat trunk
+Hard segmentation: the closest limb has the smallest distance (1) from its surface (`body.parts`), not from its axis: a fat trunk
 must not swallow the points of a thin arm. A point belongs to no limb when it is further from that surface than a gate, when it lies along
 the bone where the surface is another part's or bends with the joint (the shoulder belongs to the trunk, what is beyond the wrist to the
 hand), or when its normal points into the limb.

@@ -12,9 +12,9 @@ turning person 3 mm farther from the truth, since thickness there compensates er
 
 import numpy as np
 
+from ..body.parts import body_parts
 from ..body.shape import BodyShape
 from ..body.skin.extremities import SIMPLE
-from ..body.skin.parts import body_parts
 from .state import ShapeParameters
 
 

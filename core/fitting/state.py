@@ -13,8 +13,8 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from ..body.bone_profile import BoneProfile, bone_profiles, chain_neighbours
 from ..body.metaballs import Metaballs
+from ..body.parts import BoneProfile, bone_profiles, chain_neighbours
 from ..body.shape import BodyShape
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
 from ..geometry.rotation import cross, cross_matrix

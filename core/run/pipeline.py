@@ -13,7 +13,7 @@ from ..body.motion import BodyFit
 from ..body.shape import write_body
 from ..body.skin.contour_skin import body_skin
 from ..body.skin.extremities import shape_for_skin
-from ..checking.fit_check import check_fit
+from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
 from ..fitting.inputs.fit_input import FitInput

@@ -29,23 +29,12 @@ from truth import TEST_BARS, bound, error_m, observed, rigid
 from tricap.core.calibration.bars import enough_rays, with_bars
 from tricap.core.calibration.bundle import LevenbergMarquardt, Network, adjust
 from tricap.core.calibration.precision import predicted_error
-from tricap.core.calibration.reference_bar import (
-    initial_network,
-    lens_prior,
-)
+from tricap.core.calibration.reference_bar import initial_network, lens_prior
 from tricap.core.calibration.self_calibration import GROSS, PART, calibrate
 from tricap.core.calibration.targets import find_blobs, find_targets
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import INTERIOR, camera_of
-from tricap.core.synthetic.bar import (
-    RIG_KINDS,
-    BarNoise,
-    WavedBar,
-    benchmark_cameras,
-    draw_disc,
-    random_cameras,
-    waved_bar,
-)
+from tricap.core.synthetic.bar import RIG_KINDS, BarNoise, WavedBar, benchmark_cameras, draw_disc, random_cameras, waved_bar
 
 CASES = ((100, 0.05), (1000, 0.05), (5000, 0.05), (100, 0.3), (1000, 0.3), (5000, 0.3))
 SEEDS = 5

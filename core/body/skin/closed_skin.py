@@ -30,10 +30,10 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import spsolve
 
 from ...foundation.arrays import frozen
+from ..parts import body_parts
 from ..shape import BodyShape
 from .contour_skin import body_skin, strongest
 from .mesh import SkinSettings, corner_uv, refined
-from .parts import body_parts
 from .welding import cut, face_uv, net_faces, welded
 from .whole_surface import WholeSurface
 

@@ -24,10 +24,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...foundation.errors import InputError
+from ..parts import Part, body_parts
 from ..shape import BodyShape
 from ..skeleton import Bone, bone_frames
 from .mesh import INTERPOLATING, Skin, SkinSettings, chain_faces, refined
-from .parts import Part, body_parts
 from .rays import Rays, Segment, cast, segments_of, swing
 from .roots import limb_normals, limb_root, part_root
 

@@ -18,8 +18,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 
-from ..bone_profile import SIDES, BoneProfile, bone_profiles, chain_neighbours
 from ..metaballs import VISIBLE, Metaballs
+from ..parts import SIDES, BoneProfile, bone_profiles, chain_neighbours
 from ..shape import BodyShape
 from .mesh import SkinSettings
 

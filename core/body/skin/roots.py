@@ -35,8 +35,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..metaballs import THRESHOLD, active_balls, field, field_and_derivatives
+from ..parts import Part
 from ..shape import BodyShape
-from .parts import Part
 from .rays import SHARPEST_COS, Rays, smooth
 
 BLEND_POWER = 4.0  # n of (4): a fillet of 4 mm on a radius of 60 mm

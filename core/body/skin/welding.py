@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..parts import Part
 from .mesh import Skin
-from .parts import Part
 from .whole_surface import WholeSurface
 
 OUTSIDE = 0.5  # a ring is outside the parent part where the parent's field is below this fraction of the limb's

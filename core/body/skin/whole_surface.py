@@ -20,9 +20,9 @@ from ...foundation.arrays import frozen
 from ...foundation.progress import Monitor
 from ..fields import EXPONENTIAL, Potential
 from ..metaballs import THRESHOLD, active_balls, local_points, squared_distances
+from ..parts import body_parts
 from ..shape import BodyShape
 from ..skeleton import bone_frames
-from .parts import body_parts
 from .rays import smooth
 from .roots import OWN_SHARE, Chain, joined
 

@@ -15,11 +15,10 @@ import numpy as np
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.material_tracks import MaterialTracks
-from ..inputs.standing_feet import StandingFeet
-from ..robust import robust_scale
+from ..observations.joints import StandingFeet
 from ..segmentation import crop
 from ..solve.block_band import NormalEquations
-from ..solve.problem import Estimate
+from ..solve.problem import Estimate, robust_scale
 from ..solve.solver import Solution
 from ..solve.time_priors import MarginalPrior
 from ..state import BodyState

@@ -37,8 +37,8 @@ from ..inputs.fit_input import FitInput
 from ..inputs.keypoints import JointTracks
 from ..inputs.material_tracks import MaterialTracks
 from ..inputs.silhouettes import Silhouettes
-from ..inputs.standing_feet import StandingFeet
 from ..observations import Observation
+from ..observations.joints import StandingFeet
 from ..observations.self_collision import CollisionPairs
 from ..segmentation import SegmentationCache
 from ..settings import FitSettings

@@ -13,8 +13,7 @@ from typing import Any
 from ...foundation import store
 from ...foundation.errors import InputError
 from ...foundation.settings import nearest_name
-from .control_rig import ControlRig
-from .rig import Motion, Rig
+from .rig import ControlRig, Motion, Rig
 from .roles import ARM, FINGERS, LEG, ROLES, SIDES, Reading, read_name, sided
 from .shape import ShapeMatch, by_shape
 

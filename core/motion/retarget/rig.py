@@ -6,17 +6,30 @@ Everything is in the world (metres, Z up); the rest pose is given as rotations a
     head_b = head_parent + R_parent · R_rest,parentᵀ · (head_rest,b − head_rest,parent) + shift                         (2)
 
 A bone that does not inherit rotation has R_b = R_rest,b · B_b.
+
+Keyframes: resampling a motion at another frame rate, and key reduction.
+
+Key reduction keeps those keys of a motion keyed in every frame from which linear interpolation gives the others within a tolerance: Ramer
+(1972), Douglas and Peucker (1973), with the distance along
+the values, of one channel or of all channels of a bone at once.
+
+Control rigs: rigs whose deforming bones follow helpers and constraints, so that keys belong on the controls.
+
+In the state that a preset defines (`properties`, such as FK instead of IK) every control of the body follows another one rigidly, whatever
+helpers lie between them in the rig. The controls alone, with these as parents, are a rig like any other.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from ...foundation.arrays import frozen
 from ...foundation.errors import InputError
-from ...geometry.rotation import transposed
+from ...geometry.rotation import between, transposed
+from ...images.interlace import frame_time_s
 from .residual_motion import ResidualMotion
 
 SHORTEST_BONE_M = 1e-6
@@ -169,3 +182,98 @@ def _carried(rig: Rig, R: np.ndarray, b: int) -> np.ndarray:
     if p < 0 or not rig.inherits_rotation[b]:
         return np.broadcast_to(rig.R_rest[b], (len(R), 3, 3))
     return R[:, p] @ (rig.R_rest[p].T @ rig.R_rest[b])
+
+
+def resampled(motion: Motion, fps: float, first_frame: float) -> Motion:
+    """The motion at `fps` frames per second beginning at `first_frame`: rotations by the shortest path, positions linearly."""
+    frames = motion.frames
+    time = frame_time_s(frames - frames[0], motion.fps)
+    count = max(int(np.floor(time[-1] * fps + 1e-6)) + 1, 1)
+    wanted = frame_time_s(np.arange(count), fps)
+    after = np.clip(np.searchsorted(time, wanted - 1e-9), 1, max(len(time) - 1, 1)) if len(time) > 1 else np.zeros(count, dtype=np.intp)
+    before = np.maximum(after - 1, 0)
+    span = np.where(time[after] > time[before], time[after] - time[before], 1.0)
+    part = np.clip((wanted - time[before]) / span, 0.0, 1.0)
+    head = motion.head_m[before] + part[:, None, None] * (motion.head_m[after] - motion.head_m[before])
+    R = between(motion.R[before], motion.R[after], np.broadcast_to(part[:, None], head.shape[:2]))
+    return replace(motion, fps=fps, frames=first_frame + np.arange(count), R=R, head_m=head, residual=None)
+
+
+def needed_keys(times: np.ndarray, values: np.ndarray, tolerance: float) -> np.ndarray:
+    """Indices (n,) of the keys to keep, of values (T,) or (T, C) at times (T,), in order.
+
+    Linear interpolation between them is nowhere off by more than `tolerance`, all channels together (Euclidean). The first and the last
+    are always among them, unless all values lie within the tolerance of the first.
+    """
+    t = len(times)
+    values = np.asarray(values, dtype=np.float64)
+    values = values[:, None] if values.ndim == 1 else values
+    if t < 2 or tolerance <= 0:
+        return np.arange(t)
+    if np.linalg.norm(values - values[0], axis=1).max() <= tolerance:
+        return np.array([0])
+    keep = np.zeros(t, dtype=bool)
+    keep[[0, -1]] = True
+    stack = [(0, t - 1)]
+    while stack:
+        a, b = stack.pop()
+        if b - a < 2:
+            continue
+        part = ((times[a : b + 1] - times[a]) / (times[b] - times[a]))[:, None]
+        off = np.linalg.norm(values[a : b + 1] - (values[a] + part * (values[b] - values[a])), axis=1)
+        worst = a + int(np.argmax(off))
+        if off[worst - a] > tolerance:
+            keep[worst] = True
+            stack += [(a, worst), (worst, b)]
+    return np.flatnonzero(keep)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ControlRig:
+    """The controls of a family of rigs."""
+
+    follows: Mapping[str, str]  # by control, the one that it follows; a control that is not named follows none
+    properties: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by bone: custom properties and their values
+    skin: Mapping[str, str] = field(default_factory=dict)  # by control, the bone that has the skin's weights instead
+
+    def table(self) -> dict[str, dict[str, Any]]:
+        """As plain values, as in a mapping file."""
+        return {
+            "follows": dict(self.follows),
+            "skin": dict(self.skin),
+            "properties": {bone: dict(values) for bone, values in self.properties.items()},
+        }
+
+    def of_controls(self, *chains: Mapping[str, tuple[str, ...]]) -> "ControlRig | None":
+        """This control rig if all bones of `chains` (by role) are its controls, else None."""
+        named = {name for table in chains for chain in table.values() for name in chain}
+        return self if {*self.follows, *self.follows.values()} >= named else None
+
+
+def controls_of(rig: Rig, control_rig: ControlRig, chains: Mapping[str, tuple[str, ...]]) -> Rig:
+    """The controls in `chains` (bones by role) as a rig of their own."""
+    wanted = {name for chain in chains.values() for name in chain}
+
+    def above(name: str) -> str | None:
+        parent = control_rig.follows.get(name)
+        while parent is not None and parent not in wanted:
+            parent = control_rig.follows.get(parent)
+        return parent
+
+    def depth(name: str) -> int:
+        parent = above(name)
+        return 0 if parent is None else 1 + depth(parent)
+
+    names = sorted((name for name in rig.names if name in wanted), key=depth)
+    rows = [rig.index[name] for name in names]
+    order = {name: i for i, name in enumerate(names)}
+    parents = [order[parent] if (parent := above(name)) is not None else -1 for name in names]
+    return Rig(
+        names=tuple(names),
+        parents=np.array(parents),
+        R_rest=rig.R_rest[rows],
+        head_m=rig.head_m[rows],
+        tail_m=rig.tail_m[rows],
+        connected=np.zeros(len(names), dtype=bool),
+        inherits_rotation=np.ones(len(names), dtype=bool),
+    )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tricap.core.body.bone_profile import bone_profiles, chain_neighbours
 from tricap.core.body.complete import RINGS, TABLES, arrangement, complete_shape
 from tricap.core.body.model_file import read_model
+from tricap.core.body.parts import bone_profiles, chain_neighbours
 from tricap.core.body.shape import BodyShape, default_shape, read_body, write_body
 from tricap.core.body.skin.contour_skin import body_skin
 

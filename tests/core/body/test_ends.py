@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tricap.core.body.bone_profile import bone_profiles, chain_neighbours
 from tricap.core.body.model_file import read_model
+from tricap.core.body.parts import bone_profiles, chain_neighbours
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.contour_skin import body_skin

@@ -8,11 +8,11 @@ import pytest
 from tricap.core.body.metaball_groups import metaball_groups
 from tricap.core.body.metaballs import THRESHOLD, Metaballs, field
 from tricap.core.body.model_file import read_model
+from tricap.core.body.parts import body_parts
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.contour_skin import body_skin
 from tricap.core.body.skin.mesh import SkinSettings
-from tricap.core.body.skin.parts import body_parts
 from tricap.core.body.skin.whole_surface import WholeSurface
 
 

@@ -5,10 +5,10 @@ import pytest
 
 from tricap.core.body.metaballs import THRESHOLD, Metaballs, active_balls, field_and_derivatives
 from tricap.core.body.model_file import model_names, read_model
+from tricap.core.body.parts import body_parts
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.contour_skin import Skin, body_skin, limb_skin
-from tricap.core.body.skin.parts import body_parts
 from tricap.core.body.skin.rays import Rays
 from tricap.core.body.skin.roots import part_root
 from tricap.core.foundation.errors import InputError

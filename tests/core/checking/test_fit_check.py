@@ -7,7 +7,7 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
-from tricap.core.checking.fit_check import odd_limbs
+from tricap.core.checking.run_check import odd_limbs
 
 
 @pytest.mark.parametrize("model", ["arm.R", "full"])

@@ -14,8 +14,8 @@ from tricap.core.fitting.inputs import fit_input
 from tricap.core.fitting.inputs.background import BackgroundRegions
 from tricap.core.fitting.inputs.fit_input import BackgroundDistances, FitInput, JointPlaces, Packed
 from tricap.core.fitting.inputs.silhouettes import Silhouettes
-from tricap.core.fitting.inputs.standing_feet import StandingFeet
 from tricap.core.fitting.observations import PosePrior
+from tricap.core.fitting.observations.joints import StandingFeet
 from tricap.core.fitting.observations.self_collision import CollisionPairs
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.problem import Estimate, Problem

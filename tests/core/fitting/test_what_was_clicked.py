@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.checking.fit_check import beyond_limits, far_from_clicks
+from tricap.core.checking.run_check import beyond_limits, far_from_clicks
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages.sequence import fit_sequence

@@ -24,11 +24,10 @@ from tricap.core.geometry.rotation import (
 from tricap.core.motion.formats.bvh import write_bvh
 from tricap.core.motion.retarget.contacts import FeetSettings, hysteresis, planted, steady, without_short
 from tricap.core.motion.retarget.feet import Stand, carry_root
-from tricap.core.motion.retarget.keys import needed_keys, resampled
 from tricap.core.motion.retarget.mapping import RigMap, find_map
 from tricap.core.motion.retarget.measure import measure
 from tricap.core.motion.retarget.retarget import Retargeted, RetargetSettings, retarget
-from tricap.core.motion.retarget.rig import Motion, Rig, channels, posed
+from tricap.core.motion.retarget.rig import Motion, Rig, channels, needed_keys, posed, resampled
 from tricap.core.motion.sources import body_motion, read_motion_source
 
 from .persons import flail, mapped, mapped_rig, person, squat

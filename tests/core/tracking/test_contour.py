@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tricap.core.tracking.contour import (  # fmt: skip
+from tricap.core.tracking.contour import (
     ContourSettings,
     _sample,
     contour_of_mask,

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tricap.core.body.bone_profile import SIDES, bone_profiles, chain_neighbours
 from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
+from tricap.core.body.parts import SIDES, bone_profiles, chain_neighbours
 from tricap.core.body.shape import default_shape, one_ball_shape
 from tricap.core.body.skeleton import bone_frames
 
