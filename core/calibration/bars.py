@@ -42,7 +42,7 @@ UNDISTORT_STEPS = 6
 class PairGuesses:
     """H guesses of a pair of cameras, and the relative orientation x_j = R x_i + t that follows from each."""
 
-    score: np.ndarray  # (H,) of (5), smaller is better
+    score: np.ndarray  # (H,) of (7), smaller is better
     R: np.ndarray  # (H, 3, 3)
     t_m: np.ndarray  # (H, 3)
 
@@ -126,7 +126,7 @@ def _essential(ni: np.ndarray, nj: np.ndarray, focal: np.ndarray) -> tuple[np.nd
 
 
 def _decomposed(E: np.ndarray, ni: np.ndarray, nj: np.ndarray) -> tuple[np.ndarray, ...]:
-    """R, t of each E with most points in front of both cameras, their depths (H, m), and that fraction (H,).  (3)"""
+    """R, t of each E with most points in front of both cameras, their depths (H, m), and that fraction (H,).  (5)"""
     U, _, Vt = np.linalg.svd(E)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     candidates = []
