@@ -140,8 +140,8 @@ def watched() -> drive.Steps:
     shown_inspection = module("addon.overlay.draw").shown_inspection
     yield from drive.wait_for(lambda: shown_inspection(2) is not None, 10, "there is something under the pointer")
     found = shown_inspection(2)
-    drive.say(*found.words)
-    drive.check(set(found.found) == {"L", "C", "R"}, "its patch is known in all views")
+    drive.say(*found.lines)
+    drive.check(set(found.matched_boxes) == {"L", "C", "R"}, "its patch is known in all views")
     yield from drive.settle()
     yield from drive.shot("3_looked")
     yield from drive.key("ESC")
