@@ -136,9 +136,9 @@ def _sets() -> list[str]:
 
 def short_stretches(package: str) -> None:
     """The fit is done in stretches of two frames, as that of a long clip is in longer ones."""
-    sequence, stretches = (importlib.import_module(f"{package}.core.fitting.{name}") for name in ("sequence", "stretches"))
-    vars(sequence)["AT_ONCE"] = vars(stretches)["AT_ONCE"] = 3
-    vars(stretches)["MARGIN"] = 2
+    sequence, long_sequence = (importlib.import_module(f"{package}.core.fitting.stages.{name}") for name in ("sequence", "long_sequence"))
+    vars(sequence)["AT_ONCE"] = vars(long_sequence)["AT_ONCE"] = 3
+    vars(long_sequence)["MARGIN"] = 2
 
 
 Tell = Callable[[type], None]  # makes a Monitor class tell its stages to the parent

@@ -279,5 +279,5 @@ def test_a_real_run_is_looked_at_and_corrected(blender: ModuleType, empty: Modul
     scene.tricap.contour.spacing_px = 8.0
     assert ops.follow_contours(view="C") == {"FINISHED"}
     assert len(module("overlay.results").current(scene).contour("C", 1).xy_px) == pytest.approx(len(outline) / 2, rel=0.1)
-    with pytest.raises(RuntimeError, match="no body"):
+    with pytest.raises(RuntimeError, match="no fitted body"):
         ops.follow_contours(view="C", from_body=True)

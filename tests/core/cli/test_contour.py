@@ -150,7 +150,7 @@ def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[
     assert "tricap fit" in capsys.readouterr().err
     (tmp_path / "p.csv").write_text("x,y\n1,2\n3,4\n5,1\n")
     assert main(["contour", str(take), "--view", "C", "L", "--polygon", str(tmp_path / "p.csv"), *out]) == 2
-    assert "one --view" in capsys.readouterr().err
+    assert "single --view" in capsys.readouterr().err
 
 
 def test_a_stopped_contour_goes_on_with_the_same_vertices(tmp_path: Path, scenes: Any) -> None:
