@@ -17,6 +17,7 @@ EXTENSION = "bl_ext.user_default.tricap"
 PLATFORM = {"linux": "linux-x64", "win32": "windows-x64", "darwin": "macos-arm64"}[sys.platform]
 # Blender looks for its user's files when bpy is first imported, whichever test does that: never in a real profile.
 PROFILE = Path(tempfile.mkdtemp(prefix="tricap-profile-"))
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in the command and the add-on: with more threads the last digits differ
 os.environ["BLENDER_USER_RESOURCES"] = str(PROFILE)
 
 

@@ -12,7 +12,7 @@ KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.00
 @pytest.mark.slow
 def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three stretches, with marginal priors to the left and to the right; what tracks contribute to a twist reaches all of them."""
-    scene = make_scene(frames=24, seed=2)
+    scene = make_scene(frames=24, seed=2, click=10)
     given = FitInput(
         rig=scene.rig,
         model=scene.model,
