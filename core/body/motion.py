@@ -1,6 +1,7 @@
 """The results of a fit: a body's shape, and its motion with the quality of every number."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -55,3 +56,4 @@ class BodyFit:
     converged: bool
     points: np.ndarray  # (T, B) number of points on each bone's surface in each frame
     outline_m: np.ndarray  # (K,) distances of the views' outlines from the limbs that they touch; empty without contours
+    contradicted: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # first bone of a limb -> frames whose images contradict it

@@ -10,6 +10,7 @@ import numpy as np
 from ..body.model_file import BodyModel
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
+from .explained import Evidence, explained_area
 from .inputs.background import BackgroundRegions
 from .inputs.clicks import Clicks
 from .inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints
@@ -31,9 +32,10 @@ from .observations.shape_priors import proportions
 from .segmentation import SegmentationCache, segment, soft_segment
 from .settings import FitSettings
 from .solve.problem import Problem, Smoothness, robust_weights
-from .state import BodyState, ShapeParameters
+from .state import BodyState, ShapeParameters, free_bones, hand_bones
 
 SUPPORT_SIGMA_M, SUPPORT_WIDTH = 0.005, 3.0  # of the weights by which poses are compared
+EXPLAINED_WIDTH_M = 0.015  # of a cell beyond a limb
 FLESH_ASYMMETRY = 2.0  # the sigma of radii on the left against the right over that of lengths
 WEIGHT_SIGMA = 0.3  # of ln w: of an isolated ball only r = l √(½ ln 2w) is observable, not its weight and radius apart
 POINTS_OF_RAY = 3  # a limb of 25 cm has some 300 points (one a voxel), and 40 rays a view
@@ -205,12 +207,19 @@ class FitContext:
             float(robust_weights(o.residual(state) * o.sigma_m / SUPPORT_SIGMA_M, "geman-mcclure", SUPPORT_WIDTH).sum()) for o in found
         )
 
+    def seen(self, t: int, points: CloudPoints) -> Evidence:
+        """What is seen in frame index `t`, for a search."""
+        return Evidence.of(points, self.background.cells(t), self.settings.voxel_m, hand_bones(self.parameters))
+
     def score(self, t: int, points: CloudPoints, motion: np.ndarray, vector: np.ndarray) -> float:
-        """The `support`, less half the squared residuals of joints in frame index t and of the DOFs' limits (capped)."""
+        """The `support` and the area of the person's cells that the body explains, less that of limbs in the background and half the
+        squared residuals of joints in frame index t and of the DOFs' limits (capped)."""
         state = self.parameters.state(motion, vector)
         limits = [prior for prior in self.priors if isinstance(prior, JointLimits)]
         residuals = np.concatenate([o.residual(state) for o in (*self.joints(t), *limits)])
-        return self.support(t, points, motion, vector) - 0.5 * float(np.minimum(residuals**2, LARGEST_RESIDUAL**2).sum())
+        seen = self.seen(t, points)
+        area = explained_area(seen, state, free_bones(self.parameters), EXPLAINED_WIDTH_M) if seen.cells else 0.0
+        return self.support(t, points, motion, vector) + area - 0.5 * float(np.minimum(residuals**2, LARGEST_RESIDUAL**2).sum())
 
 
 def _hard(

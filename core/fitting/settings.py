@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
-ALGORITHM = "body 4"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 5"  # part of the fit's key: raise it when the same input gives another body
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -44,7 +44,10 @@ class FitSettings:
         high=1e5,
     )
     use_contours: bool = knob(True, "Fit the body to the views' outlines (tricap contour).")
-    use_background: bool = knob(True, "Keep limbs out of pixels that show the still background (cameras and background must stand still).")
+    use_background: bool = knob(
+        True,
+        "Fit the body to the person's outline before the still background, and keep it inside (cameras and background must stand still).",
+    )
     background_sigma_px: float = knob(
         4.0, "Sigma of the person's outline against the background.", unit="px", low=0.5, high=50.0, was=("empty_sigma_px",)
     )

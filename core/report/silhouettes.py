@@ -3,7 +3,7 @@
     IoU = |body ∩ person| / |body ∪ person|        of a whole body                                          (1)
     inside = |body ∩ person| / |body|              of a part of a body, such as an arm                      (2)
 
-The person is the region within the outline that `tricap contour` tracked, or else the largest region that occludes the still background.
+The person is the region within the outline that `tricap contour` tracked, or else what covers the still background.
 An outline has no holes, so those of the body (between an arm and the trunk) are filled too. The distance is that of the person's outline
 from the nearest point of the body's, the median over the outline.
 
@@ -22,12 +22,12 @@ from ..body.shape import BodyShape
 from ..body.skeleton import Skeleton
 from ..body.skin.contour_skin import SkinSettings, body_skin
 from ..body.skin.extremities import shape_for_skin
+from ..fitting.inputs.fit_input import BackgroundDistances
 from ..fitting.inputs.no_surface import filled
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize
-from ..images.background import WINDOW_PX, Background
 from ..take.take import Footage
 
 OUTLINE, BACKGROUND = "outline", "background"
@@ -70,10 +70,10 @@ def silhouettes_of(
     body: BodyFit,
     settings: SkinSettings,
     outlines: Mapping[str, Mapping[int, np.ndarray]],
-    backgrounds: Mapping[str, Background],
+    backgrounds: Sequence[BackgroundDistances],
     monitor: Monitor,
 ) -> Silhouettes:
-    """The agreement of the body with the outlines, and in views without one with the region that occludes the still background.
+    """The agreement of the body with the outlines, and in views without one with the regions that cover the still background.
 
     Raises:
         Cancelled: the user asked to stop.
@@ -83,18 +83,17 @@ def silhouettes_of(
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
     if not outlines and not backgrounds:
         return Silhouettes(whole=whole)
-    found = []
+    found, regions = [], {r.view: r for r in backgrounds}
     for n, i in enumerate(chosen.tolist()):
         monitor.step("silhouettes", n, len(chosen))
         frame = int(frames[i])
-        images = footage.read(frame) if backgrounds else [None] * len(footage.rig.cameras)
         masks = body_masks(footage.rig.cameras, body.shape, body.motion.values[i], settings)
-        for camera, mask, image in zip(footage.rig.cameras, masks, images):
+        for camera, mask in zip(footage.rig.cameras, masks):
             polygon = outlines.get(camera.name, {}).get(frame)
             if polygon is not None:
                 person, source = filled(polygon, camera.size_px), OUTLINE
-            elif camera.name in backgrounds and image is not None:
-                person, source = _occluding(backgrounds[camera.name], image), BACKGROUND
+            elif camera.name in regions and (shown := person_mask(regions[camera.name], frame, camera.size_px)) is not None:
+                person, source = shown, BACKGROUND
             else:
                 continue
             iou, inside, distance = overlap(mask, person, whole=whole)
@@ -145,11 +144,15 @@ def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
     return [c[:, 0] for c in cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]
 
 
-def _occluding(background: Background, image: np.ndarray) -> np.ndarray:
-    """The largest region (h, w) of an image that occludes the background, without the rim that the comparison in windows adds."""
-    occluded = cv2.erode((~background.shown_by(image)).astype(np.uint8), np.ones((WINDOW_PX // 2 * 2 + 1,) * 2, np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(occluded)
-    return _filled_holes(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))) if len(stats) > 1 else occluded > 0
+def person_mask(regions: BackgroundDistances, frame: int, size_px: tuple[int, int]) -> np.ndarray | None:
+    """The person (h, w) in front of the still background of a view; None where nothing is known of it."""
+    distance = regions.of_frame(frame)
+    if distance is None or not distance.any() or distance.all():
+        return None
+    small, (w, h) = (distance == 0).astype(np.uint8), (n * regions.step_px for n in distance.shape[::-1])
+    mask = np.zeros(size_px[::-1], bool)
+    mask[:h, :w] = cv2.resize(small, (w, h), interpolation=cv2.INTER_NEAREST)[: size_px[1], : size_px[0]] > 0
+    return _filled_holes(mask)
 
 
 def overlap(body: np.ndarray, person: np.ndarray, *, whole: bool) -> tuple[float, float, float]:

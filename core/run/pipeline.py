@@ -17,7 +17,7 @@ from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
 from ..fitting.inputs.fit_input import FitInput
-from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, known_silhouettes
+from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
 from ..fitting.inputs.take_inputs import check_body, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_sequence
@@ -232,8 +232,8 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     guided = fitting.track_again and run.measured
     tracked_again = _track_points(run, monitor, BodyGuide(body, run.footage)) if guided else {}
     run.results.remove("cache/fit")
-    silhouettes = known_silhouettes(run.footage, run.results, fitting)
-    run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], *silhouettes, monitor)
+    outlines = outline_polygons(run.footage, run.results)
+    run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)
     return given, body, tracked_again
 
 

@@ -95,6 +95,10 @@ def fit_figures(body: BodyFit, silhouettes: Mapping[str, Any], tracked_again: Ma
     return figures | ({"silhouettes": silhouettes} if silhouettes else {}) | ({"tracked_again": tracked_again} if tracked_again else {})
 
 
+LIMBS = {"upper_arm": "arm", "forearm": "forearm", "thigh": "leg", "shin": "lower leg"}
+FEW_FRAMES = 5  # that are not worth a warning
+
+
 def frame_states(body: BodyFit) -> dict[str, int]:
     """How many frames are in each state."""
     return {word: body.motion.status.count(word) for word in sorted(set(body.motion.status))}
@@ -104,9 +108,32 @@ def fit_warnings(body: BodyFit) -> list[str]:
     """What is doubtful about the fit as a whole: frames that rest on prediction, an adjustment that did not converge."""
     predicted = ", ".join(f"{n} {word}" for word, n in frame_states(body).items() if word != FITTED)
     warnings = [f"Frames in which the body rests partly on prediction: {predicted}."] if predicted else []
+    for bone, frames in body.contradicted.items():
+        if len(frames) > FEW_FRAMES:
+            warnings.append(
+                f"The images contradict the {limb_name(bone)} in {len(frames)} frames ({frame_list(frames)}): look at it there, and click "
+                "its joints in one of these frames."
+            )
     if not body.converged:
         warnings.append(f"The fit has not converged after {body.iterations} steps: look at the pictures, and raise fitting.sequence_steps.")
     return warnings
+
+
+def limb_name(bone: str) -> str:
+    """A limb in words, by its first bone: "upper_arm.R" -> "right arm"."""
+    part, _, side = bone.partition(".")
+    return " ".join([{"L": "left", "R": "right"}.get(side, ""), LIMBS.get(part, part.replace("_", " "))]).strip()
+
+
+def frame_list(frames: Sequence[int]) -> str:
+    """Frames in words: “3, 7–9”."""
+    runs: list[list[int]] = []
+    for frame in frames:
+        if runs and frame == runs[-1][-1] + 1:
+            runs[-1].append(frame)
+        else:
+            runs.append([frame])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 
 COLUMNS = ("points", "sigma_mm", "residual_px", "tracks", "track_sigma_mm", "fit_sigma0", "joint_sigma_mm")

@@ -3,14 +3,15 @@
 Only limbs whose pose must be observed take part; and, with a larger sigma, the middle of a hand, whose prior is a straight wrist: the tip
 of a bent one would pull its forearm.
 
-A pixel is background when it shows what the view's `background` image in take.toml shows; without such an image, what it shows when no
-measured point is near, or most of the time (`images.background`). A person may stand still most of the time, too: so without the image
-nothing near a measured point is background. Nor is anything along clicked limbs where the pixels have not changed since the click.
+The person is what the user's masks of every image say, or what covers the background (`images.foreground`): the view's `background` image
+in take.toml, or else what stays the same when no measured point is near. The images are averaged in square cells of about a centimetre at
+the person. Nobody is outside a mask for all images. Cells with measured points are the person's. So are those along clicked limbs that look
+like the background where they were clicked: such a limb stands still, and the background is not known there.
 """
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from pathlib import Path
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,24 +21,40 @@ from ...body.skeleton import Skeleton
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ...geometry.camera import Camera
-from ...images.background import Background, known_background, still_background
+from ...geometry.intersection import intersect_clicks
+from ...geometry.rig import Rig
+from ...images.foreground import FEWEST, CellBackground, cells, given_background, person, still_background
 from ...surface.cloud import PointCloud
+from ...take.person_masks import WHITE, silhouette_file
 from ...take.sources import read_picture
 from ...take.take import Footage, FrameClicks
 from ..observations import BackgroundExclusion
 from ..observations.background import DistanceMap
 from ..settings import FitSettings
-from ..state import ShapeParameters, free_bones
+from ..state import ShapeParameters, free_bones, hand_bones
 from .fit_input import BackgroundDistances, FitInput, Packed
 
 FRACTIONS = (0.2, 0.5, 0.8, 1.0)  # of a bone's axis, where its places are
-SAMPLES = 11  # frames for a view's background
-STEP_PX, UNIT_PX = 4, 0.5  # size of a square, unit of stored distances
-SPECK = 9  # squares: noise in one window of the comparison affects no more
+SAMPLES = 21  # frames for a view's background
+CELL_M, CELLS, LARGEST_CELL_PX = 0.008, 384, 8  # at the person; of an image without measured points; of a cell
+UNIT_PX = 0.5  # of stored distances
+MOST_CELLS = 600  # of a view, for a search
+HALF = 0.5  # of a cell is the person's, if the cell is
 STILL = 0.25  # of a limb's line looks like the background, if the limb stands still
-LIMB_M = 0.06  # nothing so near to a measured point or a clicked limb is background
+NEAR_M = 0.025  # nothing so near to a measured point shows the background
 BAND = 0.5  # width of a clicked limb over the mean length of the limbs
 HAND_FRACTION, HAND_SIGMA = 0.5, 3.0  # of a hand's axis; its sigma over that of the outline
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PersonCells:
+    """Cells of one view in one frame that show the person, thinned."""
+
+    camera: Camera
+    xy_px: np.ndarray  # (M, 2)
+    directions: np.ndarray  # (M, 3) unit rays in the world
+    area_px: float  # of the image for which each of them stands
+    distance: DistanceMap
 
 
 class BackgroundRegions:
@@ -47,146 +64,208 @@ class BackgroundRegions:
         skeleton = parameters.skeleton
         names = {joint: i for i, joint in enumerate(skeleton.joint_names)}
         free = free_bones(parameters)
-        ends = ~free & free[skeleton.parents] & ~np.isin(np.arange(len(free)), skeleton.parents)
         places = [(bone, along, 1.0) for bone, observed in zip(skeleton.bones, free) if observed for along in FRACTIONS]
-        places += [(bone, HAND_FRACTION, HAND_SIGMA) for bone, last in zip(skeleton.bones, ends) if last and bone.dofs]
+        places += [(bone, HAND_FRACTION, HAND_SIGMA) for bone, last in zip(skeleton.bones, hand_bones(parameters)) if last and bone.dofs]
         self._head = np.array([names[bone.head_joint] for bone, _, _ in places], dtype=np.intp)
         self._tail = np.array([names[bone.tail_joint] for bone, _, _ in places], dtype=np.intp)
         self._fraction = np.array([along for _, along, _ in places])
         self._sigma_px = settings.background_sigma_px * np.array([wider for _, _, wider in places])
         self._given = given.background if settings.use_background else ()
         self._rig, self._frames = given.rig, given.frames
+        self._cells: dict[int, list[PersonCells]] = {}
 
     def stretch(self, frames: Sequence[int]) -> "BackgroundRegions":
         """Those of some of the frames."""
         part = copy(self)
-        part._frames = [self._frames[t] for t in frames]
+        part._frames, part._cells = [self._frames[t] for t in frames], {}
         return part
 
     def observe(self, t: int) -> list[BackgroundExclusion]:
         """The observations of frame index `t`; none where no background is known."""
-        views = [
-            DistanceMap(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
-            for v in self._given
-            if (d := v.of_frame(self._frames[t])) is not None
-        ]
+        views = self._maps(t)
         if not views:
             return []
         return [BackgroundExclusion(views=views, head=self._head, tail=self._tail, fraction=self._fraction, sigma_px=self._sigma_px)]
 
+    @property
+    def known(self) -> bool:
+        """Whether the background of any view is known."""
+        return bool(self._given)
+
+    def cells(self, t: int) -> list[PersonCells]:
+        """The person's cells in frame index `t`, of the views whose background is known; the last frame's are cached."""
+        if t not in self._cells:
+            self._cells = {t: [_person_cells(view) for view in self._maps(t) if view.values_px.any() and not view.values_px.all()]}
+        return self._cells[t]
+
+    def _maps(self, t: int) -> list[DistanceMap]:
+        return [
+            DistanceMap(camera=self._rig[v.view], values_px=d * v.unit_px, step_px=v.step_px, first_px=(v.step_px - 1) / 2)
+            for v in self._given
+            if (d := v.of_frame(self._frames[t])) is not None
+        ]
+
+
+def _person_cells(view: DistanceMap) -> PersonCells:
+    j, i = np.nonzero(view.values_px == 0)
+    every = 1 + (len(i) - 1) // MOST_CELLS
+    xy = view.first_px + view.step_px * np.stack([i, j], axis=1)[::every]
+    rays = view.camera.rays(xy)
+    directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return PersonCells(camera=view.camera, xy_px=xy, directions=directions, area_px=float(every * view.step_px**2), distance=view)
+
 
 def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Monitor) -> list[BackgroundDistances]:
-    """The background regions in the frames of the clouds, of the views whose background is known.
+    """Where the views show the person and where the background, in the frames of the clouds; of the views in which that is known.
 
     Raises:
-        InputError: an image cannot be read, or the background in take.toml is not that of the view.
+        InputError: an image or a mask cannot be read, or the background in take.toml is not that of the view.
         Cancelled: the user asked to stop.
     """
     frames = np.array([cloud.frame for cloud in clouds])
-    known = {k: b for k, b in enumerate(still_backgrounds(footage, frames, clouds)) if b is not None}
-    distances = {k: Packed() for k in known}
-    if not known:
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int)).tolist()
+    sizes = _cell_sizes(footage, clouds, chosen)
+    known = {k: b for k, b in enumerate(_backgrounds(footage, clouds, chosen, sizes, monitor)) if b is not None}
+    masked = {k for k in range(len(sizes)) if _has_silhouettes(footage, k)}
+    if not known and not masked:
         return []
-    persons = _clicked_limbs(footage, known)
-    bare = {k: _coarse(b.bare) if b.bare is not None else np.False_ for k, b in known.items()}
+    limits = {k: cells(_mask_of(footage, k, int(frames[0])), sizes[k]) > 0 for k in known if footage.take.views[k].mask is not None}
+    persons = _clicked_limbs(footage, known, clouds, frames.tolist())
+    found = {k: Packed() for k in sorted({*known, *masked})}
     for t, cloud in enumerate(clouds):
         monitor.step("background", t, len(clouds))
-        images = footage.read(cloud.frame)
-        for k, background in known.items():
-            away = bare[k] | ~_near(footage.rig.cameras[k], cloud.xyz_m, persons[k].shape)
-            background_px = _shown(background, images[k]) & ~persons[k] & away
-            squares = cv2.distanceTransform(background_px.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
-            distances[k].append((np.minimum(squares, 255 * UNIT_PX / STEP_PX) * (STEP_PX / UNIT_PX)).astype(np.uint8))
-    return [
-        BackgroundDistances(view=footage.take.views[k].name, frame=frames, distance=d, step_px=STEP_PX, unit_px=UNIT_PX)
-        for k, d in distances.items()
-    ]
+        images = footage.read(cloud.frame) if known else []
+        for k, distances in found.items():
+            camera, size = footage.rig.cameras[k], sizes[k]
+            if k in known:
+                image = cells(images[k], size)
+                seen = _near(camera, cloud.xyz_m, image.shape, size, CELL_M)
+                shown = person(known[k], image, seen)
+                shown = np.ones(image.shape, dtype=bool) if shown is None else (shown | seen | persons[k]) & limits.get(k, True)
+            else:
+                shown = cells(_mask_of(footage, k, cloud.frame), size) > HALF
+            far = cv2.distanceTransform((~shown).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
+            distances.append((np.minimum(far, 255 * UNIT_PX / size) * (size / UNIT_PX)).astype(np.uint8))
+    views = footage.take.views
+    return [BackgroundDistances(view=views[k].name, frame=frames, distance=d, step_px=sizes[k], unit_px=UNIT_PX) for k, d in found.items()]
 
 
-def still_backgrounds(footage: Footage, frames: np.ndarray, clouds: Sequence[PointCloud] | None = None) -> list[Background | None]:
-    """The still background of every view: the image of it in take.toml, or from some of the frames (T,); None where they are too few.
+def _has_silhouettes(footage: Footage, k: int) -> bool:
+    """Whether the masks of a view are the person's silhouettes: one for all of many images only says where the person moves."""
+    view = footage.take.views[k]
+    return view.masks is not None or (view.mask is not None and footage.sequences[k].count == 1)
 
-    `clouds` (T,): the measured points of the person. A frame without points does not show where the background is.
 
-    Raises:
-        InputError: an image cannot be read, or the one in take.toml is not that of the view.
-    """
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int)).tolist()
-    persons = [] if clouds is None else [clouds[t].xyz_m for t in chosen]
-    found = list[Background | None]()
-    for k, (s, camera, view) in enumerate(zip(footage.sequences, footage.rig.cameras, footage.take.views)):
-        images = [s.read(footage.number(k, int(frames[t]))) for t in chosen]
-        if view.background is not None:
-            found.append(_background_of(footage.take.folder / view.background, view.name, images))
+def _mask_of(footage: Footage, k: int, frame: int) -> np.ndarray:
+    """The user's mask (h, w) of a view for a frame."""
+    path, camera = silhouette_file(footage, k, frame), footage.rig.cameras[k]
+    assert path is not None
+    return np.asarray(read_picture(path, camera.name, camera.size_px) > WHITE)
+
+
+def _cell_sizes(footage: Footage, clouds: Sequence[PointCloud], chosen: Sequence[int]) -> list[int]:
+    """The size of a view's cells in pixels: about `CELL_M` at the person; without measured points as in a picture of `CELLS` cells."""
+    measured = [clouds[t].xyz_m for t in chosen if len(clouds[t].xyz_m)]
+    sizes = []
+    for camera in footage.rig.cameras:
+        if measured:
+            depth = float(np.median(np.concatenate([camera.to_camera(xyz_m)[:, 2] for xyz_m in measured])))
+            size = CELL_M * camera.focal_px / max(depth, CELL_M)
+        else:
+            size = max(camera.size_px) / CELLS
+        sizes.append(int(np.clip(round(size), 1, LARGEST_CELL_PX)))
+    return sizes
+
+
+def _backgrounds(
+    footage: Footage, clouds: Sequence[PointCloud], chosen: Sequence[int], sizes: Sequence[int], monitor: Monitor
+) -> list[CellBackground | None]:
+    """The background of every view: the user's image of it, or what stays the same in the chosen frames; None where they are too few."""
+    found = list[CellBackground | None]()
+    points = [clouds[t].xyz_m for t in chosen]
+    footage.read(clouds[chosen[0]].frame)  # of the cameras' size
+    for k, (camera, view, size) in enumerate(zip(footage.rig.cameras, footage.take.views, sizes)):
+        monitor.step("background", k, len(sizes))
+        if view.background is None and (_has_silhouettes(footage, k) or len(chosen) < FEWEST):
+            found.append(None)
             continue
-        near = [_near_pixels(camera, xyz_m, images[0].shape) for xyz_m in persons] if any(map(len, persons)) else None
-        found.append(still_background(images, near))
+        images = []
+        for t in chosen:
+            monitor.check()
+            images.append(cells(footage.sequences[k].read(footage.number(k, clouds[t].frame)), size))
+        if view.background is not None:
+            found.append(_given_background(footage, k, images, size))
+            continue
+        everywhere = any(map(len, points))  # a frame without points does not show where the person is
+        near = [
+            _near(camera, xyz_m, images[0].shape, size, NEAR_M) if len(xyz_m) else np.full(images[0].shape, everywhere) for xyz_m in points
+        ]
+        found.append(still_background(images, near, size))
     return found
 
 
-def _background_of(path: Path, view: str, images: Sequence[np.ndarray]) -> Background:
+def _given_background(footage: Footage, k: int, images: Sequence[np.ndarray], size: int) -> CellBackground:
     """The background of a view by the user's own image of it.
 
     Raises:
         InputError: it cannot be read, is of another size, or none of the images shows it.
     """
-    known = known_background(read_picture(path, view, (images[0].shape[1], images[0].shape[0])), images)
-    if known is None:
-        raise InputError(f"The background image {path} is nothing like view {view} in any frame; take it with the same camera and light.")
-    return known
+    view, camera = footage.take.views[k], footage.rig.cameras[k]
+    assert view.background is not None
+    path = footage.take.folder / view.background
+    background = given_background(cells(read_picture(path, view.name, camera.size_px), size), images, size)
+    if background is None:
+        raise InputError(
+            f"The background image {path} is nothing like view {view.name} in any frame; take it with the same camera and light."
+        )
+    return background
 
 
-def _coarse(mask: np.ndarray) -> np.ndarray:
-    """The squares of `STEP_PX` that lie wholly in a mask (h, w)."""
-    h, w = (n // STEP_PX * STEP_PX for n in mask.shape)
-    return np.asarray(mask[:h, :w].reshape(h // STEP_PX, STEP_PX, w // STEP_PX, STEP_PX).all(axis=(1, 3)))
-
-
-def _shown(background: Background, image: np.ndarray) -> np.ndarray:
-    """The squares (h, w) in which an image shows the background, and the specks between them, smaller than a hand."""
-    whole = _coarse(background.shown_by(image))
-    _, label, stats, _ = cv2.connectedComponentsWithStats((~whole).astype(np.uint8), connectivity=8)
-    small = stats[:, cv2.CC_STAT_AREA] < SPECK
-    return np.asarray(whole | small[label])
-
-
-def _near(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Squares (h, w) near the images of points (N, 3)."""
+def _near(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...], size: int, reach_m: float) -> np.ndarray:
+    """Cells (h, w) of `size` pixels within reach of the images of points (N, 3), the next ones at least."""
     hit = np.zeros(shape, np.uint8)
     if not len(xyz_m):
         return hit.astype(bool)
     xy = camera.project(xyz_m)
-    at = np.floor(xy[camera.sees(xy)] / STEP_PX).astype(int)
+    at = np.floor(xy[camera.sees(xy)] / size).astype(int)
     at = at[(at >= 0).all(axis=1) & (at[:, 0] < shape[1]) & (at[:, 1] < shape[0])]
     hit[at[:, 1], at[:, 0]] = 1
-    radius = max(1, round(LIMB_M * camera.focal_px / float(np.median(camera.to_camera(xyz_m)[:, 2])) / STEP_PX))
+    depth = max(float(np.median(camera.to_camera(xyz_m)[:, 2])), reach_m)
+    radius = max(1, round(reach_m * camera.focal_px / depth / size))
     return cv2.dilate(hit, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))).astype(bool)
 
 
-def _near_pixels(camera: Camera, xyz_m: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Pixels (h, w) near the images of points (N, 3); all pixels if there are no points."""
-    if not len(xyz_m):
-        return np.ones(shape, dtype=bool)
-    squares = _near(camera, xyz_m, tuple(-(-n // STEP_PX) for n in shape))
-    return squares.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[: shape[0], : shape[1]]
-
-
-def _clicked_limbs(footage: Footage, backgrounds: Mapping[int, Background]) -> dict[int, np.ndarray]:
-    """Squares (h, w) of every view along those clicked limbs that look like the background in the click's frame."""
+def _clicked_limbs(
+    footage: Footage, backgrounds: Mapping[int, CellBackground], clouds: Sequence[PointCloud], frames: list[int]
+) -> dict[int, np.ndarray]:
+    """Cells (h, w) of every view along those clicked limbs that look like the background in the click's frame, and were not measured."""
     take = footage.take
-    masks = {k: np.zeros(_coarse(b.grey > 0).shape, bool) for k, b in backgrounds.items()}
+    masks = {k: np.zeros(b.grey.shape, bool) for k, b in backgrounds.items()}
     skeleton = read_model(str(take.body_model)).skeleton
     for clicked in (take.clicks, *take.keyframes):
         if clicked.joints and clicked.frame in footage.frames:
             images = footage.read(clicked.frame)
+            points = clouds[frames.index(clicked.frame)].xyz_m if clicked.frame in frames else np.zeros((0, 3))
             for k, background in backgrounds.items():
-                _add_still(masks[k], _lines(skeleton, clicked, take.views[k].name), _shown(background, images[k]))
+                size = background.cell_px
+                seen = _near(footage.rig.cameras[k], points, background.grey.shape, size, CELL_M)
+                shown = person(background, cells(images[k], size), seen)
+                if shown is not None:
+                    _add_still(masks[k], _lines(skeleton, clicked, footage.rig, take.views[k].name, size), ~(shown | seen))
     return masks
 
 
-def _lines(skeleton: Skeleton, clicked: FrameClicks, view: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The lines from clicked joint to clicked joint, in squares."""
-    at = {joint: pixels[view] / STEP_PX for joint, pixels in clicked.joints.items() if view in pixels}
+def _lines(skeleton: Skeleton, clicked: FrameClicks, rig: Rig, view: str, size: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The lines from clicked joint to clicked joint in a view, in cells; a joint clicked in two other views is projected into it."""
+    at = {}
+    for joint, pixels in clicked.joints.items():
+        if view in pixels:
+            at[joint] = pixels[view] / size
+        elif len(pixels) > 1:
+            place = intersect_clicks([rig[v] for v in pixels], np.array([list(pixels.values())])).xyz_m
+            xy = rig[view].project(place)[0]
+            if np.isfinite(xy).all():
+                at[joint] = xy / size
     return [(at[b.head_joint], at[b.tail_joint]) for b in skeleton.bones if b.head_joint in at and b.tail_joint in at]
 
 

@@ -114,9 +114,9 @@ class Packed(Sequence[np.ndarray]):
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BackgroundDistances:
-    """The distance of every place of a view from the nearest pixel that may show the person: 0 inside the person's outline.
+    """The distance of every place of a view from the person: 0 inside the person's outline.
 
-    Node (j, i) is the middle of a square of `step_px` × `step_px` pixels. DistanceMap are stored in steps of `unit_px`.
+    Node (j, i) is the middle of a cell of `step_px` × `step_px` pixels. Distances are stored in steps of `unit_px`.
     """
 
     view: str

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 
 from ...foundation.progress import Monitor
-from ...images.background import Background
 from ...results.folder import Results
 from ...surface.cloud import PointCloud
 from ...take.take import Footage
 from ...tracking.contour import ContourTable, Polygons
 from ..settings import FitSettings
-from .background import STEP_PX, UNIT_PX, find_background, still_backgrounds
+from .background import UNIT_PX, find_background
 from .fit_input import BackgroundDistances, Packed
 
+STEP_PX = 4  # of the distances from outlines
 LEAST_CORNERS = 3  # of a polygon
 SUBPIXEL_BITS = 4  # of a polygon's vertices in OpenCV's fixed-point coordinates
 
@@ -50,22 +50,6 @@ def outline_polygons(footage: Footage, results: Results) -> dict[str, Mapping[in
     tables = {view.name: ContourTable(results.path("contours", f"{view.name}.csv")) for view in footage.take.views}
     polygons = {name: Polygons(table, footage.frames, LEAST_CORNERS) for name, table in tables.items()}
     return {name: found for name, found in polygons.items() if found}
-
-
-def known_silhouettes(
-    footage: Footage, results: Results, settings: FitSettings
-) -> tuple[dict[str, Mapping[int, np.ndarray]], dict[str, Background]]:
-    """The outlines, and the still backgrounds of views that have none: they show the person's silhouette.
-
-    Raises:
-        InputError: an image or a table of contours cannot be read.
-    """
-    outlines = outline_polygons(footage, results)
-    if not settings.use_background or len(outlines) == len(footage.take.views):
-        return outlines, {}
-    backgrounds = still_backgrounds(footage, np.array(footage.frames))
-    names = [view.name for view in footage.take.views]
-    return outlines, {n: b for n, b in zip(names, backgrounds) if b is not None and n not in outlines}
 
 
 def filled(polygon_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:

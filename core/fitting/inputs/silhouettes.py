@@ -1,4 +1,6 @@
-"""Contours of the views as rays that touch the body, frame by frame, and the limb that each touches.
+"""Outlines of the person in the views as rays that touch the body, frame by frame, and the limb that each touches.
+
+The outlines are those of `tricap contour`; in the other views those of the region that covers the still background.
 
 A ray of the outline touches the limb that it enters deepest, or passes nearest: a ray inside any limb would be inside the outline. It
 touches none when it is further from every limb than the gate, when it meets the limb far beyond its ends, or when the outline faces the
@@ -9,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ...geometry.camera import Camera
@@ -17,12 +20,18 @@ from ..segmentation import SegmentationCache, facing_bone
 from ..settings import FitSettings
 from ..state import BodyState
 from .cloud_points import VARIANCE_FLOOR_M2
-from .fit_input import FitInput
+from .fit_input import BackgroundDistances, FitInput, Outline
 
-SPACING_M = 0.012  # of the rays, at the body
+SPACING_M, COARSE_SPACING_M = 0.012, 0.03  # of the rays at the body: of a drawn outline, and of one against the background
 BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders and the crown, where the parts' fields meet
 OUTLINE_PATCHES = 3  # an outline follows a wrong edge for about so many patches of the model's error, and does so in all similar views
 CACHED_FRAMES = 500  # with their rays: more than are adjusted at once
+# sigma of a body from its metaballs where these meet, and of clothes, hair and fingers, which are no metaballs
+COARSE_SIGMA_M = 0.006
+SMALLEST = 40  # cells along the outline of a region or of a hole in it
+SMOOTHED = 2.0  # cells along an outline, over which its steps are averaged
+EDGE, EDGE_SIGMA = 0.5, 1.0  # cells: how far the edge is outside the middles of a region's outermost cells, and its sigma
+AT_BORDER = 2  # cells
 SIMILAR = float(np.cos(np.radians(40.0)))  # views whose directions are closer than this have the same outline
 
 
@@ -34,7 +43,32 @@ class Rays:
     direction: np.ndarray  # (N, 3) unit
     outward: np.ndarray  # (N, 3) unit, away from the person and across the ray
     angle: np.ndarray  # (N,) sigma across the ray, rad
-    similar_views: np.ndarray  # (N,) number of views with about the same outline
+    patch: np.ndarray  # (N,) rays of all similar views on 1 m of the outline, whose errors of the model are one
+    model_m: np.ndarray  # (N,) sigma of a real body from its metaballs
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PersonOutlines:
+    """The outlines of the region that covers the still background of a view (`fit_input.Outlines`), made on demand."""
+
+    regions: BackgroundDistances
+
+    @property
+    def view(self) -> str:
+        """The view's name."""
+        return self.regions.view
+
+    def of_frame(self, frame: int) -> Outline | None:
+        """That of a frame; None where nothing is known of the background, or the person is not seen."""
+        distance = self.regions.of_frame(frame)
+        if distance is None or distance.all() or not distance.any():
+            return None
+        parts = [_smooth_outline(c[:, 0], distance.shape) for c in _contours(distance == 0) if len(c) >= SMALLEST]
+        if not parts:
+            return None
+        xy, normal = (np.concatenate(column) for column in zip(*parts))
+        size = self.regions.step_px
+        return xy * size + (size - 1) / 2, normal, np.full(len(xy), EDGE_SIGMA * size)
 
 
 class Silhouettes:
@@ -42,8 +76,12 @@ class Silhouettes:
 
     def __init__(self, given: FitInput, surface: np.ndarray, settings: FitSettings) -> None:
         self._surface, self._settings = (_closed(surface) if settings.balls == "one" else surface), settings
-        used = given.contours if settings.use_contours else ()
-        self._tables = [(given.rig[c.view], c) for c in used]
+        used = [*given.contours] if settings.use_contours else []
+        drawn = {outline.view for outline in used}
+        if settings.use_background:
+            used += [PersonOutlines(regions=regions) for regions in given.background if regions.view not in drawn]
+        exact, coarse = (SPACING_M, settings.model_sigma_m), (COARSE_SPACING_M, max(settings.model_sigma_m, COARSE_SIGMA_M))
+        self._tables = [(given.rig[c.view], c, coarse if isinstance(c, PersonOutlines) else exact) for c in used]
         self._frames = given.frames
         self._rays: dict[int, Rays | None] = {}
 
@@ -51,6 +89,18 @@ class Silhouettes:
         """Those of some of the frames; their rays are made on demand."""
         part = copy(self)
         part._frames, part._rays = [self._frames[t] for t in frames], {}
+        return part
+
+    def anew(self) -> "Silhouettes":
+        """The same, without rays that depend on what was computed before."""
+        part = copy(self)
+        part._rays = {}
+        return part
+
+    def drawn_only(self) -> "Silhouettes":
+        """Those of `tricap contour`. The others include hair, fingers and clothes: good enough to find a limb, but not to shape it."""
+        part = self.anew()
+        part._tables = [table for table in self._tables if not isinstance(table[1], PersonOutlines)]
         return part
 
     def observe(
@@ -72,8 +122,8 @@ class Silhouettes:
         if not len(rows):
             return []
         away = np.linalg.norm(state.head_m[bone] - rays.origin_m[rows], axis=1)
-        own, model = (rays.angle[rows] * away) ** 2 + VARIANCE_FLOOR_M2, self._settings.model_sigma_m**2
-        in_patch = np.maximum(1.0, rays.similar_views[rows] * OUTLINE_PATCHES * self._settings.model_patch_m / SPACING_M)
+        own, model = (rays.angle[rows] * away) ** 2 + VARIANCE_FLOOR_M2, rays.model_m[rows] ** 2
+        in_patch = np.maximum(1.0, rays.patch[rows] * self._settings.model_patch_m)
         found = SilhouetteRays.about(
             state,
             origin_m=rays.origin_m[rows],
@@ -85,26 +135,27 @@ class Silhouettes:
         return [found]
 
     def _of_frame(self, t: int, state: BodyState) -> Rays | None:
-        ahead = np.array([camera.R_cam_world[2] for camera, _ in self._tables]).reshape(-1, 3)
+        ahead = np.array([camera.R_cam_world[2] for camera, _, _ in self._tables]).reshape(-1, 3)
         parts = [
-            _view_rays(camera, *outline, state.head_m.mean(axis=0), int((ahead @ camera.R_cam_world[2] > SIMILAR).sum()))
-            for camera, table in self._tables
+            _view_rays(camera, outline, state.head_m.mean(axis=0), int((ahead @ camera.R_cam_world[2] > SIMILAR).sum()), drawn)
+            for camera, table, drawn in self._tables
             if (outline := table.of_frame(self._frames[t])) is not None
         ]
         if not parts:
             return None
         columns: Mapping[str, np.ndarray] = {
             name: np.concatenate([getattr(p, name) for p in parts])
-            for name in ("origin_m", "direction", "outward", "angle", "similar_views")
+            for name in ("origin_m", "direction", "outward", "angle", "patch", "model_m")
         }
         return Rays(**columns)
 
 
-def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: np.ndarray, about_m: np.ndarray, similar: int) -> Rays:
-    """The rays of one view, thinned to `SPACING_M` at a place (3,) of the body; `similar` views have about the same outline."""
+def _view_rays(camera: Camera, outline: Outline, about_m: np.ndarray, similar: int, kind: tuple[float, float]) -> Rays:
+    """The rays of one view, of a `kind`: spacing at a place (3,) of the body, model's sigma; `similar` views have about its outline."""
+    (xy_px, normal, sigma_px), (spacing_m, model_m) = outline, kind
     pixel_m = np.linalg.norm(about_m - camera.centre_m) / camera.focal_px
-    gap = np.median(np.linalg.norm(np.diff(xy_px, axis=0), axis=1)) * pixel_m if len(xy_px) > 1 else SPACING_M
-    keep = np.arange(0, len(xy_px), max(1, round(SPACING_M / max(gap, 1e-9))))
+    gap = np.median(np.linalg.norm(np.diff(xy_px, axis=0), axis=1)) * pixel_m if len(xy_px) > 1 else spacing_m
+    keep = np.arange(0, len(xy_px), max(1, round(spacing_m / max(gap, 1e-9))))
     direction, outside = (_unit(camera.rays(xy)) for xy in (xy_px[keep], xy_px[keep] + normal[keep]))
     outward = _unit(outside - np.einsum("ni,ni->n", outside, direction)[:, None] * direction)
     return Rays(
@@ -112,8 +163,32 @@ def _view_rays(camera: Camera, xy_px: np.ndarray, normal: np.ndarray, sigma_px: 
         direction=direction,
         outward=outward,
         angle=sigma_px[keep] / camera.focal_px,
-        similar_views=np.full(len(keep), similar),
+        patch=np.full(len(keep), similar * OUTLINE_PATCHES / spacing_m),
+        model_m=np.full(len(keep), model_m),
     )
+
+
+def _contours(person: np.ndarray) -> list[np.ndarray]:
+    """The outlines (V, 1, 2) of a mask (h, w) and of its holes, the person on the same side of all."""
+    return list(cv2.findContours(person.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0])
+
+
+def _smooth_outline(corners: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 2) in cells and unit outward normals (V, 2) of a closed outline of cells (V, 2), without those at the image's border.
+
+    OpenCV follows the outside of a region counter-clockwise and a hole clockwise, in an image whose y points down.
+    """
+    reach = int(3 * SMOOTHED)
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTHED) ** 2)
+    around = np.concatenate([corners[-reach:], corners, corners[:reach]]).astype(np.float64)
+    xy = np.stack([np.convolve(column, weight / weight.sum(), mode="valid") for column in around.T], axis=1)
+    along = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    size = np.linalg.norm(normal, axis=1)
+    h, w = shape
+    kept = (size > 0) & (corners >= AT_BORDER).all(axis=1) & (corners[:, 0] < w - AT_BORDER) & (corners[:, 1] < h - AT_BORDER)
+    outward = normal[kept] / size[kept, None]
+    return xy[kept] + EDGE * outward, outward
 
 
 def _closed(surface: np.ndarray) -> np.ndarray:

@@ -23,7 +23,6 @@ from .block_band import NormalEquations, eliminated, reversed_in_time
 from .problem import Estimate, Problem, Scales, linearise
 
 SPAN_S = 0.1  # accelerations of a first motion are taken over this time, which averages its noise
-LEAST = 0.1  # of the loosest sigma: however steady the observed motion
 SMALLEST_DIAGONAL = 1e-12  # of Λ, before its rows are scaled
 ENOUGH = 3  # second differences of a DOF, for a sigma of its own
 
@@ -62,8 +61,10 @@ class Acceleration:
             equations.next2[t] += np.diag(c[2] * c[0] * weight)
 
 
-def typical_acceleration(motion: np.ndarray, observed: np.ndarray, time_s: np.ndarray, loosest: np.ndarray) -> np.ndarray:
-    """Sigma (D,) of the accelerations of a motion (T, D) where it is `observed` (T, D), between `LEAST` times the `loosest` and that.
+def typical_acceleration(
+    motion: np.ndarray, observed: np.ndarray, time_s: np.ndarray, loosest: np.ndarray, least: np.ndarray | float = 0.1
+) -> np.ndarray:
+    """Sigma (D,) of the accelerations of a motion (T, D) where it is `observed` (T, D), between `least` (D,) times the `loosest` and that.
 
     An occluded limb is taken to move as that limb does where it is visible. The root mean square of second differences over `SPAN_S`.
     """
@@ -75,7 +76,7 @@ def typical_acceleration(motion: np.ndarray, observed: np.ndarray, time_s: np.nd
     good = observed[2 * step :] & observed[step:-step] & observed[: -2 * step]
     count = good.sum(axis=0)
     rms = np.sqrt((np.where(good, a, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1))
-    return np.where(count >= ENOUGH, np.clip(rms, LEAST * loosest, loosest), loosest)
+    return np.where(count >= ENOUGH, np.clip(rms, least * loosest, loosest), loosest)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

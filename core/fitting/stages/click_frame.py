@@ -1,6 +1,7 @@
 """The first body: pose and shape at the click frame (D'Apuzzo et al. 1999, §3.3)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -21,8 +22,10 @@ from .inverse_kinematics import inverse_kinematics, other_poses
 
 REACH_M = 0.20  # of the points that take part, from the surface of the clicked pose
 FIRST_GATE = 1.5  # gate_scale as long as the radii are the model's
+FIRST_STEPS, MOST_STARTS = 4, 3  # of all starts; and how many of them go on
 POSE_STEPS, STEPS = 15, 25
 LARGEST_SIGMA0 = 3.0  # of a plausible pose; in front of the limb or past it, sigma0 is larger
+KEPT_SCORE = 0.95  # of that with the outlines, by a body without them
 ALTERNATIONS, ALTERNATION_STEPS = 8, 5
 OTHERS_AROUND, AROUND_RAD, AROUND_M = 6, float(np.radians(20.0)), 0.05  # of new starts: six led to the true arm in all of 20 trials
 MOST_OTHERS = 12  # starts for limbs without clicks: those that explain most points
@@ -39,7 +42,7 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
     monitor.step(STAGE, 0, 1)
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     best, best_score = None, -np.inf
-    starts = _starts(fit, points, clicked.motion[0], clicked.vector, monitor)
+    starts = _best_starts(fit, points, _starts(fit, points, clicked.motion[0], clicked.vector, monitor), clicked.vector, monitor)
     parts = [monitor.part(STAGE, i, len(starts) + 1) for i in range(len(starts) + 1)]
     for part, motion in zip(parts, starts):
         solution = fit_pose_and_shape(fit, points, motion, clicked.vector, part)
@@ -57,7 +60,17 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
             f"Frame {points.frame} has no measured points near the clicked joints, and no outlines; check the clicks and the "
             "rig, or click in a frame where the limb was measured."
         )
-    return _with_lost_limbs(fit, points, best, best_score, parts[-1])
+    return _shaped(fit, points, _with_lost_limbs(fit, points, best, best_score, parts[-1]), clicked.vector, monitor)
+
+
+def _shaped(fit: FitContext, points: CloudPoints, found: Solution, vector: np.ndarray, monitor: Monitor) -> Solution:
+    """The solution with its shape adjusted anew from a vector (S,), without outlines against the background, where the points suffice."""
+    exact = replace(fit, silhouettes=fit.silhouettes.drawn_only())
+    if not fit.background.known or not fit.settings.use_surface:
+        return found
+    again = _to_surface(exact, points, found.motion[0], vector, monitor)
+    least = fit.score(fit.click, points, found.motion[0], found.vector) * KEPT_SCORE
+    return again if fit.score(fit.click, points, again.motion[0], again.vector) > least else found
 
 
 def _with_lost_limbs(fit: FitContext, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> Solution:
@@ -65,7 +78,7 @@ def _with_lost_limbs(fit: FitContext, points: CloudPoints, best: Solution, best_
 
     With a short base, clicks hardly determine a limb's depth: bent towards the cameras it looks as bent away from them.
     """
-    found = reacquired_poses(fit, points, best.motion[0], best.vector, _try(monitor, 0))
+    found = reacquired_poses(fit, fit.click, points, best.motion[0], best.vector, _try(monitor, 0))
     for i, start in enumerate(found):
         solution = fit_pose_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
         score = fit.score(fit.click, points, solution.motion[0], solution.vector)
@@ -164,6 +177,19 @@ def _starts(fit: FitContext, points: CloudPoints, motion: np.ndarray, vector: np
         moved[fit.model.skeleton.layout.group("base")] += shift * view
         starts.append(moved)
     return starts
+
+
+def _best_starts(fit: FitContext, points: CloudPoints, starts: list[np.ndarray], vector: np.ndarray, monitor: Monitor) -> list[np.ndarray]:
+    """The `MOST_STARTS` whose poses explain most after a few steps with the shape fixed."""
+    if len(starts) <= MOST_STARTS:
+        return starts
+    score = []
+    for motion in starts:
+        near = crop(points, fit.parameters.state(motion, vector), REACH_M)
+        problem, start = fit.problem(_observe(fit, near, FIRST_GATE)), Estimate(motion=motion[None], vector=vector)
+        pose = solve(problem, start, steps=FIRST_STEPS, furthest=FURTHEST, monitor=monitor, stage=STAGE).motion[0]
+        score.append(fit.score(fit.click, points, pose, vector))
+    return [starts[i] for i in np.sort(np.argsort(-np.array(score), kind="stable")[:MOST_STARTS])]
 
 
 def _observe(fit: FitContext, points: CloudPoints, gate_scale: float) -> Callable[[int, BodyState], list[Observation]]:

@@ -22,6 +22,7 @@ from ..solve.problem import Estimate, robust_scale
 from ..solve.solver import Solution
 from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
+from .contradicted import misplaced_limbs, widened
 from .pose_tracking import Checkpoints
 
 A = TypeVar("A")
@@ -76,6 +77,7 @@ class FrameResults:
     points: np.ndarray  # (n, B)
     evidence: np.ndarray  # (n, B)
     outline_m: np.ndarray  # (K,)
+    misplaced: np.ndarray  # (n, L) area in voxels by which each limb contradicts what is seen (`contradicted`)
 
 
 def frame_results(part: Recording, solution: Estimate, covariance: Covariance, frames: range) -> FrameResults:
@@ -86,6 +88,7 @@ def frame_results(part: Recording, solution: Estimate, covariance: Covariance, f
     joints, joint_sigma = np.empty((n, J, 3)), np.empty((n, J))
     sigma0 = np.array([frame_sigma0(fit, t, points[t], solution) for t in frames])
     counts, outline = np.zeros((2, n, B), dtype=np.int64), [np.zeros(0)]
+    wrong = []
     for i, t in enumerate(frames):
         fit.monitor.check()
         state = fit.parameters.state(solution.motion[t], solution.vector)
@@ -94,6 +97,8 @@ def frame_results(part: Recording, solution: Estimate, covariance: Covariance, f
         joint_sigma[i] = np.sqrt(np.einsum("jia,ab,jib->j", A, K, A, optimize=True) / 3)
         counts[0, i] = np.bincount(fit.surface(points[t], state).bone, minlength=B)
         counts[1, i] = fit.evidence(t, points[t], state)
+        wrong.append(misplaced_limbs(fit, t, points[t], state))
+        widened(fit.parameters, wrong[-1], pose[t], joint_sigma[i])
         outline += [np.abs(rays.residual(state)) * rays.sigma_m for rays in fit.silhouettes.observe(t, state)]
     return FrameResults(
         values=solution.motion[frames],
@@ -104,6 +109,7 @@ def frame_results(part: Recording, solution: Estimate, covariance: Covariance, f
         points=counts[0],
         evidence=counts[1],
         outline_m=np.concatenate(outline),
+        misplaced=np.array(wrong),
     )
 
 

@@ -246,7 +246,7 @@ def _pose(given: PoseTracking, target: TargetPose, monitor: Monitor) -> tuple[np
         pose, support, score = _adjusted(given, target, clicked, monitor)
         if score > best_score:
             best, best_support, best_score = pose, support, score
-    for start in reacquired_poses(fit, target.points, best, given.first.vector, monitor):
+    for start in reacquired_poses(fit, i, target.points, best, given.first.vector, monitor):
         pose, support, score = _adjusted(given, target, start, monitor)
         if score > best_score + fit.least_gain:
             best, best_support, best_score = pose, support, score
@@ -271,6 +271,15 @@ def _adjusted(given: PoseTracking, target: TargetPose, start: np.ndarray, monito
     begin = Estimate(motion=start[None], vector=vector, scales=given.first.scales)
     pose = solve(fit.problem(observe), begin, steps=fit.settings.frame_steps, monitor=monitor).motion[0]
     return pose, fit.support(i, points, pose, vector), fit.score(i, points, pose, vector)
+
+
+def adjusted_alone(given: PoseTracking, t: int, start: np.ndarray, monitor: Monitor) -> np.ndarray:
+    """The pose (D,) of frame t adjusted from a start (D,), without its neighbours."""
+    fit, state = given.fit, given.state(start)
+    near = _subsampled(crop(given.points[t], state, _reach(fit, state)))
+    ones = np.ones(len(fit.model.skeleton.bones))
+    target = TargetPose(index=t, points=near, starts=[start], from_neighbour=[], neighbour_support=None, gate_scale=ones)
+    return _adjusted(given, target, start, monitor)[0]
 
 
 def _prediction_sigma(fit: FitContext) -> np.ndarray:

@@ -48,7 +48,9 @@ from ..solve.solver import Solution, solve
 from ..solve.time_priors import Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
 from ..state import BodyState, ShapeParameters, free_bones
 from .click_frame import clicked_lengths, fit_click_frame
+from .contradicted import contradicted_frames
 from .inverse_kinematics import clicked_stature, dof_priors, shared_over_time
+from .limb_paths import follow_limbs
 from .long_sequence import (
     AT_ONCE,
     NO_PRIORS,
@@ -75,6 +77,7 @@ ADJUST = "adjust the sequence"  # stages of the progress report
 SIGMAS = "sigmas of the fit"
 ERROR_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
 MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that have the simplified body's surface
+LEAST_ANGULAR, LEAST_OF_BASE = 0.3, 0.1  # of the largest sigmas of accelerations: 1,800°/s², as elbows and knees have, and 0.5 m/s²
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
@@ -101,12 +104,14 @@ def fit_sequence(
         tracks = MaterialTracks(given.trajectories, given.frames, fit.model.surface, settings)
     tracking = PoseTracking(fit=fit, points=points, time_s=given.time_s, first=first, tracks=tracks)
     motion, observed = track_poses(tracking, monitor, checkpoints)
+    motion = follow_limbs(tracking, motion, monitor)
+    fit = replace(fit, silhouettes=fit.silhouettes.drawn_only())
     whole = Recording(
         fit=fit,
         frames=given.frames,
         points=points,
         time_s=given.time_s,
-        sigma=typical_acceleration(motion, observed, given.time_s, _loosest(fit)),
+        sigma=typical_acceleration(motion, observed, given.time_s, _loosest(fit), _least(fit)),
         tracks=tracks,
         lengths=clicked_lengths(fit, near(points[fit.click], fit.parameters.state(motion[fit.click], first.vector)), first),
         feet=_standing(fit, motion, first.vector, given.time_s),
@@ -291,6 +296,13 @@ def _loosest(fit: FitContext) -> np.ndarray:
     return sigma
 
 
+def _least(fit: FitContext) -> np.ndarray:
+    """The least sigma (D,) of accelerations over the largest, however steady the observed motion."""
+    share = np.full(len(fit.model.skeleton.dofs), LEAST_ANGULAR)
+    share[fit.model.skeleton.layout.group("base")] = LEAST_OF_BASE
+    return share
+
+
 def _whole_sequence(part: Recording, prior: MarginalPrior | None = None) -> Problem:
     """The adjustment of poses and shape, with the marginal prior from the frames of earlier stretches."""
     fit, points, feet = part.fit, part.points, part.feet
@@ -368,6 +380,7 @@ def _result(
         converged=all(one.converged for one in convergence),
         points=results.points,
         outline_m=results.outline_m,
+        contradicted=contradicted_frames(fit.parameters, np.array(whole.frames), results.misplaced),
     )
 
 

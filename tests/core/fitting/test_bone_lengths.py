@@ -100,7 +100,8 @@ def test_an_outline_beyond_the_hand_is_the_fingers_and_one_over_the_crown_is_the
             direction=view[None],
             outward=state.R[b][:, 0][None],
             angle=np.full(1, 1e-3),
-            similar_views=np.ones(1),
+            patch=np.ones(1),
+            model_m=np.full(1, 0.004),
         )
         return touched(rays, state, full.surface, 0.1)[1]
 

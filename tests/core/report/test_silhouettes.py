@@ -9,13 +9,13 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skin.contour_skin import SkinSettings
+from tricap.core.fitting.inputs.fit_input import BackgroundDistances, Packed
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
-from tricap.core.images.background import Background
 from tricap.core.report.figures import figure_rows
 from tricap.core.report.pages import _agreement_caption, check_pictured
 from tricap.core.report.pictures import BODY_OUTLINE, PERSON_OUTLINE, body_over_footage
-from tricap.core.report.silhouettes import body_masks, by_view, is_whole_body, outlines_of, overlap, silhouettes_of
+from tricap.core.report.silhouettes import body_masks, by_view, is_whole_body, outlines_of, overlap, person_mask, silhouettes_of
 
 ARM = default_shape(read_model("arm.R"))
 ARM_MOTION = np.zeros((3, len(ARM.skeleton.dofs)))
@@ -45,7 +45,7 @@ def _outline(scenes: Any, shape: BodyShape, motion: np.ndarray, shift: float = 0
 def test_the_silhouette_of_a_body_that_is_known(scenes: Any) -> None:
     person = PERSON, PERSON_MOTION
     outlines = {"C": {0: _outline(scenes, *person), 2: _outline(scenes, *person, 6.0)}}
-    found = silhouettes_of(_footage(scenes), _body(*person), SkinSettings(), outlines, {}, Monitor())
+    found = silhouettes_of(_footage(scenes), _body(*person), SkinSettings(), outlines, [], Monitor())
     exact, shifted = found.fits
     assert (exact.view, exact.frame, exact.person) == ("C", 0, "outline") and exact.iou > 0.97 and exact.distance_px < 0.5
     mask = _mask(scenes, *person)
@@ -83,7 +83,7 @@ def test_an_arm_is_not_compared_with_the_whole_person(scenes: Any) -> None:
             2: np.array([[0, 0], [9, 0], [9, 9]], float),
         }
     }
-    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), outlines, {}, Monitor())
+    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), outlines, [], Monitor())
     inside, beside = found.fits
     assert not found.whole and inside.inside == 1.0 and beside.inside < 0.02
     assert all(np.isnan([fit.iou, fit.distance_px]).all() for fit in found.fits)
@@ -104,19 +104,41 @@ def test_which_models_are_whole_bodies(model: str, whole: bool) -> None:
     assert is_whole_body(read_model(model).skeleton) == whole
 
 
-def test_a_silhouette_before_the_background(scenes: Any) -> None:
+def _regions(view: str, person: np.ndarray, step_px: int, *others: np.ndarray) -> BackgroundDistances:
+    """Of frame 0 the distance from a person (h, w), of the next ones others (h', w')."""
+    h, w = (n // step_px * step_px for n in person.shape)
+    cells = person[:h, :w].reshape(h // step_px, step_px, w // step_px, step_px).mean(axis=(1, 3)) >= 0.5
+    tables = Packed([np.where(cells, 0, 9), *others])
+    return BackgroundDistances(view=view, frame=np.arange(len(tables)), distance=tables, step_px=step_px, unit_px=0.5)
+
+
+@pytest.mark.parametrize("step_px", [1, 4])
+def test_a_silhouette_before_the_background(scenes: Any, step_px: int) -> None:
     rig = scenes.three_cameras()
     mask = body_masks(rig.cameras[:1], ARM, ARM_MOTION[0], SkinSettings())[0]
-    still = np.random.default_rng(0).uniform(60, 90, mask.shape).astype(np.float32)
-    image = np.where(mask, 160.0, still).astype(np.float32)
-    image[2:14, 150:165] = 10.0  # something else that moved
-    footage: Any = SimpleNamespace(rig=rig, frames=range(3), read=lambda frame: [image] * 3)
-    fits = silhouettes_of(footage, _body(ARM, ARM_MOTION), SkinSettings(), {}, {"L": Background(grey=still, noise=1.0)}, Monitor()).fits
-    assert {(f.view, f.person) for f in fits} == {("L", "background")} and len(fits) == 3
-    assert fits[0].inside > 0.95
+    hollow = mask.copy()
+    y, x = np.argwhere(mask).mean(axis=0).astype(int)
+    hollow[y - 3 : y + 4, x - 3 : x + 4] = False  # what is surrounded by the person is the person
+    shape = np.array(mask.shape) // step_px
+    regions = _regions("L", hollow, step_px, np.zeros(shape), np.full(shape, 200))  # frames 1 and 2: nothing known, and nobody there
+    found = person_mask(regions, 0, rig.cameras[0].size_px)
+    assert found is not None and found.shape == mask.shape and found[y, x]
+    assert (found & mask).sum() / (found | mask).sum() > {1: 0.98, 4: 0.85}[step_px]
+    assert [person_mask(regions, frame, rig.cameras[0].size_px) for frame in (1, 2, 3)] == [None] * 3
+    fits = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), {}, [regions], Monitor()).fits
+    assert [(f.view, f.frame, f.person) for f in fits] == [("L", 0, "background")]
+    assert fits[0].inside > {1: 0.98, 4: 0.9}[step_px]
     rows = figure_rows({}, [], None, None, fits)
     assert [r["name"] for r in rows] == ["silhouette of view L, share inside the person in front of the background"]
-    assert silhouettes_of(footage, _body(ARM, ARM_MOTION), SkinSettings(), {}, {}, Monitor()).fits == ()
+    assert silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), {}, [], Monitor()).fits == ()
+
+
+def test_an_outline_goes_before_the_background(scenes: Any) -> None:
+    mask = _mask(scenes, ARM, ARM_MOTION)
+    outlines = {"C": {0: _outline(scenes, ARM, ARM_MOTION)}}
+    regions = [_regions("C", ~mask, 4, np.where(mask[2::4, 2::4], 0, 9))]
+    found = silhouettes_of(_footage(scenes), _body(ARM, ARM_MOTION), SkinSettings(), outlines, regions, Monitor())
+    assert [(f.frame, f.person) for f in found.fits] == [(0, "outline"), (1, "background")] and found.fits[0].inside > 0.95
 
 
 def test_outlines_are_drawn_over_the_footage(scenes: Any) -> None:

@@ -1,0 +1,258 @@
+"""How much of what is seen in a frame a pose explains: measured points, and the person's cells in front of the still background.
+
+    w(g) = 1 / (1 + (g / width)²)²                                                                        (1)
+    gain = Σ_i a_i max(0, max_b w(g_ib) − taken_i) − Σ_s a_s (min(1, d_s / r_s) + through_s)               (2)
+
+i are points and cells, b the bones of a limb as tapered capsules, g the distance from a capsule's surface (cells: beyond its image), and
+`taken` what the rest of the body explains. s are places along the limb: d_s is how far a place lies in the background, averaged over the
+views, r_s the limb's radius there; `through` is 1 where points were measured far behind it, or where it lies inside another part. Areas a
+are in voxels of the cloud, so that (2) counts like points. Many poses of one limb are evaluated at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..body.skeleton import bone_frames
+from ..geometry.camera import Camera
+from .inputs.background import PersonCells
+from .inputs.cloud_points import CloudPoints
+from .inputs.silhouettes import nearest_to_segment
+from .limb import Limb
+from .segmentation import facing_bone
+from .state import BodyState, free_bones
+
+MOST_POINTS = 500  # of a frame
+CELL_WEIGHT = 0.5  # of the person's area in all views together, against that of measured points
+TAKEN_M, TAKEN_CELLS_M = 0.04, 0.02  # widths: a body differs from its metaballs by a centimetre or two, and what it explains is no other's
+BEYOND_M = 0.05  # what is so far beyond a limb's reach is not the limb's
+EXPLAINED = 0.95  # of a point or cell: no limb is looked for there
+FACING = 0.3  # least cosine between a point's normal and the limb's
+PLACES = np.array([0.15, 0.4, 0.65, 0.9])  # along a bone, where it must not lie in the background
+CLEAR_OF_JOINT = 0.5  # of a limb's first bone, from where on it is in no other part
+FINGERS = 1.9  # a hand's reach over its bone's length, which ends at the knuckles
+BEHIND_M = 0.06  # a limb so far before measured points would hide them
+CELL_OF_DEPTH_M = 0.03
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _NearestDepths:
+    """The depth [m] of the nearest measured point in square cells of one view, infinite without one; `low` is the index of the first."""
+
+    camera: Camera
+    cells_per_tangent: float
+    low: np.ndarray  # (2,)
+    depth_m: np.ndarray  # (w, h)
+
+    @staticmethod
+    def of(camera: Camera, xyz_m: np.ndarray) -> "_NearestDepths":
+        """Those of points (N, 3), at least one."""
+        p = camera.to_camera(xyz_m)
+        scale = float(np.median(p[:, 2])) / CELL_OF_DEPTH_M
+        at = np.floor(p[:, :2] / p[:, 2:] * scale).astype(int)
+        low = at.min(axis=0)
+        depth = np.full(at.max(axis=0) - low + 1, np.inf)
+        np.minimum.at(depth, tuple((at - low).T), p[:, 2])
+        return _NearestDepths(camera=camera, cells_per_tangent=scale, low=low, depth_m=depth)
+
+    def far_behind(self, xyz_m: np.ndarray) -> np.ndarray:
+        """Whether (N,) the nearest point is far behind places (N, 3)."""
+        q = self.camera.to_camera(xyz_m)
+        where = np.floor(q[:, :2] / np.maximum(q[:, 2:], 1e-6) * self.cells_per_tangent).astype(int) - self.low
+        inside = (where >= 0).all(axis=1) & (where < self.depth_m.shape).all(axis=1)
+        i, j = np.where(inside[:, None], where, 0).T
+        return np.asarray(inside & np.isfinite(self.depth_m[i, j]) & (self.depth_m[i, j] > q[:, 2] + BEHIND_M))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Evidence:
+    """What is seen in one frame, or what of it is near a limb, and how much of that other parts explain. Areas in voxels of the cloud."""
+
+    points: CloudPoints
+    taken: np.ndarray  # (P,) the share of each point that is explained
+    point_area: float  # of one point
+    cells: Sequence[PersonCells]  # of each view
+    taken_cells: Sequence[np.ndarray]  # (M,) of each view
+    voxel_m: float
+    reach: np.ndarray  # (B,) of each bone's flesh over its length
+    depths: _NearestDepths | None  # of all points, in the middle view
+
+    @staticmethod
+    def of(points: CloudPoints, cells: Sequence[PersonCells], voxel_m: float, hands: np.ndarray) -> "Evidence":
+        """The points, thinned, and the cells of all views; `hands` (B,): which bones end in fingers."""
+        every = 1 + (len(points.xyz_m) - 1) // MOST_POINTS if len(points.xyz_m) else 1
+        thin = points.take(np.arange(0, len(points.xyz_m), every))
+        return Evidence(
+            points=thin,
+            taken=np.zeros(len(thin.xyz_m)),
+            point_area=float(every),
+            cells=cells,
+            taken_cells=[np.zeros(len(view.xy_px)) for view in cells],
+            voxel_m=voxel_m,
+            reach=np.where(hands, FINGERS, 1.0),
+            depths=_NearestDepths.of(cells[len(cells) // 2].camera, thin.xyz_m) if cells and len(thin.xyz_m) else None,
+        )
+
+    def near(self, limb: Limb, state: BodyState) -> "Evidence":
+        """What is within reach of a limb, and not wholly explained by the rest of a body."""
+        rest, at = np.setdiff1d(np.arange(len(state.lengths_m)), limb.outer), state.head_m[limb.bones[0]]
+        reach = float(state.lengths_m[limb.outer].sum()) + BEYOND_M
+        taken = _points_explained(self.points, state, rest, TAKEN_M)
+        rows = np.flatnonzero((np.linalg.norm(self.points.xyz_m - at, axis=1) < reach) & (taken < EXPLAINED))
+        views, shares = [], []
+        for view in self.cells:
+            share = _cells_explained(view, state, rest, self.reach, TAKEN_CELLS_M)
+            pixel, depth = view.camera.project(at[None])[0], float(view.camera.to_camera(at[None])[0, 2])
+            close = np.linalg.norm(view.xy_px - pixel, axis=1) < reach * view.camera.focal_px / depth
+            keep = np.flatnonzero(close & (share < EXPLAINED))
+            views.append(replace(view, xy_px=view.xy_px[keep], directions=view.directions[keep]))
+            shares.append(share[keep])
+        return replace(self, points=self.points.take(rows), taken=taken[rows], cells=views, taken_cells=shares)
+
+    def unexplained(self, about_m: np.ndarray) -> float:
+        """The area of points and cells that nothing explains; cells at the depth of a place (3,)."""
+        total = self.point_area * float((1 - self.taken).sum())
+        return total + sum(self.cell_area(view, about_m) * float((1 - share).sum()) for view, share in zip(self.cells, self.taken_cells))
+
+    def cell_area(self, view: PersonCells, at_m: np.ndarray) -> float:
+        """The area of one of a view's cells at a place (3,), with its weight."""
+        size = view.area_px**0.5 * float(view.camera.to_camera(at_m[None])[0, 2]) / view.camera.focal_px
+        return CELL_WEIGHT / len(self.cells) * (size / self.voxel_m) ** 2
+
+
+def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
+    """(2) of a limb in N poses (N, D), of a body with the shape vector (S,)."""
+    state = limb.parameters.state(poses[0], vector)
+    capsules = _limb_capsules(evidence, limb, poses, state)
+    gain = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
+    for view, share in zip(evidence.cells, evidence.taken_cells):
+        gain += evidence.cell_area(view, capsules.first_m[0, 0]) * _gain_of_cells(view, capsules, share, width_m)
+    return gain - _misplaced(evidence, capsules, state, _others(limb, state))
+
+
+def misplaced(evidence: Evidence, limb: Limb, state: BodyState) -> float:
+    """The area of a body's limb that contradicts what is seen: the second sum of (2)."""
+    return float(_misplaced(evidence, _limb_capsules(evidence, limb, state.motion[None], state), state, _others(limb, state))[0])
+
+
+def explained_area(evidence: Evidence, state: BodyState, posed: np.ndarray, width_m: float) -> float:
+    """The area of the person's cells that a body explains, less that of its `posed` (B,) bones in the background."""
+    bones = np.array(sorted(state.profiles))
+    middle = state.head_m[bones].mean(axis=0)
+    shares = [_cells_explained(view, state, bones, evidence.reach, width_m) for view in evidence.cells]
+    area = sum(evidence.cell_area(view, middle) * float(share.sum()) for view, share in zip(evidence.cells, shares))
+    body = _Capsules.of(evidence, state, bones, posed, state.head_m[None], state.R[None])
+    return area - float(_misplaced(evidence, body, state, [])[0])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Capsules:
+    """K bones in N poses as tapered capsules."""
+
+    first_m: np.ndarray  # (N, K, 3)
+    axis: np.ndarray  # (N, K, 3) unit
+    length_m: np.ndarray  # (K,)
+    radii_m: np.ndarray  # (K, 2) at both ends
+    posed: np.ndarray  # (K,) whether its place counts: a bent hand lies anywhere
+
+    @staticmethod
+    def of(evidence: Evidence, state: BodyState, bones: np.ndarray, posed: np.ndarray, head: np.ndarray, R: np.ndarray) -> "_Capsules":
+        """Bones (K,) of a body in poses with the frames `head` (N, B, 3) and R (N, B, 3, 3); `posed` (B,)."""
+        return _Capsules(
+            first_m=head[:, bones],
+            axis=R[:, bones][..., 1],
+            length_m=state.lengths_m[bones] * evidence.reach[bones],
+            radii_m=np.array([[state.profiles[b].radii_m[i].mean() for i in (0, -1)] for b in bones.tolist()]),
+            posed=posed[bones],
+        )
+
+    def radius(self, k: int, fraction: np.ndarray) -> np.ndarray:
+        """The radius of capsule k at fractions of its length."""
+        return np.asarray(self.radii_m[k, 0] + (self.radii_m[k, 1] - self.radii_m[k, 0]) * fraction)
+
+
+def _limb_capsules(evidence: Evidence, limb: Limb, poses: np.ndarray, state: BodyState) -> _Capsules:
+    bones = np.array([b for b in limb.outer.tolist() if b in state.profiles])
+    R, head = bone_frames(limb.parameters.skeleton, state.lengths_m, poses)
+    return _Capsules.of(evidence, state, bones, free_bones(limb.parameters), head, R)
+
+
+def _others(limb: Limb, state: BodyState) -> list[int]:
+    """The bones in whose flesh a limb cannot lie."""
+    return [b for b in sorted(state.profiles) if b != limb.parent and b not in limb.outer]
+
+
+def _points_explained(points: CloudPoints, state: BodyState, bones: np.ndarray, width_m: float) -> np.ndarray:
+    """The share (P,) of each point that some bones of a body explain."""
+    share = np.zeros(len(points.xyz_m))
+    for b in [b for b in bones.tolist() if b in state.profiles]:
+        gap, _, facing = facing_bone(points.xyz_m, points.normals, state, b)
+        share = np.maximum(share, facing * _weight(gap, width_m))
+    return share
+
+
+def _cells_explained(view: PersonCells, state: BodyState, bones: np.ndarray, reach: np.ndarray, width_m: float) -> np.ndarray:
+    """The share (M,) of each of a view's cells that some bones of a body explain."""
+    share, origin = np.zeros(len(view.xy_px)), np.broadcast_to(view.camera.centre_m, (len(view.xy_px), 3))
+    for b in [b for b in bones.tolist() if b in state.profiles]:
+        head, axis, length = state.head_m[b], state.R[b][:, 1], state.lengths_m[b]
+        further = float((reach[b] - 1) * length)
+        X = nearest_to_segment(origin, view.directions, head, axis, length + further)
+        beyond = np.einsum("ni,i->n", X - head, axis) - length
+        gap = facing_bone(X, np.zeros_like(X), state, b)[0] - np.clip(beyond, 0.0, further)
+        share = np.maximum(share, _weight(np.maximum(gap, 0.0), width_m))
+    return share
+
+
+def _weight(gap: np.ndarray, width_m: float) -> np.ndarray:
+    return np.asarray(1 / (1 + (gap / width_m) ** 2) ** 2)  # (1)
+
+
+def _gain_of_points(points: CloudPoints, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
+    best, known = np.zeros((len(capsules.first_m), len(points.xyz_m))), points.normals.any(axis=1)
+    for k, length in enumerate(capsules.length_m.tolist()):
+        w = points.xyz_m - capsules.first_m[:, k, None]  # (N, P, 3)
+        along = np.clip(np.einsum("npi,ni->np", w, capsules.axis[:, k]), 0.0, length)
+        across = w - along[..., None] * capsules.axis[:, k, None]
+        distance = np.sqrt(np.einsum("npi,npi->np", across, across))
+        facing = np.einsum("npi,pi->np", across, points.normals) > FACING * distance
+        np.maximum(best, (facing | ~known) * _weight(distance - capsules.radius(k, along / length), width_m), out=best)
+    return np.asarray(np.maximum(best - taken, 0.0).sum(axis=1))
+
+
+def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
+    best = np.zeros((len(capsules.first_m), len(view.xy_px)))
+    for k, length in enumerate(capsules.length_m.tolist()):
+        first, last = capsules.first_m[:, k], capsules.first_m[:, k] + length * capsules.axis[:, k]
+        a, b = view.camera.project(first), view.camera.project(last)
+        scale = view.camera.focal_px / np.maximum(view.camera.to_camera((first + last) / 2)[:, 2], 1e-6)
+        ab = b - a
+        squared = np.maximum(np.einsum("ni,ni->n", ab, ab), 1e-9)
+        w = view.xy_px - a[:, None]
+        s = np.clip(np.einsum("npi,ni->np", w, ab) / squared[:, None], 0.0, 1.0)
+        distance = np.linalg.norm(w - s[..., None] * ab[:, None], axis=2) / scale[:, None]
+        np.maximum(best, np.nan_to_num(_weight(np.maximum(distance - capsules.radius(k, s), 0.0), width_m)), out=best)
+    return np.asarray(np.maximum(best - taken, 0.0).sum(axis=1))
+
+
+def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others: Sequence[int]) -> np.ndarray:
+    """The area (N,) of capsules that lies in the background, in `others` of a body's bones, or before points that it would hide."""
+    cost = np.zeros(len(capsules.first_m))
+    for k in np.flatnonzero(capsules.posed).tolist():
+        X = capsules.first_m[:, k, None] + (PLACES * capsules.length_m[k])[:, None] * capsules.axis[:, k, None]  # (N, S, 3)
+        flat, radius = X.reshape(-1, 3), capsules.radius(k, PLACES)
+        area = capsules.length_m[k] / len(PLACES) * 2 * radius / evidence.voxel_m**2
+        wrong, inside = np.zeros(X.shape[:2]), np.zeros(X.shape[:2])
+        for view in evidence.cells:
+            depth = view.camera.to_camera(flat)[:, 2]
+            d, _ = view.distance.sampled(np.nan_to_num(view.camera.project(flat), nan=-1.0))
+            wrong += np.minimum((d * depth / view.camera.focal_px).reshape(X.shape[:2]) / radius, 1.0) / len(evidence.cells)
+        if evidence.depths is not None:
+            wrong = wrong + evidence.depths.far_behind(flat).reshape(X.shape[:2])
+        for b in others:
+            gap = facing_bone(flat, np.zeros_like(flat), state, b)[0].reshape(X.shape[:2])
+            inside = np.maximum(inside, np.clip(-gap / radius, 0.0, 1.0))
+        clear = PLACES > CLEAR_OF_JOINT if k == 0 else np.ones(len(PLACES))
+        cost += ((wrong + inside * clear) * area).sum(axis=1)
+    return cost

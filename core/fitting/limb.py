@@ -1,0 +1,81 @@
+"""Limbs: chains of bones whose poses must be observed, with what they carry."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import qmc
+
+from ..body.skeleton import bone_frames
+from .state import ShapeParameters, free_bones
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Limb:
+    """A limb, or the outer part of one."""
+
+    parameters: ShapeParameters
+    bones: np.ndarray  # those with a pose to be observed, from the body outwards
+    outer: np.ndarray  # these and the bones that they carry: a hand
+    columns: np.ndarray  # (C,) its DOFs
+    low: np.ndarray  # (C,) their limits
+    high: np.ndarray  # (C,)
+
+    @staticmethod
+    def of(parameters: ShapeParameters, first: int) -> "Limb":
+        """The limb that begins with a bone.
+
+        The bone before it turns about itself, too: its own points hardly constrain its twist, and it carries the limb around.
+        """
+        skeleton, free = parameters.skeleton, free_bones(parameters)
+        outer = np.flatnonzero(skeleton.ancestors[:, first])
+        bones, above = outer[free[outer]], int(skeleton.parents[first])
+        twist = (skeleton.dof_bone == above) & free[above] & np.array([dof.axis == "y" for dof in skeleton.dofs])
+        columns = np.flatnonzero((np.isin(skeleton.dof_bone, bones) | twist) & ~np.isin(np.arange(len(skeleton.dofs)), skeleton.locked))
+        low, high = np.array([skeleton.dofs[c].limits for c in columns]).reshape(-1, 2).T
+        return Limb(parameters=parameters, bones=bones, outer=outer, columns=columns, low=low, high=high)
+
+    @property
+    def parent(self) -> int:
+        """The bone that carries it."""
+        return int(self.parameters.skeleton.parents[self.bones[0]])
+
+    def poses(self, pose: np.ndarray, angles: np.ndarray) -> np.ndarray:
+        """Poses (N, D) with the limb's angles (N, C), else as in a pose (D,)."""
+        whole = np.tile(pose, (len(angles), 1))
+        whole[:, self.columns] = angles
+        return whole
+
+    def samples(self, angles: np.ndarray, count: int, spread: float) -> np.ndarray:
+        """Angles (count, C), evenly within `spread` [rad] of some (C,) and within the limits of the joints (Halton 1960)."""
+        low, high = np.maximum(self.low, angles - spread), np.minimum(self.high, angles + spread)
+        return np.asarray(low + _halton(len(angles), count) * np.maximum(high - low, 0.0))
+
+    def head_m(self, pose: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """Where it begins (3,) in a pose (D,) of a body with the shape vector (S,)."""
+        return self.parameters.state(pose, vector).head_m[self.bones[0]]
+
+    def ends(self, poses: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """The tails (N, E, 3) of its bones in poses (N, D), of a body with the shape vector (S,)."""
+        lengths = self.parameters.body(vector)[0]
+        R, head = bone_frames(self.parameters.skeleton, lengths, poses)
+        return np.asarray(head[:, self.bones] + lengths[self.bones, None] * R[:, self.bones][..., 1])
+
+
+def limbs_of(parameters: ShapeParameters) -> dict[int, Limb]:
+    """Limbs and the outer parts of limbs, by the first bone of each."""
+    skeleton, free = parameters.skeleton, free_bones(parameters)
+    sided = [bone.name.endswith((".L", ".R")) for bone in skeleton.bones]
+    first = [int(b) for b in np.flatnonzero(free) if skeleton.parents[b] >= 0 and sided[b]]
+    return {b: Limb.of(parameters, b) for b in first}
+
+
+def whole_limbs(parameters: ShapeParameters) -> list[Limb]:
+    """The limbs that are no part of a larger one."""
+    limbs = limbs_of(parameters)
+    return [limb for limb in limbs.values() if limb.parent not in limbs]
+
+
+@lru_cache(maxsize=32)
+def _halton(dimensions: int, count: int) -> np.ndarray:
+    return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))

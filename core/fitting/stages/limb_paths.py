@@ -1,0 +1,127 @@
+"""The way of each limb through the recording: many poses per frame, several ways at once, and the best one in the end.
+
+    cost_k(t) = min_j [cost_j(t − 1) + min(|X_k − X̂_j|² / 2σ², LARGEST_JUMP)] − gain_k / GAIN                 (1)
+
+k are poses of the limb in frame t: those of the ways so far, kept and continued, others near them, and poses all over the joints' range
+(Halton 1960), improved where they explain most (`explained.limb_gains`). X are the ends of the limb's bones, X̂_j those predicted from way j
+with damped velocity, σ grows with the time between the frames. The best `WAYS` poses that differ go on (beam search; Viterbi 1967). The
+trunk stays as it was tracked: it is large and hardly ever lost. What is seen of a limb later thus decides where it went before, and where
+nothing is seen of it, it moves evenly.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...foundation.progress import Monitor
+from ..explained import Evidence, limb_gains
+from ..limb import Limb, whole_limbs
+from .pose_tracking import PoseTracking, adjusted_alone
+
+STAGE = "follow the limbs"
+WAYS = 8
+NEAR_WAYS = 4  # of the ways, around which poses are tried
+AROUND, AROUND_RAD = 24, float(np.radians(22.0))  # poses around each
+ANYWHERE, ANYWHERE_RAD = 400, np.pi
+IMPROVED, IMPROVED_RAD, IMPROVEMENTS = 6, float(np.radians(12.0)), 24  # of the best poses, spread and number of those tried around each
+DIFFERENT_M = 0.04  # between the ends of two poses that go on
+GAIN = 10.0  # voxels that weigh as much as a probability ratio of e
+SIGMA_M, ACCELERATION_M_S2 = 0.02, 40.0  # σ = SIGMA_M + ACCELERATION_M_S2 Δt²
+LARGEST_JUMP = 14.0
+VELOCITY_KEPT = 0.8
+COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights
+REPLACED_M = 0.05  # a tracked pose whose limb ends are nearer to the way stays
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Ways:
+    """K ways of one limb up to a frame."""
+
+    angles: np.ndarray  # (K, C)
+    ends_m: np.ndarray  # (K, E, 3)
+    velocity_m_s: np.ndarray  # (K, E, 3)
+    rate: np.ndarray  # (K, C) of the angles
+    cost: np.ndarray  # (K,)
+    before: np.ndarray  # (K,) the way in the frame before that each continues
+
+
+def follow_limbs(given: PoseTracking, motion: np.ndarray, monitor: Monitor) -> np.ndarray:
+    """The motion (T, D) with the limbs on their best ways from the click frame; the same where no background is known.
+
+    Raises:
+        Cancelled: the user asked to stop.
+    """
+    given = replace(given, fit=replace(given.fit, silhouettes=given.fit.silhouettes.anew()))  # a resumed fit has others
+    motion, fit = motion.copy(), given.fit
+    if not fit.background.known:
+        return motion
+    changed = np.zeros(len(motion), dtype=bool)
+    ahead, back = list(range(fit.click, len(motion))), list(range(fit.click, -1, -1))
+    runs = [(limb, frames) for limb in whole_limbs(fit.parameters) for frames in (ahead, back) if len(frames) > 1]
+    for i, (limb, frames) in enumerate(runs):
+        for t, angles, ends in _best_way(given, motion, limb, frames, monitor.part(STAGE, i, len(runs) + 1)):
+            if np.linalg.norm(ends - limb.ends(motion[t][None], given.first.vector)[0], axis=1).max() > REPLACED_M:
+                motion[t, limb.columns] = angles
+                changed[t] = True
+    again = monitor.part(STAGE, len(runs), len(runs) + 1)
+    for t in np.flatnonzero(changed).tolist():
+        again.step(STAGE, t, len(motion))
+        motion[t] = adjusted_alone(given, t, motion[t], again)
+    return motion
+
+
+def _best_way(
+    given: PoseTracking, motion: np.ndarray, limb: Limb, frames: list[int], monitor: Monitor
+) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """The frames after the first, with a limb's angles (C,) and the ends (E, 3) of its bones on its best way."""
+    start, ends = motion[frames[0], limb.columns][None], limb.ends(motion[frames[0]][None], given.first.vector)
+    none = np.zeros(1, dtype=np.intp)
+    ways = [_Ways(angles=start, ends_m=ends, velocity_m_s=0 * ends, rate=0 * start, cost=np.zeros(1), before=none)]
+    for n, (s, t) in enumerate(zip(frames, frames[1:])):
+        monitor.step(STAGE, n, len(frames))
+        step_s = abs(float(given.time_s[t] - given.time_s[s]))
+        near = given.fit.seen(t, given.points[t]).near(limb, given.state(motion[t]))
+        ways.append(_continued(limb, ways[-1], motion[t], given.first.vector, near, step_s))
+    k, found = int(np.argmin(ways[-1].cost)), list[tuple[int, np.ndarray, np.ndarray]]()
+    for t, way in zip(frames[:0:-1], ways[:0:-1]):
+        found.append((t, way.angles[k], way.ends_m[k]))
+        k = int(way.before[k])
+    return found
+
+
+def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, near: Evidence, step_s: float) -> _Ways:
+    """The ways one frame further, to the frame with the tracked pose (D,) and what is seen near the limb.  (1)"""
+
+    def gains(angles: np.ndarray, width: float) -> np.ndarray:
+        return limb_gains(near, limb, limb.poses(pose, angles), vector, width)
+
+    ahead = np.clip(ways.angles + VELOCITY_KEPT * step_s * ways.rate, limb.low, limb.high)
+    own = pose[limb.columns][None]
+    around = [limb.samples(a, AROUND, AROUND_RAD) for a in ahead[np.argsort(ways.cost, kind="stable")[:NEAR_WAYS]]]
+    tried = np.concatenate([ways.angles, ahead, own, *around, limb.samples(own[0], ANYWHERE, ANYWHERE_RAD)])
+    best = tried[np.argsort(-gains(tried, COARSE_M), kind="stable")[:IMPROVED]]
+    certain = len(ways.angles) + len(ahead) + 1
+    tried = np.concatenate([tried[: certain + sum(map(len, around))], best, *(limb.samples(a, IMPROVEMENTS, IMPROVED_RAD) for a in best)])
+    gain, ends = gains(tried, FINE_M), limb.ends(limb.poses(pose, tried), vector)
+    expected = ways.ends_m + VELOCITY_KEPT * step_s * ways.velocity_m_s
+    sigma = SIGMA_M + ACCELERATION_M_S2 * step_s**2
+    away = ((ends[:, None] - expected[None]) ** 2).sum(axis=(2, 3)) / (2 * sigma**2)
+    total = ways.cost[None] + np.minimum(away, LARGEST_JUMP)
+    before = np.argmin(total, axis=1)
+    cost = total[np.arange(len(tried)), before] - gain / GAIN
+    kept: list[int] = []
+    for k in np.argsort(cost, kind="stable").tolist():
+        if all(np.linalg.norm(ends[k] - ends[j], axis=1).max() > DIFFERENT_M for j in kept):
+            kept.append(k)
+        if len(kept) == WAYS:
+            break
+    b = before[kept]
+    jumped = (away[kept, b] > LARGEST_JUMP)[:, None]
+    return _Ways(
+        angles=tried[kept],
+        ends_m=ends[kept],
+        velocity_m_s=np.where(jumped[..., None], 0.0, (ends[kept] - ways.ends_m[b]) / step_s),
+        rate=np.where(jumped, 0.0, (tried[kept] - ways.angles[b]) / step_s),
+        cost=cost[kept] - cost[kept].min(),
+        before=b,
+    )

@@ -1,0 +1,148 @@
+"""The person in an image, against a background that stands still.
+
+An image is averaged in square cells. A cell's difference r from the background, less that of a slightly different light, is noise where the
+background is visible, and wide where the person covers it:
+
+    p(r | background) = (1 − ε) N(0, σ) + ε Laplace(0, 2 s) ,   p(r | person) = (1 − δ) Laplace(0, s) + δ / 256              (1)
+    x = u + w G ∗ tanh(x / 2) ,   u = c ln(p(r | person) / p(r | background)) + seen                                         (2)
+
+s is the mean difference of cells with measured points: a person in plain cloth may hardly differ from the background. c is how well the
+background is known there, `seen` is added where points were measured, and G is a Gaussian: a cell is more likely the person's among cells
+of the person (mean field of a Potts model; Koller & Friedman 2009, §11.5). The background of a cell is the tightest cluster of its values
+over time (Parzen 1962; Bickel 2002: half-sample mode), of those without measured points near if there are enough: a person who lingers does
+not become the background.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..foundation.arrays import frozen
+from ..geometry.robust import mad_sigma
+from .background import OTHER_ROOM
+
+FEWEST = 5  # images for a background
+FEWEST_BARE = 3  # of these, without anybody near the cell
+CLUSTER = 0.5  # of a cell's values, of which the tightest cluster consists
+TIGHT = 6.0  # times the noise: a wider cluster is no background
+LEAST_NOISE = 0.3  # grey values
+ROWS = 64  # of cells, processed at a time
+LINGERING = 0.3  # c of a cell near which there was always a person
+STRAY, SAME = 0.02, 0.05  # ε: shadows and the like; δ of (1)
+LEAST_DIFFERENCE = 3.0  # s over the noise
+ODDS = (-3.0, 5.0)  # bounds of the logarithm in (2)
+SEEN = 4.0  # of a cell with measured points
+COUPLING, RADIUS, ROUNDS = 6.0, 2.0, 10  # w of (2), sigma of G in cells, iterations
+SMALLEST = 60  # cells of a region
+EMPTY_SHARE = 0.25  # of an image that shows the background, whoever is in front of it
+NORMAL_QUARTILE = 0.3186  # of |N(0, 1)|
+OTHER_LIGHT = 4.0  # times the noise: the difference of so large a share is not noise
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CellBackground:
+    """The background of a view in cells (h, w), the noise of a cell in grey values, and how well it is known there, 0 to 1."""
+
+    grey: np.ndarray
+    noise: float
+    known: np.ndarray
+    cell_px: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "grey", frozen(self.grey, (None, None), np.float32, "grey"))
+        object.__setattr__(self, "known", frozen(self.known, self.grey.shape, np.float32, "known"))
+
+
+def cells(image: np.ndarray, cell_px: int) -> np.ndarray:
+    """The means (h', w') of an image (h, w) in square cells; incomplete ones at the far edges are left out."""
+    h, w = (n // cell_px * cell_px for n in image.shape)
+    whole = image[:h, :w].astype(np.float32)
+    return whole if cell_px == 1 else np.asarray(whole.reshape(h // cell_px, cell_px, w // cell_px, cell_px).mean(axis=(1, 3)))
+
+
+def still_background(images: Sequence[np.ndarray], near: Sequence[np.ndarray], cell_px: int) -> CellBackground | None:
+    """The background of images in cells (h, w), spread over time; None if there are too few.
+
+    `near` (h, w) of each: where somebody is near.
+    """
+    if len(images) < FEWEST:
+        return None
+    grey, width, bare, bare_width = (np.empty(images[0].shape, np.float32) for _ in range(4))
+    for row in range(0, len(grey), ROWS):  # piece by piece: several copies of all images would take too much memory
+        part = slice(row, row + ROWS)
+        values = np.stack([image[part] for image in images])
+        grey[part], width[part] = _tightest(np.sort(values, axis=0), np.full(values.shape[1:], len(values)))
+        without = np.where(np.stack([there[part] for there in near]), np.inf, values)
+        bare[part], bare_width[part] = _tightest(np.sort(without, axis=0), np.isfinite(without).sum(axis=0))
+    noise = max(LEAST_NOISE, float(np.median([mad_sigma(image - grey) for image in images])))
+    certain = bare_width < TIGHT * noise
+    known = np.where(certain, 1.0, np.where(width < TIGHT * noise, LINGERING, 0.0))
+    return CellBackground(grey=np.where(certain, bare, grey), noise=noise, known=known, cell_px=cell_px)
+
+
+def given_background(grey: np.ndarray, images: Sequence[np.ndarray], cell_px: int) -> CellBackground | None:
+    """A background that the user gave, in cells (h, w), with its noise from those of the images that show it; None if none does."""
+    quartiles = [float(np.quantile(np.abs(image - grey), EMPTY_SHARE)) / NORMAL_QUARTILE for image in images]
+    noise = [q for q in quartiles if q <= OTHER_ROOM]
+    if not noise:
+        return None
+    return CellBackground(grey=grey, noise=max(LEAST_NOISE, float(np.median(noise))), known=np.ones(grey.shape), cell_px=cell_px)
+
+
+def person(background: CellBackground, image: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
+    """Where (h, w) an image in cells shows the person; `seen`: cells with measured points. None in another light, or of a black image."""
+    difference = image - background.grey
+    comparable = difference[background.known == 1] if (background.known == 1).any() else difference.ravel()
+    if np.quantile(np.abs(comparable), EMPTY_SHARE) > OTHER_LIGHT * background.noise:
+        return None
+    r = np.abs(difference - _of_light(comparable, background.noise))
+    there = seen & (background.known == 1)
+    wide = max(LEAST_DIFFERENCE * background.noise, float(r[there].mean()) if there.any() else 0.0)
+    x = u = background.known * _log_odds(r, background.noise, wide) + SEEN * seen
+    for _ in range(ROUNDS):
+        x = u + COUPLING * cv2.GaussianBlur(np.tanh(x / 2), (0, 0), RADIUS)  # (2)
+    _, label, stats, _ = cv2.connectedComponentsWithStats((x > 0).astype(np.uint8))
+    large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST
+    large[0] = False
+    return np.asarray(large[label])
+
+
+def _of_light(difference: np.ndarray, noise: float) -> float:
+    """What the light adds to all differences (N,): the mean of the tightest half of those not far from the noise."""
+    near = np.sort(difference[np.abs(difference) < 2 * OTHER_LIGHT * noise])
+    half = (len(near) + 1) // 2
+    first = int(np.argmin(near[half - 1 :] - near[: len(near) - half + 1]))
+    return float(near[first : first + half].mean())
+
+
+def _log_odds(r: np.ndarray, noise: float, wide: float) -> np.ndarray:
+    """ln p(r | person) − ln p(r | background) of absolute differences (h, w).  (1)"""
+    narrow = np.exp(-0.5 * (r / noise) ** 2) / (noise * np.sqrt(2 * np.pi))
+    empty = (1 - STRAY) * narrow + STRAY * np.exp(-r / (2 * wide)) / (4 * wide)
+    covered = (1 - SAME) * np.exp(-r / wide) / (2 * wide) + SAME / 256
+    return np.clip(np.log(covered / empty), *ODDS).astype(np.float32)
+
+
+def _tightest(ascending: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mean and the width (h, w) of the tightest cluster of the first `count` (h, w) of ascending values (n, h, w); width infinite where
+    they are too few."""
+    n = len(ascending)
+    size = np.maximum(FEWEST_BARE, np.ceil(CLUSTER * count).astype(int))
+    sums = np.concatenate([np.zeros((1, *count.shape)), np.cumsum(np.where(np.isfinite(ascending), ascending, 0.0), axis=0)])
+    mean, width = ascending[0].astype(np.float64), np.full(count.shape, np.inf)
+    for i in range(n - FEWEST_BARE + 1):
+        end = i + size
+        enough = end <= count
+        last = np.take_along_axis(ascending, np.where(enough, end - 1, i)[None], axis=0)[0]
+        here = np.where(enough, last - ascending[i] if np.isfinite(ascending[i]).all() else _difference(last, ascending[i]), np.inf)
+        tighter = here < width
+        total = np.take_along_axis(sums, np.where(enough, end, 0)[None], axis=0)[0] - sums[i]
+        mean, width = np.where(tighter, total / size, mean), np.where(tighter, here, width)
+    return mean, width
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a − b; infinite where one of them is."""
+    return np.where(np.isfinite(a) & np.isfinite(b), np.where(np.isfinite(a), a, 0.0) - np.where(np.isfinite(b), b, 0.0), np.inf)

@@ -1,0 +1,165 @@
+"""What a pose explains of points and silhouettes, and the ways of limbs through frames in which nothing else holds them."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.body.skin.contour_skin import body_skin
+from tricap.core.fitting.explained import explained_area, limb_gains, misplaced
+from tricap.core.fitting.inputs.background import UNIT_PX
+from tricap.core.fitting.inputs.cloud_points import CloudPoints
+from tricap.core.fitting.inputs.fit_input import BackgroundDistances, FitInput, Packed
+from tricap.core.fitting.limb import Limb, whole_limbs
+from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.solve.problem import Scales
+from tricap.core.fitting.solve.solver import Solution
+from tricap.core.fitting.stages.contradicted import ANYWHERE_M, CONTRADICTED, widened
+from tricap.core.fitting.stages.hidden_limbs import reacquired_poses
+from tricap.core.fitting.stages.limb_paths import follow_limbs
+from tricap.core.fitting.stages.pose_tracking import PoseTracking
+from tricap.core.fitting.stages.sequence import fit_context
+from tricap.core.fitting.state import free_bones
+from tricap.core.foundation.progress import Monitor
+from tricap.core.geometry.raster import rasterize
+
+from .limb_scene import front_rig, measured_cloud
+
+STEP_PX, FRAMES = 4, 5
+SHAPE = default_shape(read_model("full"))
+NAMES = [bone.name for bone in SHAPE.skeleton.bones]
+BEFORE = np.zeros(len(SHAPE.skeleton.dof_names))
+
+
+def _raised(degrees: float) -> np.ndarray:
+    """The right arm lifted to the side by so many degrees."""
+    motion = BEFORE.copy()
+    motion[SHAPE.skeleton.layout["shoulder.R abduction"]] = np.radians(-degrees)
+    return motion
+
+
+POSES = np.array([_raised(10.0 * t) for t in range(FRAMES)])
+NOTHING = CloudPoints(frame=0, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), sigma_m=np.zeros(0))
+
+
+def _regions(rig) -> list[BackgroundDistances]:
+    """The person in the views, in all frames."""
+    skins = [body_skin(SHAPE, pose) for pose in POSES]
+    found = []
+    for camera in rig.cameras:
+        images = []
+        for skin in skins:
+            raster = rasterize(camera, skin.vertices_m, skin.triangles, back_faces=True)
+            person = (raster.image(np.ones(len(raster.sample)), 0.0) > 0)[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX]
+            far = cv2.distanceTransform((~person).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+            images.append(np.minimum(far * STEP_PX / UNIT_PX, 255))
+        found.append(
+            BackgroundDistances(view=camera.name, frame=np.arange(FRAMES), distance=Packed(images), step_px=STEP_PX, unit_px=UNIT_PX)
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def fit():
+    rig = front_rig()
+    return fit_context(_given(FRAMES, _regions(rig)), FitSettings())
+
+
+def _given(frames: int, background: list[BackgroundDistances]) -> FitInput:
+    rig, rng = front_rig(), np.random.default_rng(0)
+    joints = joint_positions(SHAPE.skeleton, SHAPE.lengths_m, BEFORE)
+    clicks = {name: {c.name: c.project(at) for c in rig.cameras} for name, at in joints.items()}
+    clouds = [measured_cloud(SHAPE, BEFORE, t, rng, points=200, noise=0.001, gross=0.0) for t in range(frames)]
+    return FitInput(rig=rig, model="full", clouds=clouds, time_s=np.arange(frames) / 30, clicks={0: clicks}, background=background)
+
+
+def _arm(fit) -> Limb:
+    return next(limb for limb in whole_limbs(fit.parameters) if NAMES[limb.bones[0]] == "upper_arm.R")
+
+
+def _vector(fit) -> np.ndarray:
+    return fit.parameters.vector(SHAPE)
+
+
+def test_the_whole_limbs_are_arms_and_legs(fit) -> None:
+    limbs, arm = whole_limbs(fit.parameters), _arm(fit)
+    assert {NAMES[limb.bones[0]] for limb in limbs} == {"upper_arm.R", "upper_arm.L", "thigh.R", "thigh.L"}
+    assert {NAMES[b] for b in arm.outer} == {"upper_arm.R", "forearm.R", "hand.R"}
+    dofs = {SHAPE.skeleton.dof_names[c] for c in arm.columns}
+    assert dofs == {f"shoulder.R {n}" for n in ("flexion", "abduction", "twist")} | {"elbow.R flexion", "elbow.R twist"}
+
+
+def test_an_arm_gains_most_where_the_silhouettes_show_it(fit) -> None:
+    limb, vector = _arm(fit), _vector(fit)
+    evidence, state = fit.seen(4, NOTHING), fit.parameters.state(POSES[4], vector)
+    near = evidence.near(limb, state)
+    gains = limb_gains(near, limb, np.array([_raised(degrees) for degrees in (0.0, 20.0, 40.0, 60.0)]), vector, 0.02)
+    assert np.argmax(gains) == 2 and gains[2] > 0.6 * near.unexplained(limb.head_m(POSES[4], vector)) > 100
+    assert gains[0] < 0 and gains[3] < 0  # in the background
+    assert misplaced(evidence, limb, state) < 1.0
+    assert misplaced(evidence, limb, fit.parameters.state(_raised(60.0), vector)) > CONTRADICTED
+    assert sum(len(view.xy_px) for view in near.cells) < 0.5 * sum(len(view.xy_px) for view in evidence.cells)
+
+
+def test_what_a_body_explains_falls_when_a_limb_leaves_the_silhouettes(fit) -> None:
+    vector, posed = _vector(fit), free_bones(fit.parameters)
+    seen = fit.seen(0, NOTHING)
+    area = [explained_area(seen, fit.parameters.state(_raised(d), vector), posed, 0.015) for d in (0.0, 15.0, 45.0)]
+    assert area[0] > area[1] + 50 > area[2] + 100
+
+
+def test_an_arm_inside_the_trunk_or_before_points_behind_it_is_misplaced(fit) -> None:
+    vector, limb = _vector(fit), _arm(fit)
+    inside = fit.parameters.state(_raised(-55.0), vector)  # through the trunk
+    assert misplaced(fit.seen(0, NOTHING), limb, inside) > CONTRADICTED
+    ahead = BEFORE.copy()
+    ahead[SHAPE.skeleton.layout["shoulder.R flexion"]] = np.radians(35.0)
+    state = fit.parameters.state(ahead, vector)
+    along = np.linspace(0.1, 0.9, 40)[:, None]
+    places = np.concatenate([state.head_m[b] + along * state.lengths_m[b] * state.R[b][:, 1] for b in limb.outer])
+    centre = fit.seen(0, NOTHING).cells[1].camera.centre_m
+    wall = centre + (places - centre) * 1.1  # the middle view sees it through the arm
+    points = CloudPoints(frame=0, xyz_m=wall, normals=np.tile([0.0, -1.0, 0.0], (len(wall), 1)), sigma_m=np.full(len(wall), 0.001))
+    own = replace(points, xyz_m=places)
+    seen = [misplaced(fit.seen(0, points), limb, state) for points in (points, own)]
+    assert seen[0] > seen[1] + CONTRADICTED
+
+
+def test_an_arm_without_points_is_found_by_its_silhouettes(fit) -> None:
+    found = reacquired_poses(fit, 4, NOTHING, BEFORE, _vector(fit))
+    true, was, now = (joint_positions(SHAPE.skeleton, SHAPE.lengths_m, m)["wrist.R"] for m in (POSES[4], BEFORE, found[-1]))
+    assert np.linalg.norm(was - true) > 0.3 and np.linalg.norm((now - true)[[0, 2]]) < 0.08  # across the view
+
+
+def test_a_limb_that_tracking_lost_is_followed_through_the_frames(fit) -> None:
+    """The motion to be improved leaves the arm where it was clicked; it was lifted, without a measured point."""
+    first = Solution(motion=BEFORE[None], vector=_vector(fit), cost=1.0, scales=Scales(), iterations=1, converged=True)
+    tracking = PoseTracking(fit=fit, points=[NOTHING] * FRAMES, time_s=np.arange(FRAMES) / 30, first=first, tracks=None)
+    lost = np.tile(BEFORE, (FRAMES, 1))
+    motion = follow_limbs(tracking, lost, Monitor())
+    true, now = (joint_positions(SHAPE.skeleton, SHAPE.lengths_m, m)["elbow.R"] for m in (POSES, motion))
+    assert np.linalg.norm((now - true)[:, [0, 2]], axis=1).max() < 0.05 < np.linalg.norm((now[0] - true[-1])[[0, 2]])
+    assert np.array_equal(follow_limbs(tracking, lost, Monitor()), motion)  # nothing is random
+
+
+def test_nothing_is_followed_where_no_background_is_known(fit) -> None:
+    bare = fit_context(_given(1, []), FitSettings())
+    first = Solution(motion=BEFORE[None], vector=_vector(fit), cost=1.0, scales=Scales(), iterations=1, converged=True)
+    tracking = PoseTracking(fit=bare, points=[NOTHING], time_s=np.zeros(1), first=first, tracks=None)
+    assert np.array_equal(follow_limbs(tracking, BEFORE[None], Monitor()), BEFORE[None])
+
+
+def test_a_contradicted_limb_is_not_certain(fit) -> None:
+    limbs, D, J = whole_limbs(fit.parameters), len(SHAPE.skeleton.dofs), len(SHAPE.skeleton.joint_names)
+    covariance, sigma = np.eye(D) * 1e-4, np.full(J, 0.01)
+    area = np.array([2 * CONTRADICTED if NAMES[limb.bones[0]] == "upper_arm.R" else 0.0 for limb in limbs])
+    widened(fit.parameters, area, covariance, sigma)
+    of = dict(zip(SHAPE.skeleton.joint_names, sigma))
+    assert of["elbow.R"] == of["wrist.R"] == ANYWHERE_M and of["elbow.L"] == of["shoulder.R"] == 0.01
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    layout = SHAPE.skeleton.layout
+    assert np.sqrt(covariance[layout["elbow.R flexion"]] * 1.0).max() > 0.5 > np.sqrt(covariance[layout["elbow.L flexion"]]).max()
