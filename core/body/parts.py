@@ -9,6 +9,7 @@ It does not follow from the radii of single balls: a limb's radius results from 
 bone's own balls. Limbs that branch off (a shoulder at the chest) are not counted.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,6 +91,33 @@ class BoneProfile:
             ahead, behind = (np.interp(along, self.stations, self.radii_m[:, i + k]) for k in (0, 2))
             axes.append(np.where(across_m[:, i] >= 0, ahead, behind))
         return np.stack(axes, axis=1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ProfileTable:
+    """The profiles of all bones in one table; the stations of each are evenly spaced."""
+
+    first: np.ndarray  # (B,) fraction along the bone of the first station
+    step: np.ndarray  # (B,)
+    radii_m: np.ndarray  # (B, K, 4), 0 for a bone without balls
+
+    @staticmethod
+    def of(profiles: Mapping[int, BoneProfile], bones: int) -> "ProfileTable":
+        """That of the profiles of some of so many bones."""
+        first, step, radii = np.zeros(bones), np.ones(bones), np.zeros((bones, ALONG, len(SIDES)))
+        for b, profile in profiles.items():
+            first[b], step[b] = profile.stations[0], (profile.stations[-1] - profile.stations[0]) / (ALONG - 1)
+            radii[b] = profile.radii_m
+        return ProfileTable(first=first, step=step, radii_m=radii)
+
+    def across(self, bone: np.ndarray, along: np.ndarray, across_m: np.ndarray) -> np.ndarray:
+        """As `BoneProfile.across`, of one bone for each point (N,)."""
+        place = np.clip((along - self.first[bone]) / self.step[bone], 0.0, ALONG - 1)
+        before = np.minimum(place.astype(np.intp), ALONG - 2)
+        share = (place - before)[:, None]
+        side = np.where(across_m >= 0, [0, 1], [2, 3])
+        at, bone = before[:, None], bone[:, None]
+        return np.asarray((1 - share) * self.radii_m[bone, at, side] + share * self.radii_m[bone, at + 1, side])
 
 
 def chain_neighbours(shape: BodyShape) -> np.ndarray:

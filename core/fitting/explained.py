@@ -20,13 +20,15 @@ from .inputs.background import PersonCells
 from .inputs.cloud_points import CloudPoints
 from .inputs.silhouettes import nearest_to_segment
 from .limb import Limb
-from .segmentation import facing_bone
+from .segmentation import facing_bone, gap_to_bone, near_pairs
 from .state import BodyState, free_bones
 
 MOST_POINTS = 500  # of a frame
+COARSE = 3  # points and cells as one, for a first choice among many poses
 CELL_WEIGHT = 0.5  # of the person's area in all views together, against that of measured points
 TAKEN_M, TAKEN_CELLS_M = 0.04, 0.02  # widths: a body differs from its metaballs by a centimetre or two, and what it explains is no other's
 BEYOND_M = 0.05  # what is so far beyond a limb's reach is not the limb's
+FAR = 4.0  # widths, from where on nothing is explained
 EXPLAINED = 0.95  # of a point or cell: no limb is looked for there
 FACING = 0.3  # least cosine between a point's normal and the limb's
 PLACES = np.array([0.15, 0.4, 0.65, 0.9])  # along a bone, where it must not lie in the background
@@ -96,19 +98,30 @@ class Evidence:
 
     def near(self, limb: Limb, state: BodyState) -> "Evidence":
         """What is within reach of a limb, and not wholly explained by the rest of a body."""
-        rest, at = np.setdiff1d(np.arange(len(state.lengths_m)), limb.outer), state.head_m[limb.bones[0]]
+        rest, at = np.setdiff1d(sorted(state.profiles), limb.outer), state.head_m[limb.bones[0]]
         reach = float(state.lengths_m[limb.outer].sum()) + BEYOND_M
-        taken = _points_explained(self.points, state, rest, TAKEN_M)
-        rows = np.flatnonzero((np.linalg.norm(self.points.xyz_m - at, axis=1) < reach) & (taken < EXPLAINED))
+        close = np.flatnonzero(np.linalg.norm(self.points.xyz_m - at, axis=1) < reach)
+        taken = _points_explained(self.points.take(close), state, rest, TAKEN_M)
+        left = taken < EXPLAINED
         views, shares = [], []
         for view in self.cells:
-            share = _cells_explained(view, state, rest, self.reach, TAKEN_CELLS_M)
             pixel, depth = view.camera.project(at[None])[0], float(view.camera.to_camera(at[None])[0, 2])
-            close = np.linalg.norm(view.xy_px - pixel, axis=1) < reach * view.camera.focal_px / depth
-            keep = np.flatnonzero(close & (share < EXPLAINED))
-            views.append(replace(view, xy_px=view.xy_px[keep], directions=view.directions[keep]))
-            shares.append(share[keep])
-        return replace(self, points=self.points.take(rows), taken=taken[rows], cells=views, taken_cells=shares)
+            around = view.take(np.linalg.norm(view.xy_px - pixel, axis=1) < reach * view.camera.focal_px / depth)
+            share = _cells_explained(around, state, rest, self.reach, TAKEN_CELLS_M)
+            views.append(around.take(share < EXPLAINED))
+            shares.append(share[share < EXPLAINED])
+        return replace(self, points=self.points.take(close[left]), taken=taken[left], cells=views, taken_cells=shares)
+
+    def thinned(self) -> "Evidence":
+        """Every `COARSE`th point and cell, each for so many."""
+        return replace(
+            self,
+            points=self.points.take(np.arange(0, len(self.taken), COARSE)),
+            taken=self.taken[::COARSE],
+            point_area=self.point_area * COARSE,
+            cells=[replace(view.take(np.s_[::COARSE]), area_px=view.area_px * COARSE) for view in self.cells],
+            taken_cells=[share[::COARSE] for share in self.taken_cells],
+        )
 
     def unexplained(self, about_m: np.ndarray) -> float:
         """The area of points and cells that nothing explains; cells at the depth of a place (3,)."""
@@ -143,7 +156,7 @@ def explained_area(evidence: Evidence, state: BodyState, posed: np.ndarray, widt
     shares = [_cells_explained(view, state, bones, evidence.reach, width_m) for view in evidence.cells]
     area = sum(evidence.cell_area(view, middle) * float(share.sum()) for view, share in zip(evidence.cells, shares))
     body = _Capsules.of(evidence, state, bones, posed, state.head_m[None], state.R[None])
-    return area - float(_misplaced(evidence, body, state, [])[0])
+    return area - float(_misplaced(evidence, body, state, np.zeros(0, np.intp))[0])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -178,31 +191,36 @@ def _limb_capsules(evidence: Evidence, limb: Limb, poses: np.ndarray, state: Bod
     return _Capsules.of(evidence, state, bones, free_bones(limb.parameters), head, R)
 
 
-def _others(limb: Limb, state: BodyState) -> list[int]:
+def _others(limb: Limb, state: BodyState) -> np.ndarray:
     """The bones in whose flesh a limb cannot lie."""
-    return [b for b in sorted(state.profiles) if b != limb.parent and b not in limb.outer]
+    return np.array([b for b in sorted(state.profiles) if b != limb.parent and b not in limb.outer], dtype=np.intp)
 
 
 def _points_explained(points: CloudPoints, state: BodyState, bones: np.ndarray, width_m: float) -> np.ndarray:
     """The share (P,) of each point that some bones of a body explain."""
-    share = np.zeros(len(points.xyz_m))
-    for b in [b for b in bones.tolist() if b in state.profiles]:
-        gap, _, facing = facing_bone(points.xyz_m, points.normals, state, b)
-        share = np.maximum(share, facing * _weight(gap, width_m))
-    return share
+    rows, bone = near_pairs(points.xyz_m, state, np.full(len(state.lengths_m), FAR * width_m), bones)
+    gap, _, facing = facing_bone(points.xyz_m[rows], points.normals[rows], state, bone)
+    return _largest(rows, facing * _weight(gap, width_m), len(points.xyz_m))
 
 
 def _cells_explained(view: PersonCells, state: BodyState, bones: np.ndarray, reach: np.ndarray, width_m: float) -> np.ndarray:
     """The share (M,) of each of a view's cells that some bones of a body explain."""
-    share, origin = np.zeros(len(view.xy_px)), np.broadcast_to(view.camera.centre_m, (len(view.xy_px), 3))
-    for b in [b for b in bones.tolist() if b in state.profiles]:
-        head, axis, length = state.head_m[b], state.R[b][:, 1], state.lengths_m[b]
-        further = float((reach[b] - 1) * length)
-        X = nearest_to_segment(origin, view.directions, head, axis, length + further)
-        beyond = np.einsum("ni,i->n", X - head, axis) - length
-        gap = facing_bone(X, np.zeros_like(X), state, b)[0] - np.clip(beyond, 0.0, further)
-        share = np.maximum(share, _weight(np.maximum(gap, 0.0), width_m))
-    return share
+    rows, bone = np.repeat(np.arange(len(view.xy_px)), len(bones)), np.tile(bones, len(view.xy_px))
+    head, axis, length = state.head_m[bone], state.R[bone, :, 1], state.lengths_m[bone]
+    further = (reach[bone] - 1) * length
+    origin = np.broadcast_to(view.camera.centre_m, (len(rows), 3))
+    X = nearest_to_segment(origin, view.directions[rows], head, axis, length + further)
+    beyond = np.einsum("ni,ni->n", X - head, axis) - length
+    gap = gap_to_bone(X, state, bone) - np.clip(beyond, 0.0, further)
+    return _largest(rows, _weight(np.maximum(gap, 0.0), width_m), len(view.xy_px))
+
+
+def _largest(rows: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+    """Of values (K,) ordered by rows (K,) the largest of each of n rows, at least 0."""
+    found, first = np.zeros(n), np.flatnonzero(np.diff(rows, prepend=-1))
+    if len(first):
+        found[rows[first]] = np.maximum(np.maximum.reduceat(values, first), 0.0)
+    return found
 
 
 def _weight(gap: np.ndarray, width_m: float) -> np.ndarray:
@@ -210,49 +228,64 @@ def _weight(gap: np.ndarray, width_m: float) -> np.ndarray:
 
 
 def _gain_of_points(points: CloudPoints, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
-    best, known = np.zeros((len(capsules.first_m), len(points.xyz_m))), points.normals.any(axis=1)
-    for k, length in enumerate(capsules.length_m.tolist()):
-        w = points.xyz_m - capsules.first_m[:, k, None]  # (N, P, 3)
-        along = np.clip(np.einsum("npi,ni->np", w, capsules.axis[:, k]), 0.0, length)
-        across = w - along[..., None] * capsules.axis[:, k, None]
-        distance = np.sqrt(np.einsum("npi,npi->np", across, across))
-        facing = np.einsum("npi,pi->np", across, points.normals) > FACING * distance
-        np.maximum(best, (facing | ~known) * _weight(distance - capsules.radius(k, along / length), width_m), out=best)
+    best, unknown = np.zeros((len(capsules.first_m), len(points.xyz_m)), np.float32), ~points.normals.any(axis=1)
+    origin = capsules.first_m[0, 0]  # numbers are small from here
+    X, normals = (v.astype(np.float32) for v in (points.xyz_m - origin, points.normals))
+    for k in range(len(capsules.length_m)):
+        first, axis = (v.astype(np.float32) for v in (capsules.first_m[:, k] - origin, capsules.axis[:, k]))
+        along, distance = _from_axis(X, first, axis, np.full(len(first), capsules.length_m[k], np.float32))
+        outwards = np.einsum("pi,pi->p", X, normals) - first @ normals.T - along * (axis @ normals.T)
+        facing = (outwards > FACING * distance) | unknown
+        np.maximum(best, facing * _weight(distance - capsules.radius(k, along / capsules.length_m[k]), width_m), out=best)
     return np.asarray(np.maximum(best - taken, 0.0).sum(axis=1))
 
 
 def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, width_m: float) -> np.ndarray:
-    best = np.zeros((len(capsules.first_m), len(view.xy_px)))
+    best = np.zeros((len(capsules.first_m), len(view.xy_px)), np.float32)
+    centre = view.xy_px.mean(axis=0) if len(view.xy_px) else np.zeros(2)
     for k, length in enumerate(capsules.length_m.tolist()):
-        first, last = capsules.first_m[:, k], capsules.first_m[:, k] + length * capsules.axis[:, k]
+        first = capsules.first_m[:, k]
+        last = first + length * capsules.axis[:, k]
         a, b = view.camera.project(first), view.camera.project(last)
-        scale = view.camera.focal_px / np.maximum(view.camera.to_camera((first + last) / 2)[:, 2], 1e-6)
-        ab = b - a
-        squared = np.maximum(np.einsum("ni,ni->n", ab, ab), 1e-9)
-        w = view.xy_px - a[:, None]
-        s = np.clip(np.einsum("npi,ni->np", w, ab) / squared[:, None], 0.0, 1.0)
-        distance = np.linalg.norm(w - s[..., None] * ab[:, None], axis=2) / scale[:, None]
-        np.maximum(best, np.nan_to_num(_weight(np.maximum(distance - capsules.radius(k, s), 0.0), width_m)), out=best)
+        seen = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+        a, ab = (np.where(seen[:, None], v, 1.0).astype(np.float32) for v in (a - centre, b - a))
+        size = np.maximum(np.linalg.norm(ab, axis=1), 1e-6)
+        metres = np.maximum(view.camera.to_camera((first + last) / 2)[:, 2], 1e-6) / view.camera.focal_px
+        xy = (view.xy_px - centre).astype(np.float32)
+        along, distance = _from_axis(xy, a, ab / size[:, None], size)
+        gap = distance * metres[:, None].astype(np.float32) - capsules.radius(k, along / size[:, None])
+        np.maximum(best, seen[:, None] * _weight(np.maximum(gap, 0.0), width_m), out=best)
     return np.asarray(np.maximum(best - taken, 0.0).sum(axis=1))
 
 
-def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others: Sequence[int]) -> np.ndarray:
+def _from_axis(X: np.ndarray, first: np.ndarray, axis: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, P) along segments, from `first` (N, d) along unit vectors (N, d), that are nearest to X (P, d), and their distances."""
+    along = axis @ X.T
+    along -= np.einsum("nd,nd->n", axis, first)[:, None]
+    squared = np.einsum("pd,pd->p", X, X) + np.einsum("nd,nd->n", first, first)[:, None] - 2 * (first @ X.T)
+    nearest = np.clip(along, 0.0, length[:, None])
+    squared -= nearest * (2 * along - nearest)
+    return nearest, np.sqrt(np.maximum(squared, 0.0, out=squared), out=squared)
+
+
+def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others: np.ndarray) -> np.ndarray:
     """The area (N,) of capsules that lies in the background, in `others` of a body's bones, or before points that it would hide."""
-    cost = np.zeros(len(capsules.first_m))
-    for k in np.flatnonzero(capsules.posed).tolist():
-        X = capsules.first_m[:, k, None] + (PLACES * capsules.length_m[k])[:, None] * capsules.axis[:, k, None]  # (N, S, 3)
-        flat, radius = X.reshape(-1, 3), capsules.radius(k, PLACES)
-        area = capsules.length_m[k] / len(PLACES) * 2 * radius / evidence.voxel_m**2
-        wrong, inside = np.zeros(X.shape[:2]), np.zeros(X.shape[:2])
-        for view in evidence.cells:
-            depth = view.camera.to_camera(flat)[:, 2]
-            d, _ = view.distance.sampled(np.nan_to_num(view.camera.project(flat), nan=-1.0))
-            wrong += np.minimum((d * depth / view.camera.focal_px).reshape(X.shape[:2]) / radius, 1.0) / len(evidence.cells)
-        if evidence.depths is not None:
-            wrong = wrong + evidence.depths.far_behind(flat).reshape(X.shape[:2])
-        for b in others:
-            gap = facing_bone(flat, np.zeros_like(flat), state, b)[0].reshape(X.shape[:2])
-            inside = np.maximum(inside, np.clip(-gap / radius, 0.0, 1.0))
-        clear = PLACES > CLEAR_OF_JOINT if k == 0 else np.ones(len(PLACES))
-        cost += ((wrong + inside * clear) * area).sum(axis=1)
-    return cost
+    k = np.flatnonzero(capsules.posed)
+    length = capsules.length_m[k]
+    radius = capsules.radii_m[k, :1] + (capsules.radii_m[k, 1:] - capsules.radii_m[k, :1]) * PLACES  # (K, S)
+    area = (length / len(PLACES))[:, None] * 2 * radius / evidence.voxel_m**2
+    X = capsules.first_m[:, k, None] + (length[:, None] * PLACES)[..., None] * capsules.axis[:, k, None]  # (N, K, S, 3)
+    flat, shape = X.reshape(-1, 3), X.shape[:-1]
+    wrong = np.zeros(shape)
+    for view in evidence.cells:
+        depth = view.camera.to_camera(flat)[:, 2]
+        d, _ = view.distance.sampled(np.nan_to_num(view.camera.project(flat), nan=-1.0))
+        wrong += np.minimum((d * depth / view.camera.focal_px).reshape(shape) / radius, 1.0) / len(evidence.cells)
+    if evidence.depths is not None:
+        wrong += evidence.depths.far_behind(flat).reshape(shape)
+    if len(others):
+        rows, bone = near_pairs(flat, state, np.zeros(len(state.lengths_m)), others)
+        inside = _largest(rows, -gap_to_bone(flat[rows], state, bone), len(flat)).reshape(shape) / radius
+        clear = (k > 0)[:, None] | (PLACES > CLEAR_OF_JOINT)
+        wrong += np.minimum(inside, 1.0) * clear
+    return np.asarray((wrong * area).sum(axis=(1, 2)))

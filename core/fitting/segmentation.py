@@ -38,17 +38,27 @@ def segment(points: CloudPoints, state: BodyState, surface: np.ndarray, gate_m: 
     `surface` (B, 2): the fractions of each bone between which a surface is its own; `gate_m` (B,) or for all: the largest distance from the
     limb's surface.
     """
-    n, gate = len(points.xyz_m), np.broadcast_to(gate_m, (len(state.lengths_m),))
-    nearest, owner = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
-    own = np.zeros(n, dtype=bool)
-    for b, rows in candidates(points.xyz_m, state, gate):
-        gap, along, facing = facing_bone(points.xyz_m[rows], points.normals[rows], state, b)
-        closer = gap < nearest[rows]
-        rows = rows[closer]
-        nearest[rows], owner[rows] = gap[closer], b
-        own[rows] = ((along >= surface[b, 0]) & (along <= surface[b, 1]) & facing)[closer]
-    found = np.flatnonzero(own & (np.abs(nearest) < gate[owner]))
-    return found, owner[found]
+    gate = np.broadcast_to(gate_m, (len(state.lengths_m),))
+    rows, bone = near_pairs(points.xyz_m, state, gate)
+    gap, along, facing = facing_bone(points.xyz_m[rows], points.normals[rows], state, bone)
+    own = (along >= surface[bone, 0]) & (along <= surface[bone, 1]) & facing & (np.abs(gap) < gate[bone])
+    return owners(rows, bone, gap, own)
+
+
+def owners(rows: np.ndarray, bone: np.ndarray, gap: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (K,) of the points that belong to the bone with the least gap, and that bone (K,).
+
+    Of pairs of a point and a bone, ordered by points: rows (P,), bones (P,), gaps (P,), and whether the point is that bone's `own` (P,) if
+    that is the nearest.
+    """
+    if not len(rows):
+        return rows, bone
+    first = np.flatnonzero(np.diff(rows, prepend=-1))
+    least = np.repeat(np.minimum.reduceat(gap, first), np.diff(first, append=len(rows)))
+    nearest = np.flatnonzero(gap == least)
+    nearest = nearest[np.diff(rows[nearest], prepend=-1) > 0]  # one of several that are as near
+    found = nearest[own[nearest]]
+    return rows[found], bone[found]
 
 
 class SegmentationCache:
@@ -78,47 +88,55 @@ class SegmentationCache:
 
 def crop(points: CloudPoints, state: BodyState, reach_m: np.ndarray | float) -> CloudPoints:
     """The points within `reach_m` (of each bone (B,), or of all) of the bones: all that a fit near this pose can ever need."""
-    near, reach = np.zeros(len(points.xyz_m), dtype=bool), np.broadcast_to(reach_m, (len(state.lengths_m),))
-    for b, rows in candidates(points.xyz_m, state, reach):
-        near[rows] |= _gap(points.xyz_m[rows], state, b)[0] < reach[b]
-    return points.take(np.flatnonzero(near))
+    reach = np.broadcast_to(reach_m, (len(state.lengths_m),))
+    rows, bone = near_pairs(points.xyz_m, state, reach)
+    return points.take(np.unique(rows[_gap(points.xyz_m[rows], state, bone)[0] < reach[bone]]))
 
 
-def candidates(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """For each bone with balls the points (K,) in a sphere that encloses all places within its `reach_m` (B,) of its surface."""
-    bones = np.unique(state.balls.bone_index)
-    widest = np.array([state.profiles[b].radii_m.max() for b in bones.tolist()])
+def near_pairs(xyz_m: np.ndarray, state: BodyState, reach_m: np.ndarray, bones: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of a point (K,) and a bone (K,), ordered by points, of `bones` or all with balls, in whose enclosing sphere the point is.
+
+    That sphere encloses all places within `reach_m` (B,) of the bone's surface.
+    """
+    bones = np.unique(state.balls.bone_index) if bones is None else bones
+    widest = state.profile_table.radii_m[bones].max(axis=(1, 2))
     half = state.lengths_m[bones] / 2
     middle = state.head_m[bones] + half[:, None] * state.R[bones, :, 1]
     origin = middle.mean(axis=0)
     X, C = xyz_m - origin, middle - origin
     squares = np.einsum("ni,ni->n", X, X)[:, None] - 2 * X @ C.T + np.einsum("bi,bi->b", C, C)
-    near = squares <= (half + widest + reach_m[bones]) ** 2
-    return [(int(b), np.flatnonzero(column)) for b, column in zip(bones, near.T)]
+    rows, column = np.nonzero(squares <= (half + widest + reach_m[bones]) ** 2)
+    return rows, bones[column]
 
 
-def facing_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance from the limb's surface (N,) [m], fraction along the bone (N,), and whether the normal points outwards (N,)."""
+def facing_bone(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points and one bone each (N,): distance from the limb's surface (N,) [m], fraction along the bone (N,), and whether the normal
+    points outwards (N,)."""
     gap, along, cosine = bone_distance(xyz_m, normals, state, bone)
     return gap, along, cosine >= FACING
 
 
-def bone_distance(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bone_distance(xyz_m: np.ndarray, normals: np.ndarray, state: BodyState, bone: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `facing_bone`, with the cosine (N,) between the normal and the limb's; 1 where the normal is unknown."""
     gap, along, outward = _gap(xyz_m, state, bone)
-    normal = (normals @ state.R[bone])[:, CROSS]
+    normal = np.einsum("ni,nij->nj", normals, state.R[bone][:, :, CROSS])
     size = np.sqrt(np.einsum("ni,ni->n", normal, normal) * np.einsum("ni,ni->n", outward, outward))
     cosine = np.where(size > 0, np.einsum("ni,ni->n", normal, outward) / np.maximum(size, 1e-300), 1.0)
     return gap, along, cosine
 
 
-def _gap(xyz_m: np.ndarray, state: BodyState, bone: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def gap_to_bone(xyz_m: np.ndarray, state: BodyState, bone: np.ndarray) -> np.ndarray:
+    """Distance (N,) [m] of points from the surface of one limb each (N,)."""
+    return _gap(xyz_m, state, bone)[0]
+
+
+def _gap(xyz_m: np.ndarray, state: BodyState, bone: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance (1) from the limb's surface (N,), fraction along the bone (N,), and the direction of its normal across the bone (N, 2)."""
-    local = (xyz_m - state.head_m[bone]) @ state.R[bone]
+    local = np.einsum("ni,nij->nj", xyz_m - state.head_m[bone], state.R[bone])
     length = state.lengths_m[bone]
     along, across = local[:, 1] / length, local[:, CROSS]
     beyond = local[:, 1] - np.clip(local[:, 1], 0.0, length)
-    axes = state.profiles[bone].across(along, across)
+    axes = state.profile_table.across(bone, along, across)
     outward = across / axes
     aside = np.einsum("ni,ni->n", across, across)
     radius = np.sqrt(aside / np.maximum(np.einsum("ni,ni->n", outward, outward), 1e-18))  # of the ellipse in the point's direction
@@ -133,16 +151,16 @@ def soft_segment(
     Arguments as in `segment`.
     """
     gate = np.broadcast_to(gate_m, (len(state.lengths_m),))
-    found = candidates(points.xyz_m, state, gate)
-    gap, likely, own = (np.zeros((len(points.xyz_m), len(found))) for _ in range(3))
-    for j, (b, rows) in enumerate(found):
-        d, along, cosine = bone_distance(points.xyz_m[rows], points.normals[rows], state, b)
-        gap[rows, j], likely[rows, j] = d, np.maximum(cosine, 0.0) * (np.abs(d) < gate[b])
-        own[rows, j] = (along >= surface[b, 0]) & (along <= surface[b, 1])
+    rows, bone = near_pairs(points.xyz_m, state, gate)
+    bones, column = np.unique(bone, return_inverse=True)
+    gap, likely, own = (np.zeros((len(points.xyz_m), len(bones))) for _ in range(3))
+    d, along, cosine = bone_distance(points.xyz_m[rows], points.normals[rows], state, bone)
+    gap[rows, column], likely[rows, column] = d, np.maximum(cosine, 0.0) * (np.abs(d) < gate[bone])
+    own[rows, column] = (along >= surface[bone, 0]) & (along <= surface[bone, 1])
     share = responsibilities(gap, likely, float(gate.mean()))
     share = np.where(own > 0, share, 0.0)
     rows, column = np.nonzero(share > LEAST_SHARE)
-    return rows, np.array([b for b, _ in found], dtype=np.intp)[column], share[rows, column]
+    return rows, bones[column], share[rows, column]
 
 
 def responsibilities(gap_m: np.ndarray, likely: np.ndarray, gate_m: float) -> np.ndarray:

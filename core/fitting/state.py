@@ -9,12 +9,12 @@ Jacobians in blocks: an observation of one body part depends on few parameters; 
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
 from ..body.metaballs import Metaballs
-from ..body.parts import BoneProfile, bone_profiles, chain_neighbours
+from ..body.parts import BoneProfile, ProfileTable, bone_profiles, chain_neighbours
 from ..body.shape import BodyShape
 from ..body.skeleton import Layout, Skeleton, frames_and_axes
 from ..geometry.rotation import cross, cross_matrix
@@ -172,6 +172,15 @@ class Part:
         return moved, self.skeleton.offset_by[np.ix_(bones, self.lengths)].astype(float)
 
 
+@lru_cache(maxsize=16)
+def balls_of_parts(parts: tuple[Part, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """The balls of each bone's part in a table (B, m), filled up with ball 0, and which of its places are filled (B, m)."""
+    filled = np.arange(max(len(part.balls) for part in parts)) < np.array([len(part.balls) for part in parts])[:, None]
+    table = np.zeros(filled.shape, dtype=np.intp)
+    table[filled] = np.concatenate([part.balls for part in parts])
+    return table, filled
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyState:
     """A body in one pose."""
@@ -191,6 +200,11 @@ class BodyState:
     def profiles(self) -> Mapping[int, BoneProfile]:
         """The visible radii about each bone that has balls, by the bone's index."""
         return self.find_profiles()
+
+    @cached_property
+    def profile_table(self) -> ProfileTable:
+        """The same for all bones at once."""
+        return ProfileTable.of(self.profiles, len(self.lengths_m))
 
     @cached_property
     def ball_frames(self) -> tuple[np.ndarray, np.ndarray]:

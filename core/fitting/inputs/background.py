@@ -11,7 +11,7 @@ like the background where they were clicked: such a limb stands still, and the b
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -55,6 +55,10 @@ class PersonCells:
     directions: np.ndarray  # (M, 3) unit rays in the world
     area_px: float  # of the image for which each of them stands
     distance: DistanceMap
+
+    def take(self, rows: np.ndarray | slice) -> "PersonCells":
+        """Some of the cells."""
+        return replace(self, xy_px=self.xy_px[rows], directions=self.directions[rows])
 
 
 class BackgroundRegions:

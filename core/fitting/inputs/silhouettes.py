@@ -16,7 +16,7 @@ import numpy as np
 
 from ...geometry.camera import Camera
 from ..observations import SilhouetteRays
-from ..segmentation import SegmentationCache, facing_bone
+from ..segmentation import SegmentationCache, facing_bone, owners
 from ..settings import FitSettings
 from ..state import BodyState
 from .cloud_points import VARIANCE_FLOOR_M2
@@ -204,24 +204,19 @@ def touched(rays: Rays, state: BodyState, surface: np.ndarray, gate_m: np.ndarra
         surface[:, 1] < 1
     )  # its outline continues in fingers, which are no bones
     last = np.where(has_fingers, surface[:, 1], last)
-    n = len(rays.direction)
-    nearest, owner, own = np.full(n, np.inf), np.zeros(n, dtype=np.intp), np.zeros(n, dtype=bool)
-    for b in np.unique(state.balls.bone_index).tolist():
-        X = nearest_to_segment(rays.origin_m, rays.direction, state.head_m[b], state.R[b][:, 1], state.lengths_m[b])
-        gap, along, facing = facing_bone(X, rays.outward, state, b)
-        closer = gap < nearest
-        nearest[closer], owner[closer] = gap[closer], b
-        own[closer] = ((along >= first[b]) & (along <= last[b]) & facing)[closer]
-    rows = np.flatnonzero(own & (np.abs(nearest) < gate[owner]))
-    return rows, owner[rows]
+    bones = np.unique(state.balls.bone_index)
+    rows, bone = np.repeat(np.arange(len(rays.direction)), len(bones)), np.tile(bones, len(rays.direction))
+    X = nearest_to_segment(rays.origin_m[rows], rays.direction[rows], state.head_m[bone], state.R[bone, :, 1], state.lengths_m[bone])
+    gap, along, facing = facing_bone(X, rays.outward[rows], state, bone)
+    return owners(rows, bone, gap, (along >= first[bone]) & (along <= last[bone]) & facing & (np.abs(gap) < gate[bone]))
 
 
-def nearest_to_segment(origin: np.ndarray, direction: np.ndarray, head: np.ndarray, axis: np.ndarray, length: float) -> np.ndarray:
-    """The points (N, 3) of rays that come nearest to a segment from `head` (3,) along the unit vector `axis` (3,)."""
+def nearest_to_segment(origin: np.ndarray, direction: np.ndarray, head: np.ndarray, axis: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """The points (N, 3) of rays that come nearest to one segment each: from `head` (N, 3) along the unit vector `axis` (N, 3)."""
     w = origin - head
-    b, d, e = direction @ axis, np.einsum("ni,ni->n", direction, w), w @ axis
+    b, d, e = (np.einsum("ni,ni->n", p, q) for p, q in ((direction, axis), (direction, w), (w, axis)))
     along = np.clip((e - b * d) / np.maximum(1 - b * b, 1e-9), 0.0, length)
-    return origin + (along * b - d)[:, None] * direction
+    return np.asarray(origin + (along * b - d)[:, None] * direction)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

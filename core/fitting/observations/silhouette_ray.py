@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..state import Block, BodyState, FromBlocks
+from ..state import Block, BodyState, FromBlocks, balls_of_parts
 from .surface_point import SurfacePoints
 
 MEAN_STEPS, NEWTON_STEPS = 5, 5  # iterations for t* from the closest approach: fixed point, then Newton
 LONGEST_M = 0.01  # of a Newton step: where ln F is hardly curved it would be far too long
+DONE_M = 1e-9  # a step after which there is no other
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,23 +80,20 @@ def _contacts(
     state: BodyState, origin_m: np.ndarray, direction: np.ndarray, bone: np.ndarray, start: np.ndarray | None = None
 ) -> np.ndarray:
     """The points (N, 3) of (1); `start` (N,) where t* is iterated from, else from the closest approaches to the balls."""
-    X = np.empty_like(origin_m)
-    for b in np.unique(bone):
-        rows = np.flatnonzero(bone == b)
-        X[rows] = _largest_field(state, int(b), origin_m[rows], direction[rows], None if start is None else start[rows])
-    return X
+    t = _largest_field(state, bone, origin_m, direction, start)
+    return np.asarray(origin_m + t[:, None] * direction)
 
 
-def _largest_field(state: BodyState, bone: int, origin: np.ndarray, direction: np.ndarray, start: np.ndarray | None) -> np.ndarray:
-    """Along a ray the field is Σ w exp(−2 (a t² + 2 b t + c)): the balls' shares p give t = −Σ p b / Σ p a; then Newton on ln F."""
-    part, balls = state.parts[bone], state.balls
-    own, of = part.balls, balls.bone_index[part.balls]
-    centre = state.head_m[of] + np.einsum("mij,mj->mi", state.R[of], balls.centre[own] * state.lengths_m[of, None])
-    M = state.R[of].transpose(0, 2, 1) / balls.radii_m[own][:, :, None]
-    o, u = origin @ M.transpose(0, 2, 1) - np.einsum("mij,mj->mi", M, centre)[:, None], direction @ M.transpose(0, 2, 1)  # (m, N, 3)
-    a, b = np.einsum("mni,mni->nm", u, u), np.einsum("mni,mni->nm", o, u)
-    least = np.einsum("mni,mni->nm", o, o) - b * b / a  # d where the ball is nearest, at t = −b/a
-    nearest, log_weight = -b / a, np.log(balls.weight[own])
+def _largest_field(state: BodyState, bone: np.ndarray, origin: np.ndarray, direction: np.ndarray, start: np.ndarray | None) -> np.ndarray:
+    """t* (N,). A ray's field is Σ w exp(−2 (a t² + 2 b t + c)): the balls' shares p give t = −Σ p b / Σ p a; then Newton on ln F."""
+    balls, own = balls_of_parts(state.parts)
+    frames, shifts = state.ball_frames
+    flat = frames.transpose(1, 0, 2).reshape(3, -1)
+    o, u = (origin @ flat).reshape(len(origin), -1, 3) - shifts, (direction @ flat).reshape(len(origin), -1, 3)
+    a, b, c = (np.take_along_axis(np.einsum("nmj,nmj->nm", p, q), balls[bone], axis=1) for p, q in ((u, u), (o, u), (o, o)))
+    log_weight = np.where(own[bone], np.log(state.balls.weight)[balls[bone]], -np.inf)
+    nearest = -b / a
+    least = c + b * nearest  # d where the ball is nearest
 
     def shares(t: np.ndarray) -> np.ndarray:
         log_terms = log_weight - 2 * (least + a * (t[:, None] - nearest) ** 2)
@@ -111,5 +109,7 @@ def _largest_field(state: BodyState, bone: int, origin: np.ndarray, direction: n
         slope = (p * slopes).sum(axis=1)
         curve = (p * (slopes**2 - 4 * a)).sum(axis=1) - slope**2
         mean = -(p * b).sum(axis=1) / (p * a).sum(axis=1)
-        t = np.where(curve < 0, t + np.clip(-slope / np.where(curve < 0, curve, 1.0), -LONGEST_M, LONGEST_M), mean)
-    return np.asarray(origin + t[:, None] * direction)
+        t, before = np.where(curve < 0, t + np.clip(-slope / np.where(curve < 0, curve, 1.0), -LONGEST_M, LONGEST_M), mean), t
+        if np.abs(t - before).max(initial=0.0) < DONE_M:
+            break
+    return np.asarray(t)

@@ -6,8 +6,6 @@ background, that no part of the body explains, evenly spread (Halton 1960), then
 for the adjustment.
 """
 
-from functools import partial
-
 import numpy as np
 
 from ...foundation.progress import Monitor
@@ -74,8 +72,7 @@ def _search(evidence: Evidence, limb: Limb, now: np.ndarray, vector: np.ndarray,
 
     `least`: the unexplained area, in voxels, for a search, and by how much its pose must explain more.
     """
-    gains = partial(limb_gains, evidence, limb, vector=vector)
-    have = gains(now[None], width_m=ROUNDS[-1][2])[0]
+    have = limb_gains(evidence, limb, now[None], vector, ROUNDS[-1][2])[0]
     if evidence.unexplained(limb.head_m(now, vector)) - have < least:
         return None
     best = now[None]
@@ -83,7 +80,7 @@ def _search(evidence: Evidence, limb: Limb, now: np.ndarray, vector: np.ndarray,
         monitor.step(SEARCH, k, len(ROUNDS))
         around = [limb.poses(pose, limb.samples(pose[limb.columns], count, np.radians(spread))) for pose in best]
         tried = np.concatenate([best, *around])
-        gain = gains(tried, width_m=width)
+        gain = limb_gains(evidence if k else evidence.thinned(), limb, tried, vector, width)
         order = np.argsort(-gain, kind="stable")[:most]
         best, gain = tried[order], gain[order]
     return best[0] if gain[0] > have + least else None

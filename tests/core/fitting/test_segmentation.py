@@ -26,7 +26,7 @@ def test_points_of_the_surface_are_no_distance_from_it(name: str, balls: str) ->
             inside = field(state.balls, state.lengths_m, state.R, state.head_m, ray, counted) > 0.5
             X = ray[np.flatnonzero(inside)[-1:]]
             normal = -field_and_derivatives(state.balls, state.lengths_m, state.R, state.head_m, X, counted)[1]
-            gap, along, facing = facing_bone(X, normal, state, b)
+            gap, along, facing = facing_bone(X, normal, state, np.full(len(X), b))
             assert abs(gap[0]) < 2e-3 and abs(along[0] - f) < 1e-9 and facing[0]  # it was 12 mm off at the neck
 
 
