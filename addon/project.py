@@ -217,7 +217,9 @@ def table(scene: bpy.types.Scene) -> Table:
     _put(made, "frames", None if props.all_frames else [props.first_frame, props.last_frame + 1])
     _put(made, "body", _body(scene, old))
     _put_clicks(scene, made)
-    _put(made, "settings", properties.overrides(scene))
+    settings = properties.overrides(scene)
+    _put(made, "quality", settings.get("surface", {}).pop("quality", None))
+    _put(made, "settings", {group: values for group, values in settings.items() if values})
     for writer in get_session().take_writers:
         writer(scene, made)
     return _same_numbers(made, old)

@@ -14,7 +14,7 @@ from ...core.images.sampling import SplineImage
 from ...core.matching.least_squares import MatchingSettings
 from ...core.matching.proposals import Proposal, propose
 from ...core.matching.views import Views
-from ...core.take.take import Footage
+from ...core.take.footage import Footage
 from ..session import get_session
 
 log = logging.getLogger(__name__)

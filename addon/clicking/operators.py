@@ -9,7 +9,8 @@ import bpy
 from ...core.body.model_file import BodyModel, joint_depths_m, read_model
 from ...core.foundation.errors import InputError
 from ...core.run import take_run
-from ...core.take.take import JOINTS, FrameClicks, open_take
+from ...core.take.footage import open_take
+from ...core.take.take import JOINTS, FrameClicks
 from .. import clicks, project, properties
 from ..overlay import canvas
 from ..panels import show_status

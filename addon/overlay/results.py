@@ -17,7 +17,8 @@ from ...core.matching.least_squares import MatchingSettings
 from ...core.results.run_json import read_run
 from ...core.run.inspection import FramePoints, TrackHistory, body_outline, read_points, read_removed, read_tracks
 from ...core.run.record import FrameTable, read_frame_table
-from ...core.take.take import open_take, read_take
+from ...core.take.footage import open_take
+from ...core.take.take import read_take
 from ...core.tracking.contour import Contour, ContourTable
 from .. import folders, project
 from ..session import OpenResults, get_session

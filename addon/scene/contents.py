@@ -22,7 +22,8 @@ from ...core.motion.formats.ply import Ply, read_ply
 from ...core.motion.tables import MotionTable, read_motion
 from ...core.results.run_json import read_run
 from ...core.take.bar_file import read_bar
-from ...core.take.take import Footage, open_take, read_take
+from ...core.take.footage import Footage, open_take
+from ...core.take.take import read_take
 from .prepare import Prepared, prepare
 
 DEFAULT_FPS = 25.0  # of a scene whose take is missing

@@ -20,7 +20,8 @@ from ...core.results.run_json import read_run
 from ...core.run.stages import stage_keys
 from ...core.run.take_run import settings_of
 from ...core.take.clicked_points import clicked_depth
-from ...core.take.take import Footage, Take, footage_frames, open_take
+from ...core.take.footage import Footage, footage_frames, open_take
+from ...core.take.take import Take
 from .. import folders, project
 from ..clicking.click_session import joints_of as joints_in_order
 from ..scene.build import KEYS_KEY, OUT_KEY

@@ -8,7 +8,7 @@ import numpy as np
 from ..foundation.progress import Monitor
 from ..images.retime import Recent
 from ..images.sequence import Movie
-from ..take.take import Footage
+from ..take.footage import Footage
 from .findings import Cause, Finding, doubtful, wrong
 
 LONGEST = 240  # frames; of a longer take its middle is used

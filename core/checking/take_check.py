@@ -26,7 +26,8 @@ from ..images.sampling import noise_sigma
 from ..matching.foreground import unchanged
 from ..matching.least_squares import MatchingSettings
 from ..take.clicked_points import clicked_depth
-from ..take.take import Footage, Take, open_take, read_take
+from ..take.footage import Footage, open_take
+from ..take.take import Take, read_take
 from .findings import Cause, Checked, Finding, doubtful, wrong
 from .rig_check import (
     FEWEST_MATCHES,

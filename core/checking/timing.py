@@ -28,7 +28,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..images.retime import LARGEST, Recent
-from ..take.take import Footage
+from ..take.footage import Footage
 from .survey import Survey, survey
 from .view_matches import Features, PairMatches, eight_bits, epipolar_distance_px, find_features, match_features, match_pair
 

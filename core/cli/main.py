@@ -24,7 +24,8 @@ from ..images.interlace import BOTH, INTERLACE
 from ..results.folder import check_separate_folder
 from ..run import pipeline, take_run
 from ..take.bar_file import read_bar, write_bar
-from ..take.take import open_take, read_take
+from ..take.footage import open_take
+from ..take.take import read_take
 from ..take.writing import footage_entry, make_take, new_table, take_of_table
 from . import batch, calibrate, check, contour, fields, points, track2d
 from .arguments import frame_range, named_path, overrides, with_joined_frames
@@ -101,6 +102,8 @@ def _stage_command(commands: Any, name: str, about: str, action: Callable[..., l
         parser.add_argument("--json", action="store_true", help="print run.json at the end, and nothing else on standard output")
         parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
+    about = "how much to measure: what a body's motion needs (the default), or every point of the surface"
+    parser.add_argument("--quality", dest="set", action="append", type="surface.quality={}".format, metavar="motion|surface", help=about)
     parser.set_defaults(run=action)
     return parser
 
@@ -150,12 +153,14 @@ def _summary(job: take_run.Run, as_json: bool) -> list[str]:
 
 def _seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from ..surface.measure import MeasureSettings, first_seeds
+    from ..surface.resolution import measured_footage
 
     take = read_take(args.take)
     settings = take_run.settings_of(take.settings, overrides(args.set), str(args.take))
     footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
     frame = footage.take.clicks.frame if footage.take.clicks.frame in footage.frames else footage.frames.start
-    where, seeds = first_seeds(footage, MeasureSettings.of(settings), frame, monitor)
+    measured = measured_footage(footage, settings["surface"].quality, settings["growing"].spacing_px)
+    where, seeds = first_seeds(measured, MeasureSettings.of(settings), frame, monitor)
     near, far = where.depth_range_m
     args.always_shown = [
         f"Frame {frame}: {len(seeds.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (depths from {where.method}), "

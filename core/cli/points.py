@@ -11,7 +11,8 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..results.folder import Results, check_separate_folder
 from ..run import take_run
-from ..take.take import Footage, open_take, read_take
+from ..take.footage import Footage, open_take
+from ..take.take import read_take
 from ..tracking.key_points import KeyPoints, track_key_points
 from ..tracking.point_tables import ChosenPoints, read_points, write_key_points
 from ..tracking.settings import TrackStatus

@@ -20,7 +20,7 @@ projection centre followed by a shift δ,
 The interior unknowns are those of Brown (1971) with affinity and shear, in the order of `INTERIOR`.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,6 +48,14 @@ class Camera:
         object.__setattr__(self, "size_px", (int(self.size_px[0]), int(self.size_px[1])))
         for name, shape in dict(matrix=(3, 3), distortions=(5,), affinity=(2,), R_cam_world=(3, 3), t_cam_world_m=(3,)).items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name=name))
+
+    def resized(self, size_px: tuple[int, int]) -> "Camera":
+        """The camera of images resized to (width, height); the corners of the images stay where they are."""
+        scale = np.array(size_px) / self.size_px
+        matrix = self.matrix.copy()
+        matrix[:2] *= scale[:, None]
+        matrix[:2, 2] += (scale - 1) / 2
+        return replace(self, size_px=size_px, matrix=matrix)
 
     @property
     def focal_px(self) -> float:

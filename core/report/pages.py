@@ -16,7 +16,7 @@ from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
-from ..take.take import Footage
+from ..take.footage import Footage
 from ..tracking.trajectories import Trajectories
 from . import pictures
 from .figures import Row, curve_graph, figure_rows, number, quoted

@@ -28,7 +28,7 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize
-from ..take.take import Footage
+from ..take.footage import Footage
 
 OUTLINE, BACKGROUND = "outline", "background"
 MOST_FRAMES = {OUTLINE: 60, BACKGROUND: 10}  # evenly over the take: a frame of four views takes a third of a second

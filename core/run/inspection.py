@@ -35,9 +35,10 @@ class FramePoints:
     sigma_m: np.ndarray  # (N,)
     xy_px: np.ndarray  # (N, K, 2) as matched; without checkpoint their projections
     middle_px: np.ndarray  # (N, K, 2) of the patches; NaN without checkpoint
-    shape: np.ndarray  # (N, K, 2, 2) of the patches, in rows' pixels; NaN without checkpoint
+    shape: np.ndarray  # (N, K, 2, 2) of the patches, in the measured images' pixels; NaN without checkpoint
     residual_px: np.ndarray  # (N,) NaN without checkpoint
     correlation: np.ndarray  # (N,) NaN without checkpoint
+    reduction: np.ndarray  # (K, 2) pixels for one of the measured images; 1 without checkpoint
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -93,7 +94,7 @@ def read_points(out: Path, frame: int, cameras: Sequence[Camera], rows: RowGrid)
     n, k = len(xyz), len(cameras)
     values = dict(
         xy_px=np.stack([camera.project(xyz) for camera in cameras], axis=1).reshape(n, k, 2), middle_px=np.full((n, k, 2), np.nan),
-        shape=np.full((n, k, 2, 2), np.nan), residual_px=np.full(n, np.nan), correlation=np.full(n, np.nan),
+        shape=np.full((n, k, 2, 2), np.nan), residual_px=np.full(n, np.nan), correlation=np.full(n, np.nan), reduction=np.ones((k, 2)),
     )  # fmt: skip
     _add_matches(values, Path(out) / "cache" / "surface" / f"{frame:04d}.npz", xyz, rows)
     return FramePoints(xyz_m=xyz, sigma_m=sigma, **values)
@@ -125,7 +126,10 @@ def _add_matches(values: dict[str, np.ndarray], path: Path, xyz: np.ndarray, row
         spacing, _, width, _ = (int(v) for v in saved["grid"])
     except InputError:  # deleted, damaged or of another version: the cloud alone is shown
         return
-    if not len(order) or saved["field_xy"].shape[1] != values["xy_px"].shape[1] or min(spacing, width) < 1:
+    reduction = saved.get("reduction", values["reduction"])  # earlier versions measured images of their full size only
+    if not len(order) or saved["field_xy"].shape[1] != len(values["reduction"]) or min(spacing, width) < 1:
+        return
+    if reduction.shape != values["reduction"].shape or not (np.isfinite(reduction) & (reduction > 0)).all():
         return
     known = np.flatnonzero(np.abs(found[row] - xyz).max(axis=1) < SAME_M)
     row = row[known]
@@ -133,10 +137,11 @@ def _add_matches(values: dict[str, np.ndarray], path: Path, xyz: np.ndarray, row
     step = np.array([spacing, max(1, round(spacing / rows.step))])
     reference = int(np.abs(shape - np.eye(2)).max(axis=(0, 2, 3)).argmin()) if len(row) else 0
     offset = xy[:, reference] - np.stack([cell % width, cell // width], axis=1) * step
-    values["xy_px"][known] = rows.to_frame(xy)
-    values["middle_px"][known] = rows.to_frame(xy - np.einsum("nkij,nj->nki", shape, offset))
-    values["shape"][known] = shape
-    values["residual_px"][known], values["correlation"][known] = saved["field_residual_px"][row], saved["field_correlation"][row]
+    middle = xy - np.einsum("nkij,nj->nki", shape, offset)
+    values["xy_px"][known], values["middle_px"][known] = ((rows.to_frame(at) + 0.5) * reduction - 0.5 for at in (xy, middle))
+    values["shape"][known], values["reduction"] = shape, reduction
+    values["residual_px"][known] = saved["field_residual_px"][row] * reduction.mean()
+    values["correlation"][known] = saved["field_correlation"][row]
 
 
 def _key(xyz: np.ndarray) -> np.ndarray:
@@ -154,10 +159,10 @@ def patch_boxes(
     _, _, (half_w, half_h) = patch_offsets(patch_px, rows.step)
     corners = np.array([[-half_w, -half_h], [half_w, -half_h], [half_w, half_h], [-half_w, half_h]]) * 1.0
     middle = rows.from_frame(points.middle_px[row])
-    found = middle[:, None] + np.einsum("kij,cj->kci", points.shape[row], corners)
+    found = middle[:, None] + np.einsum("kij,cj->kci", points.shape[row], corners) * points.reduction[:, None]
     depth = cameras[reference].to_camera(points.xyz_m[row])[2]
     start = approximations_at_depth(cameras, reference, rows, middle[None, reference], np.array([depth]))
-    begun = start.xy[0][:, None] + np.einsum("kij,cj->kci", start.shape[0], corners)
+    begun = start.xy[0][:, None] + np.einsum("kij,cj->kci", start.shape[0], corners * points.reduction[reference])
     return rows.to_frame(begun), rows.to_frame(found)
 
 

@@ -63,11 +63,11 @@ def measure(run: Run, monitor: Monitor) -> None:
     except NothingMeasured as error:
         return _no_surface(run, error, monitor)
     summaries.sort(key=lambda summary: summary.frame)
-    run.measured = MeasuredFrames(footage=run.footage, results=run.results, summaries=tuple(summaries))
+    run.measured = MeasuredFrames(footage=run.measured_footage, results=run.results, summaries=tuple(summaries))
     run.warn(
         *check_clouds(run.footage, [f.frame for f in summaries], [f.points for f in summaries], [f.residual_px for f in summaries], monitor)
     )
-    run.finish_stage("measure", began, **surface_figures(summaries, foreground))
+    run.finish_stage("measure", began, **surface_figures(summaries, foreground, float(run.measured_footage.reduction.mean())))
 
 
 def track(run: Run, monitor: Monitor) -> None:
@@ -167,7 +167,7 @@ def is_complete(run: Run) -> bool:
 def _measure_frames(run: Run, summaries: list[FrameSummary], monitor: Monitor) -> Foreground | None:
     """Write the clouds, summarise each frame in `summaries`; gives the first frame's foreground."""
     s, foreground = run.settings, None
-    for m in measure_frames(run.footage, MeasureSettings.of(s), run.results, monitor):
+    for m in measure_frames(run.measured_footage, MeasureSettings.of(s), run.results, monitor):
         write_cloud(run.results.cloud_path(m.frame), as_written(run.corrected(m.cloud), s["surface"]))
         summaries.append(summary_of(m))
         foreground = foreground or m.foreground
@@ -197,7 +197,7 @@ def _track_points(run: Run, monitor: Monitor, guide: Guide | None = None) -> dic
     kept = "Stopped: the surface of all frames is kept, and the tracks as far as they are; run it again to go on."
     with run.resumable(stopped=lambda: kept):
         rules = TrackingRules(matching=s["matching"], tracking=s["tracking"], enhance=s["enhance"], limit_px=run.measured.limit_px)
-        steps = track_frames(run.footage, run.measured, rules, run.results, monitor, guide)
+        steps = track_frames(run.measured_footage, run.measured, rules, run.results, monitor, guide)
         filtered, reasons = trajectories_of(steps, take.fps, s["tracking"], decide)
     run.trajectories = filtered.kept
     write_trajectories(run.results.folder, filtered, take.fps)
@@ -230,7 +230,7 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     run.body = body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
     _write_body(run, body, monitor)
     guided = fitting.track_again and run.measured
-    tracked_again = _track_points(run, monitor, BodyGuide(body, run.footage)) if guided else {}
+    tracked_again = _track_points(run, monitor, BodyGuide(body, run.measured_footage)) if guided else {}
     run.results.remove("cache/fit")
     outlines = outline_polygons(run.footage, run.results)
     run.silhouettes = silhouettes_of(run.footage, body, run.settings["skin"], outlines, background, monitor)

@@ -19,7 +19,7 @@ from ..foundation.settings import to_table
 from ..geometry.robust import finite_median
 from ..matching.foreground import Foreground
 from ..surface.frames import FrameSummary
-from ..take.take import Footage
+from ..take.footage import Footage
 from ..tracking.settings import TrackStatus
 from ..tracking.trajectories import Trajectories
 from .stages import command_of
@@ -45,8 +45,9 @@ def new_record(footage: Footage, settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | None) -> dict[str, Any]:
-    """Figures of the measured frames: number, points, residuals, sigma, and how the person was separated from the background."""
+def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | None, reduction: float) -> dict[str, Any]:
+    """Figures of the measured frames: number, points, residuals, sigma, how the person was separated from the background, and by which
+    factor the images were reduced."""
     return {
         "frames": len(summaries),
         "points_per_frame": float(np.mean([f.points for f in summaries])),
@@ -54,6 +55,7 @@ def surface_figures(summaries: Sequence[FrameSummary], foreground: Foreground | 
         "sigma_mm": 1e3 * finite_median([f.sigma_m for f in summaries], 0.0),
         "foreground": foreground.method if foreground else "",
         "background_planes": len(foreground.planes) if foreground else 0,
+        "reduction": round(reduction, 3),
     }
 
 

@@ -18,7 +18,8 @@ from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
 from ..surface import measure
-from ..take.take import NO_BODY, Footage, FrameClicks, Take, View
+from ..take.footage import Footage
+from ..take.take import NO_BODY, FrameClicks, Take, View
 from ..tracking import track
 
 STAGES = ("measure", "track", "fit")

@@ -24,8 +24,10 @@ from ..report.silhouettes import Silhouettes
 from ..results.folder import Results, check_separate_folder
 from ..surface.cloud import PointCloud, SurfaceSettings
 from ..surface.frames import MeasuredFrames
+from ..surface.resolution import measured_footage
 from ..take.clicked_points import clicked_depth
-from ..take.take import Footage, open_take, read_take
+from ..take.footage import Footage, open_take
+from ..take.take import read_take
 from ..tracking.contour import ContourSettings
 from ..tracking.corrections import corrected_cloud
 from ..tracking.settings import KeyPointSettings, TrackingSettings
@@ -66,6 +68,11 @@ class Run:
 
     def __post_init__(self) -> None:
         self.measured = MeasuredFrames(footage=self.footage, results=self.results)
+
+    @property
+    def measured_footage(self) -> Footage:
+        """The footage at the size at which its surface is measured and tracked."""
+        return measured_footage(self.footage, self.settings["surface"].quality, self.settings["growing"].spacing_px)
 
     @property
     def clouds(self) -> Sequence[PointCloud]:

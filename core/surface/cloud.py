@@ -36,8 +36,14 @@ MAX_CORRECTION_PX = 3.0  # px; a rounder surface than this implies is noise, not
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SurfaceSettings:
-    """The filters of the measured surface, and the thinning of its files."""
+    """How finely the surface is measured, its filters, and the thinning of its files."""
 
+    quality: str = knob(
+        "motion",
+        "Motion: large images are reduced to what the fit of a body needs, some 2,000 points of the person; surface: every pixel counts, "
+        "as it does where no body is asked for.",
+        choices=("motion", "surface"),
+    )
     min_island: int = knob(20, "Groups of fewer connected points than this are removed.", low=1, high=10_000)
     max_deviation: float = knob(4.0, "Largest distance from the neighbours' surface, in units of their scatter.", low=1.0, high=20.0)
     correct_curvature: bool = knob(
@@ -50,8 +56,8 @@ class SurfaceSettings:
 
     @property
     def of_measuring(self) -> "SurfaceSettings":
-        """These settings without those that concern only the written files."""
-        return replace(self, voxel_mm=0.0, voxel_points=1)
+        """These settings without those that concern only the size of the images and the written files."""
+        return replace(self, quality="surface", voxel_mm=0.0, voxel_points=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

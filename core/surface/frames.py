@@ -14,7 +14,7 @@ from ..foundation.arrays import LazySequence
 from ..foundation.errors import InputError
 from ..geometry.robust import finite_median
 from ..results.folder import Results
-from ..take.take import Footage
+from ..take.footage import Footage
 from .cloud import PointCloud
 from .measure import MeasuredFrame, read_checkpoint
 

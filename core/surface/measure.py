@@ -29,8 +29,8 @@ from ..matching.views import TemplateGrid, Views, template_grid
 from ..matching.voronoi_scan import voronoi_scan
 from ..results.folder import Results
 from ..take.clicked_points import clicked_depth, with_clicked
+from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
-from ..take.take import Footage, footage_frames
 from .cloud import OCCLUDED, PointCloud, SurfaceSettings, point_cloud, why_removed
 
 ALGORITHM = "surface 19"  # part of every key: raise it when the same input gives other numbers
@@ -83,8 +83,8 @@ def measured_rows(footage: Footage, frame: int) -> list[np.ndarray]:
     grid, step = footage.take.rows_at(frame), footage.take.field_layout.per_image
 
     def neighbour(k: int, at: int) -> np.ndarray | None:
-        number = footage.number(k, at)
-        return grid.rows(footage.sequences[k].read(number)) if 0 <= number < footage.sequences[k].count else None
+        number, sequence = footage.number(k, at), footage.sequences[k]
+        return grid.rows(footage.reduced_image(k, sequence.read(number))) if 0 <= number < sequence.count else None
 
     rows = [grid.rows(image) for image in footage.read(frame)]
     for k, late in enumerate(footage.delay_images):
@@ -137,6 +137,7 @@ def measure_frames(footage: Footage, settings: MeasureSettings, results: Results
         repr([(v.name, v.offset_frames) for v in take.views]),
         repr(footage.delay_images) if any(footage.delay_images) else "",
         repr(footage.click_sigma_px) if take.clicks.surface else "",
+        repr(footage.reduction.tolist()) if footage.full_size_px else "",
     )
     start = before = None
     for done, frame in enumerate(order):
@@ -149,7 +150,7 @@ def measure_frames(footage: Footage, settings: MeasureSettings, results: Results
         measured = read_checkpoint(footage, results, frame, key)
         if measured is None:
             measured = _measure(_frame_views(footage, frame, settings, first=before is None), settings, before, key, part)
-            _checkpoint(results, measured)
+            _checkpoint(results, measured, footage)
         start = start or measured
         before = measured
         yield measured
@@ -223,10 +224,10 @@ def _measure(now: _FrameViews, settings: MeasureSettings, before: MeasuredFrame 
     return MeasuredFrame(
         frame=now.frame,
         field=field.select(why == 0),
-        cloud=cloud,
+        cloud=in_full_pixels(cloud, now.footage),
         foreground=replace(where, silhouettes=()),
         key=key,
-        removed_px=views.rows.to_frame(field.xy[why > 0]).astype(np.float32),
+        removed_px=now.footage.to_full(views.rows.to_frame(field.xy[why > 0])).astype(np.float32),
         removed_why=why[why > 0],
     )
 
@@ -316,12 +317,19 @@ def _background_and_person(now: _FrameViews, seeds: Approximations) -> tuple[np.
     return planes, seeds.depth_m[moved if moved.sum() >= MIN_MOVED else off_planes]
 
 
+def in_full_pixels(cloud: PointCloud, footage: Footage) -> PointCloud:
+    """The cloud with coordinates and residuals in pixels of the files' images, where these were reduced."""
+    if not footage.full_size_px:
+        return cloud
+    return replace(cloud, xy_px=footage.to_full(cloud.xy_px), residual_px=cloud.residual_px * float(footage.reduction.mean()))
+
+
 def _single(field: MatchedField) -> MatchedField:
     """The field with its covariances in single precision, as a checkpoint stores it: a resumed run continues with the same numbers."""
     return replace(field, **{name: getattr(field, name).astype(np.float32).astype(np.float64) for name in FIELD_SINGLE})
 
 
-def _checkpoint(results: Results, m: MeasuredFrame) -> None:
+def _checkpoint(results: Results, m: MeasuredFrame, footage: Footage) -> None:
     arrays = {f"field_{f.name}": getattr(m.field, f.name) for f in fields(MatchedField) if f.name not in ("grid", "tried", "limit_px")}
     arrays = {k: v.astype(np.float32) if k.removeprefix("field_") in FIELD_SINGLE else v for k, v in arrays.items()}
     arrays |= {f"cloud_{f.name}": getattr(m.cloud, f.name) for f in fields(PointCloud) if f.name not in ("frame", "xy_px", "residual_px")}
@@ -331,6 +339,7 @@ def _checkpoint(results: Results, m: MeasuredFrame) -> None:
         "method": np.array(m.foreground.method),
         "grid": np.array([m.field.grid.spacing_px, *m.field.grid.shape, m.field.tried]),
         "limit_px": np.array(m.field.limit_px),
+        "reduction": footage.reduction,
         "removed_px": m.removed_px,
         "removed_why": m.removed_why,
     }
@@ -359,4 +368,5 @@ def read_checkpoint(footage: Footage, results: Results, frame: int, key: str) ->
     where = fg.Foreground(depth_range_m=(float(a["where"][0]), float(a["where"][1])), method=str(a["method"]), planes=a["planes"])
     why = a.get("removed_why", np.zeros(0, dtype=np.uint8))  # earlier versions did not store it
     removed = a.get("removed_px", np.zeros((0, field.xy.shape[1], 2), dtype=np.float32))
+    cloud = in_full_pixels(cloud, footage)
     return MeasuredFrame(frame=frame, field=field, cloud=cloud, foreground=where, key=key, removed_px=removed, removed_why=why)

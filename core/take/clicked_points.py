@@ -13,7 +13,8 @@ from ..geometry.intersection import Intersection, clicks_contradict, intersect_c
 from ..matching.least_squares import MatchingSettings
 from ..matching.seeds import Approximations, approximations_at_depth, settled_depths
 from ..matching.views import Views
-from .take import Clicks, Footage
+from .footage import Footage
+from .take import Clicks
 
 
 def clicked_depth(footage: Footage, name: str, at: Clicks) -> float:

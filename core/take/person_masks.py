@@ -14,8 +14,8 @@ from ..foundation.errors import InputError
 from ..images.background import OTHER_ROOM, WINDOW_PX, empty_view
 from ..images.sequence import open_sequence
 from ..matching.foreground import Silhouette
+from .footage import Footage
 from .sources import PERSON_SOURCES, read_picture
-from .take import Footage
 
 WHITE = 127.0  # grey values; brighter pixels of a mask are the person
 HOLE_PX = 15  # px, side of the largest hole that is closed in a silhouette, where the person has the background's grey value
@@ -34,7 +34,7 @@ def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, fir
         path = silhouette_file(footage, k, frame)
         if path is None:
             continue
-        picture = rows.rows(read_picture(path, view.name, camera.size_px))
+        picture = rows.rows(footage.reduced_image(k, read_picture(path, view.name, footage.sizes_px[k])))
         if view.background is not None:
             mask = _unlike(picture, image, rows.step)
         elif 0 < picture.max() <= WHITE:

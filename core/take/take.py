@@ -15,10 +15,7 @@ import numpy as np
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
-from ..geometry.intersection import CLICK_SIGMA_PX
-from ..geometry.rig import Rig, read_rig
 from ..images.interlace import BOTH, INTERLACE, FieldLayout, RowGrid, field_layout, frame_time_s
-from ..images.sequence import ImageSequence, open_sequence
 from .sources import (
     PERSON_SOURCES,
     KeypointSource,
@@ -53,6 +50,7 @@ KEYS = (
     "corrections",
     "keypoints",
     "settings",
+    "quality",
 )
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
@@ -165,46 +163,6 @@ class Take:
         return [v.name for v in self.views].index(self.reference_view)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Footage:
-    """An opened take: its cameras in the order of the views, and their sequences."""
-
-    take: Take
-    rig: Rig
-    sequences: tuple[ImageSequence, ...]
-    frames: range
-    click_sigma_px: float = CLICK_SIGMA_PX  # of the take's clicks
-    delay_images: tuple[float, ...] = ()  # time offset by which the images of each view are interpolated; empty: none
-
-    def number(self, view: int, frame: int) -> int:
-        """The number of the image in a view's sequence that shows a frame of the take."""
-        return self.take.field_layout.image(frame) + self.take.views[view].offset_frames
-
-    def single(self) -> "Footage":
-        """The footage with one frame per image."""
-        take, per = self.take.single(), self.take.field_layout.per_image
-        return replace(self, take=take, frames=range(self.frames.start // per, -(-self.frames.stop // per)))
-
-    def read(self, frame: int) -> list[np.ndarray]:
-        """The grey images (h, w) float32 of all views at one frame of the take.
-
-        Raises:
-            InputError: an image is missing, damaged, or of another size than its camera.
-        """
-        images = [s.read(self.number(k, frame)) for k, s in enumerate(self.sequences)]
-        for image, camera, view in zip(images, self.rig.cameras, self.take.views):
-            if image.shape[::-1] != camera.size_px:
-                raise InputError(
-                    f"Frame {frame} of view {view.name} has {image.shape[1]}×{image.shape[0]} pixels, but its camera in "
-                    f"{self.take.rig_path.name} has {camera.size_px[0]}×{camera.size_px[1]}; use the footage as it was calibrated."
-                )
-        return images
-
-    def files(self, frame: int) -> list[Path]:
-        """The files of one frame; a movie is the file of all of its frames."""
-        return [f[self.number(k, frame)] if len(f := s.files()) > 1 or s.count == 1 else f[0] for k, s in enumerate(self.sequences)]
-
-
 def read_take(folder: Path) -> Take:
     """Read FOLDER/take.toml.
 
@@ -233,68 +191,6 @@ def take_of_text(text: str, path: Path) -> Take:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not a TOML file: {error}; correct that place.") from error
     return _take(table, path.parent.resolve(), str(path))
-
-
-def open_take(take: Take, sequences: tuple[ImageSequence, ...] | None = None, *, click_sigma_px: float = CLICK_SIGMA_PX) -> Footage:
-    """Open the footage (unless `sequences` are the opened views) and the rig of a take and check that they belong together.
-
-    `click_sigma_px`: the knob fitting.click_sigma_px, for what depends on the clicks.
-
-    Raises:
-        InputError: a view without camera or images, views of unequal length, frames or clicks outside the footage.
-    """
-    rig = read_rig(take.rig_path)
-    rig = Rig(cameras=tuple(rig[v.name] for v in take.views), metadata=rig.metadata)
-    sequences = sequences or tuple(open_sequence(take.folder, images=v.images, movie=v.movie, view=v.name) for v in take.views)
-    frames = footage_frames(take, sequences)
-    footage = Footage(take=take, rig=rig, sequences=sequences, frames=frames, click_sigma_px=click_sigma_px)
-    _check_clicks(footage)
-    return footage
-
-
-def footage_frames(take: Take, sequences: tuple[ImageSequence, ...]) -> range:
-    """The frames of a take that are measured.
-
-    Raises:
-        InputError: the views have no common frames, or not those in the take.
-    """
-    per = take.field_layout.per_image
-    counts = [per * (s.count - v.offset_frames) for s, v in zip(sequences, take.views)]
-    first = per * max(0, *(-v.offset_frames for v in take.views))
-    if take.frames is None:
-        if len(set(counts)) > 1:
-            lengths = ", ".join(f"{v.name} has {c}" for v, c in zip(take.views, counts))
-            advice = "Trim them, or set `offset_frames` or `frames` in take.toml."
-            raise InputError(f"The views of {take.folder.name} are not equally long: {lengths} frames. {advice}")
-        if counts[0] <= first:
-            raise InputError(f"With these `offset_frames` the views of {take.folder.name} have no common frame; correct them in take.toml.")
-        return range(first, counts[0])
-    start, stop = take.frames
-    if start < first or stop > min(counts):
-        has = f"the footage has frames {first} to {min(counts)} (half-open)"
-        raise InputError(f"`frames` of {take.folder.name} is [{start}, {stop}], but {has}; correct it in take.toml.")
-    return range(start, stop)
-
-
-def _check_clicks(footage: Footage) -> None:
-    for clicked in (footage.take.clicks, *footage.take.keyframes):
-        clicks = [(f"joint “{name}”", at) for name, at in clicked.joints.items()]
-        clicks += [(f"surface seed {i + 1}", at) for i, at in enumerate(clicked.surface)]
-        for label, at in clicks:
-            _check_inside(footage, label, at)
-        if clicks and clicked.frame not in footage.frames:
-            raise InputError(
-                f"The clicks of {footage.take.folder.name} in frame {clicked.frame} are not among the frames "
-                f"{footage.frames.start} to {footage.frames.stop - 1}; change `frame` in take.toml."
-            )
-
-
-def _check_inside(footage: Footage, label: str, at: Clicks) -> None:
-    for view, xy in at.items():
-        if not footage.rig[view].sees(xy):
-            w, h = footage.rig[view].size_px
-            where = f"at ({xy[0]:g}, {xy[1]:g}), outside the image of {w}×{h} pixels"
-            raise InputError(f"The {label} in view {view} lies {where}; click it again.")
 
 
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
@@ -339,7 +235,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         keyframes=_keyframes(tables_of(table, "keyframes", where), names, where),
         corrections=tuple(_correction(c, names, where) for c in tables_of(table, "corrections", where)),
         keypoints=keypoint_sources(tables_of(table, "keypoints", where), names, JOINTS, where),
-        settings=_settings(table_of(table, "settings", where), where),
+        settings=_settings(table_of(table, "settings", where), table.get("quality"), where),
     )
 
 
@@ -432,11 +328,16 @@ def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
     return {view: np.array(xy, dtype=np.float64) for view, xy in at.items()}
 
 
-def _settings(table: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str, Any]]:
+def _settings(table: Mapping[str, Any], quality: Any, where: str) -> Mapping[str, Mapping[str, Any]]:
     for name, group in table.items():
         if not isinstance(group, dict):
             raise InputError(f"[settings] of {where} must contain tables such as [settings.matching]; “{name}” is not a table.")
-    return table
+    if quality is None:
+        return table
+    surface = table.get("surface", {})
+    if "quality" in surface:
+        raise InputError(f"{where} sets `quality` twice, also under [settings.surface]; remove one of them.")
+    return {**table, "surface": {**surface, "quality": quality}}
 
 
 def body_model(folder: Path, name: str | None, where: str) -> str | None:

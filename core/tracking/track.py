@@ -23,7 +23,7 @@ from ..matching.region_growing import MatchedField
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
 from ..surface.measure import FrameImages, MeasuredFrame, load_images
-from ..take.take import Footage
+from ..take.footage import Footage
 from .curvature_correction import NEAREST_POINTS, CurvatureCorrection, nearest_points
 from .lost_points import Guide, LostPoints, none_lost
 from .published_step import STEPS

@@ -120,7 +120,7 @@ def test_undo_save_and_open(blender: ModuleType, scene: Any, tmp_path: Path) -> 
 def test_a_correction_makes_the_later_steps_stale(blender: ModuleType, scene: Any, take: Path) -> None:
     from tricap.core.run import take_run
     from tricap.core.run.stages import stage_keys
-    from tricap.core.take.take import open_take
+    from tricap.core.take.footage import open_take
 
     def keys() -> dict[str, str]:
         module("project").write(scene)

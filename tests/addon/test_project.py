@@ -155,6 +155,16 @@ def test_no_body_is_read_and_written(project: ModuleType, blender: ModuleType, t
     assert read_table(take)["body"] == {"model": "none"} and take_of_table(take, read_table(take)).no_body
 
 
+def test_the_quality_is_a_key_of_the_take(project: ModuleType, blender: ModuleType, take: Path) -> None:
+    """It stands where a reader looks first, and nowhere else."""
+    scene = blender.context.scene
+    write_table(take, read_table(take) | {"quality": "surface"})
+    project.open_take(scene, take)
+    assert scene.tricap.surface.quality == "surface" and project.table(scene) == read_table(take)
+    scene.tricap.surface.property_unset("quality")
+    assert project.table(scene) == {key: value for key, value in read_table(take).items() if key != "quality"}
+
+
 def test_somebody_elses_change_is_not_written_over(project: ModuleType, blender: ModuleType, take: Path) -> None:
     scene = blender.context.scene
     project.open_take(scene, take)

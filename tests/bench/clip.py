@@ -27,7 +27,8 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.run import pipeline, take_run
 from tricap.core.synthetic import arm
 from tricap.core.synthetic.film import digitize, expose, paint
-from tricap.core.take.take import Take, open_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import Take
 
 FPS, WIDTH_PX = 25.0, 192
 SWING = round(arm.SWING_S * FPS)  # frames

@@ -28,7 +28,8 @@ from tricap.core.results.folder import Results
 from tricap.core.run.take_run import settings_of
 from tricap.core.surface.measure import MeasureSettings, measure_frames
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 SHAPE, SPACING, NOISE, RUNS, FINE, BORDER = (576, 768), 4, 2.0, 7, 4, 24
 START_ERROR_PX = 0.5

@@ -25,9 +25,10 @@ from ...geometry.intersection import intersect_clicks
 from ...geometry.rig import Rig
 from ...images.foreground import FEWEST, CellBackground, cells, given_background, person, still_background
 from ...surface.cloud import PointCloud
+from ...take.footage import Footage
 from ...take.person_masks import WHITE, silhouette_file
 from ...take.sources import read_picture
-from ...take.take import Footage, FrameClicks
+from ...take.take import FrameClicks
 from ..observations import BackgroundExclusion
 from ..observations.background import DistanceMap
 from ..settings import FitSettings

@@ -8,7 +8,7 @@ import numpy as np
 from ...foundation.progress import Monitor
 from ...results.folder import Results
 from ...surface.cloud import PointCloud
-from ...take.take import Footage
+from ...take.footage import Footage
 from ...tracking.contour import ContourTable, Polygons
 from ..settings import FitSettings
 from .background import UNIT_PX, find_background

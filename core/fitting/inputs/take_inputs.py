@@ -17,8 +17,9 @@ from ...motion.formats.trc import read_trc
 from ...motion.retarget.points import joint_of
 from ...results.folder import Results
 from ...surface.cloud import PointCloud
+from ...take.footage import Footage
 from ...take.sources import KeypointSource
-from ...take.take import JOINTS, Footage, FrameClicks, Take
+from ...take.take import JOINTS, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import FitSettings

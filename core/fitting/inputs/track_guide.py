@@ -14,7 +14,7 @@ from ...body.skeleton import bone_frames
 from ...body.skin.contour_skin import Skin, body_skin
 from ...foundation import store
 from ...geometry.raster import rasterize
-from ...take.take import Footage
+from ...take.footage import Footage
 
 ON_SKIN_M = 0.04  # a point further from the skin belongs to no bone
 OCCLUDING_M = 0.03  # a surface so much nearer occludes a point: the skin differs from the limb by about a centimetre

@@ -43,12 +43,14 @@ def fit_click_frame(fit: FitContext, points: CloudPoints, monitor: Monitor) -> S
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     best, best_score = None, -np.inf
     starts = _best_starts(fit, points, _starts(fit, points, clicked.motion[0], clicked.vector, monitor), clicked.vector, monitor)
-    parts = [monitor.part(STAGE, i, len(starts) + 1) for i in range(len(starts) + 1)]
+    parts = [monitor.part(STAGE, i, len(starts) + 2) for i in range(len(starts) + 2)]
     for part, motion in zip(parts, starts):
-        solution = fit_pose_and_shape(fit, points, motion, clicked.vector, part)
+        solution = _to_surface(fit, points, motion, clicked.vector, part)
         score = fit.score(fit.click, points, solution.motion[0], solution.vector)
         if score > best_score:
             best, best_score = solution, score
+    if best is not None:
+        best, best_score = _better_around(fit, points, best, best_score, parts[-2])
     support = fit.support(fit.click, points, best.motion[0], best.vector) if best is not None else 0.0
     if best is None or (support < fit.settings.min_points and not fit.tracks.joints(fit.click)):
         if not fit.settings.use_surface:
@@ -80,7 +82,7 @@ def _with_lost_limbs(fit: FitContext, points: CloudPoints, best: Solution, best_
     """
     found = reacquired_poses(fit, fit.click, points, best.motion[0], best.vector, _try(monitor, 0))
     for i, start in enumerate(found):
-        solution = fit_pose_and_shape(fit, points, start, best.vector, _try(monitor, i + 1))
+        solution = _to_surface(fit, points, start, best.vector, _try(monitor, i + 1))
         score = fit.score(fit.click, points, solution.motion[0], solution.vector)
         if score > best_score + fit.least_gain:
             best, best_score = solution, score
@@ -98,10 +100,14 @@ def fit_pose_and_shape(
         Cancelled: the user asked to stop.
     """
     monitor = monitor or Monitor()
-    best = _to_surface(fit, points, motion, vector, _try(monitor, 0))
+    first = _to_surface(fit, points, motion, vector, _try(monitor, 0))
+    return _better_around(fit, points, first, fit.score(fit.click, points, first.motion[0], first.vector), monitor)[0]
+
+
+def _better_around(fit: FitContext, points: CloudPoints, best: Solution, best_score: float, monitor: Monitor) -> tuple[Solution, float]:
+    """The solution and its score, where its residuals are too large a better one from the clicked pose or from others around it."""
     if _plausible(best):
-        return best
-    best_score = fit.score(fit.click, points, best.motion[0], best.vector)
+        return best, best_score
     clicked = inverse_kinematics(fit.parameters, fit.clicks, fit.priors, fit.proportions)
     for i, start in enumerate(_around(fit, clicked.motion[0])):
         solution = _to_surface(fit, points, start, clicked.vector, _try(monitor, i + 1))
@@ -110,7 +116,7 @@ def fit_pose_and_shape(
             best, best_score = solution, score
         if _plausible(best):
             break
-    return best
+    return best, best_score
 
 
 def _try(monitor: Monitor, number: int) -> Monitor:

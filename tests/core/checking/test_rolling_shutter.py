@@ -11,7 +11,8 @@ from tricap.core.checking.timing import _readout, estimate_offsets
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import write_rig
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 from ..conftest import Body, three_cameras, write_take_toml
 

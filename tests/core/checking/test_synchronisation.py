@@ -14,7 +14,8 @@ from tricap.core.run import pipeline, take_run
 from tricap.core.surface.measure import measured_rows
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.score import score_run
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 
 def blob(x: float) -> np.ndarray:

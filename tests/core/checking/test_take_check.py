@@ -24,7 +24,8 @@ from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.run import pipeline, take_run
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 from ..images.test_sequence import with_a_pause
 

@@ -22,7 +22,8 @@ from tricap.core.geometry.rig import read_rig
 from tricap.core.run import pipeline
 from tricap.core.take import writing
 from tricap.core.take.bar_file import read_bar, write_bar
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 Capture = pytest.CaptureFixture[str]
 

@@ -13,7 +13,8 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.foreground import cells
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 
 def test_nothing_of_a_moving_arm_is_empty(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from tricap.core.motion.formats.markers import Markers
 from tricap.core.motion.formats.trc import write_trc
 from tricap.core.run import pipeline, take_run
 from tricap.core.run.record import read_frame_table
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 from tricap.core.tracking.contour import contour_of_mask, outward_normals
 
 from ..conftest import three_cameras, write_take

@@ -13,7 +13,8 @@ from tricap.core.matching.proposals import below_surface, epipolar_curve, propos
 from tricap.core.matching.views import Views
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.truth import Truth, read_truth
-from tricap.core.take.take import Footage, open_take, read_take
+from tricap.core.take.footage import Footage, open_take
+from tricap.core.take.take import read_take
 
 
 def distance_to(curve: np.ndarray, xy: np.ndarray) -> float:

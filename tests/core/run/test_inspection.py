@@ -12,7 +12,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.motion.formats.ply import write_mesh
 from tricap.core.run import pipeline
 from tricap.core.run.inspection import body_outline, patch_boxes, read_points, read_tracks
-from tricap.core.take.take import Footage
+from tricap.core.take.footage import Footage
 from tricap.core.tracking.settings import TrackStatus
 
 

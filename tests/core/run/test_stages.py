@@ -11,7 +11,8 @@ import pytest
 from tricap.core.foundation import store
 from tricap.core.run import take_run
 from tricap.core.run.stages import STAGE_INPUTS, STAGES, WITHOUT_STAGE, stage_keys, stage_of, valid_stages
-from tricap.core.take.take import Take, open_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import Take
 from tricap.core.take.writing import read_table, take_of_table
 
 from ..conftest import Body, three_cameras, write_take

@@ -11,7 +11,8 @@ from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig
 from tricap.core.geometry.rotation import rotation_from_vector
 from tricap.core.surface.cloud import LIMB_SCATTER, ROUGHNESS, PointCloud, SurfaceSettings, point_cloud, why_removed
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 TILT = rotation_from_vector(np.array([0.1, 0.25, 0.0]))
 

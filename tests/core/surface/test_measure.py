@@ -22,7 +22,8 @@ from tricap.core.run import take_run
 from tricap.core.surface import measure
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.surface.measure import MeasuredFrame
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 
 def same(a: MeasuredFrame, b: MeasuredFrame) -> None:

@@ -11,7 +11,8 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.geometry.rig import read_rig
 from tricap.core.synthetic.arm import ArmTakeSettings, arm_motion, arm_shape, make_arm_take
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 SMALL = ArmTakeSettings(frames=2, width_px=384, interlaced="none")
 

@@ -17,7 +17,8 @@ from tricap.core.matching.proposals import where_rays_meet
 from tricap.core.run import take_run
 from tricap.core.run.stages import stage_keys
 from tricap.core.take.clicked_points import clicked_point
-from tricap.core.take.take import Footage, open_take, read_take
+from tricap.core.take.footage import Footage, open_take
+from tricap.core.take.take import read_take
 
 X = np.array([0.05, 0.02, 2.1])
 APART_PX = 40.0  # across the epipolar lines: each click misses the point between them by half of it

@@ -13,7 +13,8 @@ from tricap.core.foundation.progress import Monitor
 from tricap.core.results.folder import Results
 from tricap.core.run import pipeline, take_run
 from tricap.core.run.stages import stage_keys
-from tricap.core.take.take import open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
 
 COARSE = {"growing": {"spacing_px": 6}}
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
-from tricap.core.take.take import Take, open_take, read_take
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import Take, read_take
 
 HEAD = dict(format='"tricap-take"', version="1", fps="25.0", rig='"rig.toml"')
 VIEWS = "".join(f'[[views]]\nname = "{v}"\nimages = "{v}/*.png"\n' for v in "LCR")

@@ -1,0 +1,136 @@
+"""Large images are reduced to what a body's motion needs; everything that leaves the measurement is in pixels of the files' images."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.cli.main import main
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
+from tricap.core.results.run_json import read_run
+from tricap.core.run import pipeline
+from tricap.core.run.inspection import patch_boxes, read_points, read_removed
+from tricap.core.run.take_run import Run, open_run
+from tricap.core.surface import resolution
+from tricap.core.surface.resolution import measured_footage, seen_area_m2
+from tricap.core.take.footage import Footage, open_take
+from tricap.core.take.take import read_take, take_of_text
+
+SIZE, FOCAL_PX, FACTOR = (440, 330), 1320.0, 2.4  # 1.6 mm a pixel: with so few points, 3.9 mm are enough
+
+
+@pytest.fixture(scope="module")
+def limb(scenes: Any) -> Any:
+    """An upright cylinder."""
+    return scenes.Body(radius_m=0.06, half_m=(0.2, 0.2), shortest_m=0.02)
+
+
+@pytest.fixture(scope="module")
+def large_take(tmp_path_factory: pytest.TempPathFactory, scenes: Any, limb: Any) -> Path:
+    """Three frames of the cylinder in large images, with clicked joints of an arm and a mask."""
+    rig = scenes.three_cameras(width=SIZE[0], height=SIZE[1], focal=FOCAL_PX)
+    ends = {"shoulder.R": [0.0, -0.17, 2.16], "elbow.R": [0.0, 0.0, 2.16], "wrist.R": [0.0, 0.17, 2.16]}
+    clicks = "\n".join(
+        f'"{joint}" = {{ ' + ", ".join(f"{c.name} = {np.round(c.project(np.array(at)), 2).tolist()}" for c in rig.cameras) + " }"
+        for joint, at in ends.items()
+    )
+    more = f'[body]\nmodel = "arm.R"\n[seeds.joints]\n{clicks}\n'
+    frames = [[limb.moved(np.eye(3), [0.004 * t, 0.0, 0.0])] for t in range(3)]
+    folder = Path(scenes.write_take(tmp_path_factory.mktemp("large"), rig, frames, more=more))
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[: SIZE[1] // 4] = 0  # not the upper quarter
+    (folder / "mask.png").write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+    text = (folder / "take.toml").read_text()
+    (folder / "take.toml").write_text(text.replace('images = "C/*.png"', 'images = "C/*.png"\nmask = "mask.png"'))
+    return folder
+
+
+@pytest.fixture
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if an arm needed fewer points."""
+    monkeypatch.setattr(resolution, "POINTS", resolution.POINTS / 10)
+
+
+def _tracked(take: Path, out: Path, overrides: Any = None) -> Run:
+    with open_run(take, out, overrides) as run:
+        pipeline.track(run, Monitor())
+    return run
+
+
+def test_a_person_needs_pixels_of_some_millimetres() -> None:
+    assert 0.5 < seen_area_m2("full") < 0.7 and 0.04 < seen_area_m2("arm.R") < 0.06  # adults cover about 0.6 m² of a picture
+
+
+def test_only_large_images_of_a_body_are_reduced(large_take: Path, few_points: None) -> None:
+    footage = open_take(read_take(large_take))
+    small = measured_footage(footage, "motion", 4)
+    assert small.reduction == pytest.approx(np.full((3, 2), FACTOR), rel=0.1) and small.click_sigma_px < footage.click_sigma_px
+    assert small.read(0)[1].shape[::-1] == small.rig.cameras[1].size_px
+    unchanged = [
+        measured_footage(footage, "surface", 4),
+        measured_footage(footage, "motion", 16),
+        measured_footage(_other(footage), "motion", 4),
+    ]
+    assert all(found.full_size_px == () for found in unchanged)
+
+
+def _other(footage: Footage) -> Footage:
+    text = (footage.take.folder / "take.toml").read_text().replace('model = "arm.R"', 'model = "none"')
+    return open_take(take_of_text(text, footage.take.folder / "take.toml"))
+
+
+def test_a_reduced_camera_sees_the_same_corners(large_take: Path) -> None:
+    camera = open_take(read_take(large_take)).rig.cameras[0]
+    small, X = camera.resized((110, 100)), np.array([[0.05, -0.1, 2.2], [-0.2, 0.15, 1.9]])
+    scale = np.array([110, 100]) / camera.size_px
+    assert np.allclose(small.project(X) + 0.5, (camera.project(X) + 0.5) * scale)
+
+
+def test_a_reduced_image_gives_fewer_points_as_good_in_full_pixels(large_take: Path, limb: Any, few_points: None, tmp_path: Path) -> None:
+    run, whole = _tracked(large_take, tmp_path / "motion"), _tracked(large_take, tmp_path / "surface", {"surface": {"quality": "surface"}})
+    for t in range(3):
+        few, many = run.clouds[t], whole.clouds[t]
+        assert 100 < len(few.xyz_m) < 0.4 * len(many.xyz_m)
+        away = limb.moved(np.eye(3), [0.004 * t, 0.0, 0.0]).distance_m(few.xyz_m)
+        assert np.abs(np.median(away)) < 5e-4 and np.median(np.abs(away)) < 1e-3
+        for cloud in (few, many):
+            apart = np.stack([c.project(cloud.xyz_m) for c in run.footage.rig.cameras], axis=1) - cloud.xy_px
+            assert np.median(np.linalg.norm(apart, axis=2)) < 0.3
+            assert cloud.xy_px[:, 1, 1].min() > SIZE[1] / 4 - 6  # the mask holds
+    assert run.trajectories is not None and (run.trajectories.visible.sum(axis=0) == 3).sum() > 25
+    moved = np.diff(run.trajectories.xyz_m[[0, 2]], axis=0)[0]
+    assert np.nanmedian(moved, axis=0) == pytest.approx([0.008, 0.0, 0.0], abs=8e-4)
+    assert read_run(tmp_path / "motion" / "run.json")["stages"]["measure"]["reduction"] == pytest.approx(FACTOR, rel=0.1)
+    assert read_run(tmp_path / "surface" / "run.json")["stages"]["measure"]["reduction"] == 1
+
+
+def test_checkpoints_of_reduced_images_are_shown_in_full_pixels(large_take: Path, few_points: None, tmp_path: Path) -> None:
+    run = _tracked(large_take, tmp_path / "out")
+    first, cameras, rows = run.clouds[0], run.footage.rig.cameras, run.footage.take.rows_at(0)
+    again = _tracked(large_take, tmp_path / "out")
+    assert np.array_equal(again.clouds[0].xy_px, first.xy_px) and np.array_equal(
+        again.trajectories.xyz_m, run.trajectories.xyz_m, equal_nan=True
+    )  # type: ignore[union-attr]
+    points = read_points(tmp_path / "out", 0, cameras, rows)
+    assert points is not None and np.isfinite(points.middle_px).all()
+    apart = points.xy_px - np.stack([c.project(points.xyz_m) for c in cameras], axis=1)
+    assert np.median(np.linalg.norm(apart, axis=2)) < 0.3
+    begun, found = patch_boxes(points, len(points.xyz_m) // 2, cameras, 1, rows, 13)
+    assert np.ptp(found[1], axis=0) == pytest.approx(12 * points.reduction[1]) and np.allclose(begun[1], found[1], atol=1e-6)
+    removed, _ = read_removed(tmp_path / "out", 0)
+    assert not len(removed) or np.nanmax(removed[:, 1, 0]) > SIZE[0] / FACTOR  # of the full size
+
+
+def test_the_quality_is_chosen_in_the_file_or_by_an_option(large_take: Path, few_points: None, tmp_path: Path, capsys: Any) -> None:
+    text, path = (large_take / "take.toml").read_text(), large_take / "take.toml"
+    asked = text.replace("fps =", 'quality = "surface"\nfps =')
+    assert take_of_text(asked, path).settings == {"surface": {"quality": "surface"}}
+    with pytest.raises(InputError, match="sets `quality` twice"):
+        take_of_text(asked + '[settings.surface]\nquality = "motion"\n', path)
+    assert main(["measure", str(large_take), "--out", str(tmp_path / "out"), "--frames", "0:1", "--quality", "surface", "--quiet"]) == 0
+    assert read_run(tmp_path / "out" / "run.json")["stages"]["measure"]["reduction"] == 1
+    assert main(["measure", str(large_take), "--out", str(tmp_path / "out"), "--quality", "quick", "--quiet"]) == 2
+    assert "choose one of: motion, surface" in capsys.readouterr().err
