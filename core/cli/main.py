@@ -4,6 +4,7 @@ Exit codes: 0 done, 2 invalid input (one sentence on stderr), 130 cancelled (fin
 """
 
 import argparse
+import importlib.util
 import json
 import os
 import signal
@@ -125,9 +126,18 @@ def _track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 def _run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     given = args.take, args.out, overrides(args.set), frame_range(args.frames)
     with take_run.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
+        if not args.pictures and pipeline.is_complete(job) and _has_scene(job, args):
+            job.record["warnings"] = job.results.read_run().get("warnings", [])
+            return _summary(job, args.json) + ([] if args.json else ["Nothing has changed since that run; --restart begins anew."])
         pipeline.all_stages(job, monitor)
         scene = _build_scene(job, args, monitor)
         return _summary(job, args.json) + ([] if args.json else scene)
+
+
+def _has_scene(job: take_run.Run, given: argparse.Namespace) -> bool:
+    """Whether body.blend is there, or cannot be made by this command."""
+    without = "scene" not in _names_of(given.parser) or importlib.util.find_spec("bpy") is None
+    return without or job.results.path("body.blend").is_file()
 
 
 def _build_scene(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:

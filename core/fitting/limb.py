@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import qmc
 
 from ..body.skeleton import bone_frames
 from .state import ShapeParameters, free_bones
@@ -49,7 +48,7 @@ class Limb:
     def samples(self, angles: np.ndarray, count: int, spread: float) -> np.ndarray:
         """Angles (count, C), evenly within `spread` [rad] of some (C,) and within the limits of the joints (Halton 1960)."""
         low, high = np.maximum(self.low, angles - spread), np.minimum(self.high, angles + spread)
-        return np.asarray(low + _halton(len(angles), count) * np.maximum(high - low, 0.0))
+        return np.asarray(low + halton(len(angles), count) * np.maximum(high - low, 0.0))
 
     def head_m(self, pose: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Where it begins (3,) in a pose (D,) of a body with the shape vector (S,)."""
@@ -77,5 +76,8 @@ def whole_limbs(parameters: ShapeParameters) -> list[Limb]:
 
 
 @lru_cache(maxsize=32)
-def _halton(dimensions: int, count: int) -> np.ndarray:
+def halton(dimensions: int, count: int) -> np.ndarray:
+    """Points (count, dimensions) evenly in the unit cube, the same in every run (Halton 1960)."""
+    from scipy.stats import qmc  # takes longer to import than the rest of a command
+
     return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))

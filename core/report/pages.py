@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..body.motion import BodyFit
-from ..body.skin.contour_skin import SkinSettings
+from ..body.skin.contour_skin import SkinSettings, body_skin
+from ..body.skin.extremities import shape_for_skin
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -90,7 +91,7 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int]) -> dict
     body, silhouettes = report.body, report.silhouettes
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
-    skin = SkinSettings(**record["settings"]["skin"])
+    settings = SkinSettings(**record["settings"]["skin"])
     found: dict[str, tuple[str, np.ndarray]] = {}
     chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or sorted({0, len(clouds) // 2, len(clouds) - 1})
     total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
@@ -111,8 +112,9 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int]) -> dict
         if trajectories is not None:
             caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
             add(f"tracks_{frame:04d}.png", caption, pictures.tracks_over_footage(images[ref], camera, trajectories, i))
-        for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
-            if body is not None:
+        if body is not None:
+            skin = body_skin(shape_for_skin(body.shape, settings), body.motion.values[i], settings)
+            for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
                 person = silhouettes.outlines.get(name, {}).get(frame)
                 picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
                 agreement = _agreement_caption(silhouettes, name, frame)

@@ -7,8 +7,7 @@ import numpy as np
 
 from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
-from ..body.skin.contour_skin import SkinSettings, body_skin
-from ..body.skin.extremities import shape_for_skin
+from ..body.skin.contour_skin import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import shade
 from ..surface.cloud import PointCloud
@@ -24,13 +23,12 @@ TAIL_FRAMES = 10
 
 
 def body_over_footage(
-    grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, settings: SkinSettings, person_px: np.ndarray | None = None
+    grey: np.ndarray, camera: Camera, shape: BodyShape, values: np.ndarray, skin: Skin, person_px: np.ndarray | None = None
 ) -> np.ndarray:
-    """The skin of one pose, shaded, with its bones and outline, over one view (h, w, 3) uint8. `values` (D,) are the pose's DOFs.
+    """The `skin` of one pose, shaded, with its bones and outline, over one view (h, w, 3) uint8. `values` (D,) are the pose's DOFs.
 
     `person_px` (V, 2): the outline of the person in the footage, drawn as well.
     """
-    skin = body_skin(shape_for_skin(shape, settings), values, settings)
     picture = colour(grey).astype(np.float32)
     light, covered = shade(camera, skin.vertices_m, skin.triangles)
     alpha = (OPACITY * covered)[..., None]

@@ -5,12 +5,12 @@ from dataclasses import replace
 from itertools import chain
 
 import numpy as np
-from scipy.stats import qmc
 
 from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
+from ..limb import halton
 from ..observations import Observation
 from ..observations.shape_priors import clicked_chains
 from ..segmentation import crop
@@ -135,7 +135,7 @@ def _around(fit: FitContext, motion: np.ndarray) -> np.ndarray:
     spread[skeleton.layout.group("base")] = AROUND_M
     spread[skeleton.locked] = 0.0
     low, high = np.array([dof.limits for dof in skeleton.dofs]).T
-    moved = motion + spread * (2 * qmc.Halton(len(motion), scramble=False).random(OTHERS_AROUND + 1)[1:] - 1)  # the first point is a corner
+    moved = motion + spread * (2 * halton(len(motion), OTHERS_AROUND + 1)[1:] - 1)  # the first point is a corner
     within = np.where(spread > 0, np.clip(moved, np.minimum(low, motion), np.maximum(high, motion)), motion)
     return np.concatenate([motion[None], within])
 

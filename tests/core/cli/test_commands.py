@@ -400,3 +400,21 @@ def test_new_leaves_nothing_when_the_disk_is_full(take: Path, tmp_path: Path, mo
     assert main.main(["new", str(made), "--views", *(f"{v}={take / v}" for v in "LC")]) == 2
     assert "No space left on device" in capfd.readouterr().err and not any(made.iterdir())
     assert len(list((take / "L").iterdir())) == 4  # what the links pointed to stays
+
+
+def test_a_finished_run_is_not_computed_again(take: Path, tmp_path: Path, capfd: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    argv, out = ["run", str(take), "--out", str(tmp_path / "out"), "--frames", "0:2"], tmp_path / "out"
+    assert main.main([*argv, "--quiet"]) == 0
+    before, computed = (out / "run.json").read_bytes(), []
+    monkeypatch.setattr(pipeline, "all_stages", lambda *_: computed.append(1))
+    capfd.readouterr()
+    assert main.main(argv) == 0 and not computed and (out / "run.json").read_bytes() == before
+    said = capfd.readouterr().out
+    assert "Nothing has changed" in said and "2 frames" in said and "No body was fitted" in said
+    for more in (["--restart"], ["--pictures", "1"], ["--set", "growing.spacing_px=6"]):
+        shutil.copytree(out, tmp_path / "copy", dirs_exist_ok=True)
+        main.main(["run", str(take), "--out", str(tmp_path / "copy"), "--frames", "0:2", *more, "--quiet"])
+        assert computed.pop()
+    shutil.rmtree(out / "report")
+    main.main([*argv, "--quiet"])
+    assert computed.pop()

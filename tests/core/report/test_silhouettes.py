@@ -8,7 +8,7 @@ import pytest
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
-from tricap.core.body.skin.contour_skin import SkinSettings
+from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
 from tricap.core.fitting.inputs.fit_input import BackgroundDistances, Packed
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
@@ -144,7 +144,9 @@ def test_an_outline_goes_before_the_background(scenes: Any) -> None:
 def test_outlines_are_drawn_over_the_footage(scenes: Any) -> None:
     camera = scenes.three_cameras().cameras[1]
     grey = np.full(camera.size_px[::-1], 90.0, np.float32)
-    picture = body_over_footage(grey, camera, ARM, ARM_MOTION[0], SkinSettings(), _outline(scenes, ARM, ARM_MOTION, 10.0)).astype(int)
+    picture = body_over_footage(
+        grey, camera, ARM, ARM_MOTION[0], body_skin(ARM, ARM_MOTION[0]), _outline(scenes, ARM, ARM_MOTION, 10.0)
+    ).astype(int)
     for colour in (BODY_OUTLINE, PERSON_OUTLINE):
         assert (np.abs(picture - colour).sum(axis=2) < 60).sum() > 40
 
