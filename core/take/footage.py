@@ -23,9 +23,7 @@ class Footage:
     frames: range
     click_sigma_px: float = CLICK_SIGMA_PX  # of the take's clicks
     delay_images: tuple[float, ...] = ()  # time offset by which the images of each view are interpolated; empty: none
-    full_size_px: tuple[
-        tuple[int, int], ...
-    ] = ()  # of the images of each view, where they are reduced to the cameras' size; empty: they are not
+    full_size_px: tuple[tuple[int, int], ...] = ()  # of the views' images, where they are reduced to the cameras' size; else empty
 
     def number(self, view: int, frame: int) -> int:
         """The number of the image in a view's sequence that shows a frame of the take."""
