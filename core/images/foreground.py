@@ -21,7 +21,7 @@ import numpy as np
 
 from ..foundation.arrays import frozen
 from ..geometry.robust import mad_sigma
-from .background import OTHER_ROOM
+from .background import EMPTY_SHARE, OTHER_ROOM
 
 FEWEST = 5  # images for a background
 FEWEST_BARE = 3  # of these, without anybody near the cell
@@ -36,7 +36,6 @@ ODDS = (-3.0, 5.0)  # bounds of the logarithm in (2)
 SEEN = 4.0  # of a cell with measured points
 COUPLING, RADIUS, ROUNDS = 6.0, 2.0, 10  # w of (2), sigma of G in cells, iterations
 SMALLEST = 60  # cells of a region
-EMPTY_SHARE = 0.25  # of an image that shows the background, whoever is in front of it
 NORMAL_QUARTILE = 0.3186  # of |N(0, 1)|
 OTHER_LIGHT = 4.0  # times the noise: the difference of so large a share is not noise
 
@@ -136,13 +135,9 @@ def _tightest(ascending: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.
         end = i + size
         enough = end <= count
         last = np.take_along_axis(ascending, np.where(enough, end - 1, i)[None], axis=0)[0]
-        here = np.where(enough, last - ascending[i] if np.isfinite(ascending[i]).all() else _difference(last, ascending[i]), np.inf)
+        with np.errstate(invalid="ignore"):  # infinite ones are not enough
+            here = np.where(enough, last - ascending[i], np.inf)
         tighter = here < width
         total = np.take_along_axis(sums, np.where(enough, end, 0)[None], axis=0)[0] - sums[i]
         mean, width = np.where(tighter, total / size, mean), np.where(tighter, here, width)
     return mean, width
-
-
-def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a − b; infinite where one of them is."""
-    return np.where(np.isfinite(a) & np.isfinite(b), np.where(np.isfinite(a), a, 0.0) - np.where(np.isfinite(b), b, 0.0), np.inf)

@@ -20,7 +20,7 @@ from ..segmentation import SegmentationCache, facing_bone, owners
 from ..settings import FitSettings
 from ..state import BodyState
 from .cloud_points import VARIANCE_FLOOR_M2
-from .fit_input import BackgroundDistances, FitInput, Outline
+from .fit_input import BackgroundDistances, FitInput, Outline, Outlines
 
 SPACING_M, COARSE_SPACING_M = 0.012, 0.03  # of the rays at the body: of a drawn outline, and of one against the background
 BEYOND = 0.35  # of a bone: an outline passes over joints, shoulders and the crown, where the parts' fields meet
@@ -71,17 +71,47 @@ class PersonOutlines:
         return xy * size + (size - 1) / 2, normal, np.full(len(xy), EDGE_SIGMA * size)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _View:
+    """The outlines of one view, and how their rays are weighted."""
+
+    camera: Camera
+    outlines: Outlines
+    drawn: bool  # by `tricap contour`; not found against the background
+    spacing_m: float  # of the rays at the body
+    model_m: float  # sigma of a real body from its metaballs
+
+    def rays(self, outline: Outline, about_m: np.ndarray, similar: int) -> Rays:
+        """The rays of one of its outlines, spaced at a place (3,) of the body; `similar` views have about the same outline."""
+        xy_px, normal, sigma_px = outline
+        pixel_m = np.linalg.norm(about_m - self.camera.centre_m) / self.camera.focal_px
+        gap = np.median(np.linalg.norm(np.diff(xy_px, axis=0), axis=1)) * pixel_m if len(xy_px) > 1 else self.spacing_m
+        keep = np.arange(0, len(xy_px), max(1, round(self.spacing_m / max(gap, 1e-9))))
+        direction, outside = (_unit(self.camera.rays(xy)) for xy in (xy_px[keep], xy_px[keep] + normal[keep]))
+        outward = _unit(outside - np.einsum("ni,ni->n", outside, direction)[:, None] * direction)
+        return Rays(
+            origin_m=np.broadcast_to(self.camera.centre_m, direction.shape),
+            direction=direction,
+            outward=outward,
+            angle=sigma_px[keep] / self.camera.focal_px,
+            patch=np.full(len(keep), similar * OUTLINE_PATCHES / self.spacing_m),
+            model_m=np.full(len(keep), self.model_m),
+        )
+
+
 class Silhouettes:
     """The rays of all frames, as observations of a body."""
 
     def __init__(self, given: FitInput, surface: np.ndarray, settings: FitSettings) -> None:
         self._surface, self._settings = (_closed(surface) if settings.balls == "one" else surface), settings
-        used = [*given.contours] if settings.use_contours else []
-        drawn = {outline.view for outline in used}
-        if settings.use_background:
-            used += [PersonOutlines(regions=regions) for regions in given.background if regions.view not in drawn]
-        exact, coarse = (SPACING_M, settings.model_sigma_m), (COARSE_SPACING_M, max(settings.model_sigma_m, COARSE_SIGMA_M))
-        self._tables = [(given.rig[c.view], c, coarse if isinstance(c, PersonOutlines) else exact) for c in used]
+        drawn = [*given.contours] if settings.use_contours else []
+        others = [regions for regions in given.background if regions.view not in {outlines.view for outlines in drawn}]
+        exact, coarse = settings.model_sigma_m, max(settings.model_sigma_m, COARSE_SIGMA_M)
+        self._views = [_View(camera=given.rig[d.view], outlines=d, drawn=True, spacing_m=SPACING_M, model_m=exact) for d in drawn]
+        self._views += [
+            _View(camera=given.rig[o.view], outlines=PersonOutlines(regions=o), drawn=False, spacing_m=COARSE_SPACING_M, model_m=coarse)
+            for o in (others if settings.use_background else ())
+        ]
         self._frames = given.frames
         self._rays: dict[int, Rays | None] = {}
 
@@ -100,7 +130,7 @@ class Silhouettes:
     def drawn_only(self) -> "Silhouettes":
         """Those of `tricap contour`. The others include hair, fingers and clothes: good enough to find a limb, but not to shape it."""
         part = self.anew()
-        part._tables = [table for table in self._tables if not isinstance(table[1], PersonOutlines)]
+        part._views = [view for view in self._views if view.drawn]
         return part
 
     def observe(
@@ -135,11 +165,11 @@ class Silhouettes:
         return [found]
 
     def _of_frame(self, t: int, state: BodyState) -> Rays | None:
-        ahead = np.array([camera.R_cam_world[2] for camera, _, _ in self._tables]).reshape(-1, 3)
+        ahead = np.array([view.camera.R_cam_world[2] for view in self._views]).reshape(-1, 3)
         parts = [
-            _view_rays(camera, outline, state.head_m.mean(axis=0), int((ahead @ camera.R_cam_world[2] > SIMILAR).sum()), drawn)
-            for camera, table, drawn in self._tables
-            if (outline := table.of_frame(self._frames[t])) is not None
+            view.rays(outline, state.head_m.mean(axis=0), int((ahead @ view.camera.R_cam_world[2] > SIMILAR).sum()))
+            for view in self._views
+            if (outline := view.outlines.of_frame(self._frames[t])) is not None
         ]
         if not parts:
             return None
@@ -148,24 +178,6 @@ class Silhouettes:
             for name in ("origin_m", "direction", "outward", "angle", "patch", "model_m")
         }
         return Rays(**columns)
-
-
-def _view_rays(camera: Camera, outline: Outline, about_m: np.ndarray, similar: int, kind: tuple[float, float]) -> Rays:
-    """The rays of one view, of a `kind`: spacing at a place (3,) of the body, model's sigma; `similar` views have about its outline."""
-    (xy_px, normal, sigma_px), (spacing_m, model_m) = outline, kind
-    pixel_m = np.linalg.norm(about_m - camera.centre_m) / camera.focal_px
-    gap = np.median(np.linalg.norm(np.diff(xy_px, axis=0), axis=1)) * pixel_m if len(xy_px) > 1 else spacing_m
-    keep = np.arange(0, len(xy_px), max(1, round(spacing_m / max(gap, 1e-9))))
-    direction, outside = (_unit(camera.rays(xy)) for xy in (xy_px[keep], xy_px[keep] + normal[keep]))
-    outward = _unit(outside - np.einsum("ni,ni->n", outside, direction)[:, None] * direction)
-    return Rays(
-        origin_m=np.broadcast_to(camera.centre_m, direction.shape),
-        direction=direction,
-        outward=outward,
-        angle=sigma_px[keep] / camera.focal_px,
-        patch=np.full(len(keep), similar * OUTLINE_PATCHES / spacing_m),
-        model_m=np.full(len(keep), model_m),
-    )
 
 
 def _contours(person: np.ndarray) -> list[np.ndarray]:

@@ -22,6 +22,7 @@ from ..state import BodyState
 from .block_band import NormalEquations, eliminated, reversed_in_time
 from .problem import Estimate, Problem, Scales, linearise
 
+LEAST = 0.1  # of the loosest sigma: however steady the observed motion
 SPAN_S = 0.1  # accelerations of a first motion are taken over this time, which averages its noise
 SMALLEST_DIAGONAL = 1e-12  # of Λ, before its rows are scaled
 ENOUGH = 3  # second differences of a DOF, for a sigma of its own
@@ -62,7 +63,7 @@ class Acceleration:
 
 
 def typical_acceleration(
-    motion: np.ndarray, observed: np.ndarray, time_s: np.ndarray, loosest: np.ndarray, least: np.ndarray | float = 0.1
+    motion: np.ndarray, observed: np.ndarray, time_s: np.ndarray, loosest: np.ndarray, least: np.ndarray | float = LEAST
 ) -> np.ndarray:
     """Sigma (D,) of the accelerations of a motion (T, D) where it is `observed` (T, D), between `least` (D,) times the `loosest` and that.
 

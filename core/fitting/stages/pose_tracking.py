@@ -171,16 +171,13 @@ def _track(given: PoseTracking, state: PoseTrackingState, t: int, direction: int
 
 def _correct_backwards(given: PoseTracking, motion: np.ndarray, clicked: int, direction: int, monitor: Monitor) -> None:
     """From a clicked frame back over those before it, as long as the pose found from there is better."""
-    fit, gate_scale = given.fit, np.ones(len(given.fit.model.skeleton.bones))
+    fit = given.fit
     for t in range(clicked - direction, fit.click, -direction):
         if t in fit.places:
             return
-        start = motion[t + direction]
-        after = given.state(start)
-        near = _subsampled(crop(given.points[t], after, _reach(fit, after)))
-        target = TargetPose(index=t, points=near, starts=[start], from_neighbour=[], neighbour_support=None, gate_scale=gate_scale)
+        target = _alone(given, t, motion[t + direction])
         pose, _ = _pose(given, target, monitor)
-        if given.score(t, near, pose) <= given.score(t, near, motion[t]) + fit.least_gain:
+        if given.score(t, target.points, pose) <= given.score(t, target.points, motion[t]) + fit.least_gain:
             return
         motion[t] = pose
 
@@ -275,11 +272,15 @@ def _adjusted(given: PoseTracking, target: TargetPose, start: np.ndarray, monito
 
 def adjusted_alone(given: PoseTracking, t: int, start: np.ndarray, monitor: Monitor) -> np.ndarray:
     """The pose (D,) of frame t adjusted from a start (D,), without its neighbours."""
+    return _adjusted(given, _alone(given, t, start), start, monitor)[0]
+
+
+def _alone(given: PoseTracking, t: int, start: np.ndarray) -> TargetPose:
+    """Frame t without its neighbours, with the points that are near in a pose (D,)."""
     fit, state = given.fit, given.state(start)
     near = _subsampled(crop(given.points[t], state, _reach(fit, state)))
     ones = np.ones(len(fit.model.skeleton.bones))
-    target = TargetPose(index=t, points=near, starts=[start], from_neighbour=[], neighbour_support=None, gate_scale=ones)
-    return _adjusted(given, target, start, monitor)[0]
+    return TargetPose(index=t, points=near, starts=[start], from_neighbour=[], neighbour_support=None, gate_scale=ones)
 
 
 def _prediction_sigma(fit: FitContext) -> np.ndarray:

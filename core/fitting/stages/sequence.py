@@ -45,7 +45,7 @@ from ..settings import FitSettings
 from ..smooth_radii import smooth_radii
 from ..solve.problem import Estimate, Problem, Scales, linearise, variance_factors
 from ..solve.solver import Solution, solve
-from ..solve.time_priors import Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
+from ..solve.time_priors import LEAST, Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
 from ..state import BodyState, ShapeParameters, free_bones
 from .click_frame import clicked_lengths, fit_click_frame
 from .contradicted import contradicted_frames
@@ -77,7 +77,7 @@ ADJUST = "adjust the sequence"  # stages of the progress report
 SIGMAS = "sigmas of the fit"
 ERROR_REACH_M = 0.10  # along a limb: a measured arm and a measured walker differ from their metaballs over about as much
 MUSCLE_SIGMA = 0.15  # relative, of the complete model's radii about those that have the simplified body's surface
-LEAST_ANGULAR, LEAST_OF_BASE = 0.3, 0.1  # of the largest sigmas of accelerations: 1,800°/s², as elbows and knees have, and 0.5 m/s²
+LEAST_ANGULAR = 0.3  # of the largest sigmas of angular accelerations: 1,800°/s², as elbows and knees have
 FEW_POINTS = 0.35  # of the points that the body has in the other frames, or in the click frame
 
 
@@ -299,7 +299,7 @@ def _loosest(fit: FitContext) -> np.ndarray:
 def _least(fit: FitContext) -> np.ndarray:
     """The least sigma (D,) of accelerations over the largest, however steady the observed motion."""
     share = np.full(len(fit.model.skeleton.dofs), LEAST_ANGULAR)
-    share[fit.model.skeleton.layout.group("base")] = LEAST_OF_BASE
+    share[fit.model.skeleton.layout.group("base")] = LEAST
     return share
 
 
