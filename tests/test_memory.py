@@ -27,6 +27,11 @@ def test_a_long_fit_keeps_next_to_nothing_of_a_frame(memory: ModuleType) -> None
 
 @pytest.mark.slow
 def test_measuring_and_tracking_keep_no_frames(memory: ModuleType) -> None:
-    """The peaks vary while the machine is busy, so the smaller growth of two counts; what is kept shows in both."""
-    rows = [memory.growth(("track",), [15, 45], pictures=4)[0] for _ in range(2)]  # tracking measures first
-    assert min(row["kb_per_frame"] for row in rows) < KB_PER_FRAME, rows
+    """The peaks vary by 10 MB while the machine is busy; what is kept shows in every try."""
+    rows: list[object] = []
+    for _ in range(4):
+        row = memory.growth(("track",), [15, 75], pictures=4)[0]  # tracking measures first
+        if row["kb_per_frame"] < KB_PER_FRAME:
+            return
+        rows.append(row)
+    raise AssertionError(rows)
