@@ -79,23 +79,19 @@ LEAST_M = 0.003  # where the balls do not surround the axis
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class BoneProfile:
-    """Fractions along a bone (K,), and the radii there (K, 4) [m] towards x, z, −x and −z of its axes; constant beyond the ends."""
+    """Even fractions along a bone (K,), and the radii there (K, 4) [m] towards x, z, −x and −z of its axes; constant beyond the ends."""
 
     stations: np.ndarray
     radii_m: np.ndarray
 
     def across(self, along: np.ndarray, across_m: np.ndarray) -> np.ndarray:
         """Half axes (N, 2) of the quarter ellipse of a point at fractions (N,) along and positions (N, 2) in x and z across the bone."""
-        axes = []
-        for i in (0, 1):
-            ahead, behind = (np.interp(along, self.stations, self.radii_m[:, i + k]) for k in (0, 2))
-            axes.append(np.where(across_m[:, i] >= 0, ahead, behind))
-        return np.stack(axes, axis=1)
+        return ProfileTable.of({0: self}, 1).across(np.zeros(len(along), dtype=np.intp), along, across_m)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ProfileTable:
-    """The profiles of all bones in one table; the stations of each are evenly spaced."""
+    """The profiles of all bones in one table."""
 
     first: np.ndarray  # (B,) fraction along the bone of the first station
     step: np.ndarray  # (B,)

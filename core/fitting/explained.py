@@ -180,8 +180,8 @@ class _Capsules:
             posed=posed[bones],
         )
 
-    def radius(self, k: int, fraction: np.ndarray) -> np.ndarray:
-        """The radius of capsule k at fractions of its length."""
+    def radius(self, k: int | np.ndarray, fraction: np.ndarray) -> np.ndarray:
+        """The radius of capsule k, or of several (K, 1), at fractions of its length."""
         return np.asarray(self.radii_m[k, 0] + (self.radii_m[k, 1] - self.radii_m[k, 0]) * fraction)
 
 
@@ -272,7 +272,7 @@ def _misplaced(evidence: Evidence, capsules: _Capsules, state: BodyState, others
     """The area (N,) of capsules that lies in the background, in `others` of a body's bones, or before points that it would hide."""
     k = np.flatnonzero(capsules.posed)
     length = capsules.length_m[k]
-    radius = capsules.radii_m[k, :1] + (capsules.radii_m[k, 1:] - capsules.radii_m[k, :1]) * PLACES  # (K, S)
+    radius = capsules.radius(k[:, None], PLACES)  # (K, S)
     area = (length / len(PLACES))[:, None] * 2 * radius / evidence.voxel_m**2
     X = capsules.first_m[:, k, None] + (length[:, None] * PLACES)[..., None] * capsules.axis[:, k, None]  # (N, K, S, 3)
     flat, shape = X.reshape(-1, 3), X.shape[:-1]

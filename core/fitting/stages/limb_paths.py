@@ -91,15 +91,14 @@ def _best_way(
 
 def _continued(limb: Limb, ways: _Ways, pose: np.ndarray, vector: np.ndarray, near: Evidence, step_s: float) -> _Ways:
     """The ways one frame further, to the frame with the tracked pose (D,) and what is seen near the limb.  (1)"""
-
     ahead = np.clip(ways.angles + VELOCITY_KEPT * step_s * ways.rate, limb.low, limb.high)
     own = pose[limb.columns][None]
     around = [limb.samples(a, AROUND, AROUND_RAD) for a in ahead[np.argsort(ways.cost, kind="stable")[:NEAR_WAYS]]]
-    tried = np.concatenate([ways.angles, ahead, own, *around, limb.samples(own[0], ANYWHERE, ANYWHERE_RAD)])
+    going_on = np.concatenate([ways.angles, ahead, own, *around])
+    tried = np.concatenate([going_on, limb.samples(own[0], ANYWHERE, ANYWHERE_RAD)])
     coarse = limb_gains(near.thinned(), limb, limb.poses(pose, tried), vector, COARSE_M)
     best = tried[np.argsort(-coarse, kind="stable")[:IMPROVED]]
-    certain = len(ways.angles) + len(ahead) + 1
-    tried = np.concatenate([tried[: certain + sum(map(len, around))], best, *(limb.samples(a, IMPROVEMENTS, IMPROVED_RAD) for a in best)])
+    tried = np.concatenate([going_on, best, *(limb.samples(a, IMPROVEMENTS, IMPROVED_RAD) for a in best)])
     poses = limb.poses(pose, tried)
     gain, ends = limb_gains(near, limb, poses, vector, FINE_M), limb.ends(poses, vector)
     expected = ways.ends_m + VELOCITY_KEPT * step_s * ways.velocity_m_s
