@@ -14,6 +14,7 @@ import numpy as np
 from ..core.foundation import settings as knobs
 from ..core.run import take_run
 from . import take_properties
+from .scene import metaballs
 from .session import get_session
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -125,6 +126,13 @@ def register() -> None:
             description="Folder for the results. Empty: next to the .blend file, or next to the take",
         ),
         "last": bpy.props.StringProperty(name="Result", description="Summary of the last run"),
+        "show_metaballs": bpy.props.BoolProperty(
+            name="Metaballs",
+            options=set(),
+            get=lambda group: metaballs.shown(group.id_data),
+            set=lambda group, value: metaballs.show(group.id_data, value),
+            description="Show the metaballs behind the skin. Blender then computes them in every frame, which slows playback",
+        ),
     }
     annotations |= take_properties.annotations()
     annotations |= {name: bpy.props.PointerProperty(type=group) for name, group in groups.items()}

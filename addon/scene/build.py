@@ -123,8 +123,9 @@ def remove_earlier() -> None:
         used |= {m for o in objects if hasattr(o.data, "materials") for m in o.data.materials if m}
         if scene.active_clip in used:
             scene.active_clip = None
+        inside = [child for child in collection.children_recursive if metaballs.COLLECTION_KEY in child]
         bpy.data.batch_remove(objects)
-        bpy.data.collections.remove(collection)
+        bpy.data.batch_remove([*inside, collection])
         for _ in range(2):  # materials have no users only once their meshes and node groups are removed
             free = {id_ for id_ in used if id_.users == 0}
             used -= free
@@ -299,7 +300,7 @@ def _add_body(
     measured_shape = shape
     shape, values, sigma = with_rest_pose(shape, values, sigma, options.rest_pose)
     armature_object = armature.add_armature(collection, shape)
-    flesh = metaballs.add_metaballs(collection, armature_object, shape)
+    flesh = metaballs.add_metaballs(metaballs.add_collection(collection), armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
         prepared_skin = contents.prepared.skin if shape is measured_shape and options.detail == DETAIL else None
@@ -311,8 +312,9 @@ def _add_body(
         warnings.append(f"No polygonal skin in the scene: {error}")
     else:
         for other in {*flesh, skin_object} - {shown}:  # they coincide with the surface that is shown
-            other.hide_set(True)  # by the eye icon only: metaballs stay evaluated, for users and for scripts
             other.hide_render = True
+        skin_object.hide_set(skin_object is not shown)
+        metaballs.show(bpy.context.scene, False)
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:
         action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)

@@ -12,7 +12,12 @@ objects whose names differ only in the number; Blender calls these a family and 
 
 core.body.metaball_groups decides which balls form a family, so that hips and shoulders are as thick as fitted and arms do not fuse with
 the flanks.
+
+Blender polygonises visible and hidden metaballs alike in every frame, which for a whole body takes some 30 times as long as everything
+else in the scene. They are therefore in a collection of their own, which the view layers exclude as long as nobody looks at them.
 """
+
+from collections.abc import Iterator
 
 import bpy
 import numpy as np
@@ -23,11 +28,48 @@ from ...core.body.shape import BodyShape
 from . import nodes
 
 NAME = "Flesh"
+COLLECTION = "Metaballs"
+COLLECTION_KEY = "tricap_metaballs"  # custom property by which the collection is found again, whatever its name
 KERNELS = ((0.1174, 0.8021), (0.3608, 1.1586), (0.3972, 1.5345), (0.1227, 2.0242))  # stiffness s_j, size a_j  (1)
 STIFFNESS_MAX = 10.0  # Blender's own limit
 SIZE_MAX = 16.0  # largest half axis / radius (Blender's limit: 20): the circles that the viewport draws at the radius lie in the flesh
 RESOLUTION_M, RENDER_RESOLUTION_M = 0.008, 0.005
 SKIN_COLOUR = (0.80, 0.52, 0.41)
+
+
+def add_collection(parent: bpy.types.Collection) -> bpy.types.Collection:
+    """An empty collection for metaballs, in `parent`."""
+    collection = bpy.data.collections.new(COLLECTION)
+    collection[COLLECTION_KEY] = True
+    parent.children.link(collection)
+    return collection
+
+
+def exist(scene: bpy.types.Scene) -> bool:
+    """Whether the scene has a collection of metaballs. Scenes of version 0.2 have them among the other objects."""
+    return any(COLLECTION_KEY in collection for collection in scene.collection.children_recursive)
+
+
+def shown(scene: bpy.types.Scene) -> bool:
+    """Whether a view layer of the scene includes the metaballs, so that Blender evaluates them."""
+    return any(not layer.exclude for layer in _layers(scene))
+
+
+def show(scene: bpy.types.Scene, included: bool) -> None:
+    """Include the metaballs in every view layer of the scene, or exclude them."""
+    for layer in list(_layers(scene)):
+        layer.exclude = not included
+    for view_layer in scene.view_layers:
+        view_layer.update()  # until then Blender 4.5 crashes when a script goes through its objects
+
+
+def _layers(scene: bpy.types.Scene) -> Iterator[bpy.types.LayerCollection]:
+    waiting = [layer.layer_collection for layer in scene.view_layers]
+    while waiting:
+        layer = waiting.pop()
+        if COLLECTION_KEY in layer.collection:
+            yield layer
+        waiting.extend(layer.children)
 
 
 def add_metaballs(collection: bpy.types.Collection, armature_object: bpy.types.Object, shape: BodyShape) -> list[bpy.types.Object]:
