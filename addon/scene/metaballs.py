@@ -47,7 +47,7 @@ def add_collection(parent: bpy.types.Collection) -> bpy.types.Collection:
 
 def exist(scene: bpy.types.Scene) -> bool:
     """Whether the scene has a collection of metaballs. Scenes of version 0.2 have them among the other objects."""
-    return any(COLLECTION_KEY in collection for collection in scene.collection.children_recursive)
+    return next(_layers(scene), None) is not None
 
 
 def shown(scene: bpy.types.Scene) -> bool:
