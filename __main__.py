@@ -5,7 +5,8 @@ import sys
 
 
 def _leave_out_working_folder() -> None:
-    """`python -m` looks for modules in the working folder first; that of a stranger's take must not bring any along."""
+    """`python -m` looks for modules in the working folder first; neither this process nor its children load any from there."""
+    os.environ["PYTHONSAFEPATH"] = "1"
     here = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     if sys.path and sys.path[0] in ("", os.getcwd()) and os.getcwd() != here:
         del sys.path[0]

@@ -127,7 +127,18 @@ def test_sentences_are_fit_for_a_terminal() -> None:
 def test_results_are_not_written_through_links_out_of_their_folder(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "letter.txt").write_text("mine")
-    for name in ("clouds", "cache", "cache/surface", "report", "contours", "run.json", "points2d.csv", ".tricap-lock"):
+    for name in (
+        "clouds",
+        "cache",
+        "cache/surface",
+        "report",
+        "contours",
+        "fields",
+        "fields/L",
+        "run.json",
+        "points2d.csv",
+        ".tricap-lock",
+    ):
         out = tmp_path / f"out {Path(name).name}"
         (out / name).parent.mkdir(parents=True)
         (out / name).symlink_to(tmp_path / "elsewhere" / ("letter.txt" if Path(name).suffix or name == ".tricap-lock" else ""))

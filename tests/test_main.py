@@ -56,6 +56,14 @@ def test_modules_in_a_stranger_s_folder_are_not_loaded(tmp_path: Path) -> None:
     assert done.returncode == 2 and "stranger" not in done.stdout + done.stderr, done.stderr
 
 
+def test_child_processes_do_not_load_them_either(tmp_path: Path) -> None:
+    (tmp_path / "json.py").write_text("print('stranger')\n")
+    child = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import json'], check=True)"
+    code = f"from tricap.__main__ import _leave_out_working_folder as leave; leave(); {child}"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0 and "stranger" not in done.stdout, done.stderr
+
+
 @pytest.mark.slow
 def test_the_demo_ends_and_leaves_every_promised_file(tmp_path: Path) -> None:
     pytest.importorskip("bpy")

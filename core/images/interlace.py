@@ -109,13 +109,16 @@ def field_pictures(sequence: ImageSequence, fields: FieldLayout, folder: Path, m
     """FOLDER/000000.png …, an image of every field of a sequence, written unless they exist.
 
     Raises:
-        InputError: an image cannot be read, or the folder cannot be written to.
+        InputError: an image cannot be read, the folder or its parent is a link, or the folder cannot be written to.
         Cancelled: the monitor was cancelled; the next call writes all images.
     """
     paths = tuple(folder / f"{n:06d}.png" for n in range(fields.per_image * sequence.count))
     source, record = _identity(sequence, fields), folder / MADE_FROM
     if record.is_file() and store.read_json(record) == source and all(path.is_file() for path in paths):
         return paths
+    link = next((path for path in (folder, folder.parent) if path.is_symlink()), None)
+    if link is not None:
+        raise InputError(f"{link} is a link, through which pictures of the fields would be written elsewhere; remove the link.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         record.unlink(missing_ok=True)

@@ -167,10 +167,11 @@ class FitCheckpoints:
 
 
 def _written(folder: Path) -> list[Path]:
-    """Every path that a command writes to in a folder of results, and the existing folders of checkpoints."""
-    cache = folder / "cache"
+    """Every path that a command writes to in a folder of results, and the existing folders of checkpoints and of fields."""
     names = ("run.json", "contours", "points2d.csv", "points3d.csv", NAME, *RESULTS)
-    return [*(folder / name for name in names), cache, *(cache.iterdir() if cache.is_dir() and not cache.is_symlink() else ())]
+    parents = (folder / "cache", folder / "fields")
+    inside = [path for parent in parents if parent.is_dir() and not parent.is_symlink() for path in parent.iterdir()]
+    return [*(folder / name for name in names), *parents, *inside]
 
 
 def _inside(path: Path, folder: Path) -> bool:

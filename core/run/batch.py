@@ -141,11 +141,18 @@ def _scene(job: take_run.Run) -> None:
         return
     package = __name__.rpartition(".core.")[0]
     blend = job.results.path("body.blend")
-    line = [sys.executable, "-m", package, "scene", str(job.results.folder), "--blend", str(blend), "--quiet"]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    if done.returncode:
-        job.warn(f"No body.blend was written: {done.stderr.strip().splitlines()[-1].removeprefix('tricap: ')}")
+    line = [sys.executable, "-P", "-m", package, "scene", str(job.results.folder), "--blend", str(blend), "--quiet"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": _search_path(package)})
+    if done.returncode or not blend.is_file():
+        said = done.stderr.strip().splitlines() or ["Blender ended without a message."]
+        job.warn(f"No body.blend was written: {said[-1].removeprefix('tricap: ')}")
         job.results.write_run(job.record)
+
+
+def _search_path(package: str) -> str:
+    """PYTHONPATH of a child that runs this very package: its folder, then the user's own entries."""
+    root = Path(__file__).absolute().parents[2 + len(package.split("."))]
+    return os.pathsep.join([str(root), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))])
 
 
 def _reporter(take: str) -> Callable[[str, float, float], None] | None:

@@ -6,7 +6,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
+from tricap.core.foundation.errors import InputError
 from tricap.core.images.interlace import BOTH, field_layout, field_pictures
 from tricap.core.images.sequence import open_sequence
 
@@ -31,3 +33,17 @@ def test_fields_as_pictures(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "C" / "1.png"), np.full((6, 8), 99, np.uint8))
     os.utime(tmp_path / "C" / "1.png", ns=(1, 1))
     assert made("even")[0] == [20, 0, 99, 99]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+@pytest.mark.parametrize("link", ["fields", "fields/C"])
+def test_pictures_are_not_written_through_links(tmp_path: Path, link: str) -> None:
+    (tmp_path / "C").mkdir()
+    cv2.imwrite(str(tmp_path / "C" / "0.png"), np.zeros((6, 8), np.uint8))
+    sequence = open_sequence(tmp_path, images="C/*.png", movie=None, view="C")
+    (tmp_path / "elsewhere" / "C").mkdir(parents=True)
+    (tmp_path / link).parent.mkdir(exist_ok=True)
+    (tmp_path / link).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="is a link"):
+        field_pictures(sequence, field_layout(BOTH, "odd"), tmp_path / "fields" / "C")
+    assert [path.name for path in (tmp_path / "elsewhere").rglob("*")] == ["C"]

@@ -112,6 +112,22 @@ def test_the_task_of_a_worker(takes: list[Path], tmp_path: Path, monkeypatch: py
     assert run_take(str(takes[0]), str(tmp_path / "file"), {}, False)["status"] == Status.INVALID_INPUT
 
 
+def test_the_scene_is_built_by_this_package_and_its_absence_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module of the working folder, which would run in place of the package, is not loaded; a child that writes nothing is noticed."""
+    pytest.importorskip("bpy")
+    stranger = "from pathlib import Path\nPath('stranger ran').touch()\n"
+    (tmp_path / "tricap.py").write_text(stranger)
+    monkeypatch.chdir(tmp_path)
+    warnings, results = list[str](), tmp_path / "results"
+    folder = SimpleNamespace(folder=results, path=results.joinpath, write_run=lambda record: None)
+    job = SimpleNamespace(results=folder, record={}, warn=warnings.append)
+    batch._scene(job)
+    assert not (tmp_path / "stranger ran").exists() and len(warnings) == 1 and str(results) in warnings[0], warnings
+    monkeypatch.setattr(batch.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0, stderr=""))
+    batch._scene(job)
+    assert warnings[1] == "No body.blend was written: Blender ended without a message."
+
+
 @pytest.mark.parametrize(("workers", "cores", "threads"), [(1, 2, "2"), (2, 2, "1"), (2, 8, "2"), (16, 8, "1")])
 def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, threads: str) -> None:
     environment = os.environ | batch.thread_limits(workers, cores)
