@@ -29,6 +29,20 @@ def steps() -> drive.Steps:
     for line in drive.reports():
         drive.say("Blender said:", line)
     yield from drive.shot("3_done")
+    yield from metaballs(area)
+
+
+def metaballs(area: bpy.types.Area) -> drive.Steps:
+    """The switch in step 7 shows the metaballs, and hides them again."""
+    part = bpy.data.objects["Flesh"]
+    drive.check(part.name not in bpy.context.view_layer.objects, "the metaballs are excluded")
+    bpy.context.window_manager.tricap_steps.rig = True
+    yield from drive.settle()
+    yield from drive.press(area, "show_metaballs")
+    drive.check(part.name in bpy.context.view_layer.objects and part.visible_get(), "the switch shows them")
+    yield from drive.shot("4_metaballs")
+    yield from drive.press(area, "show_metaballs")
+    drive.check(part.name not in bpy.context.view_layer.objects, "and hides them again")
 
 
 def stopped_by_esc(area: bpy.types.Area) -> drive.Steps:
