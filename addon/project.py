@@ -20,7 +20,7 @@ from ..core.foundation.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
 from ..core.images.interlace import BOTH, FieldLayout, field_layout
 from ..core.take.sources import PERSON_SOURCES
-from ..core.take.take import NO_BODY, Take
+from ..core.take.take import NO_BODY, TOP_LEVEL, Take
 from ..core.take.take import body_model as take_body_model
 from ..core.take.writing import Table, new_table, read_table, renumbered, take_of_table, write_table
 from . import clicks, folders, properties
@@ -218,7 +218,8 @@ def table(scene: bpy.types.Scene) -> Table:
     _put(made, "body", _body(scene, old))
     _put_clicks(scene, made)
     settings = properties.overrides(scene)
-    _put(made, "quality", settings.get("surface", {}).pop("quality", None))
+    for key, group in TOP_LEVEL.items():
+        _put(made, key, settings.get(group, {}).pop(key, None))
     _put(made, "settings", {group: values for group, values in settings.items() if values})
     for writer in get_session().take_writers:
         writer(scene, made)

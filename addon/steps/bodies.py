@@ -20,7 +20,7 @@ from .person import draw_person
 from .states import Fix, Status
 
 OFTEN_CHANGED: dict[str, tuple[tuple[str, str], ...]] = {  # changed often; the others are under Advanced
-    "surface": (("surface", "quality"), ("matching", "patch_px"), ("growing", "spacing_px")),
+    "surface": (("method", "preset"), ("surface", "quality"), ("matching", "patch_px"), ("growing", "spacing_px")),
     "tracks": (("tracking", "smooth_frames"), ("tracking", "min_length")),
     "body": (),
 }

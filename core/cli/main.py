@@ -103,6 +103,8 @@ def _stage_command(commands: Any, name: str, about: str, action: Callable[..., l
         parser.add_argument("--json", action="store_true", help="print run.json at the end, and nothing else on standard output")
         parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
+    about = "the settings that are not set otherwise: the defaults, or the published method"
+    parser.add_argument("--preset", dest="set", action="append", type="method.preset={}".format, metavar="default|published", help=about)
     about = "how much to measure: what a body's motion needs (the default), or every point of the surface"
     parser.add_argument("--quality", dest="set", action="append", type="surface.quality={}".format, metavar="motion|surface", help=about)
     parser.set_defaults(run=action)

@@ -12,7 +12,7 @@ ALGORITHM = "body 5"  # part of the fit's key: raise it when the same input give
 class FitSettings:
     """How the body is fitted to clouds and clicks."""
 
-    method: str = knob("joint", "At the click frame: pose and radii together, or in turns as published.", choices=("joint", "alternating"))
+    method: str = knob("joint", "Pose and shape are adjusted together, or in turns as published.", choices=("joint", "alternating"))
     residual: str = knob(
         "metric", "Surface residual: metric (root of the logarithm) or the paper's field difference.", choices=("metric", "paper")
     )

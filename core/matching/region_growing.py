@@ -57,7 +57,13 @@ class GrowingSettings:
         choices=("strong", "clothing", "skin", "own"),
     )
     spacing_px: int = knob(4, "Distance between measured points in the reference image.", unit="px", low=1, high=32)
-    seed_spacing_px: int = knob(24, "Distance between the points at which automatic seeds are searched for.", unit="px", low=4, high=128)
+    seed_spacing_px: int = knob(
+        24,
+        "Distance between the points at which automatic seeds are searched for; 0: none, the surface starts from clicks.",
+        unit="px",
+        low=0,
+        high=128,
+    )
     attempts: int = knob(3, "How often a point is tried, each time from another neighbour.", low=1, high=8)
     bigger_patches: int = knob(
         5,

@@ -73,8 +73,8 @@ STAGE_INPUTS: dict[str, StageInput] = {
         files=("frames.csv", "joints.csv", "motion.csv", "body.toml", "skin", "report", "body.blend"),
     ),
 }
-# Groups of settings in no stage's key: the outlines of `tricap contour` enter the fit's key by their content, chosen points enter none.
-WITHOUT_STAGE = ("contour", "key_points")
+# Groups in no stage's key: a preset enters by its settings, the outlines of `tricap contour` by their content, chosen points do not.
+WITHOUT_STAGE = ("method", "contour", "key_points")
 STAGE_FILES = tuple(name for own in STAGE_INPUTS.values() for name in own.files)
 
 

@@ -32,10 +32,12 @@ from ..tracking.contour import ContourSettings
 from ..tracking.corrections import corrected_cloud
 from ..tracking.settings import KeyPointSettings, TrackingSettings
 from ..tracking.trajectories import Trajectories
+from .presets import PRESETS, MethodSettings
 from .record import frame_table, new_record, write_frame_table
 from .stages import STAGE_FILES, STAGE_INPUTS, stage_keys, valid_stages
 
 SETTINGS: dict[str, type] = {
+    "method": MethodSettings,
     "timing": TimingSettings,
     "enhance": EnhanceSettings,
     "matching": MatchingSettings,
@@ -124,16 +126,18 @@ class Run:
 
 
 def settings_of(take_settings: Overrides, overrides: Overrides, where: str) -> dict[str, Any]:
-    """All settings of a run: the defaults, then take.toml's, then the command's or the panel's.
+    """All settings of a run: the defaults, then those of the preset, then take.toml's, then the command's or the panel's.
 
     Raises:
         InputError: an unknown table or name, or a value that cannot be.
     """
-    groups: dict[str, dict[str, Any]] = {name: {} for name in SETTINGS}
+    given: dict[str, dict[str, Any]] = {name: {} for name in SETTINGS}
     for source, place in ((take_settings, f" in {where}"), (overrides, "")):
         for name, table in current_tables(source, SETTINGS, place).items():
-            groups[name].update(table)
-    return {name: from_table(cls, groups[name], f"[{name}]") for name, cls in SETTINGS.items()}
+            given[name].update(table)
+    method: MethodSettings = from_table(MethodSettings, given["method"], "[method]")
+    preset = PRESETS[method.preset]
+    return {name: from_table(cls, {**preset.get(name, {}), **given[name]}, f"[{name}]") for name, cls in SETTINGS.items()}
 
 
 @contextmanager

@@ -28,13 +28,15 @@ from ..matching.seeds import Approximations, sweep_seeds
 from ..matching.views import TemplateGrid, Views, template_grid
 from ..matching.voronoi_scan import voronoi_scan
 from ..results.folder import Results
-from ..take.clicked_points import clicked_depth, with_clicked
+from ..take.clicked_points import clicked_depth, clicked_seeds, seeds_before_joints, settled_seeds
 from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from .cloud import OCCLUDED, PointCloud, SurfaceSettings, point_cloud, why_removed
 
 ALGORITHM = "surface 19"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
+SEED_SPACING_PX = 24  # without automatic seeds: of those by which the background is found, and of those from the frame before
+SEED_SPEED_M_S = 1.0  # sigma of the speed in depth at which seeds come from the frame before
 ANY_DEPTH_M = (fg.NEAREST_M, 1e3)
 FIELD_SINGLE = ("shape", "covariance", "correlation", "covariance_m2", "residual_px", "sigma0")  # stored in single precision
 
@@ -211,7 +213,8 @@ def _measure(now: _FrameViews, settings: MeasureSettings, before: MeasuredFrame 
         where, seeds = _first_foreground(now, settings, monitor)
     else:
         where = fg.after(views.base.to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
-        seeds = _swept(now, settings, where.depth_range_m, monitor)
+        automatic = settings.growing.seed_spacing_px > 0
+        seeds = _swept(now, settings, where.depth_range_m, monitor) if automatic else _seeds_of_before(now, settings, before)
     sources = silhouette_sources(now.footage)
     where = replace(where, silhouettes=now.silhouettes, method=f"{where.method}, {sources}" if sources else where.method)
     field = _matched(now, seeds, settings, where, monitor)
@@ -247,7 +250,7 @@ def _swept(now: _FrameViews, settings: MeasureSettings, depth_range_m: tuple[flo
         now.views,
         now.grid,
         settings.matching,
-        spacing_px=growing.seed_spacing_px,
+        spacing_px=growing.seed_spacing_px or SEED_SPACING_PX,
         depth_range_m=depth_range_m,
         monitor=monitor,
         pairs=growing.pairs,
@@ -282,10 +285,36 @@ def _first_foreground(now: _FrameViews, settings: MeasureSettings, monitor: Moni
     else:
         where = fg.Foreground(depth_range_m=ANY_DEPTH_M, method="everything")
     where = replace(where, planes=planes)
+    if not settings.growing.seed_spacing_px:
+        return where, _seeds_from_clicks(now, settings)
     seeds = sweep(where.depth_range_m)
     if take.clicks.surface and now.frame == take.clicks.frame:
-        seeds = with_clicked(footage, now.views, seeds, settings.matching)
+        clicked = clicked_seeds(footage, now.views, settings.matching)
+        seeds = Approximations(**{f.name: np.concatenate([getattr(s, f.name) for s in (seeds, clicked)]) for f in fields(Approximations)})
     return where, seeds
+
+
+def _seeds_from_clicks(now: _FrameViews, settings: MeasureSettings) -> Approximations:
+    """The clicked surface seeds of the first frame, or else the surface in front of the clicked joints.
+
+    Raises:
+        InputError: nothing is clicked, or in another frame.
+    """
+    clicks = now.footage.take.clicks
+    if clicks.named and now.frame != clicks.frame:
+        raise InputError(f"Without automatic seeds the surface starts from the clicks in frame {clicks.frame}: measure that frame, too.")
+    seeds = clicked_seeds if clicks.surface else seeds_before_joints
+    return seeds(now.footage, now.views, settings.matching)
+
+
+def _seeds_of_before(now: _FrameViews, settings: MeasureSettings, before: MeasuredFrame) -> Approximations:
+    """Seeds where the frame before was matched, one in about every `SEED_SPACING_PX`, moved in depth to where the views correlate."""
+    grid = before.field.grid
+    every = max(1, round(SEED_SPACING_PX / grid.spacing_px))
+    row, column = np.divmod(before.field.cell, grid.shape[1])
+    chosen = (row % every == 0) & (column % every == 0)
+    moved_m = SEED_SPEED_M_S * abs(now.frame - before.frame) / now.footage.take.fps
+    return settled_seeds(now.views, before.field.xyz_m[chosen], np.full(int(chosen.sum()), moved_m), settings.matching)
 
 
 def _seed_points(now: _FrameViews, seeds: Approximations) -> np.ndarray:

@@ -4,8 +4,6 @@ A click is precise to a few pixels; the depth at which its rays meet may be wron
 of the reference view is therefore swept about that depth, within the clicks' own sigma, and the seed starts where the views correlate best.
 """
 
-from dataclasses import fields
-
 import numpy as np
 
 from ..foundation.errors import InputError
@@ -15,6 +13,8 @@ from ..matching.seeds import Approximations, approximations_at_depth, settled_de
 from ..matching.views import Views
 from .footage import Footage
 from .take import Clicks
+
+LIMB_RADIUS_M = 0.05  # by which the surface lies before a joint, and its sigma
 
 
 def clicked_depth(footage: Footage, name: str, at: Clicks) -> float:
@@ -46,20 +46,38 @@ def clicked_point(footage: Footage, name: str, at: Clicks) -> Intersection:
     return point
 
 
-def with_clicked(footage: Footage, views: Views, seeds: Approximations, matching: MatchingSettings) -> Approximations:
-    """The swept seeds and those of the clicked surface points, which need not be clicked in the reference view.
+def clicked_seeds(footage: Footage, views: Views, matching: MatchingSettings) -> Approximations:
+    """The seeds of the clicked surface points, which need not be clicked in the reference view.
 
     Raises:
         InputError: see `clicked_point`.
     """
-    surface, base = footage.take.clicks.surface, views.base
-    points = [clicked_point(footage, f"surface seed {i + 1}", at) for i, at in enumerate(surface)]
-    xyz = np.concatenate([p.xyz_m for p in points])
+    axis = views.base.R_cam_world[2]
+    points = [clicked_point(footage, f"surface seed {i + 1}", at) for i, at in enumerate(footage.take.clicks.surface)]
     K = np.concatenate([p.covariance_m2 for p in points])
-    axis, depth = base.R_cam_world[2], base.to_camera(xyz)[:, 2]
-    xy = views.rows.from_frame(base.project(xyz))
-    sigma = np.sqrt(np.einsum("i,nij,j->n", axis, K, axis))
+    return settled_seeds(views, np.concatenate([p.xyz_m for p in points]), np.sqrt(np.einsum("i,nij,j->n", axis, K, axis)), matching)
+
+
+def seeds_before_joints(footage: Footage, views: Views, matching: MatchingSettings) -> Approximations:
+    """The seeds of the surface in front of the clicked joints, for takes without clicked surface points.
+
+    Raises:
+        InputError: see `clicked_point`; or no joint is clicked in this take.
+    """
+    if not footage.take.clicks.joints:
+        raise InputError(
+            "Without automatic seeds the surface starts from clicks, and this take has none; click joints or points of the surface, or "
+            "let seeds be found with growing.seed_spacing_px=24."
+        )
+    points = np.concatenate([clicked_point(footage, name, at).xyz_m for name, at in footage.take.clicks.joints.items()])
+    rays = points - views.base.centre_m
+    surface = points - LIMB_RADIUS_M * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return settled_seeds(views, surface, np.full(len(points), LIMB_RADIUS_M), matching)
+
+
+def settled_seeds(views: Views, xyz_m: np.ndarray, sigma_m: np.ndarray, matching: MatchingSettings) -> Approximations:
+    """Seeds near points (M, 3) with these sigmas of depth (M,), where the views correlate best; without those outside the image."""
+    base, xy = views.base, views.rows.from_frame(views.base.project(xyz_m))
     inside = views.template.inside(xy, 0.0)
-    depth = settled_depths(views, xy[inside], depth[inside], sigma[inside], matching)
-    clicked = approximations_at_depth(views.cameras, views.reference, views.rows, xy[inside], depth)
-    return Approximations(**{f.name: np.concatenate([getattr(seeds, f.name), getattr(clicked, f.name)]) for f in fields(Approximations)})
+    depth = settled_depths(views, xy[inside], base.to_camera(xyz_m)[inside, 2], sigma_m[inside], matching)
+    return approximations_at_depth(views.cameras, views.reference, views.rows, xy[inside], depth)

@@ -50,8 +50,10 @@ KEYS = (
     "corrections",
     "keypoints",
     "settings",
+    "preset",
     "quality",
 )
+TOP_LEVEL = {"preset": "method", "quality": "surface"}  # settings that are keys of take.toml itself, and their groups
 
 CORRECTIONS = {"trajectory": ("frame", "xy"), "region": ("frames", "polygon")}  # the keys of each kind
 NO_BODY = "none"  # `model` under [body]
@@ -235,7 +237,7 @@ def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:
         keyframes=_keyframes(tables_of(table, "keyframes", where), names, where),
         corrections=tuple(_correction(c, names, where) for c in tables_of(table, "corrections", where)),
         keypoints=keypoint_sources(tables_of(table, "keypoints", where), names, JOINTS, where),
-        settings=_settings(table_of(table, "settings", where), table.get("quality"), where),
+        settings=_settings(table, where),
     )
 
 
@@ -328,16 +330,18 @@ def _clicks(at: Any, views: tuple[str, ...], label: str) -> Clicks:
     return {view: np.array(xy, dtype=np.float64) for view, xy in at.items()}
 
 
-def _settings(table: Mapping[str, Any], quality: Any, where: str) -> Mapping[str, Mapping[str, Any]]:
+def _settings(take: Mapping[str, Any], where: str) -> Mapping[str, Mapping[str, Any]]:
+    """[settings], with the `TOP_LEVEL` keys among them."""
+    table = dict(table_of(take, "settings", where))
     for name, group in table.items():
         if not isinstance(group, dict):
             raise InputError(f"[settings] of {where} must contain tables such as [settings.matching]; “{name}” is not a table.")
-    if quality is None:
-        return table
-    surface = table.get("surface", {})
-    if "quality" in surface:
-        raise InputError(f"{where} sets `quality` twice, also under [settings.surface]; remove one of them.")
-    return {**table, "surface": {**surface, "quality": quality}}
+    for key in (key for key in TOP_LEVEL if key in take):
+        values = table.get(group := TOP_LEVEL[key], {})
+        if key in values:
+            raise InputError(f"{where} sets `{key}` twice, also under [settings.{group}]; remove one of them.")
+        table[group] = {**values, key: take[key]}
+    return table
 
 
 def body_model(folder: Path, name: str | None, where: str) -> str | None:

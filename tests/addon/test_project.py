@@ -156,13 +156,15 @@ def test_no_body_is_read_and_written(project: ModuleType, blender: ModuleType, t
 
 
 def test_the_quality_is_a_key_of_the_take(project: ModuleType, blender: ModuleType, take: Path) -> None:
-    """It stands where a reader looks first, and nowhere else."""
+    """It stands where a reader looks first, and nowhere else; so does the preset."""
     scene = blender.context.scene
-    write_table(take, read_table(take) | {"quality": "surface"})
+    write_table(take, read_table(take) | {"preset": "published", "quality": "surface"})
     project.open_take(scene, take)
-    assert scene.tricap.surface.quality == "surface" and project.table(scene) == read_table(take)
+    assert (scene.tricap.surface.quality, scene.tricap.method.preset) == ("surface", "published")
+    assert project.table(scene) == read_table(take)
     scene.tricap.surface.property_unset("quality")
-    assert project.table(scene) == {key: value for key, value in read_table(take).items() if key != "quality"}
+    scene.tricap.method.property_unset("preset")
+    assert project.table(scene) == {key: value for key, value in read_table(take).items() if key not in ("preset", "quality")}
 
 
 def test_somebody_elses_change_is_not_written_over(project: ModuleType, blender: ModuleType, take: Path) -> None:

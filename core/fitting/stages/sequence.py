@@ -47,7 +47,7 @@ from ..solve.problem import Estimate, Problem, Scales, linearise, variance_facto
 from ..solve.solver import Solution, solve
 from ..solve.time_priors import LEAST, Acceleration, Coupling, MarginalPrior, marginal_prior, typical_acceleration
 from ..state import BodyState, ShapeParameters, free_bones
-from .click_frame import clicked_lengths, fit_click_frame
+from .click_frame import ALTERNATION_STEPS, clicked_lengths, fit_click_frame
 from .contradicted import contradicted_frames
 from .inverse_kinematics import clicked_stature, dof_priors, shared_over_time
 from .limb_paths import follow_limbs
@@ -143,16 +143,33 @@ def _at_once(whole: Recording, start: Estimate, monitor: Monitor) -> BodyFit:
 
 def _adjusted(part: Recording, start: Estimate, monitor: Monitor) -> tuple[Recording, Problem, list[Solution]]:
     """Poses and shape together. With the complete model there is a second solution, and the returned recording has that model."""
-    steps = part.fit.settings.sequence_steps
     problem = _whole_sequence(part)
-    solution = solve(problem, start, steps=steps, monitor=monitor, stage=ADJUST)
+    solution = _solve(part.fit, problem, start, monitor, ADJUST)
     solutions = [_restarted(part, solution, problem, monitor)]
     if part.fit.settings.balls == "complete":
         part = replace(part, fit=_completed(part.fit, solutions[0].vector))
         problem = _whole_sequence(part)
         again = replace(solutions[0], vector=part.fit.parameters.vector())
-        solutions.append(solve(problem, again, steps=steps, monitor=monitor, stage="refine the complete model"))
+        solutions.append(_solve(part.fit, problem, again, monitor, "refine the complete model"))
     return part, problem, solutions
+
+
+def _solve(fit: FitContext, problem: Problem, start: Estimate, monitor: Monitor, stage: str) -> Solution:
+    """Minimise the problem's cost over poses and shape: together, or in turns as published, each with the other fixed, until both end
+    with their first step."""
+    steps = fit.settings.sequence_steps
+    if fit.settings.method == "joint" or not len(problem.free_shape) or not steps:
+        return solve(problem, start, steps=steps, monitor=monitor, stage=stage)
+    turns = replace(problem, fixed=np.arange(start.motion.shape[1])), replace(problem, free_shape=NO_SHAPE)
+    iterations = 0
+    for cycle in range(steps):
+        shape = solve(turns[0], start, steps=ALTERNATION_STEPS, monitor=monitor.part(stage, 2 * cycle, 2 * steps))
+        poses = solve(turns[1], shape, steps=ALTERNATION_STEPS, monitor=monitor.part(stage, 2 * cycle + 1, 2 * steps))
+        start, iterations = poses, iterations + shape.iterations + poses.iterations
+        settled = shape.converged and poses.converged and shape.iterations == poses.iterations == 1
+        if settled:
+            break
+    return replace(poses, iterations=iterations, converged=settled)
 
 
 def _in_stretches(whole: Recording, start: Estimate, monitor: Monitor, checkpoints: Checkpoints | None) -> BodyFit:
@@ -347,7 +364,7 @@ def _restarted(part: Recording, solution: Solution, problem: Problem, monitor: M
         return solution
     motion = solution.motion.copy()
     motion[bad] = np.stack([np.interp(time_s[bad], time_s[good], column) for column in motion[good].T], axis=1)
-    again = solve(problem, replace(solution, motion=motion), steps=fit.settings.sequence_steps, monitor=monitor, stage=ADJUST)
+    again = _solve(fit, problem, replace(solution, motion=motion), monitor, ADJUST)
     more = sum(
         fit.support(t, points[t], again.motion[t], again.vector) - fit.support(t, points[t], solution.motion[t], solution.vector)
         for t in bad.tolist()

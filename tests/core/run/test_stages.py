@@ -138,9 +138,13 @@ def test_every_group_of_knobs_concerns_one_stage() -> None:
     assert sorted([*groups, *WITHOUT_STAGE]) == sorted(take_run.SETTINGS) and stage_of("tracking") == "track"
 
 
-@pytest.mark.parametrize("group", WITHOUT_STAGE)
+@pytest.mark.parametrize("group", ["contour", "key_points"])
 def test_what_stands_aside_makes_nothing_stale(take: Path, group: str) -> None:
-    assert stale(take, {group: other_than_default(group)}) == []
+    assert group in WITHOUT_STAGE and stale(take, {group: other_than_default(group)}) == []
+
+
+def test_a_preset_concerns_the_stages_of_its_settings(take: Path) -> None:
+    assert stale(take, {"method": {"preset": "published"}}) == ["measure", "track", "fit"]
 
 
 def test_a_run_keeps_what_is_still_good_and_removes_what_is_not(take: Path, tmp_path: Path) -> None:
