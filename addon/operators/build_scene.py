@@ -113,8 +113,9 @@ def put_into_scene(
     first = scene_build.COLLECTION not in bpy.data.collections
     report_scene(operator, write_scene(contents, blend, options))
     body = bpy.data.objects.get(armature.NAME)
-    if body is not None and context.scene.tricap_retarget.source is None:
-        context.scene.tricap_retarget.source = body
+    chosen = context.scene.tricap_retarget
+    if body is not None:
+        chosen.source, chosen.export = chosen.source or body, chosen.export or body
     if first and body is not None and context.window is not None and not bpy.app.background:
         _hide_default_cube(operator, context)
         for item in context.selected_objects:

@@ -11,6 +11,7 @@ from .apply import set_range
 from .write import write_action
 
 SHORTEST_M = 1e-4  # of a bone that an armature can have
+LOOSE = 5e-6  # by the rig's size: a head that moves less relative to its parent is rigidly attached
 
 
 def build_armature(motion: Motion, name: str) -> bpy.types.Object:
@@ -49,7 +50,7 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
             basis=basis,
             shift_m=shift_m,
             carrier=first,
-            loose_m={},
+            loose_m=loose_shifts(motion, first),
             driven=driven,
             scale=1.0,
             roles=(),
@@ -62,11 +63,12 @@ def build_armature(motion: Motion, name: str) -> bpy.types.Object:
     return armature_object
 
 
-def loose_bones(motion: Motion) -> list[str]:
-    """Bones whose heads move relative to their parents by more than 0.1 mm, which an armature built here does not show."""
-    rig = motion.rig
-    return [
-        name
-        for b, name in enumerate(rig.names)
-        if rig.parents[b] >= 0 and float(np.abs(head_of(rig, motion.R, motion.head_m, b) - motion.head_m[:, b]).max()) > SHORTEST_M
-    ]
+def loose_shifts(motion: Motion, carrier: int) -> dict[int, np.ndarray]:
+    """By bone, how far (T, 3) its head moves in the world relative to its parent, or a root other than `carrier` from its rest."""
+    rig, shifts = motion.rig, dict[int, np.ndarray]()
+    smallest = LOOSE * float(np.ptp(np.concatenate([rig.head_m, rig.tail_m]), axis=0).max())
+    for b in range(len(rig.names)):
+        shift_m = motion.head_m[:, b] - head_of(rig, motion.R, motion.head_m, b)
+        if b != carrier and float(np.abs(shift_m).max()) > smallest:
+            shifts[b] = shift_m
+    return shifts

@@ -23,12 +23,13 @@ from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
 from ..scene import skin
-from .apply import set_range
-from .build import build_armature, loose_bones
+from . import playing
+from .build import build_armature
 from .programs import Program, bone_names
 
 FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # the axis of the file that is Blender's Y
 UP = {"Y up": "Y", "Z up": "Z", "OpenSim": "Y"}
+NO_MESHES = "Alembic stores meshes, and this motion has none; choose fbx, glb or usd."
 TEMPORARY = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "collections")
 
 
@@ -38,40 +39,42 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
     Raises:
         InputError: the format cannot store the motion, or the file cannot be written.
     """
-    loose = loose_bones(motion)
-    if loose:
-        raise InputError(
-            f"{len(loose)} bones of the motion move relative to their parents (such as “{loose[0]}”), which {kind} cannot store; use bvh."
-        )
     if kind == "abc" and not out.is_dir():
-        raise InputError("Alembic stores meshes, and this motion has none; choose fbx, glb or usd.")
-    unit_m = metres_per(program.unit or "m", "the preset") if kind == "fbx" else 1.0
-    with temporary_scene() as scene:
-        scene.unit_settings.scale_length = unit_m
-        armature_object = build_armature(scaled(motion, 1.0 / unit_m), file.stem)
+        raise InputError(NO_MESHES)
+    with _plain_armature(kind, file, program, motion) as armature_object:
         if out.is_dir():
-            skin_object = skin.add_skin(scene.collection, armature_object, read_body(out / "body.toml"))
-            skin_object.data.transform(Matrix.Scale(1.0 / unit_m, 4))
+            skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, read_body(out / "body.toml"))
+            skin_object.data.transform(Matrix.Scale(1.0 / _unit_m(kind, program), 4))
         _write(kind, file, program, armature_object, bone_names(motion.rig, program))
     return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
 
 
-def export_opened(kind: str, file: Path, program: Program, motion: Motion) -> str:
-    """Write the one animated armature of the open file, with the meshes that it deforms; lengths stay in metres.
+def export_played(kind: str, file: Path, program: Program, armature_object: bpy.types.Object, motion: Motion) -> str:
+    """Write what an armature plays (`motion`, from `read_played`), with the meshes that it deforms or carries; returns a summary.
 
     Raises:
-        InputError: the format cannot store it, or the file cannot be written.
+        InputError: there are no meshes for Alembic, or the file cannot be written.
     """
-    armature_object = next(o for o in bpy.data.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action)
-    skins = [o for o in bpy.data.objects if o.type == "MESH" and armature_object in (m.object for m in o.modifiers if m.type == "ARMATURE")]
+    skins = playing.skins_of(armature_object)
     if kind == "abc" and not skins:
-        raise InputError("Alembic stores meshes, and this motion has none; choose fbx, glb or usd.")
-    with temporary_scene() as scene:
-        for thing in (armature_object, *skins):
-            scene.collection.objects.link(thing)
-        set_range(scene, motion)
-        _write(kind, file, program, armature_object, bone_names(motion.rig, program))
+        raise InputError(NO_MESHES)
+    with playing.in_first_frame(), _plain_armature(kind, file, program, motion) as plain:
+        with playing.copied_skins(skins, armature_object, plain, 1.0 / _unit_m(kind, program)):
+            _write(kind, file, program, plain, bone_names(motion.rig, program))
     return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
+
+
+@contextmanager
+def _plain_armature(kind: str, file: Path, program: Program, motion: Motion) -> Iterator[bpy.types.Object]:
+    """An armature that plays the motion in the unit of the file, in a temporary scene."""
+    unit_m = _unit_m(kind, program)
+    with temporary_scene() as scene:
+        scene.unit_settings.scale_length = unit_m
+        yield build_armature(scaled(motion, 1.0 / unit_m), file.stem)
+
+
+def _unit_m(kind: str, program: Program) -> float:
+    return metres_per(program.unit or "m", "the preset") if kind == "fbx" else 1.0
 
 
 def scaled(motion: Motion, factor: float) -> Motion:

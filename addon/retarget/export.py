@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ ENDINGS = {kind: (f".{kind}",) for kind in ("bvh", "fbx", "abc", *POINTS)} | {
     "glb": (".glb", ".gltf"), "usd": (".usd", ".usda", ".usdc", ".usdz")}  # fmt: skip
 
 
-def named_for(kind: str, file: Path, out: Path) -> Path:
+def named_for(kind: str, file: Path, out: Path | None) -> Path:
     """The file to write, with the ending of the format where the name has none. Skins go into a folder of any name.
 
     Raises:
@@ -36,7 +37,8 @@ def named_for(kind: str, file: Path, out: Path) -> Path:
         if any(ending in others for others in ENDINGS.values()):
             raise InputError(f"{file.name} has the ending of another format; let it end in {ENDINGS[kind][0]}, or choose that format.")
         file = file if ending else file.with_name(file.name + ENDINGS[kind][0])
-    check_not_result(file, out)
+    if out is not None:
+        check_not_result(file, out)
     return file
 
 
@@ -51,27 +53,46 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
     """
     program = PROGRAMS[preset]
     monitor.step("exporting", 0, 1)
+    if is_imported_by_blender(out):
+        from .files import open_moving
+
+        return export_played(open_moving(out), kind, file, preset, monitor)
     if kind == "ply":
         return _copy_skins(out, file)
-    in_blender = is_imported_by_blender(out)
-    if kind in POINTS and not in_blender:
-        return _write_points(kind, file, points_of(out, up=up, unit=unit), program)
-    motion = _opened(out, monitor) if in_blender else read_motion_source(out, up=up, unit=unit)
     if kind in POINTS:
-        return _write_points(kind, file, heads_of(motion), program)
+        return _write_points(kind, file, points_of(out, up=up, unit=unit), program)
+    motion = read_motion_source(out, up=up, unit=unit)
     if kind == "bvh":
-        names, unit_m = bone_names(motion.rig, program), metres_per(program.unit or "m", preset)
-        write_bvh(file, motion, unit_m=unit_m, order=program.bvh_order, names=names)
-        return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
-    from .by_blender import export_motion, export_opened
+        return _write_bvh(file, motion, program)
+    from .by_blender import export_motion
 
-    return export_opened(kind, file, program, motion) if in_blender else export_motion(kind, out, file, program, motion)
+    return export_motion(kind, out, file, program, motion)
 
 
-def _opened(path: Path, monitor: Monitor) -> Motion:
-    from .files import open_motion
+def export_played(armature_object: Any, kind: str, file: Path, preset: str, monitor: Monitor) -> str:
+    """Write what an armature of the open file plays, with the meshes that it deforms; returns a summary. Main thread only.
 
-    return open_motion(path, monitor)
+    Raises:
+        InputError: the armature cannot be exported in this format, or the file cannot be written.
+        Cancelled: the monitor was cancelled.
+    """
+    from . import by_blender, playing
+
+    program = PROGRAMS[preset]
+    if kind == "ply":
+        return playing.write_skins(armature_object, file, monitor)
+    motion = playing.read_played(armature_object, monitor)
+    if kind in POINTS:
+        return _write_points(kind, file, playing.points_of_played(armature_object, motion), program)
+    if kind == "bvh":
+        return _write_bvh(file, motion, program)
+    return by_blender.export_played(kind, file, program, armature_object, motion)
+
+
+def _write_bvh(file: Path, motion: Motion, program: Program) -> str:
+    names, unit_m = bone_names(motion.rig, program), metres_per(program.unit or "m", "the preset")
+    write_bvh(file, motion, unit_m=unit_m, order=program.bvh_order, names=names)
+    return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
 
 
 def points_of(out: Path, *, up: str = "", unit: str = "") -> Markers:

@@ -51,12 +51,24 @@ def open_motion(path: Path, monitor: Monitor, *, up: str = "", unit: str = "") -
     """
     if not is_imported_by_blender(path):
         return read_motion_source(path, up=up, unit=unit)
+    source = open_moving(path)
+    return with_residual_motion(source, read_motion(source, read_rig(source), action_frames(source), monitor))
+
+
+def open_moving(path: Path) -> bpy.types.Object:
+    """Open a file, and return its one armature with an action or NLA strips. Of an imported file the scene plays the action's frames.
+
+    Raises:
+        InputError: it cannot be read, or has no such armature or several.
+    """
     open_rig(path)
-    moving = [o for o in bpy.data.objects if o.type == "ARMATURE" and o.animation_data and o.animation_data.action]
+    moving = [o for o in bpy.data.objects if o.type == "ARMATURE" and (data := o.animation_data) and (data.action or data.nla_tracks)]
     if len(moving) != 1:
         raise InputError(f"{path.name} has {len(moving)} armatures with an action; it must have exactly one.")
-    source = moving[0]
-    return with_residual_motion(source, read_motion(source, read_rig(source), action_frames(source), monitor))
+    if path.suffix.lower() != ".blend":
+        scene, frames = bpy.context.scene, action_frames(moving[0])
+        scene.frame_start, scene.frame_end = frames.start, frames.stop - 1
+    return moving[0]
 
 
 def import_rig(path: Path) -> list[bpy.types.Object]:

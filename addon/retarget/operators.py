@@ -84,7 +84,7 @@ class Retarget(JobOperator, bpy.types.Operator):
         if props.strip:
             push_to_strip(self._target, outcome.written.action)
         notes = [*filter(None, [self._unused_mapping]), *outcome.notes]
-        props.last_export = ""
+        props.last_export, props.export = "", self._target
         props.last = "\n".join([str(outcome.figures), *notes])
         for note in notes:
             self.report({"INFO"}, note)

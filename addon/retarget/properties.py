@@ -19,6 +19,12 @@ AUTOMATIC = "USUAL"  # the identifier in saved files
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 
 
+EXPORTED = (
+    ("PLAYED", "What Plays", "The armature as it plays in the scene: with its edited action, NLA layers and constraints"),
+    ("MEASURED", "Measured Motion", "The motion as it was measured, with its sigmas, from the files of the run"),
+)
+
+
 def _is_armature(_: bpy.types.PropertyGroup, thing: bpy.types.Object) -> bool:
     return bool(thing.type == "ARMATURE")
 
@@ -90,6 +96,13 @@ class Retargeting(bpy.types.PropertyGroup):
     rows_of: bpy.props.PointerProperty(type=bpy.types.Object)  # type: ignore[valid-type]  # the armature of the mapping
     steering: bpy.props.StringProperty()  # type: ignore[valid-type]  # JSON: the control rig of the mapping
     missing: bpy.props.StringProperty()  # type: ignore[valid-type]
+    export_source: bpy.props.EnumProperty(name="Motion", items=EXPORTED, description="What Export Motion writes")  # type: ignore[valid-type]
+    export: bpy.props.PointerProperty(
+        type=bpy.types.Object,
+        name="Armature",
+        poll=_is_armature,  # type: ignore[valid-type]
+        description="The armature to export; its skin is exported, too. Empty: the only one of the scene",
+    )
     last: bpy.props.StringProperty()  # type: ignore[valid-type]  # figures and notes of the last retargeting
     last_export: bpy.props.StringProperty()  # type: ignore[valid-type]  # what was exported since
 

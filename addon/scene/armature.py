@@ -20,6 +20,7 @@ ROOT = "root"
 ROOT_LENGTH_M = 0.1
 NAME = "Body"
 ROLES_KEY = "tricap_roles"  # custom property of armature data: the bone of each part of the body
+JOINTS_KEY = "tricap_joints"  # custom property of armature data: by joint, a bone that begins or ends there
 
 
 def add_armature(collection: bpy.types.Collection, shape: BodyShape) -> bpy.types.Object:
@@ -29,6 +30,9 @@ def add_armature(collection: bpy.types.Collection, shape: BodyShape) -> bpy.type
     armature_object = bpy.data.objects.new(NAME, armature)
     armature_object.show_in_front = True
     armature[ROLES_KEY] = model_roles(bone.name for bone in shape.skeleton.bones)
+    skeleton = shape.skeleton
+    ends = [{"bone": skeleton.bones[b].name, "at_tail": at_tail} for b, at_tail in skeleton.joint_bones]
+    armature[JOINTS_KEY] = dict(zip(skeleton.joint_names, ends))
     collection.objects.link(armature_object)
     _edit_bones(armature_object, shape)
     _bone_collections(armature)

@@ -187,8 +187,12 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
 
 def retarget(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
     """Export; retargeting is a section of its own."""
-    row = layout.row()
-    row.operator_menu_enum("tricap.export", "kind", text="Export Motion", icon="EXPORT")
+    props = context.scene.tricap_retarget
+    layout.row().prop(props, "export_source", expand=True)
+    if props.export_source == "PLAYED":
+        layout.prop(props, "export")
+    button = layout.operator_menu_enum("tricap.export", "kind", text="Export Motion", icon="EXPORT")
+    button.source, button.armature = props.export_source, props.export.name if props.export is not None else ""
 
 
 DRAW = {

@@ -1,4 +1,4 @@
-"""bpy.ops.tricap.export(filepath="…", kind="bvh", preset="plain", out="")"""
+"""bpy.ops.tricap.export(filepath="…", kind="bvh", preset="plain", source="PLAYED", armature="", out="")"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,8 +12,10 @@ from ...core.motion.sources import read_motion_source
 from .. import folders
 from ..jobs import JobOperator
 from ..retarget.by_blender import export_motion
-from ..retarget.export import BY_BLENDER, export_file, named_for
+from ..retarget.export import BY_BLENDER, export_file, export_played, named_for
+from ..retarget.operators import armature_of
 from ..retarget.programs import PROGRAMS
+from ..retarget.properties import EXPORTED
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 KINDS = (
@@ -44,11 +46,13 @@ class Export(JobOperator, bpy.types.Operator):
         description="Use the names, units and axes of this software",
     )
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH")  # type: ignore[valid-type]
+    source: bpy.props.EnumProperty(name="Motion", items=EXPORTED, description="What is exported")  # type: ignore[valid-type]
+    armature: bpy.props.StringProperty(name="Armature", description="What Plays: of this armature; empty: the one in the panel")  # type: ignore[valid-type]
     out: bpy.props.StringProperty(
         name="Results",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder of a run. Empty: the project's",
+        description="Measured Motion: of the run in this folder; empty: the project's. A folder selects Measured Motion",
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -58,24 +62,64 @@ class Export(JobOperator, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    def draw(self, context: bpy.types.Context) -> None:
+        """The options in the file browser."""
+        layout = self.layout
+        layout.use_property_split, layout.use_property_decorate = True, False
+        for name in ("kind", "preset", "source"):
+            layout.prop(self, name)
+        if self.source == "PLAYED":
+            layout.prop_search(self, "armature", bpy.data, "objects")
+        else:
+            layout.prop(self, "out")
+
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], str | Motion]:
-        """The results and the file."""
+        """What is exported, and the file."""
         if not self.filepath:
             raise InputError("Choose the file to export to.")
-        out, kind, preset = folders.output_folder(self.out, context.scene), self.kind, self.preset
-        file = named_for(kind, folders.absolute(self.filepath), out)
-        self._out, self._file = out, file
+        kind, preset, chosen = self.kind, self.preset, folders.absolute(self.filepath)
+        if self.source == "PLAYED" and not self.out:
+            self._armature, self._file = self._playing(context), named_for(kind, chosen, _results(context.scene))
+            return lambda monitor: ""
+        out = folders.output_folder(self.out, context.scene)
+        self._armature, self._out, self._file = None, out, named_for(kind, chosen, out)
         if kind in BY_BLENDER:
             return lambda monitor: read_motion_source(out)
-        return lambda monitor: export_file(out, kind, file, preset, monitor)
+        return lambda monitor: export_file(out, kind, self._file, preset, monitor)
+
+    def _playing(self, context: bpy.types.Context) -> bpy.types.Object:
+        """The armature to export: the given one, that of the panel, or the only one of the scene.
+
+        Raises:
+            InputError: there is none.
+        """
+        chosen = context.scene.tricap_retarget.export
+        if self.armature or chosen is not None:
+            return armature_of(self.armature, chosen, "armature to export")
+        armatures = [o for o in context.scene.objects if o.type == "ARMATURE"]
+        if not armatures:
+            raise InputError("The scene has no armature to export. Build the rig first (step 7), or choose Measured Motion.")
+        if len(armatures) > 1:
+            raise InputError(f"The scene has {len(armatures)} armatures. Choose the one to export.")
+        return armatures[0]
 
     def finish(self, context: bpy.types.Context, result: str | Motion) -> set[str]:
-        """Write what Blender's exporters write, and report it."""
-        if isinstance(result, Motion):
+        """Write what needs the open file, and report it."""
+        if self._armature is not None:
+            result = export_played(self._armature, self.kind, self._file, self.preset, Monitor())
+        elif isinstance(result, Motion):
             result = export_motion(self.kind, self._out, self._file, PROGRAMS[self.preset], result)
         context.scene.tricap_retarget.last_export = f"Exported {self._file.name}: {result}."
         self.report({"INFO"}, f"{self._file}: {result}")
         return {"FINISHED"}
+
+
+def _results(scene: bpy.types.Scene) -> Path | None:
+    """The folder of the project's results, which no export overwrites; None where no project is chosen."""
+    try:
+        return folders.output_folder("", scene)
+    except InputError:
+        return None
 
 
 CLASSES = (Export,)

@@ -51,8 +51,8 @@ class Layout:
         self.operators.append(name)
         return SimpleNamespace()
 
-    def operator_menu_enum(self, name: str, prop: str, **words: Any) -> None:
-        self.operator(name)
+    def operator_menu_enum(self, name: str, prop: str, **words: Any) -> Any:
+        return self.operator(name)
 
     def template_list(self, kind: str, _: str, data: Any, name: str, active: Any, active_name: str, **words: Any) -> None:
         import bpy
