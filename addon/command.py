@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from ..core.body.fields import EXPONENTIAL, POTENTIALS
-from ..core.body.skin.closed_skin import DETAIL
 from ..core.cli import main as commands
 from ..core.cli.arguments import check_simplify, standard_output_kept_clean
 from ..core.foundation.errors import InputError
 from ..core.foundation.progress import Monitor
 from .retarget import command as retargeting
+
+DETAIL = 2  # that of body/skin/closed_skin.py, which is imported only when a scene is built
 
 
 def main(argv: list[str] | None = None) -> int:

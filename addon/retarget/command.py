@@ -11,10 +11,11 @@ from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.foundation.settings import from_table
-from ...core.motion.formats.markers import UNITS_M
 from ...core.results.folder import check_not_result
-from .programs import PROGRAMS, is_imported_by_blender
 
+# those of programs.py and of core/motion/formats/markers.py, which are imported when a command runs
+PROGRAM_NAMES = ("plain", "mixamo", "unreal", "unity", "maya", "motionbuilder", "opensim")
+UNITS = ("m", "meters", "metres", "dm", "cm", "mm", "um", "in", "inch")
 FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
 
 
@@ -58,7 +59,7 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--out", dest="file", metavar="FILE", type=Path, required=True, help="the file to write (for ply: a folder)")
-    parser.add_argument("--preset", choices=tuple(PROGRAMS), default="plain", help="names, units and axes of a program")
+    parser.add_argument("--preset", choices=PROGRAM_NAMES, default="plain", help="names, units and axes of a program")
     _add_axes(parser)
     parser.set_defaults(run=_clean(export))
 
@@ -75,7 +76,7 @@ def _clean(run: Callable[[argparse.Namespace, Monitor], list[str]]) -> Callable[
 
 def _add_axes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--up", choices=("Y", "Z"), default="", help="the up axis of a BVH, TRC, C3D or CSV file")
-    parser.add_argument("--unit", choices=tuple(UNITS_M), default="", help="the unit of such a file, if not the one stated in it")
+    parser.add_argument("--unit", choices=UNITS, default="", help="the unit of such a file, if not the one stated in it")
 
 
 def _need_blender(what: str) -> None:
@@ -164,8 +165,10 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         Cancelled: the monitor was cancelled.
     """
     from .export import BY_BLENDER, export_file, named_for
+    from .programs import is_imported_by_blender
 
     file = named_for(args.format, args.file, args.out)
+
     if args.format in BY_BLENDER or is_imported_by_blender(args.out):
         _need_blender("export")
     return [f"{file}: {export_file(args.out, args.format, file, args.preset, monitor, up=args.up, unit=args.unit)}"]

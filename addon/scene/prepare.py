@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ...core.body.shape import BodyShape
 from ...core.body.skin.closed_skin import DETAIL, OneSkin, one_skin
@@ -72,6 +71,8 @@ def prepare(
 
 def velocity_nearby(frame: int, xyz_m: np.ndarray, trajectories: Mapping[str, np.ndarray] | None) -> np.ndarray:
     """Velocity (N, 3) of the nearest tracked point in the frame; 0 where none is within NEAR_M."""
+    from scipy.spatial import cKDTree
+
     at = np.flatnonzero(trajectories["frames"] == frame) if trajectories is not None else np.zeros(0, dtype=int)
     if trajectories is None or not len(at) or not len(xyz_m):
         return np.zeros((len(xyz_m), 3))

@@ -24,7 +24,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from .metaballs import THRESHOLD, Metaballs, local_points, squared_distances
 from .parts import Part, body_parts
@@ -67,6 +66,8 @@ def metaball_groups(shape: BodyShape) -> list[Metaballs]:
 
 def _solved(f: np.ndarray, slope: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """(1) for one group, whose balls' fields are f (N, m)."""
+    from scipy.optimize import lsq_linear
+
     A, prior = f / (SIGMA_M * slope)[:, None], len(f) / SIGMA**2
     N = A.T @ A + prior * np.eye(len(wanted))
     L = np.linalg.cholesky(N)  # the same minimum with m equations: N = L Lᵀ

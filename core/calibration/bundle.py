@@ -19,7 +19,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from ..geometry.camera import INTERIOR, Camera, camera_of, columns_of_derivatives, columns_of_exterior, image_of, interior_of
 from ..geometry.rotation import cross_matrix, rotation_from_vector
@@ -176,6 +175,8 @@ def design(network: Network, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray
 
 def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarray, unknowns: Unknowns, unit_px: float) -> Normals:
     """The normal equations (3) with pseudo-observations; `unit_px` is the sigma s of an image coordinate."""
+    from scipy.linalg import block_diag
+
     C, N, p = len(network.R), len(network.middle), len(unknowns.columns)
     V, g_c = np.zeros((C, p, p)), np.zeros((C, p))
     U, g_b, W = np.empty((5, 5, N)), np.empty((5, N)), np.empty((5, C, p, N))
@@ -273,6 +274,8 @@ def solve_step(network: Network, normals: Normals, unknowns: Unknowns, damping: 
 
 def _solved(A: np.ndarray, rhs: np.ndarray) -> np.ndarray:
     """x of A x = rhs; of minimum norm where A is singular, as with a camera that has no image points."""
+    from scipy.linalg import cho_factor, cho_solve
+
     try:
         return np.asarray(cho_solve(cho_factor(A), rhs))
     except np.linalg.LinAlgError:

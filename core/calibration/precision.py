@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from ..geometry.camera import INTERIOR, Camera, exterior_derivatives, image_with_derivatives, interior_of
 from ..geometry.rotation import cross_matrix
@@ -67,6 +66,8 @@ def with_left_out(
     `covariance` (C p, C p) and `unknowns` are those of the adjustment without the groups, `full` (16 C, 16 C) and `off` (C, 10), values
     less expected values, those of the adjustment with all unknowns free.
     """
+    from scipy.linalg import block_diag
+
     every = replace(unknowns, free=np.ones(len(INTERIOR), dtype=bool))
     free = (np.arange(len(off))[:, None] * 16 + unknowns.columns).ravel()
     P = np.zeros_like(full)

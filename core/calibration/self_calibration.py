@@ -14,7 +14,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import fdtrc
 
 from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR
@@ -219,5 +218,7 @@ def _covariance(state: Adjusted, keep: np.ndarray, unknowns: Unknowns, sigma: fl
 
 def wald(network: Network, unknowns: Unknowns, covariance: np.ndarray, group: tuple[str, ...], redundancy: float) -> float:
     """Probability of values as large as those of a group in all cameras if their true values were the expected ones.  (3)"""
+    from scipy.special import fdtrc
+
     x, Q = group_of(network.interior - unknowns.expected, unknowns, covariance, group)[:2]
     return float(fdtrc(len(x), redundancy, x @ np.linalg.solve(Q, x) / len(x)))

@@ -23,7 +23,6 @@ from itertools import permutations
 
 import cv2
 import numpy as np
-from scipy.special import ndtr
 
 from ..foundation.arrays import frozen
 from ..geometry.robust import MAD_TO_SIGMA, mad_sigma
@@ -254,6 +253,8 @@ def _touched(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> np.ndarray:
 
 def _disc(p: np.ndarray, grid: np.ndarray, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Observed − computed (m, k) of (2) and its Jacobian (m, k, 8) at parameters (m, 8)."""
+    from scipy.special import ndtr
+
     cx, cy, b11, b12, b22, rho, g0, g1 = p.T[:, :, None]
     ux, uy = grid[:, 0] - cx, grid[:, 1] - cy
     wx, wy = b11 * ux + b12 * uy, b12 * ux + b22 * uy

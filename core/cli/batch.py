@@ -1,31 +1,11 @@
 """`tricap batch`: many takes on a Dask cluster. Exit codes: 0 all done, 2 a take has invalid input, 1 a bug or a lost worker."""
 
 import argparse
-from pathlib import Path
-from typing import Any
 
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled, Monitor
-from ..run.batch import RETRIES, Engine, Status, as_json, run_batch, summary
+from ..run.batch import Engine, Status, as_json, run_batch, summary
 from .arguments import overrides
-
-
-def add_command(commands: Any) -> None:
-    """Join `batch` to the parser's commands."""
-    about = "run many takes, on the processors of this machine or on a Dask cluster"
-    parser = commands.add_parser("batch", help=about, description=about[0].upper() + about[1:])
-    parser.add_argument("takes", type=Path, nargs="+", metavar="TAKE", help="folders with take.toml")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results; each take gets one in it")
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, such as tcp://farm:8786; its workers need Tricap")
-    where.add_argument("--workers", type=int, default=2, metavar="N", help="processes on this machine (default 2)")
-    parser.add_argument(
-        "--retries", type=int, default=RETRIES, metavar="N", help=f"retries of a take whose worker dies (default {RETRIES})"
-    )
-    parser.add_argument("--restart", action="store_true", help="start every take again instead of resuming")
-    parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
-    parser.add_argument("--json", action="store_true", help="print the outcomes as JSON, and nothing else on standard output")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:

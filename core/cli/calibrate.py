@@ -3,54 +3,17 @@
 import argparse
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 from ..calibration import report
 from ..calibration.calibrate import calibrate_rig, measure_bar, open_bar, write_report
-from ..calibration.rig_files import FORMATS, read_any, write_as
+from ..calibration.rig_files import read_any, write_as
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.rig import read_rig, write_rig
-from ..images.interlace import BOTH, INTERLACE
 from ..take.bar_file import write_bar
 from ..tracking.point_tables import read_points
 from .arguments import check_not_read
-
-
-def add_command(commands: Any) -> None:
-    """Join `calibrate` to the parser's commands."""
-    parser = commands.add_parser("calibrate", help="a rig from the images of a waved bar, or from another tool's calibration")
-    parser.add_argument("bar", nargs="?", type=Path, metavar="BARDIR", help="folder with a folder of images, or a movie, per camera")
-    parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the rig to write, such as rig.toml")
-    parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
-    parser.add_argument(
-        "--interlaced",
-        choices=(*INTERLACE, BOTH),
-        default="none",
-        help="the lines of interlaced video to use; both: two frames per image, one of the odd lines and one of the even lines",
-    )
-    parser.add_argument("--first-field", choices=("odd", "even"), default="odd", help="with both: the lines that were exposed first")
-    parser.add_argument(
-        "--mask", type=Path, metavar="PATH", help="image that is black where no target can be, or a folder of them named like the cameras"
-    )
-    parser.add_argument("--target-diameter", type=float, metavar="M", help="diameter of the bar's targets in metres, if known")
-    parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar lies on the floor, which becomes z = 0")
-    parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar is held level")
-    parser.add_argument(
-        "--points",
-        type=Path,
-        metavar="FILE",
-        help="CSV of point,view,x,y: the pixels of “origin”, “x” and “y”, which become the world's origin and axes",
-    )
-    parser.add_argument("--like", type=Path, metavar="RIG", help="put the cameras where those of the same names stand in this rig.toml")
-    parser.add_argument("--report", type=Path, metavar="DIR", help="folder for the report: text, JSON, pictures")
-    parser.add_argument("--import", dest="source", type=Path, metavar="FILE", help="read another tool's calibration instead of images")
-    parser.add_argument("--export", dest="format", choices=sorted(FORMATS), help="write the rig in another tool's format")
-    parser.add_argument("--json", action="store_true", help="print the figures")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:

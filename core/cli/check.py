@@ -3,23 +3,10 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any
 
 from ..checking.findings import Checked
-from ..checking.rig_check import check_rig
-from ..checking.run_check import check_run
-from ..checking.take_check import check_take
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-
-
-def add_command(commands: Any) -> None:
-    """Join `check` to the parser's commands."""
-    about = "what is wrong or doubtful about a take, a rig or a result, and what to do"
-    parser = commands.add_parser("check", help=about, description=about[0].upper() + about[1:])
-    parser.add_argument("subject", type=Path, metavar="TAKE|OUT|RIG", help="folder of a take or of a run, or rig.toml")
-    parser.add_argument("--json", action="store_true", help="print the findings and figures as JSON")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -41,10 +28,16 @@ def check(subject: Path, monitor: Monitor) -> Checked:
         InputError: it is none of them.
     """
     if (subject / "run.json").is_file():
+        from ..checking.run_check import check_run
+
         return check_run(subject, monitor)
     if (subject / "take.toml").is_file() or (subject.name == "take.toml" and subject.is_file()):
+        from ..checking.take_check import check_take
+
         return check_take(subject, monitor)
     if subject.is_file() and subject.suffix.lower() == ".toml":
+        from ..checking.rig_check import check_rig
+
         return check_rig(subject)
     raise InputError(
         f"{subject} is neither a take (a folder with take.toml), nor a result (with run.json), nor a rig.toml; check the path."

@@ -3,12 +3,9 @@
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..foundation import store
 from ..foundation.errors import InputError
@@ -62,22 +59,6 @@ class Start:
 
 
 MEASURED_SURFACE = Start()
-
-
-def add_command(commands: Any) -> None:
-    """Add `contour` to the parser's commands."""
-    about = "the outline of the person in one view, tracked through the frames"
-    parser = commands.add_parser("contour", help=about, description=about[0].upper() + about[1:])
-    parser.add_argument("take", type=Path, metavar="TAKE", help="folder with take.toml")
-    parser.add_argument("--view", required=True, nargs="+", metavar="NAME", help="the view, such as C, or several")
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results; contours/NAME.csv is written")
-    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
-    start = parser.add_mutually_exclusive_group()
-    start.add_argument("--polygon", type=Path, metavar="FILE", help="CSV with x,y of the outline in the first frame")
-    start.add_argument("--background", type=Path, metavar="FILE", help="image of the view without the person")
-    start.add_argument("--from-body", action="store_true", help="start from the outline of the body that was fitted in OUT")
-    parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
-    parser.set_defaults(run=run, json=False)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -311,6 +292,8 @@ def _outline(grey: np.ndarray, points: np.ndarray, settings: ContourSettings) ->
 
 def _replaced(predicted: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """The predicted contour, or the frame's own outline where the two differ too much, because limbs crossed or separated."""
+    from scipy.spatial import cKDTree
+
     if len(outline) < MIN_VERTICES:
         return predicted
     there, back = (cKDTree(b).query(a)[0] for a, b in ((predicted, outline), (outline, predicted)))

@@ -1,8 +1,6 @@
 """`tricap fields --out FILE.svg`: a plot of the field functions of metaballs (D'Apuzzo et al. 1999, Fig. 12)."""
 
 import argparse
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,14 +12,6 @@ from ..report.figures import HEIGHT, WIDTH, field_graph
 
 PLOT_RADIUS = 1.5  # in units of l
 SAMPLES = 301
-
-
-def add_command(commands: Any) -> None:
-    """Join the command to the parser's sub-commands."""
-    about = "plot the field functions of metaballs, with r_t, r_a and w_t"
-    parser: argparse.ArgumentParser = commands.add_parser("fields", help=about, description=about[0].upper() + about[1:])
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.svg", help="the picture to write")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:

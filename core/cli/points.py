@@ -20,12 +20,6 @@ from ..tracking.track import TrackingRules
 from .arguments import frame_range, overrides
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments to those of `tricap track`."""
-    parser.add_argument("--points", type=Path, metavar="FILE", help="track only the points of a CSV: point,view,x,y (two views or more)")
-    parser.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
-
-
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """Track the chosen points and write OUT/points3d.csv and OUT/points2d.csv; the lines to show.
 

@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
-from ..images.interlace import INTERLACE, row_grid
+from ..images.interlace import row_grid
 from ..images.sequence import IMAGE_ENDINGS, ImageSequence, open_sequence
 from ..matching.least_squares import MatchingSettings
 from ..tracking.planar import PlanarTracks, track_planar
@@ -22,20 +21,6 @@ from .arguments import check_not_read, frame_range, overrides
 MIN_CORRELATION = 0.7  # default of matching.min_correlation here: faces have weak texture and deform
 MAX_SIGMA_PX = 0.4  # default of matching.max_sigma_px here, for the same reason
 WAIT_FRAMES = 100  # default of tracking.wait_frames here: a lost point is searched for only at its last place
-
-
-def add_command(commands: Any) -> None:
-    """Add `track2d` to the parser's commands."""
-    about = "the 2-D mode: track chosen points through the images of one camera"
-    parser = commands.add_parser("track2d", help=about, description=about[0].upper() + about[1:])
-    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a movie, or a folder of images")
-    parser.add_argument("--points", type=Path, required=True, metavar="FILE", help="CSV with point,x,y in the first frame (and joined_to)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="CSV to write: frame,point,x,y,sigma,correlation,status")
-    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1; the points are those of frame A")
-    parser.add_argument("--interlaced", choices=INTERLACE, default="none", help="which lines of interlaced video to use")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw the points, joined with lines, over the images")
-    parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
-    parser.set_defaults(run=run, json=False)
 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import scipy.linalg  # noqa: F401  its BLAS must be loaded before its threads can be limited
 from threadpoolctl import threadpool_limits
 
 Part = TypeVar("Part")
@@ -19,6 +18,8 @@ def one_thread_in_linear_algebra() -> threadpool_limits:
 
     With more threads the order of summation varies, which changes the last digits, and small matrices keep threads busy waiting.
     """
+    import scipy.linalg  # noqa: F401  its BLAS must be loaded before its threads can be limited
+
     return threadpool_limits(1, user_api="blas")
 
 

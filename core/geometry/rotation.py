@@ -1,7 +1,6 @@
 """Rotations: Rodrigues vectors, matrices (…, 3, 3) and quaternions (…, 4), w x y z. Radians, right-handed."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 
 def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
@@ -116,6 +115,8 @@ def matrix_from_quaternion(q: np.ndarray) -> np.ndarray:
 
 def quaternion_from_matrix(R: np.ndarray) -> np.ndarray:
     """Unit quaternions (…, 4) of matrices (…, 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     R = np.asarray(R, dtype=np.float64)
     xyzw = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
     return np.roll(xyzw, 1, axis=-1).reshape(*R.shape[:-2], 4)
@@ -123,11 +124,15 @@ def quaternion_from_matrix(R: np.ndarray) -> np.ndarray:
 
 def vector_from_matrix(R: np.ndarray) -> np.ndarray:
     """Rodrigues vectors (…, 3) [rad] of matrices (…, 3, 3), angles 0…π."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_matrix(np.reshape(R, (-1, 3, 3))).as_rotvec().reshape(*np.shape(R)[:-2], 3)
 
 
 def matrix_from_vector(v: np.ndarray) -> np.ndarray:
     """Matrices (…, 3, 3) of Rodrigues vectors (…, 3) [rad], which may be read-only (older scipy needs a copy)."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_rotvec(np.array(v, dtype=np.float64).reshape(-1, 3)).as_matrix().reshape(*np.shape(v)[:-1], 3, 3)
 
 

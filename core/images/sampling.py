@@ -9,8 +9,6 @@ with the cubic spline, which takes as long to prepare. OpenCV 4 rounds the posit
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.interpolate import BSpline
-from scipy.ndimage import spline_filter1d
 
 from ..geometry.robust import mad_sigma
 
@@ -148,6 +146,9 @@ def noise_sigma(image: np.ndarray) -> float:
 
 def _refine(image: np.ndarray, axis: int) -> np.ndarray:
     """The spline through the rows or columns, evaluated at quarter pixels."""
+    from scipy.interpolate import BSpline
+    from scipy.ndimage import spline_filter1d
+
     coefficients = spline_filter1d(image.astype(np.float64), order=ORDER, axis=axis, mode="mirror").astype(np.float32)
     one = np.ones(1, np.float32)
     shape = list(image.shape)

@@ -13,7 +13,6 @@ from itertools import product
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from ..foundation.progress import Monitor
 from ..foundation.settings import knob
@@ -393,6 +392,8 @@ def _enough(matched: Sequence[Matches], required: int) -> np.ndarray:
 
 def chi2_limit(rays: np.ndarray) -> np.ndarray:
     """Largest sigma0 (N,) of intersections of so many rays that 999 in 1000 good points have: 2 K − 3 are redundant."""
+    from scipy.special import gammaincinv
+
     redundant = np.maximum(2 * rays - 3, 1)
     return np.asarray(np.sqrt(2 * gammaincinv(redundant / 2, RAY_TEST) / redundant))
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from ..foundation.progress import Monitor
 from ..foundation.threads import equal_pieces, in_threads
@@ -207,6 +206,8 @@ def _normalised(patch: np.ndarray) -> np.ndarray:
 
 def _peaks(score: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depth of the best sample of each row, refined by a parabola, and whether its score is high enough and leads the second-best peak."""
+    from scipy.ndimage import maximum_filter1d
+
     rows, best = np.arange(len(score)), score.argmax(axis=1)
     top = score[rows, best]
     peaks = (score == maximum_filter1d(score, size=PEAK_SAMPLES, axis=1)) & (

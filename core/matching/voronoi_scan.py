@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..foundation.progress import Monitor
 from ..geometry.intersection import forward_intersection
@@ -109,6 +108,8 @@ class _Scan:
     def __init__(
         self, template: SplineImage, image: SplineImage, grid: TemplateGrid, seeds: np.ndarray, settings: MatchingSettings, monitor: Monitor
     ) -> None:
+        from scipy.spatial import cKDTree
+
         n = grid.shape[0] * grid.shape[1]
         self._template, self._image, self._grid, self._settings, self._monitor = template, image, grid, settings, monitor
         self._seeds = seeds

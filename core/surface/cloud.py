@@ -15,7 +15,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import label
 
 from ..foundation.arrays import frozen
 from ..foundation.settings import knob
@@ -152,6 +151,8 @@ def _correction_m(surface: LocalSurface, focal_px: float) -> np.ndarray:
 
 def _island_size(field: MatchedField) -> np.ndarray:
     """(N,) size of the connected group of each point."""
+    from scipy.ndimage import label
+
     taken = np.zeros(field.grid.shape, dtype=bool)
     taken.ravel()[field.cell] = True
     islands, _ = label(taken, structure=np.ones((3, 3)))

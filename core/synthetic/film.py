@@ -15,8 +15,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy.fft
-from scipy.ndimage import map_coordinates
 
 from ..foundation.arrays import frozen
 from ..geometry.camera import Camera
@@ -36,12 +34,16 @@ class SolidNoise:
 
     def __call__(self, xyz_m: np.ndarray) -> np.ndarray:
         """The noise (N,) at points (N, 3), trilinear between the grid's cells."""
+        from scipy.ndimage import map_coordinates
+
         at = np.asarray(xyz_m).T / self.pitch_m
         return map_coordinates(self.values, at, order=1, mode="grid-wrap", output=np.float32)
 
 
 def solid_noise(seed: int, *, cells: int = 160, pitch_m: float = 0.002, shortest_m: float = 0.012, longest_m: float = 0.080) -> SolidNoise:
     """Noise with wavelengths from `shortest_m` to `longest_m`. A seed gives the same noise everywhere; 160³ cells take 0.3 s."""
+    import scipy.fft
+
     white = np.random.default_rng(seed).standard_normal((cells, cells, cells), dtype=np.float32)
     k = scipy.fft.fftfreq(cells, pitch_m)
     k2 = k[:, None, None] ** 2 + k[None, :, None] ** 2 + scipy.fft.rfftfreq(cells, pitch_m) ** 2

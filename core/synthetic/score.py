@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..body.shape import read_body
 from ..foundation.errors import InputError
@@ -169,6 +168,8 @@ def _meshes(folder: Path, truth: Truth, monitor: Monitor) -> list[tuple[int, Ply
 
 
 def _score_clouds(truth: Truth, out: Path, monitor: Monitor) -> CloudScore | None:
+    from scipy.spatial import cKDTree
+
     distances, coverage = [], []
     for frame, ply in _meshes(out / "clouds", truth, monitor):
         distances.append(truth.closest(frame, ply.xyz_m)[0] * 1e3)
@@ -326,6 +327,8 @@ def _score_shape(truth: Truth, path: Path) -> ShapeScore | None:
 
 
 def _score_skin(truth: Truth, out: Path, monitor: Monitor) -> SkinScore | None:
+    from scipy.spatial import cKDTree
+
     distances = []
     for frame, ply in _meshes(out / "skin", truth, monitor):
         nearest = cKDTree(truth.vertices_m[frame]).query(ply.xyz_m)[1]

@@ -7,11 +7,14 @@ and, for recordings of a body model: dof_names, motion_values (T, D), bone_names
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 NEEDED = ("vertices_m", "triangles", "textured", "visible", "joints_m", "joint_names", "time_s")
 LIMBS = {"shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg", "knee": "Leg", "ankle": "Foot"}
@@ -80,6 +83,8 @@ def closest_on_mesh(vertices_m: np.ndarray, triangles: np.ndarray, points_m: np.
 
     The 20 triangles with the nearest centres are tried, which is exact as long as triangles of very different size do not meet.
     """
+    from scipy.spatial import cKDTree
+
     points = np.asarray(points_m, dtype=np.float64)
     corners = vertices_m[triangles]
     tree = cKDTree(corners.mean(axis=1))
@@ -87,7 +92,7 @@ def closest_on_mesh(vertices_m: np.ndarray, triangles: np.ndarray, points_m: np.
     return tuple(np.concatenate(column) for column in zip(*found))  # type: ignore[return-value]
 
 
-def _closest_of(corners: np.ndarray, tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _closest_of(corners: np.ndarray, tree: "cKDTree", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     near = tree.query(points, k=min(CANDIDATES, len(corners)))[1].reshape(len(points), -1)
     weights = _weights(corners[near] - points[:, None, None])
     squared = (np.einsum("nkc,nkcx->nkx", weights, corners[near] - points[:, None, None]) ** 2).sum(axis=2)

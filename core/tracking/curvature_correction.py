@@ -18,15 +18,18 @@ a whole pixel. Seen from the front, (1) is what flattens a cloud (surface/local_
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..geometry.camera import Camera
 from ..matching.least_squares import Matches
 from ..matching.region_growing import MatchedField
 from ..surface.cloud import PointCloud
 from ..surface.local_surface import curvatures
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 NEAREST_POINTS = 4  # of the cloud, whose normals give the slopes at a place
 REMAINING_PART = 0.5  # of a correction: its standard deviation
@@ -48,7 +51,9 @@ class CurvatureCorrection:
     half_patch: tuple[int, int]  # columns and rows, of the frame's rows
 
     @cached_property
-    def _tree(self) -> cKDTree:
+    def _tree(self) -> "cKDTree":
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.field.grid.rows.to_frame(self.field.xy[:, self.reference]))
 
     def local_surface(self, xy: np.ndarray) -> np.ndarray:
@@ -93,7 +98,7 @@ class CurvatureCorrection:
         return replace(match, xy=match.xy - b, covariance=match.covariance + REMAINING_PART**2 * b[:, :, None] * b[:, None])
 
 
-def nearest_points(tree: cKDTree, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def nearest_points(tree: "cKDTree", at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances and rows (N, k) of the points in a tree nearest to places (N, 2): `count`, or all if there are fewer."""
     k = min(count, tree.n)
     distance, near = tree.query(at, k=k)

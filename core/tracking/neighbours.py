@@ -13,7 +13,6 @@ distance from the point is the same at both instants: in a rigid body all distan
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..geometry.robust import mad_sigma
 from ..geometry.rotation import cross_matrix, rotation_from_vector
@@ -39,6 +38,8 @@ def nearest_neighbours(xyz_m: np.ndarray, among_m: np.ndarray, radius_m: float, 
 
     `same`: the points are those of `among_m`, and no point counts as its own neighbour.
     """
+    from scipy.spatial import cKDTree
+
     if not len(among_m):
         return np.zeros((len(xyz_m), 1), dtype=np.int64), np.zeros((len(xyz_m), 1), dtype=bool)
     count = min(NEIGHBOURS + same, len(among_m))

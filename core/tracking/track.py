@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..foundation import store
 from ..foundation.progress import Monitor
@@ -48,6 +47,8 @@ def start_tracks(field: MatchedField, cloud: PointCloud, view: TrackingView) -> 
 
 def regenerate(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, view: TrackingView, next_identity: int) -> TrackedFrame:
     """The tracked points of a frame, and new ones where no tracked point is near the frame's measured surface."""
+    from scipy.spatial import cKDTree
+
     rows = _thinned(field, view.tracking.spacing_px)
     if len(tracked.identity) and len(rows):
         to_frame = field.grid.rows.to_frame
@@ -62,6 +63,8 @@ def on_surface(tracked: TrackedFrame, field: MatchedField, cloud: PointCloud, vi
     A point's direction comes from the track, its depth from the surface, which was measured together with its neighbours and corrected for
     curvature.
     """
+    from scipy.spatial import cKDTree
+
     if not len(field.cell) or not len(tracked.identity):
         return tracked
     camera, to_frame = view.cameras[view.reference], field.grid.rows.to_frame

@@ -23,11 +23,9 @@ crease by spreading its narrow quads: a gap of 2 mm would be bridged by 20.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
-from scipy.sparse.linalg import spsolve
 
 from ...foundation.arrays import frozen
 from ..parts import body_parts
@@ -36,6 +34,9 @@ from .contour_skin import body_skin, strongest
 from .mesh import SkinSettings, corner_uv, refined
 from .welding import cut, face_uv, net_faces, welded
 from .whole_surface import WholeSurface
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 LARGEST_JUMP = np.radians(4.8)  # [rad]
 WIDTH = 1.5  # w of (1) in quads
@@ -46,8 +47,10 @@ SHORTEST_M = 1e-4  # least edge length in (1)
 FOLD = 0.4  # cosine between a face's normal and the mean normal at a corner, below which the face is in a fold
 
 
-def mean_of_neighbours(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+def mean_of_neighbours(faces: np.ndarray, count: int) -> "sparse.csr_matrix":
     """(V, V): the mean of the values at the neighbours of each of `count` vertices."""
+    from scipy import sparse
+
     ends = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     both = np.concatenate([ends, ends[:, ::-1]])
     joined = sparse.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), (count, count))
@@ -55,7 +58,7 @@ def mean_of_neighbours(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     return sparse.csr_matrix(sparse.diags(1.0 / np.maximum(np.asarray(joined.sum(axis=1)).ravel(), 1.0)) @ joined)
 
 
-def within(near: sparse.csr_matrix, chosen: np.ndarray, rings: int) -> np.ndarray:
+def within(near: "sparse.csr_matrix", chosen: np.ndarray, rings: int) -> np.ndarray:
     """The vertices at most `rings` edges from the chosen ones."""
     found = chosen.astype(np.float64)
     for _ in range(rings):
@@ -115,8 +118,10 @@ def faired(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, tied: np.n
     return best
 
 
-def _reached_from(near: sparse.csr_matrix, among: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+def _reached_from(near: "sparse.csr_matrix", among: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Those `among` the vertices that edges between them connect to `chosen` (V,) ones."""
+    from scipy.sparse import csgraph
+
     _, piece = csgraph.connected_components(near[among][:, among], directed=False)
     return np.asarray(among[np.isin(piece, piece[chosen[among]])])
 
@@ -128,6 +133,9 @@ def _defects(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _plate(vertices: np.ndarray, faces: np.ndarray, rows: np.ndarray, moved: np.ndarray, ties: np.ndarray) -> np.ndarray:
     """Positions (M, 3) of the vertices `moved` (M,) that minimise (1) over the vertices `rows`, with the weights `ties` (M,)."""
+    from scipy import sparse
+    from scipy.sparse.linalg import spsolve
+
     ends = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     ends = ends[np.isin(ends[:, 0], rows)]  # both ways round: every edge has two quads
     count = len(vertices)
@@ -246,7 +254,7 @@ def _sparse(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, surface: 
 
 
 def _relaxed(
-    vertices: np.ndarray, near: sparse.csr_matrix, free: np.ndarray, sewn: np.ndarray, part: np.ndarray, surface: WholeSurface
+    vertices: np.ndarray, near: "sparse.csr_matrix", free: np.ndarray, sewn: np.ndarray, part: np.ndarray, surface: WholeSurface
 ) -> np.ndarray:
     """Vertices (V, 3), the free ones relaxed on the surface; those near a seam first in all directions."""
     found, part = vertices.copy(), part[free]
@@ -261,7 +269,7 @@ def _relaxed(
     return found
 
 
-def _unfolded(vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _unfolded(vertices: np.ndarray, faces: np.ndarray, near: "sparse.csr_matrix", free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) of which the free ones leave the surface where it folds, and the degree (V,), 0 to 1, to which each has left it."""
     found, may = vertices.copy(), np.isin(np.arange(len(vertices)), free)
     loose = np.zeros(len(vertices))
@@ -292,7 +300,7 @@ def _unflipped(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.n
     return found
 
 
-def _smoothed(weights: np.ndarray, vertices: np.ndarray, faces: np.ndarray, near: sparse.csr_matrix, free: np.ndarray) -> np.ndarray:
+def _smoothed(weights: np.ndarray, vertices: np.ndarray, faces: np.ndarray, near: "sparse.csr_matrix", free: np.ndarray) -> np.ndarray:
     found = weights.copy()
     edge = float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).mean())
     for _ in range(round(2 * (SMOOTHED_M / edge) ** 2)):

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from ..metaballs import VISIBLE, Metaballs
 from ..parts import SIDES, BoneProfile, bone_profiles, chain_neighbours
@@ -164,6 +163,8 @@ def _slender_neck(shape: BodyShape) -> Metaballs:
 
 def _fitted(shape: BodyShape, b: int, end: Extremity, profile: BoneProfile) -> np.ndarray:
     """(4,) ln s_x, ln s_y, ln s_z and the pitch of (1)."""
+    from scipy.optimize import least_squares
+
     radii = profile.radii_m[list(end.stations)][:, list(end.sides)]
     across = radii[..., None] * SIDES[list(end.sides)]
     points = (across + np.outer(profile.stations[list(end.stations)] * shape.lengths_m[b], [0.0, 1.0, 0.0])[:, None]).reshape(-1, 3)

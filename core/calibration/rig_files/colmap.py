@@ -7,7 +7,6 @@ camera, Hamilton) and its points. COLMAP's pixel (0.5, 0.5) is the middle of the
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ...foundation import store
 from ...foundation.errors import InputError
@@ -31,6 +30,8 @@ def read(path: Path) -> Rig:
     Raises:
         InputError: a file is missing or damaged, or a camera has a model that ours does not contain.
     """
+    from scipy.spatial.transform import Rotation
+
     folder = path if path.is_dir() else path.parent
     interior = {}
     for line in _lines(folder / "cameras.txt"):
@@ -81,6 +82,8 @@ def _interior(line: list[str], folder: Path) -> tuple[tuple[float, float], np.nd
 
 def write(folder: Path, rig: Rig) -> list[Path]:
     """Write the three text files into a folder, cameras as FULL_OPENCV."""
+    from scipy.spatial.transform import Rotation
+
     inner, outer = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"], ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[]"]
     for n, camera in enumerate(map(plain, rig.cameras), start=1):
         k1, k2, p1, p2, k3 = camera.distortions.tolist()

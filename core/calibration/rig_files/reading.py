@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
@@ -109,6 +108,8 @@ def grid_of(camera: Camera) -> np.ndarray:
 
 def fitted(camera: Camera, model: Model, start: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Parameters of `model`, the camera's rotation, and the largest distance left [px]. `scale` are magnitudes of the parameters."""
+    from scipy.optimize import least_squares
+
     xy = grid_of(camera)
     rays = camera.directions(xy)
 

@@ -7,7 +7,6 @@ depth image of the body's skin has nothing in front of it: neither the limb's ow
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ...body.motion import BodyFit
 from ...body.skeleton import bone_frames
@@ -36,6 +35,8 @@ class BodyGuide:
 
     def bind(self, frame: int, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The bone (N,) of each point (N, 3) of a frame, −1 for none, and the point in the bone's axes (N, 3).  (1)"""
+        from scipy.spatial import cKDTree
+
         own, i = np.zeros((len(xyz_m), 3)), self._row.get(frame)
         if i is None or not len(xyz_m):
             return np.full(len(xyz_m), -1, dtype=np.int64), own

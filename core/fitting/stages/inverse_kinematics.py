@@ -6,7 +6,6 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ...body.skeleton import Skeleton, joint_positions
 from ..inputs.clicks import Clicks
@@ -135,6 +134,8 @@ def _shift(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, placed: l
 
 def _turn_trunk(skeleton: Skeleton, lengths: np.ndarray, xyz_m: np.ndarray, placed: list[int], motion: np.ndarray) -> None:
     """Rotate the first bone so that the trunk's joints fit best (Kabsch 1976)."""
+    from scipy.spatial.transform import Rotation
+
     rest = np.stack(list(joint_positions(skeleton, lengths, np.zeros(len(motion))).values()))[placed]
     found = xyz_m[placed]
     U, _, Vt = np.linalg.svd((found - found.mean(axis=0)).T @ (rest - rest.mean(axis=0)))

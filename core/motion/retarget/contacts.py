@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from ...foundation.settings import knob
 from ...geometry.rotation import angle_of, quaternion_from_matrix, unit
@@ -99,6 +98,8 @@ def ball_places(motion: Motion, rig_map: RigMap, side: str) -> np.ndarray | None
 
 def stands(places: np.ndarray, fps: float, settings: FeetSettings, scale: float) -> np.ndarray:
     """Frames (T,) in which a joint at `places` (T, 3) is in contact."""
+    from scipy.ndimage import uniform_filter1d
+
     if settings.mode == "off":
         return np.zeros(len(places), dtype=bool)
     window = max(1, 2 * round(SMOOTH_S * fps / 2) + 1)

@@ -17,16 +17,18 @@ small as possible, since a foot is short, and 10 mm at the ankle are 4° of it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from ...geometry.rotation import cross_matrix, matrix_from_vector, rotate, shortest, unit, vector_from_matrix
 from .contacts import Contacts, FeetSettings, runs, stance
 from .mapping import RigMap
 from .rig import Rig
 from .roles import sided
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 SMOOTH_S = 0.05  # τ [s]: time constant that keeps the feet's noise out of the body's path
 LEVEL = 0.1  # λ: damps the velocity of the correction, so that it stays in the air what it was on the ground
@@ -242,6 +244,9 @@ def carry_root(
 
     By side: ankles (T, 3), hip joints relative to the middle of the hips (T, 3), and W^½ (T, 3, 3).
     """
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
     t, k = len(next(iter(ankles.values()))), len(stands)
     if not stands:
         return np.zeros((t, 3)), np.zeros((t, 3)), np.zeros((0, 3))
@@ -266,15 +271,19 @@ def carry_root(
     return frames[:, :3], frames[:, 3:], np.column_stack([x[6 * t :].reshape(k, 2), np.zeros(k)])
 
 
-def _placed(blocks: np.ndarray, columns: np.ndarray, width: int) -> sparse.csr_matrix:
+def _placed(blocks: np.ndarray, columns: np.ndarray, width: int) -> "sparse.csr_matrix":
     """Blocks (n, 3, m), one below the other, at their columns (n, m)."""
+    from scipy import sparse
+
     n, _, m = blocks.shape
     rows = np.broadcast_to(np.arange(3 * n).reshape(n, 3, 1), blocks.shape)
     return sparse.csr_matrix((blocks.ravel(), (rows.ravel(), np.broadcast_to(columns[:, None, :], blocks.shape).ravel())), (3 * n, width))
 
 
-def _roughness(t: int, order: int) -> sparse.csr_matrix:
+def _roughness(t: int, order: int) -> "sparse.csr_matrix":
     """M (t, t): xᵀ M x is the sum of the squared differences of first or second order of x; zero for too few frames."""
+    from scipy import sparse
+
     if t < order + 1:
         return sparse.csr_matrix((t, t))
     bend = sparse.diags([[-1.0, 1.0], [1.0, -2.0, 1.0]][order - 1], list(range(order + 1)), shape=(t - order, t))

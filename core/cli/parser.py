@@ -1,0 +1,190 @@
+"""The commands of the core and their arguments.
+
+A command's module is imported when it runs: help and invalid arguments need neither scipy nor the stages (tests/core/cli/test_start.py).
+"""
+
+import argparse
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..body.model_file import model_names
+from ..foundation.progress import Monitor
+from ..images.interlace import BOTH, INTERLACE
+from .arguments import named_path
+
+# Adds a sub-command to the parser. The command's `run(args, monitor)` returns the lines to show, and sets `args.always_shown` to those
+# that --quiet does not suppress: findings and failures.
+Adder = Callable[[Any], None]
+Action = Callable[[argparse.Namespace, Monitor], list[str]]
+RIG_FORMATS = ("agisoft", "anipose", "caliscope", "colmap", "easymocap", "opencv", "openptv", "pose2sim")  # of calibration/rig_files
+WORKERS = 2  # of a batch, by default
+RETRIES = 3  # of a take whose worker died; one that dies more often probably lacks memory
+
+
+def action(module: str, name: str = "run") -> Action:
+    """A command's action: the function `name` of a module of this folder, which is imported when the command runs."""
+
+    def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+        lines: list[str] = getattr(importlib.import_module(f".{module}", __package__), name)(args, monitor)
+        return lines
+
+    return run
+
+
+def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
+    """The parser with all commands, those of the core and those that `adders` add."""
+    parser = argparse.ArgumentParser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for add in (_new, _stages, _check, _calibrate, _track2d, _contour, _batch, _fields, *adders):
+        add(commands)
+    for sub in commands.choices.values():
+        for argument in sub._actions:
+            argument.type = named_path if argument.type is Path else argument.type
+        sub.add_argument("--quiet", action="store_true", help="show errors and findings only")
+    return parser
+
+
+def _command(commands: Any, name: str, about: str, run: Action) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=about, description=about[0].upper() + about[1:])
+    parser.set_defaults(run=run, json=False)
+    return parser
+
+
+def _take_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("take", type=Path, metavar="TAKE", help="folder with take.toml")
+
+
+def _set_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help="a setting, such as matching.patch_px=17")
+
+
+def _new(commands: Any) -> None:
+    new = _command(commands, "new", "make a take from movies or image folders", action("take"))
+    new.add_argument("take", type=Path, metavar="TAKE", help="the folder to create")
+    new.add_argument("--views", nargs="+", required=True, metavar="NAME=FILE", help="movies or image folders, in the order of the cameras")
+    new.add_argument("--interlaced", choices=(*INTERLACE, BOTH), default="none", help="the lines of interlaced video to measure")
+    new.add_argument("--fps", type=float, default=25.0, metavar="F", help="images per second (default: 25)")
+    new.add_argument("--rig", type=Path, metavar="FILE", help="the cameras: rig.toml, or a calibration of another tool")
+    about = f"the body model: {', '.join(model_names())}, your own .toml file, or none (surface and tracks only)"
+    new.add_argument("--model", default=None, metavar="NAME", help=about)
+
+
+def _stages(commands: Any) -> None:
+    """The commands that run stages, and the demo, which runs them on a synthetic take."""
+    seeds = _command(commands, "seeds", "count the surface seeds in one frame and show their depths", action("stages", "seeds"))
+    measure = _command(commands, "measure", "measure the surface of each frame", action("stages", "measure"))
+    track = _command(commands, "track", "track the points of the surface, or chosen points", action("stages", "track"))
+    fit = _command(commands, "fit", "fit the body's shape and motion", action("stages", "fit"))
+    about = "run all stages, from the images to the Blender file; a stopped run resumes"
+    everything = _command(commands, "run", about, action("stages", "run"))
+    for parser in (seeds, measure, track, fit, everything):
+        _take_argument(parser)
+        if parser is not seeds:
+            parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results")
+            parser.add_argument("--json", action="store_true", help="print run.json at the end, and nothing else on standard output")
+            parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
+        _set_argument(parser)
+        preset = "method.preset={}".format
+        about = "the settings that are not set otherwise: the defaults, or the published method"
+        parser.add_argument("--preset", dest="set", action="append", type=preset, metavar="default|published", help=about)
+        about = "how much to measure: what a body's motion needs (the default), or every point of the surface"
+        parser.add_argument(
+            "--quality", dest="set", action="append", type="surface.quality={}".format, metavar="motion|surface", help=about
+        )
+    track.add_argument("--points", type=Path, metavar="FILE", help="track only the points of a CSV: point,view,x,y (two views or more)")
+    track.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
+    everything.add_argument("--restart", action="store_true", help="start again instead of resuming")
+    everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="frames to show in the report")
+    demo = _command(
+        commands, "demo", "make a synthetic recording, run all stages on it, and compare with the truth", action("stages", "demo")
+    )
+    demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
+
+
+def _check(commands: Any) -> None:
+    check = _command(commands, "check", "what is wrong or doubtful about a take, a rig or a result, and what to do", action("check"))
+    check.add_argument("subject", type=Path, metavar="TAKE|OUT|RIG", help="folder of a take or of a run, or rig.toml")
+    check.add_argument("--json", action="store_true", help="print the findings and figures as JSON")
+
+
+def _calibrate(commands: Any) -> None:
+    about = "a rig from the images of a waved bar, or from another tool's calibration"
+    parser = _command(commands, "calibrate", about, action("calibrate"))
+    parser.add_argument("bar", nargs="?", type=Path, metavar="BARDIR", help="folder with a folder of images, or a movie, per camera")
+    parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the rig to write, such as rig.toml")
+    parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
+    parser.add_argument(
+        "--interlaced",
+        choices=(*INTERLACE, BOTH),
+        default="none",
+        help="the lines of interlaced video to use; both: two frames per image, one of the odd lines and one of the even lines",
+    )
+    parser.add_argument("--first-field", choices=("odd", "even"), default="odd", help="with both: the lines that were exposed first")
+    parser.add_argument(
+        "--mask", type=Path, metavar="PATH", help="image that is black where no target can be, or a folder of them named like the cameras"
+    )
+    parser.add_argument("--target-diameter", type=float, metavar="M", help="diameter of the bar's targets in metres, if known")
+    parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar lies on the floor, which becomes z = 0")
+    parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar is held level")
+    parser.add_argument(
+        "--points",
+        type=Path,
+        metavar="FILE",
+        help="CSV of point,view,x,y: the pixels of “origin”, “x” and “y”, which become the world's origin and axes",
+    )
+    parser.add_argument("--like", type=Path, metavar="RIG", help="put the cameras where those of the same names stand in this rig.toml")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="folder for the report: text, JSON, pictures")
+    parser.add_argument("--import", dest="source", type=Path, metavar="FILE", help="read another tool's calibration instead of images")
+    parser.add_argument("--export", dest="format", choices=RIG_FORMATS, help="write the rig in another tool's format")
+    parser.add_argument("--json", action="store_true", help="print the figures")
+
+
+def _track2d(commands: Any) -> None:
+    about = "the 2-D mode: track chosen points through the images of one camera"
+    parser = _command(commands, "track2d", about, action("track2d"))
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a movie, or a folder of images")
+    parser.add_argument("--points", type=Path, required=True, metavar="FILE", help="CSV with point,x,y in the first frame (and joined_to)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="CSV to write: frame,point,x,y,sigma,correlation,status")
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1; the points are those of frame A")
+    parser.add_argument("--interlaced", choices=INTERLACE, default="none", help="which lines of interlaced video to use")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw the points, joined with lines, over the images")
+    _set_argument(parser)
+
+
+def _contour(commands: Any) -> None:
+    about = "the outline of the person in one view, tracked through the frames"
+    parser = _command(commands, "contour", about, action("contour"))
+    _take_argument(parser)
+    parser.add_argument("--view", required=True, nargs="+", metavar="NAME", help="the view, such as C, or several")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the results; contours/NAME.csv is written")
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument("--polygon", type=Path, metavar="FILE", help="CSV with x,y of the outline in the first frame")
+    start.add_argument("--background", type=Path, metavar="FILE", help="image of the view without the person")
+    start.add_argument("--from-body", action="store_true", help="start from the outline of the body that was fitted in OUT")
+    _set_argument(parser)
+
+
+def _batch(commands: Any) -> None:
+    about = "run many takes, on the processors of this machine or on a Dask cluster"
+    parser = _command(commands, "batch", about, action("batch"))
+    parser.add_argument("takes", type=Path, nargs="+", metavar="TAKE", help="folders with take.toml")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results; each take gets one in it")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, such as tcp://farm:8786; its workers need Tricap")
+    where.add_argument("--workers", type=int, default=WORKERS, metavar="N", help=f"processes on this machine (default {WORKERS})")
+    parser.add_argument(
+        "--retries", type=int, default=RETRIES, metavar="N", help=f"retries of a take whose worker dies (default {RETRIES})"
+    )
+    parser.add_argument("--restart", action="store_true", help="start every take again instead of resuming")
+    _set_argument(parser)
+    parser.add_argument("--json", action="store_true", help="print the outcomes as JSON, and nothing else on standard output")
+
+
+def _fields(commands: Any) -> None:
+    about = "plot the field functions of metaballs, with r_t, r_a and w_t"
+    parser = _command(commands, "fields", about, action("fields"))
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.svg", help="the picture to write")

@@ -1,0 +1,117 @@
+"""`tricap seeds, measure, track, fit, run, demo`: the stages of a run."""
+
+import argparse
+import importlib.util
+import json
+
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..results.folder import check_separate_folder
+from ..run import pipeline, take_run
+from ..surface.measure import MeasureSettings, first_seeds
+from ..surface.resolution import measured_footage
+from ..synthetic.arm import make_arm_take
+from ..synthetic.score import score_run
+from ..take.footage import open_take
+from ..take.take import read_take
+from . import points
+from .arguments import frame_range, overrides
+
+
+def seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """The surface seeds of one frame."""
+    take = read_take(args.take)
+    settings = take_run.settings_of(take.settings, overrides(args.set), str(args.take))
+    footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
+    frame = footage.take.clicks.frame if footage.take.clicks.frame in footage.frames else footage.frames.start
+    measured = measured_footage(footage, settings["surface"].quality, settings["growing"].spacing_px)
+    where, found = first_seeds(measured, MeasureSettings.of(settings), frame, monitor)
+    near, far = where.depth_range_m
+    args.always_shown = [
+        f"Frame {frame}: {len(found.depth_m)} surface seeds between {near:.2f} and {far:.2f} m (depths from {where.method}), "
+        f"{len(footage.take.clicks.joints)} clicked joints, {len(where.planes)} planes of the room excluded."
+    ]
+    return list(args.always_shown)
+
+
+def measure(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """The surface of every frame."""
+    return _stages(("measure",), args, monitor)
+
+
+def track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """The trajectories of the surface's points, or of points that the user chose."""
+    return points.run(args, monitor) if args.points else _stages(("measure", "track"), args, monitor)
+
+
+def fit(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """The body's shape and motion."""
+    return _stages(("fit",), args, monitor)
+
+
+def _stages(names: tuple[str, ...], args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    with take_run.open_run(args.take, args.out, overrides(args.set), frame_range(args.frames)) as job:
+        for name in names:
+            getattr(pipeline, name)(job, monitor)
+        return _summary(job, args.json)
+
+
+def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """All stages, from the images to the Blender file; the lines to show."""
+    given = args.take, args.out, overrides(args.set), frame_range(args.frames)
+    with take_run.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
+        if not args.pictures and pipeline.is_complete(job) and _has_scene(job, args):
+            job.record["warnings"] = job.results.read_run().get("warnings", [])
+            return _summary(job, args.json) + ([] if args.json else ["Nothing has changed since that run; --restart begins anew."])
+        pipeline.all_stages(job, monitor)
+        scene = _build_scene(job, args, monitor)
+        return _summary(job, args.json) + ([] if args.json else scene)
+
+
+def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Make the synthetic arm, run all stages, and compare with the truth."""
+    take, out = args.out / "take", args.out
+    check_separate_folder(out)
+    if not (take / "take.toml").exists():
+        make_arm_take(take, monitor=monitor)
+    job = pipeline.run(take, out, None, monitor)
+    lines = _build_scene(job, args, monitor)
+    return [
+        str(job),
+        *lines,
+        "Compared with the truth of the recording:",
+        str(score_run(take, out, monitor)),
+        f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}   Blender file: {out / 'body.blend'}",
+    ]
+
+
+def _has_scene(job: take_run.Run, given: argparse.Namespace) -> bool:
+    """Whether body.blend is there, or cannot be made by this command."""
+    without = "scene" not in _names_of(given.parser) or importlib.util.find_spec("bpy") is None
+    return without or job.results.path("body.blend").is_file()
+
+
+def _build_scene(job: take_run.Run, given: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Build body.blend with the add-on's command `scene`, where Blender is available."""
+    blend = job.results.path("body.blend")
+    if "scene" not in _names_of(given.parser):
+        return []
+    try:
+        quiet = ["--quiet"] if given.quiet else []
+        args = given.parser.parse_args(["scene", str(job.results.folder), "--blend", str(blend), *quiet])
+        return [str(line) for line in args.run(args, monitor)]
+    except InputError as error:
+        job.warn(f"No body.blend was written: {error}")
+        job.results.write_run(job.record)
+    return []
+
+
+def _summary(job: take_run.Run, as_json: bool) -> list[str]:
+    if as_json:
+        return [json.dumps(job.results.read_run(), indent=1, ensure_ascii=False)]
+    return [f"{job.results.folder}: {job}", *(f"Note: {sentence}" for sentence in job.record["warnings"])]
+
+
+def _names_of(parser: argparse.ArgumentParser) -> list[str]:
+    """The names of the sub-commands."""
+    return [name for action in parser._actions if isinstance(action.choices, dict) for name in action.choices]

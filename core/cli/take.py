@@ -1,0 +1,45 @@
+"""`tricap new`: a take from movies or image folders."""
+
+import argparse
+from pathlib import Path
+
+from ..body.model_file import read_model
+from ..calibration.rig_files import read_any
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..take.bar_file import read_bar, write_bar
+from ..take.writing import footage_entry, make_take, new_table, take_of_table
+
+
+def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
+    """Make TAKE with take.toml; footage outside the folder is linked into it, or copied where links are impossible.
+
+    Everything is checked before the first file is written.
+    """
+    folder: Path = args.take
+    if (folder / "take.toml").exists():
+        raise InputError(f"{folder} is a take already; choose another folder.")
+    views = [tuple(v.split("=", 1)) for v in args.views]
+    if any(len(v) != 2 or not all(v) for v in views):
+        raise InputError("Write each view as NAME=FILE, such as L=left.mp4.")
+    sources = [Path(source).resolve() for _, source in views]
+    for (name, _), source in zip(views, sources):
+        if sources.count(source) > 1:
+            raise InputError(f"View {name} has the same footage as another view, {source}; give each view the footage of its own camera.")
+    entries, links = zip(*(footage_entry(folder, name, Path(source)) for name, source in views))
+    table = new_table(entries, fps=args.fps, interlaced=args.interlaced, model=args.model)
+    take = take_of_table(folder, table)
+    if take.body_model and not args.model.endswith(".toml"):  # a user's own model may be copied into the folder later
+        read_model(args.model)
+    rig = read_any(args.rig) if args.rig else None
+    if rig:
+        for view in take.views:
+            rig[view.name]
+    make_take(folder, table, links, rig)
+    if rig and (bar := read_bar(args.rig, rig)):
+        write_bar(folder / "rig.toml", rig, *bar)
+    todo = [] if rig else ["copy or calibrate rig.toml into it"]
+    todo += ["click joints in Blender, or write them into its take.toml"] if take.body_model else []
+    return [
+        f"{folder}: a take of {len(views)} views, {args.fps:g} images per second. Next: {', '.join([*todo, f'tricap check {folder}'])}."
+    ]
