@@ -3,31 +3,39 @@
     python tests/mutations.py FOLDER COUNT [NAME…]      COUNT damaged copies for each reader; one line of JSON each on standard output
 
 A copy is damaged as transfers, disks and strangers do it: cut, with bytes changed, numbers too large or not finite, values of another kind,
-nested too deeply, with endless lines, in another encoding, empty. Never larger than a megabyte.
+nested too deeply, with endless lines, in another encoding, empty. Never larger than a megabyte. In place of every file there is then
+something that is no file, or far too large: SPECIAL.
 """
 
 import json
+import os
 import random
 import re
+import signal
+import socket
 import struct
 import sys
 import time
 import traceback
 import zlib
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 LARGEST = 1_000_000
 SECONDS, MEGABYTES = 2.0, 500.0
+WAITS_S = 8  # after which a reader is stopped that waits instead of working
+ADDRESSES = 6 << 30  # bytes that the process may have: more would take the machine's memory
 NUMBERS = (b"1e308", b"-1e308", b"nan", b"inf", b"-inf", b"-1", b"0", b"99999999999999999999", b"2147483648", b"4294967295", b"1e-320",
-           b"65536", b"0x10", b"1_0", b"9" * 5000)  # fmt: skip
+           b"65536", b"0x10", b"1_0", b"9" * 5000, b"9" * 400, b"0x" + b"f" * 9000, b"1" * 300 + b".0")  # fmt: skip
 KINDS = (b'"text"', b"[]", b"{}", b"[[1, 2], [3]]", b"null", b"true", b"''", b"-", b"1979-05-27", b"[" * 60, b"&a;", b"%n")
 WORDS = (struct.pack("<I", 0xFFFFFFFF), struct.pack("<I", 0x7FFFFFFF), struct.pack("<I", 0x10000000), struct.pack("<H", 0xFFFF),
          struct.pack("<f", float("nan")), struct.pack("<f", 1e38), struct.pack("<d", float("inf")), struct.pack(">I", 0x00FFFFFF),
          b"\0" * 8, struct.pack("<I", 1 << 24))  # fmt: skip
 NODES: tuple[Any, ...] = (None, True, "", "9" * 5000, "\u00b2", "1e999", -1, 2**80, 1e308, -0.5, [], {}, [[1], 2], {"a": []}, ["x"] * 3000)
-NEST = (b"[", b'{"a":', b"<a>", b"((", b"a = [[", b"{ ", b"- ")
+NEST = (b"[", b'{"a":', b"<a>", b"((", b"a = [[", b"{ ", b"- ", b"a.", b"{a=", b"data: [", b"JOINT a {", b"[[a.", b'"\\u0041".')
+SPARSE_BYTES = 20_000_000_000
 
 
 def mutate(data: bytes, r: random.Random) -> bytes:
@@ -170,37 +178,105 @@ def forget_the_most() -> None:
         sys.stderr.write(f"Memory is not counted anew: {error}\n")
 
 
+def _pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def _link_to(target: str) -> Callable[[Path], None]:
+    return lambda path: path.symlink_to(target)
+
+
+def _sparse(path: Path) -> None:
+    """A file of 20 GB that takes no room on the disk; it begins like the sound one."""
+    with path.open("wb") as file:
+        file.truncate(SPARSE_BYTES)
+
+
+def _endpoint(path: Path) -> None:
+    os.chdir(path.parent)  # the name of a socket is at most 100 bytes long
+    with socket.socket(socket.AF_UNIX) as endpoint:
+        endpoint.bind(path.name)
+
+
+SPECIAL: dict[str, Callable[[Path], None]] = {
+    "a pipe": _pipe,
+    "an endless device": _link_to("/dev/zero"),
+    "a terminal": _link_to("/dev/tty"),
+    "a file of 20 GB": _sparse,
+    "a folder": Path.mkdir,
+    "a socket": _endpoint,
+    "a link to itself": lambda path: path.symlink_to(path.name),
+    "a link to the kernel's memory": _link_to("/proc/self/mem"),
+}
+if os.name == "nt":
+    SPECIAL = {name: SPECIAL[name] for name in ("a file of 20 GB", "a folder")}
+
+
+class Waits(BaseException):
+    """Nobody catches it: no reader takes it for an error of the file."""
+
+
+def _out_of_time(signum: int, frame: Any) -> None:
+    raise Waits(f"it has waited for {WAITS_S} s")
+
+
+def tried(read: Callable[[Path], Any], folder: Path) -> tuple[bool, str, float, float]:
+    """One call of a reader: whether it refused the file, its fault or "", and the seconds of work and megabytes that it took."""
+    from readers import InputError
+
+    forget_the_most()
+    refused, fault, before, began = False, "", memory_mb()[0], time.process_time()
+    if os.name != "nt":
+        signal.signal(signal.SIGALRM, _out_of_time)
+        signal.alarm(WAITS_S)
+    try:
+        read(folder)
+    except InputError as error:
+        refused = True
+        if len(str(error)) > 2000 or not str(error).isprintable():
+            fault = f"an unreadable sentence of {len(str(error))} characters: {str(error)[:200]!r}"
+    except BaseException:
+        fault = traceback.format_exc(limit=-4)
+    finally:
+        if os.name != "nt":
+            signal.alarm(0)
+    seconds, most = time.process_time() - began, memory_mb()[1] - before
+    if seconds > SECONDS or most > MEGABYTES:
+        fault = fault or f"{seconds:.1f} s of work, {most:.0f} MB"
+    return refused, fault, seconds, most
+
+
 def attack(name: str, folder: Path, count: int) -> dict[str, Any]:
-    """Damage a reader's files `count` times; what came of it. The faults carry the damaged file's number."""
-    from readers import FAULTY, READERS, InputError
+    """Damage a reader's files `count` times, then put each of SPECIAL in place of each; what came of it. The faults carry the damaged
+    file's number, or what was in its place."""
+    from readers import FAULTY, READERS
 
     make, read = (READERS | FAULTY)[name]
     files = make(folder)
     whole = {path: path.read_bytes() for path in files}
     read(folder)
-    said = {"reader": name, "read": 0, "refused": 0, "slowest_s": 0.0, "most_mb": 0.0, "faults": []}
+    said = {"reader": name, "read": 0, "refused": 0, "special": 0, "slowest_s": 0.0, "most_mb": 0.0, "faults": []}
     for number in range(count):
         r = random.Random(f"{name} {number}")
         target = r.choice(files)
         for path in files:
             path.write_bytes(mutate(whole[path], r) if path == target else whole[path])
-        forget_the_most()
-        before, began, fault = memory_mb()[0], time.process_time(), ""
-        try:
-            read(folder)
-            said["read"] += 1
-        except InputError as error:
-            said["refused"] += 1
-            if len(str(error)) > 2000 or not str(error).isprintable():
-                fault = f"an unreadable sentence of {len(str(error))} characters: {str(error)[:200]!r}"
-        except BaseException:
-            fault = traceback.format_exc(limit=-4)
-        seconds, most = time.process_time() - began, memory_mb()[1] - before
+        refused, fault, seconds, most = tried(read, folder)
+        said["refused" if refused else "read"] += 1
         said["slowest_s"], said["most_mb"] = max(said["slowest_s"], seconds), max(said["most_mb"], most)
-        if seconds > SECONDS or most > MEGABYTES:
-            fault = fault or f"{seconds:.1f} s of work, {most:.0f} MB"
         if fault:
             said["faults"].append({"number": number, "file": target.name, "fault": fault})
+    for path in files:
+        path.write_bytes(whole[path])
+    for target, (what, put) in product(files if name in READERS else (), SPECIAL.items()):
+        target.unlink()
+        put(target)
+        _, fault, _, _ = tried(read, folder)
+        said["special"] += 1
+        if fault:
+            said["faults"].append({"number": what, "file": target.name, "fault": fault})
+        target.rmdir() if target.is_dir() and not target.is_symlink() else target.unlink(missing_ok=True)
+        target.write_bytes(whole[target])
     return said
 
 
@@ -209,7 +285,11 @@ def main() -> None:
     sys.path.insert(0, str(Path(__file__).parent))
     import readers
 
-    folder, count = Path(sys.argv[1]), int(sys.argv[2])
+    if os.name != "nt":
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
+    folder, count = Path(sys.argv[1]).absolute(), int(sys.argv[2])
     for name in sys.argv[3:] or readers.READERS:
         own = folder / name.replace(".", "_")
         own.mkdir(parents=True, exist_ok=True)

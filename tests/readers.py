@@ -15,7 +15,7 @@ from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
 from tricap.core.checking.run_check import check_run
-from tricap.core.foundation import store
+from tricap.core.foundation import bounded, store
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.geometry.rig import read_rig, write_rig
@@ -75,6 +75,15 @@ surface = [ { L = [20.0, 24.0], C = [55.0, 38.0] } ]
 [settings.matching]
 patch_px = 13
 """
+
+
+def kept_motion(folder: Path) -> None:
+    """The text that an action keeps, which comes from a .blend file."""
+    try:
+        kept = bounded.text_of(folder / "a.txt", bounded.JSON_BYTES, errors="replace")
+    except OSError as error:
+        raise InputError(str(error)) from error
+    from_text(kept).at(np.arange(3))
 
 
 def points() -> Markers:
@@ -189,7 +198,8 @@ def tracked(path: Path) -> None:
 def looked_at(folder: Path) -> None:
     """What the overlays ask of the trajectories."""
     history = read_tracks(folder)
-    assert history is not None
+    if history is None:  # what is no file is not there
+        return
     for frame in (0, 4):
         history.tails(RIG.cameras[0], frame, 3, history.kept)
         [TrackStatus(int(status)).words for status in history.at(RIG.cameras[0], frame)[1]]
@@ -223,8 +233,7 @@ def surface(folder: Path) -> list[Path]:
 
 def shown(folder: Path) -> None:
     found = read_shown(folder, 0, RIG.cameras, row_grid("none"))
-    assert found is not None
-    if len(found.xyz_m):
+    if found is not None and len(found.xyz_m):
         patch_boxes(found, 0, RIG.cameras, 1, row_grid("none"), 13)
     read_removed(folder, 0)
 
@@ -341,7 +350,7 @@ READERS: dict[str, tuple[Make, Read]] = {
     "body.toml": (written("body.toml", body), lambda f: read_body(f / "body.toml")),
     "own model": (written("own.toml", own_model), lambda f: read_model(f / "own.toml")),
     "mapping": (text("map.json", (HERE.parent / "addon" / "presets" / "mixamo.json").read_text()), lambda f: read_preset(f / "map.json")),
-    "residual motion": (text("a.txt", residual_motion()), lambda f: from_text((f / "a.txt").read_text(errors="replace")).at(np.arange(3))),
+    "residual motion": (text("a.txt", residual_motion()), kept_motion),
     "keypoints of OpenPose": (written("a.json", person), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
     "keypoints of COCO": (written("a.json", coco), lambda f: keypoints_json.read_keypoints([f / "a.json"])),
     "vrm": (written("a.vrm", glb), lambda f: read_humanoid(f / "a.vrm")),

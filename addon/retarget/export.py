@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.foundation import store
+from ...core.foundation import bounded, store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.bvh import write_bvh
@@ -122,5 +122,5 @@ def _copy_skins(out: Path, folder: Path) -> str:
     if not files:
         raise InputError(f"{out} has neither skins nor clouds; run the take first.")
     for file in files:
-        store.write_bytes(folder / file.name, file.read_bytes())
+        store.write_bytes(folder / file.name, bounded.bytes_of(file, bounded.ARRAYS_BYTES))
     return f"{len(files)} files from {files[0].parent.name}/"

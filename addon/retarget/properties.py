@@ -6,12 +6,12 @@ from typing import Any
 
 import bpy
 
+from ...core.foundation import bounded
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import UNITS_M
 from ...core.motion.retarget.contacts import FeetSettings
-from ...core.motion.retarget.mapping import RigMap
+from ...core.motion.retarget.mapping import RigMap, control_rig_of
 from ...core.motion.retarget.retarget import RetargetSettings
-from ...core.motion.retarget.rig import ControlRig
 from ...core.motion.retarget.roles import ROLES
 from ..properties import group_class
 
@@ -136,7 +136,11 @@ def edited_map(props: Any, target: bpy.types.Object | None) -> RigMap | None:
             raise InputError(f"The mapping has {roles.count(role)} lines for “{role}”; remove all but one.")
     bones = {row.role: names(row.bones) for row in props.rows if names(row.bones)}
     twist = {row.role: names(row.twist) for row in props.rows if names(row.twist)}
-    control_rig = ControlRig(**json.loads(props.steering)) if props.steering else None
+    try:
+        table = bounded.json_of(props.steering or "null")
+    except ValueError as error:
+        raise InputError(f"The mapping in this .blend file is damaged ({error}); press Recognise to make it again.") from error
+    control_rig = control_rig_of(table, {"L": "L", "R": "R"}, "The mapping in this .blend file") if table is not None else None
     return RigMap(bones=bones, twist=twist, origin="the panel", control_rig=control_rig and control_rig.of_controls(bones, twist))
 
 

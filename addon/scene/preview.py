@@ -18,6 +18,7 @@ from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.geometry.camera import Camera, image_of, interior_of
+from ...core.images.sequence import decoded
 from . import cloud, trajectories
 from .contents import Contents
 
@@ -151,7 +152,7 @@ def _rendered(scene: bpy.types.Scene) -> np.ndarray:
             bpy.ops.render.render(write_still=True)
         finally:
             scene.render.filepath, scene.render.image_settings.file_format, scene.render.image_settings.color_mode = earlier
-        return np.asarray(cv2.imread(str(Path(folder) / "picture.png"), cv2.IMREAD_UNCHANGED)).astype(np.float64)
+        return decoded(Path(folder) / "picture.png").astype(np.float64)
 
 
 def _over(behind: np.ndarray, picture: np.ndarray, opacity: float) -> np.ndarray:

@@ -5,7 +5,6 @@ file the bones of the right side define both. A file with `part_of` is another m
 The other is a built-in one by its name, or a .toml file in the same folder.
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, radians
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..foundation import bounded
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
@@ -102,9 +102,9 @@ def _path(name: Any, folder: Path) -> Path:
 
 def _table(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"The body model {path} cannot be read: {error}.") from error
+        return bounded.toml_of(bounded.text_of(path, bounded.TOML_BYTES))
+    except (OSError, ValueError) as error:
+        raise InputError(f"The body model {path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
 
 
 def joint_depths_m(model: BodyModel) -> dict[str, float]:

@@ -8,7 +8,6 @@ Here the visible radii are joined along the whole chain, and the cross radii l o
     √(−½ ln F(X)) − √(½ ln 2) = 0 at points X of the outline,   ln l = its value bone by bone ± `FREE`
 """
 
-import tomllib
 from dataclasses import dataclass, replace
 from math import degrees, isfinite
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from .metaballs import ACROSS, VISIBLE, Metaballs, field_and_derivatives, three_balls
@@ -224,8 +223,8 @@ def read_body(path: Path) -> BodyShape:
         InputError: the file is missing, is not a body.toml of this version, or lacks an entry.
     """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        table = bounded.toml_of(bounded.text_of(path, bounded.TOML_BYTES))
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"Cannot read the body {path}: {reason}; run the fit again.") from error
     if table.get("format") != "tricap-body" or table.get("version") != 1:

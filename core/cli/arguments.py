@@ -4,12 +4,12 @@ import argparse
 import os
 import re
 import sys
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ..foundation import bounded
 from ..foundation.errors import InputError
 
 
@@ -26,8 +26,8 @@ def overrides(pairs: list[str]) -> dict[str, dict[str, Any]]:
         if not equals or not dot:
             raise InputError(f"--set {pair} cannot be read; write GROUP.NAME=VALUE, such as matching.patch_px=17.")
         try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
+            value = bounded.toml_of(f"value = {text}")["value"]
+        except ValueError:
             value = text
         tables.setdefault(group, {})[knob] = value
     return tables

@@ -18,6 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from . import bounded
 from .errors import InputError
 
 NAME = ".tricap-lock"
@@ -145,8 +146,8 @@ def _wait_for_a_standing_count(path: Path, *, own: bool) -> None:
 def _owner(path: Path) -> dict[str, Any]:
     """The owner in the file; empty if it cannot be parsed."""
     try:
-        found = json.loads(path.read_bytes()[:1000])
-    except (OSError, ValueError, RecursionError):
+        found = bounded.json_of(bounded.bytes_of(path, bounded.TOML_BYTES)[:1000])
+    except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
 

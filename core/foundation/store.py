@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from . import bounded
 from .errors import InputError
 
 HEADER = "header_json"
@@ -107,10 +108,10 @@ def read_json(path: Path) -> Any:
         InputError: the file cannot be read or is no JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return bounded.json_of(bounded.text_of(path, bounded.JSON_BYTES))
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"{path} is not a JSON file ({error}); remove it and run again.") from error
 
 
@@ -129,10 +130,8 @@ def load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         InputError: it is missing, damaged, of a newer version, or was not written by Tricap.
     """
     try:
-        _refuse_bomb(Path(path))
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        header = json.loads(str(arrays.pop(HEADER)))
+        arrays = load_arrays(path)
+        header = bounded.json_of(str(arrays.pop(HEADER)))
     except FileNotFoundError as error:
         raise InputError(f"{path} is missing; run the stage that writes it.") from error
     except DAMAGED as error:
@@ -163,12 +162,21 @@ def check_layout(path: Path, arrays: Mapping[str, np.ndarray], **layout: tuple[s
             raise InputError(f"{path} is damaged: {name} has the shape {array.shape} of {array.dtype}; run the stage that writes it again.")
 
 
-def _refuse_bomb(path: Path) -> None:
-    """Refuse a small archive that would unpack to gigabytes."""
-    with zipfile.ZipFile(path) as archive:
-        unpacked = sum(info.file_size for info in archive.infolist())
-    if unpacked > max(LARGEST_UNPACKED, LARGEST_RATIO * path.stat().st_size):
-        raise InputError(f"{path} would unpack to {unpacked / 1e9:.1f} GB, which no result of its size does; remove it and run again.")
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz, without pickle.
+
+    Raises:
+        InputError: it is a small archive that would unpack to gigabytes.
+        One of DAMAGED: it cannot be read.
+    """
+    with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
+        with zipfile.ZipFile(file) as archive:
+            unpacked = sum(info.file_size for info in archive.infolist())
+        if unpacked > max(LARGEST_UNPACKED, LARGEST_RATIO * os.fstat(file.fileno()).st_size):
+            raise InputError(f"{path} would unpack to {unpacked / 1e9:.1f} GB, which no result of its size does; remove it and run again.")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
 
 
 def digest(*parts: bytes | str | Path) -> str:
@@ -194,7 +202,7 @@ def _bytes(data: bytes) -> Iterator[bytes]:
 
 def _file(path: Path) -> Iterator[bytes]:
     """The size and the content of a file, in pieces."""
-    with path.open("rb") as file:
+    with bounded.opened(path, bounded.MOVIE_BYTES) as file:
         yield os.fstat(file.fileno()).st_size.to_bytes(8, "little")
         while piece := file.read(1 << 20):
             yield piece

@@ -3,7 +3,6 @@
 import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
 from .camera import Camera
@@ -48,12 +47,12 @@ def read_rig(path: Path) -> Rig:
         InputError: the file is missing, is no TOML, or a camera in it is incomplete or impossible.
     """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        table = bounded.toml_of(bounded.text_of(path, bounded.TOML_BYTES))
     except OSError as error:
         raise InputError(
             f"Cannot read the rig {path}: {error.strerror or error}. Calibrate first, or correct `rig` in take.toml."
         ) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"The rig {path} is not a TOML file: {error}.") from error
     metadata = table.get("metadata", {})
     unit = metadata.get("unit", "m") if isinstance(metadata, dict) else None

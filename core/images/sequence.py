@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from ..foundation import bounded
 from ..foundation.errors import InputError
 
 JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # the markers with the size
@@ -313,7 +314,7 @@ def decoded(path: Path) -> np.ndarray:
         InputError: the file is missing, is not an image, is too large (MAX_PIXELS, MAX_SIDE_PX), or has an unsupported type of pixels.
     """
     try:
-        data = np.fromfile(path, dtype=np.uint8)
+        data = np.frombuffer(bounded.bytes_of(path, bounded.IMAGE_BYTES), dtype=np.uint8)
     except OSError as error:
         raise InputError(f"Cannot read the image {path}: {error.strerror or error}.") from error
     _refuse_open_exr(data[:8].tobytes(), path)
@@ -366,7 +367,7 @@ def _refuse_open_exr(first: bytes, path: Path) -> None:
 
 def _first_bytes(path: Path, what: str) -> bytes:
     try:
-        with open(path, "rb") as file:
+        with bounded.opened(path, bounded.IMAGE_BYTES if what == "image" else bounded.MOVIE_BYTES) as file:
             return file.read(8)
     except FileNotFoundError as error:
         if path.is_symlink():

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..body.motion import BodyMotion
 from ..body.skeleton import Skeleton
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse, frozen
 from ..foundation.errors import InputError
 
@@ -135,7 +135,7 @@ def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) 
 
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     try:
-        lines = list(csv.reader(io.StringIO(Path(path).read_text(encoding="utf-8"))))
+        lines = list(csv.reader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"Cannot read the table {path}: {error}; run the fit again.") from error
     if not lines:

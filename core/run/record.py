@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..body.motion import FITTED, BodyFit
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
 from ..geometry.robust import finite_median
@@ -217,7 +217,7 @@ def read_frame_table(path: Path) -> FrameTable:
         InputError: it is missing or damaged.
     """
     try:
-        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8"))))
+        rows = list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
         return FrameTable(
             frames=np.array([int(r["frame"]) for r in rows], dtype=np.int64),
             values={name: np.array([float(r[name]) if r[name] else np.nan for r in rows]) for name in COLUMNS},

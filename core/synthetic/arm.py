@@ -21,7 +21,7 @@ from ..body.metaballs import three_balls
 from ..body.model_file import read_model
 from ..body.shape import BodyShape
 from ..body.skeleton import joint_positions
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import knob
@@ -107,7 +107,7 @@ def is_arm_take(folder: Path) -> bool:
 def _made_here(folder: Path) -> bool:
     """True when the rig of the folder bears our mark."""
     rig = folder / "rig.toml"
-    return rig.exists() and MARK in rig.read_text(encoding="utf-8", errors="replace")
+    return rig.exists() and MARK in bounded.text_of(rig, bounded.TOML_BYTES, errors="replace")
 
 
 def _studio(settings: ArmTakeSettings) -> _Studio:

@@ -6,13 +6,14 @@ position, but must not drift.
 """
 
 import csv
-import zipfile
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..body.shape import read_body
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..motion.formats.ply import Ply, read_ply
@@ -193,9 +194,9 @@ def _score_trajectories(truth: Truth, path: Path, monitor: Monitor) -> Trajector
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as file:
-            frames, xyz, shared = file["frames"].astype(np.intp), file["xyz_m"].astype(np.float64), "track" in file.files
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        file = store.load_arrays(path)
+        frames, xyz, shared = file["frames"].astype(np.intp), file["xyz_m"].astype(np.float64), "track" in file
+    except store.DAMAGED as error:
         raise InputError(f"{path} has no trajectories or is damaged; run the tracking again.") from error
     if shared:
         raise InputError(f"{path} has several trajectories in a column, which cannot be scored; run fewer frames of the take (--frames).")
@@ -234,8 +235,7 @@ def _true_paths(truth: Truth, frames: np.ndarray, xyz: np.ndarray, first: np.nda
 def _table(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
     """The columns of a CSV file by name."""
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))
+        rows = list(csv.reader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"Cannot read {path}: {error}; run the fit again.") from error
     missing = [name for name in needed if not rows or name not in rows[0]]

@@ -4,13 +4,13 @@ vertices_m (T, V, 3), triangles (F, 3), textured (V,), visible (T, ⌈V/8⌉) pa
 and, for recordings of a body model: dof_names, motion_values (T, D), bone_names, lengths_m (B,), radii_m (M, 3)
 """
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..foundation import store
 from ..foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,11 +56,10 @@ def read_truth(take: Path) -> Truth:
     """
     path = Path(take) / "truth.npz"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: file[name] for name in file.files}
+        data = store.load_arrays(path)
     except FileNotFoundError as error:
         raise InputError(f"{path} is missing; only a recording with known truth can be scored.") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except store.DAMAGED as error:
         raise InputError(f"{path} is damaged ({error}); make the recording again.") from error
     missing = [name for name in NEEDED if name not in data]
     if missing:

@@ -4,7 +4,6 @@ Joint and view names, and every key, are checked when the file is read; the imag
 """
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..foundation import bounded
 from ..foundation.arrays import frozen
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
@@ -174,7 +174,7 @@ def read_take(folder: Path) -> Take:
     folder = Path(folder)
     path = folder / "take.toml" if folder.name != "take.toml" else folder
     try:
-        return take_of_text(path.read_text(encoding="utf-8-sig"), path)
+        return take_of_text(bounded.text_of(path, bounded.TOML_BYTES), path)
     except OSError as error:
         message = f"{folder} is not a take: cannot read {path.name} in it ({error.strerror or error}). Make one with `tricap new`."
         raise InputError(message) from error
@@ -189,8 +189,8 @@ def take_of_text(text: str, path: Path) -> Take:
         InputError: the text is no TOML, or has an unknown key or an impossible value.
     """
     try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+        table = bounded.toml_of(text)
+    except ValueError as error:
         raise InputError(f"{path} is not a TOML file: {error}; correct that place.") from error
     return _take(table, path.parent.resolve(), str(path))
 

@@ -6,12 +6,11 @@ Editors change the table of the file; keys that they do not change stay, but com
 import glob
 import json
 import shutil
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..geometry.rig import Rig, write_rig
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS
@@ -38,11 +37,11 @@ def read_table(folder: Path) -> Table:
     if not path.exists():
         return {}
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = bounded.text_of(path, bounded.TOML_BYTES)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"Cannot read {path}: {getattr(error, 'strerror', None) or error}.") from error
     take_of_text(text, path)
-    return tomllib.loads(text)
+    return bounded.toml_of(text)
 
 
 def take_of_table(folder: Path, table: Table) -> Take:

@@ -35,6 +35,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..foundation import bounded
 from ..foundation.errors import InputError
 from ..foundation.settings import knob
 from ..geometry.robust import mad_sigma
@@ -328,7 +329,7 @@ class ContourTable(Mapping[int, Contour]):
                 raise self._damaged() from error
 
     def _find_frames(self) -> None:
-        with self._path.open("rb") as file:
+        with bounded.opened(self._path, bounded.TABLE_BYTES) as file:
             self._columns = [name.strip() for name in file.readline().decode("utf-8").split(",")]
             if not set(COLUMNS) <= set(self._columns):
                 raise ValueError("a column is missing")
@@ -363,7 +364,7 @@ class ContourTable(Mapping[int, Contour]):
     def __getitem__(self, frame: int) -> Contour:
         place = self._places[frame]
         try:
-            with self._path.open("rb") as file:
+            with bounded.opened(self._path, bounded.TABLE_BYTES) as file:
                 file.seek(place.start)
                 lines = file.read(place.stop - place.start).decode("utf-8").split("\n")
             rows = [line.rstrip("\r").split(",") for line in lines if line.strip()]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.arrays import check_sparse
 from ..foundation.errors import InputError
 from ..foundation.settings import nearest_name
@@ -38,7 +38,7 @@ def read_points(path: Path, *, with_views: bool = False) -> ChosenPoints:
     """
     needed = ("point", "x", "y", *(("view",) if with_views else ()))
     try:
-        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
+        rows = list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
     except OSError as error:
         raise InputError(f"Cannot read the points {path}: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -103,7 +103,7 @@ def read_planar(path: Path) -> PlanarTable:
         InputError: it cannot be read, or is another kind of table.
     """
     try:
-        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
+        rows = list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
         places = {(int(np.int32(int(r["frame"]))), r["point"]): (float(r["x"] or "nan"), float(r["y"] or "nan")) for r in rows}
     except OSError as error:
         raise InputError(f"Cannot read the tracks {path}: {error.strerror or error}.") from error
@@ -148,7 +148,7 @@ def read_polygon(path: Path) -> np.ndarray:
         InputError: the file cannot be read, or has fewer than three vertices.
     """
     try:
-        rows = list(csv.DictReader(io.StringIO(Path(path).read_text(encoding="utf-8-sig"))))
+        rows = list(csv.DictReader(io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"Cannot read the polygon {path}: {error}.") from error
     if len(rows) < 3 or not {"x", "y"} <= set(rows[0]):

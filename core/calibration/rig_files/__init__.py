@@ -6,6 +6,7 @@ from pathlib import Path
 from ...foundation.errors import InputError
 from ...geometry.rig import Rig
 from . import agisoft, colmap, opencv_files, openptv, toml_files
+from .reading import text_of
 
 FORMATS: dict[str, Callable[[Path, Rig], list[Path]]] = {
     "agisoft": agisoft.write,
@@ -48,11 +49,7 @@ def _read(path: Path) -> Rig:
     if path.name in ("intri.yml", "extri.yml") or (path.is_dir() and (folder / "intri.yml").exists()):
         return opencv_files.read_easymocap(path)
     if ending == ".xml":
-        return (
-            opencv_files.read(path)
-            if path.read_text(encoding="utf-8", errors="replace").find("opencv_storage") >= 0
-            else agisoft.read(path)
-        )
+        return opencv_files.read(path) if "opencv_storage" in text_of(path) else agisoft.read(path)
     if ending in (".yml", ".yaml"):
         return opencv_files.read(path)
     raise InputError(f"{path} is of no known kind; give rig.toml, or a file or folder of {', '.join(sorted(FORMATS))}.")

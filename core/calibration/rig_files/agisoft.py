@@ -12,7 +12,7 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera, camera_of, interior_of
 from ...geometry.rig import Rig
@@ -25,13 +25,10 @@ def read(path: Path) -> Rig:
     Raises:
         InputError: it is no XML of Metashape, or a camera is incomplete or of another model.
     """
-    text = text_of(path)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{path} defines entities, which a calibration does not need; export the cameras again.")
     try:
-        root = Xml.fromstring(text)
-    except Xml.ParseError as error:
-        raise InputError(f"{path} is not an XML file: {error}.") from error
+        root = bounded.xml_of(text_of(path))
+    except ValueError as error:
+        raise InputError(f"{path} is not an XML file that can be read ({error}); export the cameras again.") from error
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
     scaled = root.findtext(".//chunk/transform/scale")
     scale = float(numbers((scaled or "1").split(), (1,), f"The chunk's scale in {path}")[0])

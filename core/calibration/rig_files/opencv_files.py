@@ -14,19 +14,17 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as Xml
 
 import cv2
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig
 from ...geometry.rotation import rotation_from_vector, vector_from_rotation
 from .reading import five, make_camera, numbers, plain, text_of
 
-KEY = re.compile(r'("[^"]*"|[^\s:#"-][^:]*?)\s*:(?:\s+(.*))?$')
 NAMES = re.compile(r'"([^"]*)"|([^\s",]+)')
 MOST_LINES, LARGEST_MATRIX = 200_000, 10_000
 Entry = np.ndarray | float | str | list[str]
@@ -78,23 +76,23 @@ def _of_yaml(text: str, path: Path) -> dict[str, Entry]:
     if len(lines) > MOST_LINES:
         raise InputError(f"{path} has more lines than a calibration has.")
     for line in lines:
-        found = KEY.match(line) if line[:1] not in (" ", "\t", "-", "%", "#", ".") else None
-        if found:
-            name = found.group(1).strip('"')
-            blocks[name] = [found.group(2) or ""]
+        name, colon, rest = line.partition(":")
+        if colon and line[:1] not in (" ", "\t", "-", "%", "#", ".") and (not rest or rest[0].isspace()):
+            block = blocks[name.strip().strip('"')] = [rest.strip()]
         elif blocks and line.strip() and not line.startswith(("%", "---", "...", "#")):
-            blocks[name].append(line.strip())
+            block.append(line.strip())
     return {name: _yaml_entry(name, block, path) for name, block in blocks.items()}
 
 
 def _yaml_entry(name: str, block: list[str], path: Path) -> Entry:
     whole = " ".join(block)
     if whole.startswith("!!opencv-matrix"):
-        data = re.search(r"data:\s*\[([^\]]*)\]", whole)
-        counts = [re.search(rf"\b{word}:\s*(\d{{1,9}})\b", whole) for word in ("rows", "cols")]
-        if data is None or not all(counts):
+        head, opening, rest = whole.partition("[")
+        data, closing, _ = rest.partition("]")
+        counts = [re.search(rf"\b{word}:\s*+(\d{{1,9}})\b", head) for word in ("rows", "cols")]
+        if not closing or not head.rstrip().endswith("data:") or not all(counts):
             raise InputError(f"The matrix “{name}” in {path} is damaged; write it with cv2.FileStorage.")
-        return _matrix(name, data.group(1).replace(",", " "), [int(c.group(1)) for c in counts if c], path)
+        return _matrix(name, data.replace(",", " "), [int(c.group(1)) for c in counts if c], path)
     if len(block) > 1 and not block[0] and block[1].startswith("-"):
         return [item.lstrip("- ").strip().strip('"') for item in block[1:]]
     if whole.strip().startswith("["):
@@ -103,12 +101,10 @@ def _yaml_entry(name: str, block: list[str], path: Path) -> Entry:
 
 
 def _of_xml(text: str, path: Path) -> dict[str, Entry]:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{path} defines entities, which a calibration does not need; write it with cv2.FileStorage.")
     try:
-        root = Xml.fromstring(text)
-    except (Xml.ParseError, ValueError) as error:
-        raise InputError(f"{path} is not an XML file: {error}.") from error
+        root = bounded.xml_of(text)
+    except ValueError as error:
+        raise InputError(f"{path} is not an XML file that can be read ({error}); write it with cv2.FileStorage.") from error
     found: dict[str, Entry] = {}
     for element in root:
         if element.get("type_id") == "opencv-matrix":

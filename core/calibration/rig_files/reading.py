@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from ...foundation import bounded
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rotation import rotation_from_vector
 
-LARGEST_FILE, LARGEST_PX = 50_000_000, 100_000
+LARGEST_PX = 100_000
 NO_UNIT = "the file has no unit, so its lengths were taken as metres"
 
 
@@ -28,12 +29,12 @@ def text_of(path: Path) -> str:
         InputError: it is missing, too large, or no text.
     """
     try:
-        data = Path(path).read_bytes()
+        text = bounded.text_of(path, bounded.CALIBRATION_BYTES, errors="replace")
     except OSError as error:
         raise InputError(f"Cannot read the calibration {path}: {error.strerror or error}.") from error
-    if len(data) > LARGEST_FILE or b"\0" in data[:4096]:
-        raise InputError(f"{path} is no calibration file (it is {'too large' if len(data) > LARGEST_FILE else 'not text'}).")
-    return data.decode("utf-8", errors="replace")
+    if "\0" in text[:4096]:
+        raise InputError(f"{path} is no calibration file (it is not text).")
+    return text
 
 
 def numbers(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:

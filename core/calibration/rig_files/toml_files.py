@@ -6,13 +6,12 @@ Pose2Sim: a table per camera's name, distortions (k1 k2 p1 p2), fisheye, metres.
 caliscope `camera_array.toml`: [cameras.0], … with cam_id, rotation (Rodrigues, or 3×3 in older files), metres; a missing key is None.
 """
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.camera import Camera
 from ...geometry.rig import Rig, sigmas_of
@@ -29,8 +28,8 @@ def read(path: Path) -> Rig:
         InputError: it is none of them, or a camera is incomplete.
     """
     try:
-        table = tomllib.loads(text_of(path))
-    except (ValueError, RecursionError) as error:
+        table = bounded.toml_of(text_of(path))
+    except ValueError as error:
         raise InputError(f"{path} is not a TOML file: {error}.") from error
     metadata = table.get("metadata", {})
     unit = str(metadata.get("unit", "m")) if isinstance(metadata, dict) else "m"

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...geometry.rotation import about, euler_from_matrix, shortest, unit
 from ..retarget.rig import Motion, Rig
 
-LARGEST_BYTES = 1 << 30
 MOST_JOINTS = 4096
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 TALL_M = 1.7  # height of a person, for the unit
@@ -44,9 +43,7 @@ def read_bvh(path: Path, *, unit_m: float | None = None, up: str | None = None) 
         InputError: it cannot be read, is no BVH file, or is shorter than its header says.
     """
     try:
-        if Path(path).stat().st_size > LARGEST_BYTES:
-            raise InputError(f"{path} is larger than {LARGEST_BYTES >> 30} GB; cut it into shorter pieces.")
-        text = Path(path).read_text(encoding="utf-8", errors="replace")
+        text = bounded.text_of(path, bounded.TABLE_BYTES, errors="replace")
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
     head, found, body = text.partition("MOTION")

@@ -16,14 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from .markers import MOST_VALUES, Markers, axes_of, check_size, metres_per
 
 BLOCK = 512
 INTEL, DEC, MIPS = 84, 85, 86  # processor types: byte order and floats
 RESIDUAL_SCALE_MM = 0.1
-LARGEST_BYTES = 1 << 30
 MOST_WORD = 65535  # of the header's 16-bit numbers
 BATCH = 255  # labels in one parameter
 
@@ -150,9 +149,7 @@ def read_c3d(path: Path, *, axes: str = "Z up", unit: str = "") -> Markers:
     """
     rotation = axes_of(axes)
     try:
-        if Path(path).stat().st_size > LARGEST_BYTES:
-            raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")
-        data = Path(path).read_bytes()
+        data = bounded.bytes_of(path, bounded.TABLE_BYTES)
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
     if len(data) < 2 * BLOCK or data[1] != 0x50 or data[0] < 2:

@@ -4,7 +4,6 @@ Of several people, the one nearest to the person in the image before is tracked;
 The centre of the top-left pixel is (0, 0), as everywhere in Tricap.
 """
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ...foundation import bounded
 from ...foundation.arrays import check_sparse, frozen
 from ...foundation.errors import InputError
 from ...geometry.robust import finite_median
@@ -44,7 +44,7 @@ HALPE = (*COCO, "crown", "neck", "mid_hip", "left_big_toe", "right_big_toe", "le
 LAYOUTS = {17: COCO, 18: (*ARMS, *LEGS, *FACE), 25: (*ARMS, "MidHip", *LEGS, *FACE, *FEET), 26: HALPE}  # by the number of keypoints
 WHOLE_BODY = 133  # COCO with feet, face and hands: the body's come first
 NUMBER = re.compile(r"(\d{1,12})(?:_keypoints)?$", re.IGNORECASE)  # in the name of an image's file
-LARGEST_BYTES, MOST_DIGITS = 1 << 28, 15
+MOST_DIGITS = 15
 Person = np.ndarray  # (K, 3) x, y, confidence
 
 
@@ -158,12 +158,10 @@ def _layout(count: int, path: Path) -> tuple[str, ...]:
 
 def _json(path: Path) -> Any:
     try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise InputError(f"{path} is larger than 256 MB; cut it into shorter pieces.")
-        return json.loads(path.read_text(encoding="utf-8"))
+        return bounded.json_of(bounded.text_of(path, bounded.JSON_BYTES))
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"{path} is no JSON file: {error}.") from error
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.arrays import frozen
 from ...foundation.errors import InputError
 from ...images.interlace import frame_time_s
@@ -28,7 +28,6 @@ AXES = {
 }
 UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "inch": 0.0254}
 MOST_VALUES = 1 << 28  # 2 GB of float64
-LARGEST_BYTES = 1 << 30  # of a CSV file
 DEFAULT_FPS = 25.0  # of tables without times
 
 
@@ -146,12 +145,10 @@ def read_points_csv(path: Path, *, axes: str = "Z up", unit: str = "") -> Marker
 def _read(path: Path) -> Markers:
     """Points in the file's axes and unit."""
     try:
-        if Path(path).stat().st_size > LARGEST_BYTES:
-            raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            header = [name.strip() for name in next(csv.reader(file), [])]
+        text = io.StringIO(bounded.text_of(path, bounded.TABLE_BYTES))
+        header = [name.strip() for name in next(csv.reader(text), [])]
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"Cannot read the table {path}: {error}.") from error
+        raise InputError(f"Cannot read the table {path}: {getattr(error, 'strerror', None) or error}.") from error
     if "joint" in header:
         table = read_joints(path)
         frames, names = table.frames, tuple(table.joints_m)
@@ -159,10 +156,10 @@ def _read(path: Path) -> Markers:
             raise InputError(f"The table {path} has no rows; choose one with points.")
         xyz, sigma = (np.stack([column[name] for name in names], axis=1) for column in (table.joints_m, table.sigma_m))
         return Markers(names=names, fps=rate(frames, table.time_s), frames=frames, xyz_m=xyz, sigma_m=sigma)
-    return _wide(path, header)
+    return _wide(path, header, text)
 
 
-def _wide(path: Path, header: list[str]) -> Markers:
+def _wide(path: Path, header: list[str], rows: io.StringIO) -> Markers:
     columns: dict[str, dict[str, int]] = {}
     for i, name in enumerate(header):
         if len(name) > 2 and name[-1].lower() in "xyz" and name[-2] in " _.":
@@ -171,7 +168,7 @@ def _wide(path: Path, header: list[str]) -> Markers:
     if not columns or "frame" not in header:
         raise InputError(f"{path} has no columns of points; write frame, time_s, NAME x, NAME y, NAME z, or rows like joints.csv.")
     try:
-        table = np.genfromtxt(path, delimiter=",", skip_header=1, encoding="utf-8-sig", ndmin=2)
+        table = np.genfromtxt(rows, delimiter=",", ndmin=2)
     except ValueError as error:
         raise InputError(f"{path} has rows of different lengths; export it again.") from error
     if table.shape[0] == 0 or table.shape[1] != len(header):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 
 KINDS = {
@@ -113,7 +113,7 @@ def read_ply(path: Path) -> Ply:
         InputError: it cannot be read, is not such a file, is shorter than its header says, or its faces name missing vertices.
     """
     try:
-        data = Path(path).read_bytes()
+        data = bounded.bytes_of(path, bounded.ARRAYS_BYTES)
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
     elements, position = _read_header(data, path)

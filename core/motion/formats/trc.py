@@ -4,13 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...foundation import store
+from ...foundation import bounded, store
 from ...foundation.errors import InputError
 from ...images.interlace import frame_time_s
 from .markers import Markers, axes_of, check_size, metres_per
 
 HEADINGS = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames".split()
-LARGEST_BYTES = 1 << 30
 
 
 def write_trc(path: Path, markers: Markers, *, axes: str = "OpenSim", unit: str = "m") -> None:
@@ -65,9 +64,7 @@ def read_trc(path: Path, *, axes: str = "OpenSim", unit: str = "") -> Markers:
 
 def _lines(path: Path) -> list[str]:
     try:
-        if Path(path).stat().st_size > LARGEST_BYTES:
-            raise InputError(f"{path} is larger than 1 GB; cut it into shorter pieces.")
-        return Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+        return bounded.text_of(path, bounded.TABLE_BYTES, errors="replace").splitlines()
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
 

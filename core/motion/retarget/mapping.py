@@ -101,12 +101,16 @@ def read_preset(path: Path) -> Preset:
     if not isinstance(sides, dict) or set(sides) != {"L", "R"} or not all(isinstance(x, str) for x in [*sides.values(), *prefixes]):
         raise InputError(f'{path} has invalid “sides” or “prefixes”; write {{"L": "Left", "R": "Right"}} and a list of texts.')
     parts = {key: _by_role(table.get(key, {}), sides, key, path) for key in ("bones", "twist")}
-    control_rig = _control_rig(table["steering"], sides, path) if "steering" in table else None
+    control_rig = control_rig_of(table["steering"], sides, path) if "steering" in table else None
     return Preset(name=str(table.get("name", Path(path).stem)), prefixes=tuple(prefixes), control_rig=control_rig, **parts)
 
 
-def _control_rig(table: Any, sides: Map[str, str], path: Path) -> ControlRig:
-    """The part “steering” of a preset; "{s}" in a bone's name stands for both sides."""
+def control_rig_of(table: Any, sides: Map[str, str], path: Path | str) -> ControlRig:
+    """The part “steering” of a preset; "{s}" in a bone's name stands for both sides.
+
+    Raises:
+        InputError: it has another layout; `path` is its name there.
+    """
     if not isinstance(table, dict) or not isinstance(table.get("follows"), dict):
         raise InputError(f"{path} has no hierarchy of its controls; “steering” needs a table “follows” with a name by name.")
 
@@ -120,12 +124,14 @@ def _control_rig(table: Any, sides: Map[str, str], path: Path) -> ControlRig:
     follows, skin, properties = (both(table.get(key)) for key in ("follows", "skin", "properties"))
     if not all(isinstance(name, str) for name in [*follows.values(), *skin.values()]):
         raise InputError(f"{path} must have names of bones in “follows” and “skin” of “steering”.")
+    ends: set[str] = set()  # names from which the line upwards ends
     for name in follows:
-        line = [name]
-        while (above := follows.get(line[-1])) is not None:
+        line, above = {name: None}, follows.get(name)
+        while above is not None and above not in ends:
             if above in line:
                 raise InputError(f"{path} lets “{name}” follow itself; correct “follows” of “steering”.")
-            line.append(above)
+            line[above], above = None, follows.get(above)
+        ends.update(line)
     for values in properties.values():
         if not isinstance(values, dict) or not all(isinstance(v, (int, float)) for v in values.values()):
             raise InputError(f"{path} needs numbers by name in “properties” of “steering”.")

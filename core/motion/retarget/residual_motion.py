@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ...foundation import bounded
 from ...foundation.arrays import frozen
 from ...foundation.errors import InputError
 
@@ -131,7 +132,7 @@ def from_text(text: str) -> ResidualMotion:
         InputError: the text is of another format, or damaged.
     """
     try:
-        table = json.loads(text)
+        table = bounded.json_of(text)
         if (table["format"], table["version"]) != (FORMAT, VERSION):
             raise ValueError("another format")
         frames = np.array(table["frames"], dtype=float)

@@ -13,13 +13,14 @@ these are second guesses, for parts without a bone of an unambiguous name.
 The roles of bones in a VRM file: the humanoid table in the JSON of a binary glTF file (VRM 0.x and 1.0 specifications).
 """
 
-import json
+import os
 import re
 import struct
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ...foundation import bounded
 from ...foundation.errors import InputError
 
 SIDES = ("L", "R")
@@ -213,7 +214,6 @@ def _finger(core: str, plain: list[str], words: list[str]) -> str:
     return f"{finger}.{numbers[0] if numbers else 1}"
 
 
-LARGEST_JSON = 1 << 28
 PARTS = {
     "shoulder": "clavicle",
     "upperarm": "upper_arm",
@@ -233,17 +233,17 @@ def read_humanoid(path: Path) -> dict[str, str]:
         InputError: it cannot be read or is no binary glTF file.
     """
     try:
-        with Path(path).open("rb") as file:
+        with bounded.opened(path, bounded.ARRAYS_BYTES) as file:
             magic, _, _, length, kind = struct.unpack("<4sIII4s", file.read(20))
-            if magic != b"glTF" or kind != b"JSON" or length > min(LARGEST_JSON, Path(path).stat().st_size):
+            if magic != b"glTF" or kind != b"JSON" or length > min(bounded.JSON_BYTES, os.fstat(file.fileno()).st_size):
                 raise InputError(f"{path} is not a binary glTF file or is damaged; export it again.")
-            table = json.loads(file.read(length))
+            table = bounded.json_of(file.read(length))
         nodes, extensions = table.get("nodes", []), table.get("extensions", {})
         bones = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
         pairs = [(row["bone"], row["node"]) for row in bones]
         pairs += [(bone, row["node"]) for bone, row in extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {}).items()]
         return {role: nodes[node]["name"] for bone, node in pairs if (role := role_of(bone)) and "name" in nodes[node]}
-    except (OSError, ValueError, struct.error, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, struct.error, KeyError, IndexError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is not a VRM or glTF file that can be read ({error}); export it again.") from error
 
 

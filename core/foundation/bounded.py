@@ -1,0 +1,170 @@
+"""Files from outside, opened and parsed in one place: a regular file, not larger than its kind may be, before its first byte is read.
+
+Pipes, devices and sockets never end or never begin; a sparse file of gigabytes takes no room on the disk. Texts are parsed within limits
+of nesting, of digits and of the parts of a key, so that a megabyte takes neither minutes nor gigabytes, and no value breaks later
+arithmetic. Faults are OSError and ValueError, which every reader turns into the sentence that says what the file is and what to do.
+"""
+
+import errno
+import io
+import json
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+from xml.etree import ElementTree as Xml
+
+TOML_BYTES = 4 << 20  # take.toml, rig.toml, body.toml, a body model: thousands of clicks
+CALIBRATION_BYTES = 50_000_000  # other tools' files, some of which contain all observations
+JSON_BYTES = 1 << 28
+TABLE_BYTES = 1 << 30  # CSV, TRC, C3D, BVH: hours of motion
+IMAGE_BYTES = 1 << 29  # 36 megapixels of 4 × 16 bits, not compressed, are 0.3 GB
+ARRAYS_BYTES = 8 << 30  # PLY and our own .npz
+MOVIE_BYTES = 1 << 42  # decoded piece by piece
+
+MOST_KEY_PARTS = 32  # of a dotted TOML key, for whose parts tomllib needs quadratic time
+DEEPEST = 64  # tables and lists in each other
+WHOLE_BITS = 63  # of a whole number, as TOML has it
+PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+LONG_KEY = re.compile(rf"(?<![\w.-]){PART}(?:[ \t]*+\.[ \t]*+{PART}){{{MOST_KEY_PARTS}}}")
+
+
+@contextmanager
+def opened(path: Path, largest: int) -> Iterator[BinaryIO]:
+    """A file to be read in pieces.
+
+    Raises:
+        OSError: it cannot be opened, is no regular file, or is larger than `largest` bytes.
+    """
+    path = Path(path)
+    _check(path.stat(), path, largest)  # before it is opened: opening a pipe waits, opening a device may change it
+    handle = os.open(path, os.O_RDONLY | _flag("O_BINARY") | _flag("O_CLOEXEC") | _flag("O_NONBLOCK"))
+    with os.fdopen(handle, "rb") as file:
+        _check(os.fstat(handle), path, largest)
+        yield file
+
+
+def _flag(name: str) -> int:
+    return int(getattr(os, name, 0))  # not every system has each
+
+
+def _check(state: os.stat_result, path: Path, largest: int) -> None:
+    if stat.S_ISDIR(state.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder", str(path))
+    if not stat.S_ISREG(state.st_mode):
+        raise OSError(errno.EINVAL, "it is a device, a pipe or a socket, not a file", str(path))
+    if state.st_size > largest:
+        raise OSError(errno.EFBIG, f"it is larger than {_size(largest)}, the most that such a file may have", str(path))
+
+
+def _size(count: int) -> str:
+    return f"{count / (1 << 30):.0f} GB" if count >= 1 << 30 else f"{count / (1 << 20):.0f} MB"
+
+
+def check_file(path: Path, largest: int) -> None:
+    """Check a file that another library opens by its name.
+
+    Raises:
+        OSError: it cannot be opened, is no regular file, or is larger than `largest` bytes.
+    """
+    with opened(path, largest):
+        pass
+
+
+def bytes_of(path: Path, largest: int) -> bytes:
+    """The content of a file.
+
+    Raises:
+        OSError: it cannot be read, is no regular file, is larger than `largest` bytes, or has more bytes than its size, as those of /proc.
+    """
+    with opened(path, largest) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(size + 1)
+    if data is None or len(data) > size:
+        raise OSError(errno.EBUSY, "it grows while it is read", str(path))
+    return data
+
+
+def text_of(path: Path, largest: int, errors: str = "strict") -> str:
+    """The text of a file in UTF-8, with or without a byte order mark; ends of lines become “\\n”.
+
+    Raises:
+        OSError: see `bytes_of`.
+        UnicodeDecodeError: it is in another encoding.
+    """
+    return io.TextIOWrapper(io.BytesIO(bytes_of(path, largest)), encoding="utf-8-sig", errors=errors).read()
+
+
+def toml_of(text: str) -> dict[str, Any]:
+    """The table of a TOML text.
+
+    Raises:
+        ValueError: it is no TOML, or beyond the limits.
+    """
+    if len(text) > TOML_BYTES:
+        raise ValueError(f"it is larger than {_size(TOML_BYTES)}")
+    found = LONG_KEY.search(text)
+    if found is not None:
+        line = text.count("\n", 0, found.start()) + 1
+        raise ValueError(f"a key with more than {MOST_KEY_PARTS} parts (at line {line})")
+    try:
+        table = tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"more than {DEEPEST} tables and lists in each other") from error
+    check_value(table)
+    return table
+
+
+def json_of(text: str | bytes) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        ValueError: it is no JSON, or beyond the limits.
+    """
+    try:
+        value = json.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"more than {DEEPEST} tables and lists in each other") from error
+    check_value(value)
+    return value
+
+
+def xml_of(text: str) -> Xml.Element:
+    """The root of an XML text without entities of its own, which could be of any size.
+
+    Raises:
+        ValueError: it is no XML, or defines entities.
+    """
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("it defines entities")
+    try:
+        return Xml.fromstring(text)
+    except Xml.ParseError as error:
+        raise ValueError(str(error)) from error
+
+
+def check_value(value: Any) -> None:
+    """Check tables, lists and numbers within each other.
+
+    Raises:
+        ValueError: they are nested too deeply, or a whole number is larger than any format has.
+    """
+    level = [value]
+    for _ in range(DEEPEST):
+        level = [inner for outer in level for inner in _inside(outer)]
+        if not level:
+            return
+    raise ValueError(f"more than {DEEPEST} tables and lists in each other")
+
+
+def _inside(outer: Any) -> list[Any]:
+    """The tables and lists in a value, after its whole numbers were checked."""
+    values = outer.values() if isinstance(outer, dict) else outer if isinstance(outer, list) else (outer,)
+    for value in values:
+        if type(value) is int and value.bit_length() > WHOLE_BITS:
+            raise ValueError("a whole number beyond 9e18")
+    return [value for value in values if isinstance(value, (dict, list))]
