@@ -4,9 +4,9 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import calibrate, clicking, command, correcting, jobs, operators, overlay, properties, retarget, session, steps
+    from . import calibrate, clicking, command, correcting, jobs, operators, overlay, properties, reopened, retarget, session, steps
 
-    return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, command
+    return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, reopened, command
 
 
 def register() -> None:

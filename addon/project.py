@@ -8,7 +8,7 @@ A scene is bound to a take once it has views. Without views, the take that the p
 Other parts of the add-on that have values of take.toml in the scene add a function to `Session.take_writers` and `take_readers`.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -226,8 +226,10 @@ def table(scene: bpy.types.Scene) -> Table:
     return _same_numbers(made, old)
 
 
-def open_take(scene: bpy.types.Scene, folder: Path) -> None:
+def open_take(scene: bpy.types.Scene, folder: Path, shown: Mapping[str, bpy.types.MovieClip] | None = None) -> None:
     """Show a take in the scene: its footage as clips, its clicks as tracks, its values and settings in the panel.
+
+    `shown`: by view, clips of the file that are used where they show its footage.
 
     Raises:
         InputError: it is not a take, or its footage cannot be opened; the scene is unchanged.
@@ -241,7 +243,7 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
     props = scene.tricap
     props.take = folders.for_user(folder)
     props.fps, props.interlaced, props.first_field = saved["fps"], opened.interlaced, opened.first_field
-    show_views(scene, saved["views"], files)
+    show_views(scene, saved["views"], files, shown)
     props.reference_view = saved.get("reference_view", "")
     props.all_frames = opened.frames is None
     if opened.frames:
@@ -255,19 +257,22 @@ def open_take(scene: bpy.types.Scene, folder: Path) -> None:
     remember(scene, folder)
 
 
-def show_views(scene: bpy.types.Scene, entries: list[Table], files: dict[str, Path]) -> None:
-    """Make the scene's views those of `entries` ([[views]]), with a clip each; a clip that already shows the file is reused.
+def show_views(
+    scene: bpy.types.Scene, entries: list[Table], files: dict[str, Path], shown: Mapping[str, bpy.types.MovieClip] | None = None
+) -> None:
+    """Make the scene's views those of `entries` ([[views]]), with a clip each; a clip of the views, or of `shown`, that already shows the
+    file is reused.
 
     Raises:
         InputError: Blender cannot read a file; the views are unchanged.
     """
     props = scene.tricap
-    before = {view.name: view.clip for view in props.views if view.clip is not None}
-    shown = {name: _clip_of(before.get(name), name, path) for name, path in files.items()}
+    before = dict(shown or {}) | {view.name: view.clip for view in props.views if view.clip is not None}
+    clip_of = {name: _clip_of(before.get(name), name, path) for name, path in files.items()}
     props.views.clear()
     for entry in entries:
         view = props.views.add()
-        view.clip = shown[entry["name"]]
+        view.clip = clip_of[entry["name"]]
         view.clip[clips.FIELDS_KEY] = _first_field(scene)
         view.name = entry["name"]
         view.images, view.movie = entry.get("images", ""), entry.get("movie", "")

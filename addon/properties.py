@@ -97,6 +97,13 @@ def show_settings(scene: bpy.types.Scene, tables: Mapping[str, Mapping[str, Any]
                 group.property_unset(field.name)
 
 
+def changed_settings(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The settings in `tables` that differ from the defaults."""
+    defaults = {name: dataclasses.asdict(settings()) for name, settings in stages().items()}
+    current = knobs.current_tables(tables, stages(), "")
+    return {name: {key: value for key, value in table.items() if value != defaults[name][key]} for name, table in current.items()}
+
+
 def stages() -> Mapping[str, type]:
     """The settings class of every stage, by its name in take.toml."""
     return take_run.SETTINGS

@@ -6,7 +6,7 @@ read_contents (any thread) → write_scene (main thread) → save_blend
 import math
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from .trajectories import add_arrows, add_trajectories, sparser
 COLLECTION = "Tricap"
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
+PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
 KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/run/stages.py)
 
 
@@ -90,6 +91,8 @@ def write_scene(
     collection = bpy.data.collections.new(COLLECTION)
     collection[OUT_KEY] = str(contents.out)
     collection[KEYS_KEY] = {stage: e["key"] for stage, e in contents.run.get("stages", {}).items() if e.get("key") and stage in STAGES}
+    if blend is not None:
+        collection[PLACES_KEY] = _places(contents, Path(blend).resolve().parent)
     scene.collection.children.link(collection)
     set_time(scene, contents)
     warnings, counts = list(contents.warnings), {}
@@ -109,6 +112,15 @@ def write_scene(
     if blend is not None:
         save_blend(Path(blend))
     return SceneReport(collection=collection.name, counts=counts, warnings=tuple(warnings), blend=blend)
+
+
+def _places(contents: Contents, folder: Path) -> dict[str, str]:
+    """The folders of the results and of the take relative to a folder; without those on another drive."""
+    places = {}
+    for name, place in (("out", contents.out), ("take", Path(contents.run.get("take", contents.out)))):
+        with suppress(ValueError):
+            places[name] = os.path.relpath(place.resolve(), folder)
+    return places
 
 
 def remove_earlier() -> None:

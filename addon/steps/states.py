@@ -139,6 +139,8 @@ def _footage(scene: bpy.types.Scene, found: _Project) -> State:
     if not project.bound(scene):
         if props.take and (project.existing_folder(scene) / "take.toml").exists():
             return State(status=Status.READY, message="Press Open Take to show its footage.")
+        if problem := get_session().file.take_problem:
+            return State(status=Status.EMPTY, message=problem)
         if not props.take and not bpy.data.filepath:
             return State(status=Status.EMPTY, message=SAVE_FIRST)
         return State(status=Status.EMPTY, message="Add the movies or image folders of your cameras.")

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tricap.__main__ import main
 from tricap.core.geometry.rig import read_rig, write_rig
 from tricap.core.run import pipeline
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
@@ -640,3 +641,50 @@ def test_both_fields_are_shown_one_by_one(blender: ModuleType, why: Callable[[st
     scene.tricap.views["C"].offset_frames, scene.tricap.interlaced = 0, "odd"
     assert blender.ops.tricap.reload_footage() == {"FINISHED"} and scene.tricap.views["C"].clip.frame_duration == 3
     assert read_table(folder) == {**before, "interlaced": "odd", "settings": QUICK}
+
+
+@pytest.fixture(scope="module")
+def built(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a take, and results of two of its frames, with other settings, as `tricap run` writes them: with body.blend."""
+    folder = tmp_path_factory.mktemp("built")
+    shutil.copytree(sample, folder / "take")
+    argv = ["run", str(folder / "take"), "--out", str(folder / "out"), "--frames", "0:2", "--set", "growing.spacing_px=7", "--quiet"]
+    assert main(argv) == 0
+    return folder
+
+
+@pytest.mark.parametrize("moved", ["nothing", "results", "results and take"])
+def test_the_commands_scene_shows_the_finished_project(
+    blender: ModuleType, built: Path, tmp_path: Path, words: Words, why: Any, moved: str
+) -> None:
+    folder = tmp_path if "results" in moved else built
+    for name in ("out", "take"):
+        if ("results", "take")[name == "take"] in moved:
+            shutil.copytree(built / name, tmp_path / name)
+    take = (folder if (folder / "take").exists() else built) / "take"
+    before = {path: path.stat().st_mtime_ns for path in take.rglob("*")}
+    assert blender.ops.wm.open_mainfile(filepath=str(folder / "out" / "body.blend")) == {"FINISHED"}
+    assert words() == "done done done done done done done ready", why("footage")
+    scene = blender.context.scene
+    assert Path(blender.path.abspath(scene.tricap.take)).resolve() == take
+    assert Path(blender.path.abspath(scene.tricap.out)).resolve() == folder / "out"
+    assert (scene.tricap.growing.spacing_px, scene.tricap.first_frame, scene.tricap.last_frame) == (7, 0, 1)
+    assert scene.tricap_retarget.source.name == scene.tricap_retarget.export.name == "Body"
+    clips = {view.clip for view in scene.tricap.views}
+    assert clips == set(blender.data.movieclips) and len(clips) == 3, "those behind the cameras are used"
+    shown = {Path(blender.path.abspath(clip.filepath)).resolve() for clip in clips}
+    assert all(file.is_file() and file.is_relative_to(take) for file in shown) and {clip.size[0] for clip in clips} == {512}
+    assert before == {path: path.stat().st_mtime_ns for path in take.rglob("*")}, "opening a file writes nothing"
+
+
+def test_a_scene_whose_take_is_gone_says_so(blender: ModuleType, built: Path, tmp_path: Path, words: Words, why: Any) -> None:
+    lost = (built / "take").rename(built / "renamed")
+    try:
+        blender.ops.wm.open_mainfile(filepath=str(built / "out" / "body.blend"))
+        assert words().endswith("empty empty empty done ready") and why("footage").endswith("Press Open Take and choose where it is now.")
+        assert blender.ops.tricap.open_take(directory=str(lost)) == {"FINISHED"}
+        scene = blender.context.scene.tricap
+        scene.growing.spacing_px, scene.all_frames, scene.last_frame = 7, False, 1
+        assert words() == "done done done done done done done ready"
+    finally:
+        lost.rename(built / "take")
