@@ -37,7 +37,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     """The parser with all commands, those of the core and those that `adders` add."""
     parser = argparse.ArgumentParser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_new, _stages, _check, _calibrate, _track2d, _contour, _batch, _fields, *adders):
+    for add in (_new, _stages, _check, _calibrate, _track2d, _contour, _compare, _batch, _fields, *adders):
         add(commands)
     for sub in commands.choices.values():
         for argument in sub._actions:
@@ -166,6 +166,16 @@ def _contour(commands: Any) -> None:
     start.add_argument("--background", type=Path, metavar="FILE", help="image of the view without the person")
     start.add_argument("--from-body", action="store_true", help="start from the outline of the body that was fitted in OUT")
     _set_argument(parser)
+
+
+def _compare(commands: Any) -> None:
+    parser = _command(commands, "compare", "run the published and the default method on a take, and compare them", action("compare"))
+    _take_argument(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for compare.html and both results")
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B - 1")
+    _set_argument(parser)
+    parser.add_argument("--restart", action="store_true", help="start again instead of resuming")
+    parser.add_argument("--json", action="store_true", help="print the measures as JSON, and nothing else on standard output")
 
 
 def _batch(commands: Any) -> None:

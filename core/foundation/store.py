@@ -90,14 +90,15 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """`write_bytes` of readable JSON. JSON has no NaN and no infinity: they become null."""
-    write_text(path, json.dumps(_with_null(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(path, json.dumps(without_nan(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def _with_null(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """The value with null for every number that is not finite."""
     if isinstance(value, Mapping):
-        return {name: _with_null(v) for name, v in value.items()}
+        return {name: without_nan(v) for name, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_with_null(v) for v in value]
+        return [without_nan(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -1,0 +1,49 @@
+"""One self-contained HTML document: style, pictures and graphs inside, no network. Readable in dark mode, on paper and on a phone."""
+
+import base64
+import html
+from collections.abc import Iterable
+
+STYLE = """
+:root{color-scheme:light dark;--paper:#fff;--ink:#222;--soft:#666;--line:#ddd;--note:#fff3d0;--box:#f5f5f5;--good:#1e8449;--bad:#b03a2e}
+@media (prefers-color-scheme:dark){:root{--paper:#1b1d20;--ink:#e4e4e4;--soft:#a0a0a0;--line:#3c4046;--note:#4a3f1c;--box:#26292d;
+--good:#58d68d;--bad:#ec7063}}
+*{box-sizing:border-box}body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:0 auto;padding:1em;color:var(--ink);
+background:var(--paper)}h1{margin:.2em 0}h2{margin:1.6em 0 .5em}img,svg{max-width:100%;height:auto}
+figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px}.row{display:grid;gap:1em;
+grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));margin:1em 0}.wide{overflow-x:auto}
+table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;border-bottom:1px solid var(--line);vertical-align:top}
+.note{background:var(--note);padding:.4em .8em;margin:.4em 0}.soft{color:var(--soft)}.good{color:var(--good)}.bad{color:var(--bad)}
+.verdict{font-size:1.2em;margin:.4em 0}summary{cursor:pointer;font-weight:600;margin:.6em 0}pre{white-space:pre-wrap;
+overflow-wrap:anywhere;background:var(--box);padding:.6em}svg{color:var(--ink);background:none}
+@media print{:root{--paper:#fff;--ink:#000;--soft:#444;--line:#bbb;--note:#eee;--box:#f5f5f5}body{max-width:none;font-size:11pt}
+figure,svg,tr{break-inside:avoid}}
+"""
+
+
+def document(title: str, body: str, script: str = "") -> str:
+    """The page. `title` is text, `body` HTML, `script` JavaScript of our own."""
+    code = f"<script>{script}</script>" if script else ""
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>{body}{code}</body></html>\n"
+    )
+
+
+def figure(caption: str, picture: bytes, kind: str = "jpeg") -> str:
+    """A picture (JPEG or PNG) with its caption, which is its alternative text, too."""
+    text = html.escape(caption)
+    data = base64.b64encode(picture).decode()
+    return f'<figure><img alt="{text}" src="data:image/{kind};base64,{data}"><figcaption>{text}</figcaption></figure>'
+
+
+def notes(sentences: Iterable[str]) -> str:
+    """Warnings."""
+    return "".join(f'<p class="note">{html.escape(sentence)}</p>' for sentence in sentences)
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table of HTML cells; the first of each row is its heading. It scrolls by itself on a narrow screen."""
+    top = "".join(f"<th>{cell}</th>" for cell in head)
+    body = "".join(f"<tr><th>{first}</th>{''.join(f'<td>{cell}</td>' for cell in rest)}</tr>" for first, *rest in rows)
+    return f'<div class="wide"><table><tr>{top}</tr>{body}</table></div>'

@@ -1,0 +1,62 @@
+"""The published and the default method side by side: the measures, the page, and what is refused."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.cli.main import main
+from tricap.core.report.comparison import DEFAULT, HIGHER, LOWER, PUBLISHED, Measure, comparison_page
+from tricap.core.run.compare import NEIGHBOURS, surface_noise_m
+
+
+@pytest.mark.parametrize("sigma_m", [0.0002, 0.001])
+def test_noise_of_a_point_on_a_round_limb(sigma_m: float) -> None:
+    """Independent noise along the normals of a limb of 45 mm, 4 mm apart: its sigma, not the limb's shape, is measured."""
+    angle, z = np.meshgrid(np.arange(-0.8, 0.8, 0.09), np.arange(0, 0.2, 0.004))
+    radius = 0.045 + np.random.default_rng(3).normal(0, sigma_m, angle.shape)
+    xyz = np.stack([radius * np.sin(angle), -radius * np.cos(angle), z], axis=-1).reshape(-1, 3)
+    assert surface_noise_m(xyz) == pytest.approx(sigma_m, rel=0.12)  # ± 4 % by the number of points; the limb's shape adds 0.00002 m
+    assert np.isnan(surface_noise_m(xyz[:NEIGHBOURS]))
+
+
+def test_the_better_value() -> None:
+    """By direction; none within 2 %, without a value, or where no value is better than another."""
+
+    def winner(a: float, b: float, better: str) -> str:
+        return Measure(name="", unit="", published=a, default=b, better=better).winner
+
+    assert (winner(1.0, 2.0, HIGHER), winner(1.0, 2.0, LOWER)) == (DEFAULT, PUBLISHED)
+    assert [winner(*v) for v in ((1.0, 1.01, HIGHER), (np.nan, 1.0, LOWER), (1.0, 2.0, ""), (0.0, 0.0, LOWER))] == [""] * 4
+
+
+def test_names_are_text_in_the_page(tmp_path: Path) -> None:
+    page = comparison_page("<script>kick", [Measure(name="a < b", unit="<i>", published=1.0, default=np.nan)], [tmp_path, tmp_path])
+    assert "<script>" not in page and "&lt;script&gt;kick" in page and "a &lt; b" in page and "&lt;i&gt;" in page and "–" in page
+
+
+def test_both_methods_on_a_take(plane_take: Path, tmp_path: Path, scenes: Any, capsys: Any) -> None:
+    """Two runs in folders of their own, one page and one table; a second call computes nothing."""
+    take, out = Path(shutil.copytree(plane_take, tmp_path / "take")), tmp_path / "out"
+    pixels = ", ".join(
+        "{} = [{:.1f}, {:.1f}]".format(c.name, *c.project([0.0, 0.0, scenes.depth_m])) for c in scenes.three_cameras().cameras
+    )
+    (take / "take.toml").write_text((take / "take.toml").read_text() + f"[seeds]\nsurface = [{{ {pixels} }}]\n")
+    command = ["compare", str(take), "--out", str(out), "--frames", "0:2", "--json", "--quiet"]
+    assert main(command) == 0
+    first = json.loads(capsys.readouterr().out)
+    rows = {row["name"]: row for row in first}
+    assert rows["points a frame"]["published"] > 100 and rows["reported sigma of a joint (median)"]["default"] is None
+    for method, scan in ((PUBLISHED, "published"), (DEFAULT, "fronts")):
+        run = json.loads((out / method / "run.json").read_text())
+        assert run["settings"]["method"]["preset"] == method and run["settings"]["growing"]["method"] == scan
+    assert json.loads((out / "compare.json").read_text())["measures"] == first
+    page = (out / "compare.html").read_text()
+    assert page.count("<img") == 2 * len(list((out / PUBLISHED / "report").glob("*.png"))) and "http" not in page
+    before = (out / DEFAULT / "run.json").stat().st_mtime_ns
+    assert main(command) == 0 and (out / DEFAULT / "run.json").stat().st_mtime_ns == before
+    assert main([*command, "--set", "method.preset=published"]) == 2 and "leave out --preset" in capsys.readouterr().err
+    assert main(["compare", str(take), "--out", str(take)]) == 2 and "is itself a take" in capsys.readouterr().err
