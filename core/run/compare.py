@@ -1,8 +1,7 @@
 """`tricap compare`: one take with the published and with the default method, and the same measures of both side by side.
 
 Each method is a run of its own, in DIR/published and DIR/default, and resumes as any run does. The measures are computed from the files
-that both wrote, not from what a method reports about itself, except for times and sigmas. With truth.npz in the take (recordings of
-`synthetic/`) both are scored against it.
+that both wrote, not from what a method reports about itself, except for times and sigmas.
 """
 
 from collections.abc import Sequence
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..foundation import store
 from ..foundation.errors import InputError
@@ -20,7 +18,6 @@ from ..geometry.robust import finite_median, mad_sigma
 from ..motion.formats.ply import read_ply
 from ..report.comparison import DEFAULT, HIGHER, LOWER, METHODS, NEITHER, PUBLISHED, Measure, comparison_page
 from ..results.folder import Results, check_separate_folder
-from ..synthetic.score import Score, score_run
 from . import pipeline
 from .take_run import Overrides, open_run
 
@@ -28,10 +25,10 @@ PLACE_M = 0.02  # edge of the cubes in which coverage is counted
 NEIGHBOURS = 20  # through which a quadric is fitted, for the noise
 
 
-def compare(
+def run_both(
     take: Path, out: Path, overrides: Overrides, frames: tuple[int, int] | None, monitor: Monitor, *, restart: bool = False
-) -> list[Measure]:
-    """Run both methods and write DIR/compare.html and DIR/compare.json.
+) -> list[Path]:
+    """Run both methods; the folders of their results, in the order of `METHODS`.
 
     Raises:
         InputError: see `pipeline.run`; or the overrides choose a preset.
@@ -45,38 +42,24 @@ def compare(
             if not pipeline.is_complete(run):
                 monitor.begin(method)
                 pipeline.all_stages(run, monitor)
-    folders = [out / method for method in METHODS]
-    found = [*_of_clouds(folders, monitor), *_of_runs([Results(f).read_run() for f in folders])]
-    if (take / "truth.npz").is_file():
-        found = [*_of_truth(*(score_run(take, folder, monitor) for folder in folders)), *found]
-    table = {"format": "tricap-comparison", "version": 1, "take": str(take), "measures": [asdict(m) | {"winner": m.winner} for m in found]}
-    store.write_json(out / "compare.json", table)
-    store.write_text(out / "compare.html", comparison_page(take.resolve().name, found, folders))
-    return found
+    return [out / method for method in METHODS]
 
 
-def _of_truth(published: Score, default: Score) -> list[Measure]:
-    """The measures against the truth."""
-    wanted = (
-        ("coverage of the true surface", "%", HIGHER, lambda s: 100 * s.clouds.coverage),
-        ("error of a point (median)", "mm", LOWER, lambda s: s.clouds.median_mm),
-        ("error of a point (95 %)", "mm", LOWER, lambda s: s.clouds.p95_mm),
-        ("points off by 10 mm or more", "%", LOWER, lambda s: 100 * s.clouds.gross_fraction),
-        ("error of a trajectory (median)", "mm", LOWER, lambda s: s.trajectories.median_mm),
-        ("places of trajectories off by 10 mm or more", "%", LOWER, lambda s: 100 * s.trajectories.false_fraction),
-        ("error of the joints (mean)", "mm", LOWER, lambda s: s.joints.mpjpe_mm),
-        ("error of the joints' motion (rms)", "mm", LOWER, lambda s: s.joints.motion_rms_mm),
-        ("error of the bends of elbows and knees (rms, mean)", "°", LOWER, lambda s: np.mean([h.rms_deg for h in s.hinges.values()])),
-        ("error of the skin (median)", "mm", LOWER, lambda s: s.skin.median_mm),
-    )
+def measures_of(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
+    """The measures that need no truth, of two results."""
+    return [*_of_clouds(folders, monitor), *_of_runs([Results(f).read_run() for f in folders])]
 
-    def value(score: Score, of: Any) -> float:
-        try:
-            return float(of(score))
-        except AttributeError:  # a part of the score is None: the run lacks that result
-            return float("nan")
 
-    return [Measure(name=n, unit=u, published=value(published, of), default=value(default, of), better=b) for n, u, b, of in wanted]
+def write_comparison(out: Path, take: Path, folders: Sequence[Path], measures: Sequence[Measure]) -> None:
+    """Write DIR/compare.json and DIR/compare.html."""
+    rows = [as_row(measure) for measure in measures]
+    store.write_json(out / "compare.json", {"format": "tricap-comparison", "version": 1, "take": str(take), "measures": rows})
+    store.write_text(out / "compare.html", comparison_page(take.resolve().name, measures, folders))
+
+
+def as_row(measure: Measure) -> dict[str, Any]:
+    """A measure for JSON."""
+    return asdict(measure) | {"winner": measure.winner}
 
 
 def _of_runs(runs: Sequence[dict[str, Any]]) -> list[Measure]:
@@ -122,6 +105,8 @@ def _of_clouds(folders: Sequence[Path], monitor: Monitor) -> list[Measure]:
 
 def surface_noise_m(xyz_m: np.ndarray) -> float:
     """Robust sigma [m] of points (N, 3) about quadrics through their nearest neighbours, themselves left out; NaN for fewer than 21."""
+    from scipy.spatial import cKDTree
+
     if len(xyz_m) <= NEIGHBOURS:
         return float("nan")
     near = xyz_m[cKDTree(xyz_m).query(xyz_m, NEIGHBOURS + 1)[1][:, 1:]] - xyz_m[:, None]
