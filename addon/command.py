@@ -42,7 +42,9 @@ def add_commands(subparsers: Any) -> None:
         choices=range(1, 9),
         help=f"level of detail of the skin, 1 to 8 (default {DETAIL})",
     )
-    parser.add_argument("--exact-skin", action="store_true", help="also the run's skin of every frame, as FILE.pc2 next to the .blend")
+    parser.add_argument(
+        "--exact-skin", action="store_true", help="also the skin cast in every frame (0.3 s each), as FILE.pc2 next to the .blend"
+    )
     parser.add_argument("--implicit", action="store_true", help="also the implicit surface itself in one frame, for checking")
     parser.add_argument(
         "--field",

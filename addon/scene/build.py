@@ -38,7 +38,7 @@ class SceneOptions:
     """The user's choices for a scene."""
 
     detail: int = DETAIL  # of the skin: pieces per edge
-    exact_skin: bool = False  # also the run's skin of every frame: a mesh cache next to the .blend
+    exact_skin: bool = False  # also the skin cast in every frame: a mesh cache next to the .blend
     implicit: bool = False  # also the implicit surface itself
     field: str = EXPONENTIAL.name  # of the implicit surface, one of core.body.fields.POTENTIALS
     rest_pose: str = "A"  # of the armature, one of rest_pose.POSES

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...core.body.shape import BodyShape, read_body
+from ...core.body.skin.contour_skin import body_skin
 from ...core.body.skin.extremities import shape_for_skin
 from ...core.body.skin.mesh import SkinSettings
 from ...core.foundation import store
@@ -31,7 +32,7 @@ DEFAULT_FPS = 25.0  # of a scene whose take is missing
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameSkins:
-    """The skins that a run wrote: frames (T,) ascending, vertices_m (T, V, 3) float32, and the settings of their sampling."""
+    """The skin cast in every frame: frames (T,) ascending, vertices_m (T, V, 3) float32, and the settings of the sampling."""
 
     frames: np.ndarray
     vertices_m: np.ndarray
@@ -102,7 +103,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
         motion=motion,
         skin_settings=settings,
         prepared=prepared,
-        skins=_skins(settings, out / "skin", monitor, warnings) if skins else None,
+        skins=_skins(person, motion, settings, monitor, warnings) if skins else None,
         bar=_bar(footage, warnings),
         warnings=tuple(warnings),
     )
@@ -137,18 +138,21 @@ def _clouds(folder: Path, monitor: Monitor, warnings: list[str]) -> dict[int, Pl
     return clouds
 
 
-def _skins(settings: SkinSettings, folder: Path, monitor: Monitor, warnings: list[str]) -> FrameSkins | None:
-    files = {int(path.stem): path for path in folder.glob("*.ply") if path.stem.isdecimal()}
-    if not files:
-        warnings.append(f"No exact skin in the scene: {folder} has no skins; run the fit again.")
+def _skins(
+    shape: BodyShape | None, motion: MotionTable | None, settings: SkinSettings, monitor: Monitor, warnings: list[str]
+) -> FrameSkins | None:
+    if shape is None or motion is None:
+        warnings.append("No exact skin in the scene: the run has no body; run the fit again.")
         return None
     vertices = []
-    for i, frame in enumerate(sorted(files)):
-        monitor.step("reading skins", i, len(files))
-        vertices.append(read_ply(files[frame]).xyz_m.astype("<f4"))
-        if len(vertices[-1]) != len(vertices[0]):
-            raise InputError(f"{files[frame]} has {len(vertices[-1])} points, earlier skins have {len(vertices[0])}; run the fit again.")
-    return FrameSkins(frames=np.array(sorted(files)), vertices_m=np.stack(vertices), settings=settings)
+    try:
+        for i, pose in enumerate(motion.values):
+            monitor.step("casting skins", i, len(motion.frames))
+            vertices.append(body_skin(shape, pose, settings).vertices_m.astype("<f4"))
+    except InputError as error:
+        warnings.append(f"No exact skin in the scene: {error}")
+        return None
+    return FrameSkins(frames=motion.frames, vertices_m=np.stack(vertices), settings=settings)
 
 
 def _optional(path: Path, what: str, read: Callable[[Path], Any], warnings: list[str]) -> Any:

@@ -1,7 +1,7 @@
 """The polygonal skin: one closed mesh of quads with texture coordinates, bound to the armature, and on request exact in every frame.
 
-The armature deforms the skin of the rest pose by blending bones, keeping volumes. The exact skin is the run's own, the implicit
-surface of each frame's pose, as a mesh cache next to the .blend (PC2, Blender's Mesh Cache modifier): shape keys would
+The armature deforms the skin of the rest pose by blending bones, keeping volumes. The exact skin is cast onto the implicit surface
+of each frame's pose, as a mesh cache next to the .blend (PC2, Blender's Mesh Cache modifier): shape keys would
 add 120 MB to a file of 1,000 frames.
 
 The implicit surface of the fitted field itself, for checking metaballs and skin, is meshed by OpenVDB, which comes with Blender.
@@ -56,16 +56,12 @@ def add_skin(
 
 
 def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: FrameSkins, cache: Path) -> bpy.types.Object:
-    """The run's skin of every frame. Writes `cache` (.pc2); missing frames repeat the previous skin.
+    """The skin cast in every frame. Writes `cache` (.pc2); missing frames repeat the previous skin.
 
     Raises:
-        InputError: the skins are not those of this body, or the cache cannot be written.
+        InputError: the cache cannot be written.
     """
     rest = body_skin(shape, np.zeros(len(shape.skeleton.dof_names)), skins.settings)
-    if rest.vertices_m.shape != skins.vertices_m.shape[1:]:
-        raise InputError(
-            f"The run's skins have {skins.vertices_m.shape[1]} points, that of body.toml {len(rest.vertices_m)}; run the fit again."
-        )
     first, last = int(skins.frames[0]), int(skins.frames[-1])
     row_of_frame = np.searchsorted(skins.frames, np.arange(first, last + 1), side="right") - 1
     head = PC2_HEADER.pack(b"POINTCACHE2\0", 1, len(rest.vertices_m), float(first), 1.0, len(row_of_frame))

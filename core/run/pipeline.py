@@ -11,8 +11,8 @@ import numpy as np
 
 from ..body.motion import BodyFit
 from ..body.shape import write_body
-from ..body.skin.contour_skin import body_skin
 from ..body.skin.extremities import shape_for_skin
+from ..body.skin.posed import skins_in
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
@@ -238,16 +238,21 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
 
 
 def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
-    person = shape_for_skin(body.shape, run.settings["skin"])
-    for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
-        monitor.step("skin", i, len(body.motion.frames))
-        try:
-            skin = body_skin(person, values, run.settings["skin"])
-        except InputError as no_skin:
-            run.warn(f"No skin was made: {no_skin}")
-            run.results.remove("skin")
-            break
-        write_mesh(run.results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)
+    try:
+        _write_skins(run, body, monitor)
+    except InputError as no_skin:
+        run.warn(f"No skin was made: {no_skin}")
+        run.results.remove("skin")
     write_joints(run.results.path("joints.csv"), body.motion)
     write_motion(run.results.path("motion.csv"), body.motion, body.shape.skeleton)
     write_body(run.results.path("body.toml"), body.shape)
+
+
+def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> None:
+    """Write skin/NNNN.ply. Raises InputError for a body that has none."""
+    settings, frames = run.settings["skin"], body.motion.frames
+    skin_at = skins_in(shape_for_skin(body.shape, settings), body.motion.values, settings)
+    for i, (frame, values) in enumerate(zip(frames, body.motion.values)):
+        monitor.step("skin", i, len(frames))
+        skin = skin_at(values)
+        write_mesh(run.results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)

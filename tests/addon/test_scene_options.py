@@ -15,6 +15,7 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.closed_skin import one_skin
 from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
+from tricap.core.body.skin.extremities import shape_for_skin
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 
@@ -25,7 +26,6 @@ from .test_scene_body import animated, curves, world_vertices
 def test_the_exact_skin_is_the_skin_of_every_frame(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     from tricap.addon.scene.build import SceneOptions, build_scene
 
-    (small_run.out / "skin" / f"{FRAMES[2]:04d}.ply").unlink()
     build_scene(small_run.out, tmp_path / "body.blend", options=SceneOptions(exact_skin=True, rest_pose="T"))
     for name in ("body.blend", "body.pc2"):  # both may be moved together
         (tmp_path / "elsewhere é").mkdir(exist_ok=True)
@@ -33,8 +33,7 @@ def test_the_exact_skin_is_the_skin_of_every_frame(empty: ModuleType, small_run:
     empty.ops.wm.open_mainfile(filepath=str(tmp_path / "elsewhere é" / "body.blend"))
     for frame, motion in zip(FRAMES, small_run.motion):
         empty.context.scene.frame_set(frame)
-        known = small_run.motion[1] if frame == FRAMES[2] else motion  # a missing frame holds the one before
-        exact = body_skin(small_run.shape, known).vertices_m  # the table keeps nine digits
+        exact = body_skin(shape_for_skin(small_run.shape, SkinSettings()), motion).vertices_m  # the table keeps nine digits
         assert np.abs(world_vertices(empty, empty.data.objects["Exact skin"]) - exact).max() < 1e-5
 
 
@@ -45,16 +44,15 @@ def test_exact_skins_that_cannot_be(empty: ModuleType, small_run: SmallRun, tmp_
     with pytest.raises(InputError, match="give the Blender file a name"):
         build_scene(small_run.out, options=wanted)
     said = {"format": "tricap-run", "version": 1, "take": str(small_run.take)}
-    store.write_json(small_run.out / "run.json", {**said, "settings": {"skin": {"rays": 24}}})
+    store.write_json(small_run.out / "run.json", {**said, "settings": {"skin": {"rays": 25}}})
     report = build_scene(small_run.out, tmp_path / "a.blend", options=wanted)
-    assert any("run's skins have" in warning for warning in report.warnings) and not (tmp_path / "a.pc2").exists()
+    assert any("even number of rays" in warning for warning in report.warnings) and not (tmp_path / "a.pc2").exists()
     store.write_json(small_run.out / "run.json", {**said, "settings": {"skin": {"rays": "many"}}})
     with pytest.raises(InputError, match="rays"):
         build_scene(small_run.out, tmp_path / "a.blend", options=wanted)
-    for path in (small_run.out / "skin").iterdir():
-        path.unlink()
     store.write_json(small_run.out / "run.json", said)
-    assert any("has no skins" in warning for warning in build_scene(small_run.out, tmp_path / "a.blend", options=wanted).warnings)
+    (small_run.out / "motion.csv").unlink()
+    assert any("the run has no body" in warning for warning in build_scene(small_run.out, tmp_path / "a.blend", options=wanted).warnings)
 
 
 def test_the_implicit_surface_is_that_of_the_field(empty: ModuleType, small_run: SmallRun) -> None:

@@ -40,6 +40,10 @@ class SkinSettings:
         "B-spline patches go through the points, or approximate them and shrink a little.",
         choices=(INTERPOLATING, APPROXIMATING),
     )
+    exact: bool = knob(
+        False,
+        "Cast the skin of every frame onto the fitted surface (0.3 s a frame), instead of moving that of the middle pose with the bones.",
+    )
     anatomy: bool = knob(
         True, "Anatomical heads, hands and feet, with jaw, fingers, heel and toes, instead of the three fitted balls of a bone."
     )

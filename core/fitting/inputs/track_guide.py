@@ -10,7 +10,8 @@ import numpy as np
 
 from ...body.motion import BodyFit
 from ...body.skeleton import bone_frames
-from ...body.skin.contour_skin import Skin, body_skin
+from ...body.skin.contour_skin import Skin
+from ...body.skin.posed import PosedSkin
 from ...foundation import store
 from ...geometry.raster import rasterize
 from ...take.footage import Footage
@@ -24,14 +25,15 @@ class BodyGuide:
     """The body in every frame of its motion. Skins are made on demand; the last two are cached."""
 
     def __init__(self, body: BodyFit, footage: Footage) -> None:
-        self._shape, self._motion, self._camera = body.shape, body.motion, footage.rig.cameras[footage.take.reference]
+        self._skin, self._motion = PosedSkin(body.shape, body.motion.values), body.motion
+        self._camera = footage.rig.cameras[footage.take.reference]
         self._R, self._head = bone_frames(body.shape.skeleton, body.shape.lengths_m, body.motion.values)
         self._row = {int(frame): i for i, frame in enumerate(body.motion.frames)}
         self._skins: dict[int, tuple[Skin, np.ndarray]] = {}
         self.longest_frames = round(WAIT_S * footage.take.fps)
         balls = body.shape.metaballs
         parts = (body.motion.frames, body.motion.values, body.shape.lengths_m, balls.centre, balls.radii_m, balls.weight)
-        self.key = store.digest("guide 1", *(np.ascontiguousarray(part).tobytes() for part in parts))
+        self.key = store.digest("guide 2", *(np.ascontiguousarray(part).tobytes() for part in parts))
 
     def bind(self, frame: int, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The bone (N,) of each point (N, 3) of a frame, −1 for none, and the point in the bone's axes (N, 3).  (1)"""
@@ -68,7 +70,7 @@ class BodyGuide:
         if frame not in self._skins:
             while len(self._skins) > 1:
                 del self._skins[next(iter(self._skins))]
-            skin = body_skin(self._shape, self._motion.values[self._row[frame]])
+            skin = self._skin.at(self._motion.values[self._row[frame]])
             raster = rasterize(self._camera, skin.vertices_m, skin.triangles)
             self._skins[frame] = skin, raster.image(raster.depth_m, np.inf)
         return self._skins[frame]
