@@ -8,6 +8,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..foundation.progress import Monitor
 from ..foundation.store import without_nan
 from ..report.comparison import HIGHER, LOWER, Measure
