@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..core.foundation.errors import InputError
+from ..core.foundation.errors import InputError, sentence_of
 from ..core.foundation.progress import Cancelled, Monitor
 from ..core.foundation.threads import one_thread_in_linear_algebra
 from .panels import show_status
@@ -241,8 +241,11 @@ class JobOperator:
     def _prepare(self, context: bpy.types.Context) -> Job | None:
         try:
             return Job(self.snapshot(context), self.steps, self.step)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+        except Exception as error:  # the edge of the operator: faults of the input and of the system are told, bugs are raised
+            reason = sentence_of(error)
+            if reason is None:
+                raise
+            self.report({"ERROR"}, reason)  # type: ignore[attr-defined]
             return None
 
     def _conclude(self, context: bpy.types.Context, job: Job) -> set[str]:
@@ -263,8 +266,8 @@ class JobOperator:
         return ended
 
     def _report_error(self, job: Job, error: BaseException) -> None:
-        if isinstance(error, InputError):
-            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+        if (reason := sentence_of(error)) is not None:
+            self.report({"ERROR"}, reason)  # type: ignore[attr-defined]
         elif isinstance(error, (Cancelled, KeyboardInterrupt)):
             self.report({"WARNING"}, f"{error} {self.if_stopped}".strip())  # type: ignore[attr-defined]
         else:
@@ -295,7 +298,7 @@ class JobOperator:
 
 
 def _message(error: BaseException) -> str:
-    return str(error) if isinstance(error, InputError) else BUG.format(error=f"{type(error).__name__}: {error}")
+    return sentence_of(error) or BUG.format(error=f"{type(error).__name__}: {error}")
 
 
 def redraw(context: bpy.types.Context) -> None:

@@ -27,10 +27,10 @@ CHANGING = set("append appendleft extend insert remove pop popleft popitem clear
 
 OPENING = {"open", "read_text", "read_bytes", "fromfile", "loadtxt", "imread", "iterparse"}
 PARSING = {"json.load", "json.loads", "np.load", "Xml.parse", "Xml.fromstring", "ElementTree.parse", "ElementTree.fromstring"}
-OWN = {  # an operator's argument; a file that was opened there; the lock, and where unwanted output goes
+OWN = {  # an operator's argument; a file that was opened there; what is written, and where unwanted output goes
     "json.loads": ("addon/correcting/operators.py",),
     "np.load": ("core/foundation/store.py",),
-    "os.open": ("core/foundation/lock.py", "core/cli/arguments.py"),
+    "os.open": ("core/foundation/lock.py", "core/foundation/store.py", "core/cli/arguments.py", "core/cli/streams.py"),
 }
 
 Imported = tuple[int, bool, tuple[str, ...]]  # line, relative or not, the module's dotted name (relative ones from the root)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import bpy
 
+from ...core.foundation import bounded
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.bvh import read_bvh
@@ -116,6 +117,7 @@ def _rig_of_bvh(path: Path) -> None:
 def _try(load: Callable[[], object], path: Path) -> None:
     """Run an importer; any error that it raises becomes an InputError about the file."""
     try:
+        bounded.check_file(path, bounded.ARRAYS_BYTES)
         load()
     except Exception as error:  # noqa: BLE001  importers raise anything, from struct.error to RuntimeError with a traceback as text
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]

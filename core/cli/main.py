@@ -13,14 +13,20 @@ from typing import Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Cancelled, Monitor
+from . import streams
 from .arguments import with_joined_frames
 from .parser import Adder, build_parser
 
 
 def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     """Run one command of the core, or one that `adders` add; returns the exit code."""
+    with streams.robust():
+        return _run(argv, adders)
+
+
+def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     parser = build_parser(adders)
     args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
     args.parser = parser
@@ -29,15 +35,17 @@ def main(argv: list[str] | None = None, adders: tuple[Adder, ...] = ()) -> int:
     try:
         with _interrupts(monitor), threadpool_limits(1, user_api="blas"):  # those that Blender has loaded
             lines = args.run(args, monitor)
-    except InputError as error:
-        _write_line(f"tricap: {error}", sys.stderr)
-        return 2
+        for line in lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", []):
+            streams.write_line(line, sys.stdout)
     except Cancelled as stop:
-        _write_line(f"tricap: {stop}", sys.stderr)
+        streams.write_line(f"tricap: {stop}", sys.stderr)
         return 130
-    shown = lines if not args.quiet or getattr(args, "json", False) else getattr(args, "always_shown", [])
-    for line in shown:
-        _write_line(line, sys.stdout)
+    except (InputError, OSError, MemoryError, cv2.error) as error:
+        reason = sentence_of(error)
+        if reason is None:
+            raise
+        streams.write_line(f"tricap: {reason}", sys.stderr)
+        return 2
     return int(getattr(args, "exit_code", 0))
 
 
@@ -73,8 +81,7 @@ def _prepare_libraries() -> None:
 
 def _progress_line(stage: str, done: float, total: float) -> None:
     part = min(1.0, done / total) if total else 1.0
-    sys.stderr.write(f"\r{stage:<24} [{'#' * round(30 * part):<30}] {100 * part:3.0f} %" + ("\n" if part >= 1 else ""))
-    sys.stderr.flush()
+    streams.write(f"\r{stage:<24} [{'#' * round(30 * part):<30}] {100 * part:3.0f} %" + ("\n" if part >= 1 else ""), sys.stderr)
 
 
 def _plain_progress() -> Callable[[str, float, float], None]:
@@ -85,11 +92,6 @@ def _plain_progress() -> Callable[[str, float, float], None]:
         tenth = int(10 * done / total) if total else 10
         if last.get(stage) != tenth:
             last[stage] = tenth
-            _write_line(f"{stage}: {10 * tenth} %", sys.stderr)
+            streams.write_line(f"{stage}: {10 * tenth} %", sys.stderr)
 
     return report
-
-
-def _write_line(text: str, stream: Any) -> None:
-    stream.write(text + "\n")
-    stream.flush()

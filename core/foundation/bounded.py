@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from xml.etree import ElementTree as Xml
 
+from .errors import InputError
+
 TOML_BYTES = 4 << 20  # take.toml, rig.toml, body.toml, a body model: thousands of clicks
 CALIBRATION_BYTES = 50_000_000  # other tools' files, some of which contain all observations
 JSON_BYTES = 1 << 28
@@ -63,6 +65,22 @@ def _check(state: os.stat_result, path: Path, largest: int) -> None:
 
 def _size(count: int) -> str:
     return f"{count / (1 << 30):.0f} GB" if count >= 1 << 30 else f"{count / (1 << 20):.0f} MB"
+
+
+def check_name(path: Path) -> None:
+    """Check that the name of a folder can be written into files and reports: on some systems names are any bytes.
+
+    Raises:
+        InputError: it is no Unicode text.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"The name of the folder {_shown(path)} is not UTF-8; rename it, or one of those above it.") from error
+
+
+def _shown(path: Path) -> str:
+    return str(path).encode(errors="backslashreplace").decode()
 
 
 def check_file(path: Path, largest: int) -> None:

@@ -1,5 +1,6 @@
-"""The error that a user can correct. Any other exception is a bug."""
+"""The error that a user can correct, and the sentence for faults of the computer. Any other exception is a bug."""
 
+NO_MEMORY = -4  # OpenCV's code
 LONGEST = 1500  # characters of a message
 
 
@@ -12,3 +13,16 @@ class InputError(Exception):
     def __init__(self, message: str = "") -> None:
         text = "".join(c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in str(message))
         super().__init__(text if len(text) <= LONGEST else text[: LONGEST // 2] + " … " + text[-LONGEST // 2 :])
+
+
+def sentence_of(error: BaseException) -> str | None:
+    """What to tell the user at the edge of a command or job: of an InputError its message, of a fault of the system, of a disk or of memory
+    that no reader or writer expected a sentence with the file; None for a bug."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+        return str(InputError(f"Cannot use {names or 'a file'}: {error.strerror}. Check its name, its rights and its drive."))
+    if isinstance(error, MemoryError) or getattr(error, "code", None) == NO_MEMORY:
+        return "There is not enough memory. Close other programs, raise the limit if there is one, or reduce the images or the settings."
+    return None

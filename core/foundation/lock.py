@@ -86,7 +86,7 @@ def _handle(path: Path) -> int:
     if path.is_symlink():  # Windows has no O_NOFOLLOW
         raise refused
     try:
-        handle = os.open(path, flags, 0o644)
+        handle = os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             raise refused from error

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..foundation import store
+from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.lock import NAME, locked
 from . import run_json
@@ -58,6 +58,7 @@ class Results:
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).resolve()
+        bounded.check_name(self.folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
         outside = [path for path in _written(self.folder) if not _inside(path, self.folder)]

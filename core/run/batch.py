@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ..foundation import store
-from ..foundation.errors import InputError
+from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Monitor
 from ..results.folder import check_separate_folder
 from . import pipeline, take_run
@@ -119,12 +119,12 @@ def run_take(take: str, out: str, overrides: take_run.Overrides, restart: bool) 
             pipeline.all_stages(job, Monitor(_reporter(take)))
             _scene(job)
         status, said = Status.DONE, _summary_of(job)
-    except InputError as error:
-        status, said = Status.INVALID_INPUT, str(error)
     except Exception as error:  # the edge of the worker: every error goes into the summary
-        path = Path(out).with_name(f"{Path(out).name}_error.txt")
-        store.write_text(path, traceback.format_exc())
-        status, said = Status.BUG, f"Tricap made a mistake ({type(error).__name__}); please report it with {path}."
+        status, said = Status.INVALID_INPUT, sentence_of(error) or ""
+        if not said:
+            path = Path(out).with_name(f"{Path(out).name}_error.txt")
+            store.write_text(path, traceback.format_exc())
+            status, said = Status.BUG, f"Tricap made a mistake ({type(error).__name__}); please report it with {path}."
     return asdict(Outcome(take=take, out=out, status=status, said=said, seconds=round(time.perf_counter() - began, 1)))
 
 

@@ -173,6 +173,7 @@ def read_take(folder: Path) -> Take:
     """
     folder = Path(folder)
     path = folder / "take.toml" if folder.name != "take.toml" else folder
+    bounded.check_name(path.parent.resolve())
     try:
         return take_of_text(bounded.text_of(path, bounded.TOML_BYTES), path)
     except OSError as error:

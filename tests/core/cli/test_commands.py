@@ -64,7 +64,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a folder for a pattern": (lambda t: edit(t, "L/*.png", "L"), "“L” is a folder; write “L/*.png”"),
     "offset true": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = true\n'), "`offset_frames` of view 'L' of"),
     "offset in parts": (lambda t: edit(t, 'name = "L"\n', 'name = "L"\noffset_frames = 1.5\n'), "is 1.5; write a whole number"),
-    "offset endless": (lambda t: edit(t, 'name = "L"\n', f'name = "L"\noffset_frames = {10**30}\n'), "write a whole number of frames"),
+    "offset endless": (lambda t: edit(t, 'name = "L"\n', f'name = "L"\noffset_frames = {10**15}\n'), "write a whole number of frames"),
     "path outside": (lambda t: edit(t, "L/*.png", "../L/*.png"), "lies outside the take"),
     "unknown setting": (lambda t: click(t, "[settings.matching]\npatch = 13\n"), "has no setting “patch”. Did you mean “patch_px”?"),
     "setting out of range": (lambda t: click(t, "[settings.matching]\npatch_px = 1000\n"), "it must lie between 5 and 51"),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rig import read_rig
 from tricap.core.images.sequence import read_image
 from tricap.core.motion.retarget.mapping import read_preset
+from tricap.core.results.folder import Results
 from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
 
@@ -139,3 +141,16 @@ def test_a_long_line_of_controls_is_read_in_a_moment(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="follow itself"):
         read_preset(path)
     assert time.process_time() - began < SECONDS  # minutes, when every name was looked for in its whole line
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are Unicode there")
+def test_a_name_that_is_no_unicode_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"k\xff")
+    folder.mkdir()
+    (folder / "take.toml").write_text(HEAD + VIEWS)
+    for read in (read_take, Results):
+        with pytest.raises(InputError, match=r"k.udcff is not UTF-8; rename it"):
+            read(folder)
+    (folder / "below").mkdir()
+    with pytest.raises(InputError, match="one of those above it"):
+        read_take(folder / "below")

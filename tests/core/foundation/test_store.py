@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -158,3 +159,23 @@ def test_the_digest_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
     data = bytes(range(256)) * 9000  # more than one piece
     (tmp_path / "x").write_bytes(data)
     assert store.digest(tmp_path / "x", "y") == store.digest(data, "y") != store.digest(data + b"y")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+def test_results_have_the_rights_that_the_user_asked_for(tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        for umask, mode in ((0o077, 0o600), (0o002, 0o664), (0o022, 0o644)):
+            os.umask(umask)
+            store.write_text(tmp_path / "a", "a")
+            assert (tmp_path / "a").stat().st_mode & 0o777 == mode
+    finally:
+        os.umask(before)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_bytes_that_are_no_text_are_read_back_from_json(tmp_path: Path) -> None:
+    """Such as those in the name of a folder."""
+    value = {"take": b"k\xff\xc3\xa9".decode("utf-8", "surrogateescape")}
+    store.write_json(tmp_path / "a.json", value)
+    assert store.read_json(tmp_path / "a.json") == value

@@ -87,10 +87,15 @@ def test_a_scheduler_by_its_address(takes: list[Path], tmp_path: Path, monkeypat
 
     monkeypatch.setattr(pipeline, "all_stages", stages)
     monkeypatch.setattr(batch, "_scene", lambda job: None)
+    if sys.platform == "linux":  # where names of folders are any bytes
+        takes.append(Path(shutil.copytree(takes[0], takes[0].with_name(os.fsdecode(b"k\xff")))))
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
         engine = Engine(scheduler=cluster.scheduler_address)
         outcomes = run_batch(takes, tmp_path / "out", engine, COARSE, Monitor())
-        assert [o.status for o in outcomes] == [Status.DONE, Status.INVALID_INPUT, Status.BUG]
+        assert [o.status for o in outcomes[:3]] == [Status.DONE, Status.INVALID_INPUT, Status.BUG]
+        assert all(o.status == Status.INVALID_INPUT and "k\\udcff is not UTF-8" in o.said for o in outcomes[3:])
+        told = json.loads((tmp_path / "out" / "batch.json").read_text())["takes"]
+        assert [t["take"] for t in told] == [str(take) for take in takes]
         assert "throw_error.txt" in outcomes[2].said and "ZeroDivisionError: ours" in (tmp_path / "out" / "throw_error.txt").read_text()
         monitor = Monitor()
         monitor.cancel()

@@ -1,0 +1,92 @@
+"""Standard output and standard error, whatever they are: closed, full, a pipe that nobody reads, or without some of our characters.
+
+None of that ends a computation, or changes the exit code of what was found; only output that was asked for and could not be written, such
+as on a full disk, is a fault of its own.
+"""
+
+import codecs
+import errno
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from ..foundation.errors import InputError
+
+ESCAPED = "tricap-escaped"  # the name of our error handler
+NOBODY_READS = {errno.EPIPE, errno.ESHUTDOWN, *({errno.EINVAL} if os.name == "nt" else set())}
+
+
+def _escaped(error: UnicodeError) -> tuple[str, int]:
+    """Characters that an encoding lacks, as in JSON: \\u201c, in two parts beyond 16 bits."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    units = error.object[error.start : error.end].encode("utf-16-be", "surrogatepass").hex()
+    return "".join(f"\\u{units[i : i + 4]}" for i in range(0, len(units), 4)), error.end
+
+
+codecs.register_error(ESCAPED, _escaped)
+
+
+@contextmanager
+def robust() -> Iterator[None]:
+    """While it lasts, both streams exist and take every character; at the end they are flushed, and given up where that fails."""
+    _open_missing()
+    before = [(stream, stream.errors) for stream in (sys.stdout, sys.stderr) if hasattr(stream, "reconfigure")]
+    for stream, _ in before:
+        stream.reconfigure(errors=ESCAPED)
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except OSError:
+                _give_up(stream)
+        for stream, errors in before:
+            stream.reconfigure(errors=errors)
+
+
+def write_line(text: str, stream: Any) -> None:
+    """Write a line and flush it; where nobody reads it, it and all further ones are dropped.
+
+    Raises:
+        InputError: it cannot be written to standard output, such as to a file on a full disk.
+    """
+    write(f"{text}\n", stream)
+
+
+def write(text: str, stream: Any) -> None:
+    """Write a text without a line end, such as a progress bar, as `write_line` does.
+
+    Raises:
+        InputError: see there.
+    """
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError as error:
+        _give_up(stream)
+        if stream is sys.stdout and error.errno not in NOBODY_READS:
+            where = "Cannot write the output of this command"
+            raise InputError(f"{where}: {error.strerror or error}. Free some space, or send it elsewhere.") from error
+
+
+def _give_up(stream: Any) -> None:
+    """Whatever is written to a stream, and what waits in its buffer, is dropped from here."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+def _open_missing() -> None:
+    """Give the program the streams that it was started without; otherwise the next file that is opened would take their number."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number: this one
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))

@@ -1,0 +1,75 @@
+"""The `tricap` command with any kind of standard output and error: its exit code and its work do not depend on them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tricap.core.foundation.errors import InputError, sentence_of
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="redirects by a shell of Unix")
+VIEWS = '[[views]]\nname = "L"\nimages = "L/*.png"\n[[views]]\nname = "R"\nimages = "R/*.png"\n'
+RIG = "[cam_0]\nname = 'é“\U0001f600'\n"
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rig.toml in which `tricap check` finds something, with a name beyond every old encoding."""
+    path = tmp_path_factory.mktemp("rig") / "rig.toml"
+    path.write_text(RIG, encoding="utf-8")
+    return path
+
+
+def shell(line: str, rig: Path, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    """`tricap ARGUMENTS` in the line is the command."""
+    script = line.replace("tricap", f"{sys.executable} -P -m tricap").replace("RIG", str(rig))
+    return subprocess.run(["bash", "-c", script], capture_output=True, env={**os.environ, **environment}, timeout=120)
+
+
+def test_every_line_ends_with_the_code_of_what_was_found(rig: Path) -> None:
+    lines = (
+        "tricap check RIG | head -c 0; exit ${PIPESTATUS[0]}",
+        "tricap check RIG >&-",
+        "tricap check RIG 2>&-",
+        "tricap check RIG <&- >&- 2>&-",
+        "tricap check RIG 2> /dev/full",
+        "tricap check RIG --json > /dev/null",
+    )
+    script = "; ".join(f"({line}); echo $?" for line in lines)
+    done = shell(script, rig)
+    codes = [line for line in done.stdout.decode().split() if line.isdecimal()]
+    assert codes == ["1"] * len(lines), done
+    assert b"Traceback" not in done.stderr and b"Exception ignored" not in done.stderr, done.stderr
+
+
+def test_an_output_that_cannot_be_written_is_one_sentence(rig: Path) -> None:
+    done = shell("tricap check RIG > /dev/full", rig)
+    assert done.returncode == 2 and done.stderr.decode().startswith("tricap: Cannot write the output of this command: No space"), done
+    assert done.stderr.count(b"\n") == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
+def test_every_encoding_takes_every_character(rig: Path, encoding: str) -> None:
+    plain = shell("tricap check RIG; tricap check RIG --json", rig, PYTHONIOENCODING=encoding)
+    text = plain.stdout.decode(encoding)
+    assert plain.returncode == 1 and b"Traceback" not in plain.stderr, plain
+    found = json.loads(text[text.index("{") :])
+    assert "é“\U0001f600" in str(found), text
+
+
+def test_faults_of_the_system_are_sentences() -> None:
+    assert sentence_of(InputError("a")) == "a"
+    assert sentence_of(KeyError("a")) is None and sentence_of(OSError("no number")) is None
+    said = sentence_of(OSError(36, "File name too long", "a" * 5000))
+    assert said and "File name too long" in said and len(said) < 1600
+    assert "memory" in str(sentence_of(MemoryError()))
+
+
+def test_a_name_that_is_too_long_is_one_sentence(rig: Path) -> None:
+    long = "a" * 500
+    for line in (f"check {long}", f"run {long} --out {rig.parent / 'out'}", f"calibrate {long} --out {rig.parent / 'b.toml'} --bar 1"):
+        done = shell(f"tricap {line}", rig)
+        assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"tricap: " in done.stderr, done
