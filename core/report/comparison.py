@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from ..images.sequence import decoded
 from . import pictures
 from .document import document, figure, table
 
@@ -72,10 +72,7 @@ def _picture_rows(folders: Sequence[Path]) -> list[str]:
         for name in (name for name in found[0] if name.startswith(f"{kind}_") and name in found[1]):
             frame = name.removesuffix(".png").removeprefix(f"{kind}_").replace("_", ", view ")
             pair = [
-                figure(
-                    f"{kind}, frame {frame}: {method}", pictures.jpeg(cv2.imdecode(np.fromfile(files[name], np.uint8), cv2.IMREAD_COLOR))
-                )
-                for method, files in zip(METHODS, found)
+                figure(f"{kind}, frame {frame}: {method}", pictures.jpeg(decoded(files[name]))) for method, files in zip(METHODS, found)
             ]
             rows.append(f'<div class="row">{"".join(pair)}</div>')
     return rows
