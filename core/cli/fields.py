@@ -8,7 +8,7 @@ from ..body.fields import POTENTIALS, THRESHOLD, Potential
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..report.figures import HEIGHT, WIDTH, field_graph
+from ..report.graphs import HEIGHT, WIDTH, field_graph
 
 PLOT_RADIUS = 1.5  # in units of l
 SAMPLES = 301

@@ -11,7 +11,9 @@ STYLE = """
 *{box-sizing:border-box}body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:0 auto;padding:1em;color:var(--ink);
 background:var(--paper)}h1{margin:.2em 0}h2{margin:1.6em 0 .5em}img,svg{max-width:100%;height:auto}
 figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px}.row{display:grid;gap:1em;
-grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));margin:1em 0}.wide{overflow-x:auto}
+grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));margin:1em 0}.cells{gap:.4em;
+grid-template-columns:repeat(auto-fit,minmax(150px,1fr))}.graphs{
+grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr))}.wide{overflow-x:auto}
 table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;border-bottom:1px solid var(--line);vertical-align:top}
 .note{background:var(--note);padding:.4em .8em;margin:.4em 0}.soft{color:var(--soft)}.good{color:var(--good)}.bad{color:var(--bad)}
 .verdict{font-size:1.2em;margin:.4em 0}summary{cursor:pointer;font-weight:600;margin:.6em 0}pre{white-space:pre-wrap;

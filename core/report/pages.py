@@ -1,16 +1,20 @@
-"""report/report.html: one self-contained page, and its pictures as files."""
+"""report/report.html: one self-contained page, and its pictures as files.
 
-import base64
+The page begins with what came out and what is doubtful; then come the figures of the papers, graphs, and at the end all numbers.
+"""
+
 import html
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ..body.motion import BodyFit
-from ..body.skin.contour_skin import SkinSettings, body_skin
+from ..body.skin.contour_skin import SkinSettings
 from ..body.skin.extremities import shape_for_skin
+from ..body.skin.mesh import Skin
+from ..body.skin.posed import skins_in
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
@@ -20,14 +24,16 @@ from ..surface.cloud import PointCloud
 from ..take.footage import Footage
 from ..tracking.trajectories import Trajectories
 from . import pictures
-from .figures import Row, curve_graph, figure_rows, number, quoted
+from .document import document, figure, notes, table
+from .figures import Row, figure_rows, figures_csv, number, quoted
+from .graphs import SCRIPT, curve_graph
+from .overview import LEGEND, bone_sigma_mm, known_body, strip_frames, verdict, window_px
 from .silhouettes import OUTLINE, PERSON, Silhouettes
+from .trails import trail_pictures
 
-STYLE = (
-    "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}img,svg{max-width:100%}"
-    "table{border-collapse:collapse}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #ddd}"
-    ".note{background:#fff3d0;padding:.4em .8em}pre{white-space:pre-wrap}"
-)
+LIMBS = {"arm": ("clavicle", "shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "toe")}  # joints
+KINDS = {"Measured surface": ("surface", "cloud"), "Trajectories": ("tracks", "trails"), "Body over the footage": ("body",)}  # of pictures
+SIDES = {"L": "Left", "R": "Right"}
 LABELS = {
     "points_per_frame": "points a frame",
     "residual_px": "residual of the rays [px], median",
@@ -59,6 +65,7 @@ class Report:
     trajectories: Trajectories | None
     body: BodyFit | None
     silhouettes: Silhouettes
+    doubtful: Mapping[int, str] = field(default_factory=dict)  # frame -> why, the worst first
 
 
 def write_report(results: Results, report: Report, monitor: Monitor, pictured: Sequence[int] = ()) -> None:
@@ -67,31 +74,48 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     Cancelling leaves the report of the run before.
     """
     record, fits = report.record, report.silhouettes.fits
-    shown = _pictures(report, monitor, pictured)
+    trails = trail_pictures(results.path("trajectories_raw.npz"), report.footage.rig.cameras[report.footage.take.reference])
+    skin_at = _skin(report)
+    shown = _pictures(report, skin_at, monitor, pictured) | {
+        f"trails_{n}.png": trail for n, trail in zip(("all", "removed", "kept"), trails)
+    }
     files: dict[str, tuple[str, bytes, bytes]] = {}
     for done, (name, (caption, picture)) in enumerate(shown.items()):
         monitor.step("report", len(shown) + done, 2 * len(shown))
         files[name] = (caption, pictures.png(picture), pictures.jpeg(picture))
     rows = figure_rows(record, report.clouds, report.trajectories, report.body, fits)
     small = {name: (caption, picture) for name, (caption, _, picture) in files.items()}
-    page = _page(record, rows, small, _graphs(report) + _silhouette_graphs(report.silhouettes))
+    page = _page(report, rows, small, _strip(report, skin_at, monitor))
     monitor.step("report", 1, 1)
     results.remove("report")
     for name, (_, data, _) in files.items():
         store.write_bytes(results.path("report", name), data)
     per_frame = [asdict(f) | {key: number(getattr(f, key)) for key in ("iou", "inside", "distance_px")} for f in fits]
-    table = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
-    store.write_json(results.path("report", "report.json"), table)
+    numbers = {"format": "tricap-report", "version": 1, **record, "figures": rows, "silhouettes": per_frame}
+    store.write_json(results.path("report", "report.json"), numbers)
+    store.write_text(results.path("report", "figures.csv"), figures_csv(rows))
     store.write_text(results.path("report", "report.html"), page)
 
 
-def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int]) -> dict[str, tuple[str, np.ndarray]]:
+def _skin(report: Report) -> Callable[[np.ndarray], Skin] | None:
+    """The skin in a pose; None without a body, or for a body without a skin, of which the run has warned."""
+    if report.body is None:
+        return None
+    settings = SkinSettings(**report.record["settings"]["skin"])
+    try:
+        return skins_in(shape_for_skin(report.body.shape, settings), report.body.motion.values, settings)
+    except InputError:
+        return None
+
+
+def _pictures(
+    report: Report, skin_at: Callable[[np.ndarray], Skin] | None, monitor: Monitor, pictured: Sequence[int]
+) -> dict[str, tuple[str, np.ndarray]]:
     """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
     footage, record, clouds, trajectories = report.footage, report.record, report.clouds, report.trajectories
     body, silhouettes = report.body, report.silhouettes
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
-    settings = SkinSettings(**record["settings"]["skin"])
     found: dict[str, tuple[str, np.ndarray]] = {}
     chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or sorted({0, len(clouds) // 2, len(clouds) - 1})
     total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
@@ -112,8 +136,8 @@ def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int]) -> dict
         if trajectories is not None:
             caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
             add(f"tracks_{frame:04d}.png", caption, pictures.tracks_over_footage(images[ref], camera, trajectories, i))
-        if body is not None:
-            skin = body_skin(shape_for_skin(body.shape, settings), body.motion.values[i], settings)
+        if body is not None and skin_at is not None:
+            skin = skin_at(body.motion.values[i])
             for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
                 person = silhouettes.outlines.get(name, {}).get(frame)
                 picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
@@ -133,6 +157,26 @@ def _agreement_caption(silhouettes: Silhouettes, view: str, frame: int) -> str:
     return f" and its outline (green); {agreement} {PERSON[fit.person]}{drawn}"
 
 
+def _strip(report: Report, skin_at: Callable[[np.ndarray], Skin] | None, monitor: Monitor) -> list[tuple[str, bytes]]:
+    """Captions and pictures of the body over the footage of the reference view, in frames all over the recording and in doubtful ones."""
+    body, footage = report.body, report.footage
+    if body is None or skin_at is None:
+        return []
+    k = footage.take.reference
+    camera, frames = footage.rig.cameras[k], body.motion.frames.tolist()
+    chosen = strip_frames(len(frames), [frames.index(frame) for frame in report.doubtful if frame in frames])
+    side = max(window_px(camera, body.motion.joints_m[i]) for i in chosen)
+    found = []
+    for i in chosen:
+        monitor.step("report", 1, 2)
+        centre, grey = camera.project(body.motion.joints_m[i]), footage.read(frames[i])[k]
+        middle = 0.5 * (np.nanmin(centre, axis=0) + np.nanmax(centre, axis=0))
+        picture = known_body(grey, camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i), middle, side)
+        why = f": {report.doubtful[frames[i]]}" if frames[i] in report.doubtful else ""
+        found.append((f"Frame {frames[i]}{why}", pictures.jpeg(picture)))
+    return found
+
+
 def _silhouette_graphs(silhouettes: Silhouettes) -> list[str]:
     """The overlap over the frames, view by view."""
     fits, measure = silhouettes.fits, "IoU of the silhouette" if silhouettes.whole else "Share of the silhouette inside the person's"
@@ -141,8 +185,8 @@ def _silhouette_graphs(silhouettes: Silhouettes) -> list[str]:
     return [curve_graph(f"{measure}, view {view}", "", t[:, 0].astype(int), {view: t[:, 1]}) for view, t in tables.items()]
 
 
-def _graphs(report: Report) -> list[str]:
-    clouds, trajectories, body = report.clouds, report.trajectories, report.body
+def _measurement_graphs(report: Report) -> list[str]:
+    clouds, trajectories = report.clouds, report.trajectories
     rows = [(c.frame, len(c.xyz_m), finite_median(c.residual_px), 1e3 * finite_median(c.sigma_m)) for c in clouds]
     frames, points, residual, sigma = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     graphs = [
@@ -152,39 +196,74 @@ def _graphs(report: Report) -> list[str]:
     ]
     if trajectories is not None:
         graphs.append(curve_graph("Tracked points", "", trajectories.frames, {"points": trajectories.visible.sum(axis=1).astype(float)}))
-    if body is not None:
-        angles = [i for i, dof in enumerate(body.shape.skeleton.dofs) if i not in set(body.shape.skeleton.layout.group("base").tolist())]
-        for i in angles:
-            name = body.motion.dof_names[i]
-            graphs.append(
-                curve_graph(
-                    name, "°", body.motion.frames, {name: np.degrees(body.motion.values[:, i])}, np.degrees(body.motion.sigma[:, i])
-                )
-            )
     return graphs
 
 
-def _page(record: Mapping[str, Any], rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], graphs: Sequence[str]) -> str:
-    notes = "".join(f'<p class="note">{html.escape(w)}</p>' for w in record["warnings"])
-    stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in record["stages"].items())
+def _limb_graphs(report: Report) -> dict[str, list[str]]:
+    """The degrees of freedom over the frames with a band of one sigma, by limb; dashed: limits of the joint, frames with clicks."""
+    body = report.body
+    if body is None:
+        return {}
+    take, motion, base = report.footage.take, body.motion, set(body.shape.skeleton.layout.group("base").tolist())
+    marks = [k.frame for k in (take.clicks, *take.keyframes) if k.joints]
+    graphs: dict[str, list[str]] = {}
+    for i, dof in enumerate(body.shape.skeleton.dofs):
+        name, metres = motion.dof_names[i], i in base and motion.dof_names[i].rpartition(" ")[2] in ("x", "y", "z")
+        values, sigma, limits = motion.values[:, i], motion.sigma[:, i], np.array(dof.limits)
+        if not metres:
+            values, sigma, limits = np.degrees(values), np.degrees(sigma), np.degrees(limits)
+        limit = (float(limits[0]), float(limits[1])) if i not in base else (-np.inf, np.inf)
+        graph = curve_graph(name, "m" if metres else "°", motion.frames, {name: values}, sigma, limits=limit, marks=marks)
+        graphs.setdefault("Place and direction of the body" if i in base else limb_of(name), []).append(graph)
+    return graphs
+
+
+def limb_of(dof: str) -> str:
+    """The limb of a degree of freedom, by its joint: "elbow.R flexion" -> "Right arm"."""
+    joint, _, side = dof.partition(" ")[0].partition(".")
+    limb = next((limb for limb, joints in LIMBS.items() if joint in joints), "")
+    return f"{SIDES[side]} {limb}" if limb and side in SIDES else "Trunk and head"
+
+
+def _page(report: Report, rows: Sequence[Row], files: Mapping[str, tuple[str, bytes]], strip: Sequence[tuple[str, bytes]]) -> str:
+    """The whole page. Names of the take, its views and its files are text, wherever they come from."""
+    record, take = report.record, html.escape(report.record["take"].rsplit("/", 1)[-1])
+    facts = (
+        f"{len(record['views'])} views ({', '.join(record['views'])}), frames {record['frames'][0]} to {record['frames'][1] - 1}, "
+        f"{record['fps']:g} frames/s, interlaced: {record['interlaced']}"
+    )
+    cells = "".join(figure(caption, picture) for caption, picture in strip)
     shown = "".join(
-        f'<figure><img alt="" src="data:image/jpeg;base64,{base64.b64encode(small).decode()}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-        for caption, small in files.values()
+        f"<h2>{title}</h2><div class='row'>{''.join(found)}</div>"
+        for title, kinds in KINDS.items()
+        if (found := [figure(*files[name]) for kind in kinds for name in files if name.startswith(f"{kind}_")])
     )
-    settings = html.escape(
-        "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in record["settings"].items())
+    limbs = "".join(_folded(limb, _grid(graphs)) for limb, graphs in _limb_graphs(report).items() if any(graphs))
+    settings = "\n".join(f"[{group}] " + ", ".join(f"{k} = {v}" for k, v in table.items()) for group, table in record["settings"].items())
+    graphs = _grid(_measurement_graphs(report) + _silhouette_graphs(report.silhouettes))
+    stages = "".join(f"<tr><th>{html.escape(stage)}</th><td>{_figures(figures)}</td></tr>" for stage, figures in record["stages"].items())
+    body = (
+        f'<h1>{take}</h1><p class="verdict">{html.escape(verdict(record, report.body, len(report.doubtful)))}</p>'
+        f'<p class="soft">{html.escape(facts)}</p>'
+        + (f'<div class="row cells">{cells}</div><p class="soft">{LEGEND}</p>' if cells else "")
+        + notes(record["warnings"])
+        + f'{shown}<h2>Over time</h2><p class="soft">Point at a curve to read it, drag over a range to enlarge it, double-click to see '
+        "all. Bands: one sigma. Dashed: limits of the joint, and frames with clicks.</p>"
+        f"{graphs}{limbs}<h2>All figures</h2>"
+        + _folded("Figures (also in report.json and figures.csv)", _quotable(rows))
+        + _folded("Stages", f"<table>{stages}</table>")
+        + _folded("To repeat it", f"<pre>{html.escape(str(record.get('repeat', '')))}</pre>")
+        + _folded("Settings", f"<pre>{html.escape(settings)}</pre>")
     )
-    repeat = html.escape(str(record.get("repeat", "")))
-    take = html.escape(record["take"].rsplit("/", 1)[-1])
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Tricap: {take}</title><style>{STYLE}</style><h1>{take}</h1>'
-        f"<p>{len(record['views'])} views ({html.escape(', '.join(record['views']))}), "
-        f"frames {record['frames'][0]} to {record['frames'][1] - 1}, {record['fps']:g} frames/s, "
-        f"interlaced: {record['interlaced']}</p>{notes}<h2>Figures</h2>{_quotable(rows)}<h2>Stages</h2><table>{stages}</table>"
-        f"<h2>Over time</h2>{''.join(graphs)}<h2>Pictures</h2>{shown}"
-        f"<h2>To repeat it</h2><pre>{repeat}</pre><h2>Settings</h2><pre>{settings}</pre></html>\n"
-    )
+    return document(f"Tricap: {report.record['take'].rsplit('/', 1)[-1]}", body, SCRIPT)
+
+
+def _grid(graphs: Sequence[str]) -> str:
+    return f'<div class="row graphs">{"".join(graphs)}</div>'
+
+
+def _folded(title: str, content: str) -> str:
+    return f"<details><summary>{html.escape(title)}</summary>{content}</details>"
 
 
 def _quotable(rows: Sequence[Row]) -> str:
@@ -192,9 +271,8 @@ def _quotable(rows: Sequence[Row]) -> str:
     cells = []
     for row in rows:
         value, sigma = quoted(row["value"], row["sigma"])
-        texts = (value, f"± {sigma}", row["unit"], row["sigma_of"])
-        cells.append(f"<tr><th>{html.escape(row['name'])}</th>{''.join(f'<td>{t}</td>' for t in texts)}</tr>")
-    return f"<table><tr><th></th><th>value</th><th>sigma</th><th>unit</th><th>the sigma is</th></tr>{''.join(cells)}</table>"
+        cells.append([html.escape(row["name"]), value, f"± {sigma}", html.escape(row["unit"]), html.escape(row["sigma_of"])])
+    return table(["", "value", "sigma", "unit", "the sigma is"], cells)
 
 
 def _figures(figures: Mapping[str, Any]) -> str:

@@ -37,7 +37,7 @@ from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
 from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_trajectories
-from .record import fit_figures, fit_warnings, surface_figures, track_figures
+from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, surface_figures, track_figures
 from .stages import STAGES
 from .take_run import Overrides, Run, open_run
 
@@ -119,6 +119,7 @@ def report(run: Run, monitor: Monitor) -> None:
         trajectories=run.trajectories,
         body=run.body,
         silhouettes=run.silhouettes,
+        doubtful=doubtful_frames(frame_table(run.measured.summaries, run.trajectories, run.body), run.body),
     )
     write_report(run.results, shown, monitor, run.pictured)
     run.finish_stage("report", began)

@@ -201,6 +201,20 @@ def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | 
     return FrameTable(frames=frames, values=values, fit=tuple(fit))
 
 
+def doubtful_frames(table: FrameTable, body: BodyFit | None) -> dict[int, str]:
+    """Why frames are doubtful, the worst first: those in which the images contradict a limb, then those worse than the median frame."""
+    contradicted: dict[int, list[str]] = {}
+    for bone, frames in body.contradicted.items() if body is not None else ():
+        for frame in frames:
+            contradicted.setdefault(int(frame), []).append(limb_name(bone))
+    found = {frame: f"the images contradict the {' and the '.join(limbs)}" for frame, limbs in contradicted.items()}
+    badness, reasons = table.badness()
+    for t in np.argsort(-badness, kind="stable").tolist():
+        if reasons[t]:
+            found.setdefault(int(table.frames[t]), reasons[t])
+    return found
+
+
 def write_frame_table(path: Path, table: FrameTable) -> None:
     """Write frames.csv; NaN gives an empty cell."""
     lines = [",".join(("frame", *COLUMNS, "fit"))]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tricap.core.report import pictures
-from tricap.core.report.figures import MOST_PER_CURVE, curve_graph, thinned
+from tricap.core.report.graphs import MOST_PER_CURVE, curve_graph, thinned
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.tracking.trajectories import Trajectories
 

@@ -1,0 +1,188 @@
+"""The page of the report: its first screen, names from elsewhere, trails, and what a browser makes of it."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.motion import BodyFit, BodyMotion
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
+from tricap.core.foundation import store
+from tricap.core.report.document import STYLE, document, figure, notes, table
+from tricap.core.report.figures import figures_csv
+from tricap.core.report.graphs import SCRIPT, curve_graph
+from tricap.core.report.overview import CELL_PX, bone_sigma_mm, known_body, known_colours, strip_frames, verdict
+from tricap.core.report.pages import Report, _page, limb_of
+from tricap.core.report.pictures import jpeg
+from tricap.core.report.silhouettes import Silhouettes
+from tricap.core.report.trails import GROUND, KEPT_COLOUR, REASONS, SIDE_PX, trail_pictures
+from tricap.core.tracking.settings import TrackStatus
+
+BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed (Debian: chromium)")
+ARM = default_shape(read_model("arm.R"))
+NASTY = "<img src=x onerror=alert(1)>"
+PROBE = """
+const seen = {errors: window.failed, width: document.documentElement.scrollWidth, inner: innerWidth}
+seen.columns = getComputedStyle(document.querySelector('.row')).gridTemplateColumns.split(' ').length
+seen.paper = getComputedStyle(document.body).backgroundColor
+const svg = document.querySelector('svg.graph'), box = svg.getBoundingClientRect(), at = x => box.left + box.width * x / 520
+const send = (kind, x) => svg.dispatchEvent(new PointerEvent(kind, {clientX: at(x), clientY: box.top + 50}))
+send('pointermove', 509); seen.read = svg.querySelector('.read').textContent
+send('pointerdown', 56 + 227); send('pointerup', 510); seen.zoomed = [...svg.querySelectorAll('.end')].map(e => e.textContent)
+svg.dispatchEvent(new MouseEvent('dblclick')); seen.whole = svg.querySelector('.end').textContent
+dispatchEvent(new Event('beforeprint')); seen.open = document.querySelectorAll('details[open]').length
+const out = document.createElement('pre'); out.id = 'probe'; out.textContent = JSON.stringify(seen); document.body.append(out)
+"""
+
+
+def fitted(**changes: Any) -> BodyFit:
+    """An arm in three frames, well known but for its wrist."""
+    d, j = len(ARM.skeleton.dofs), len(ARM.skeleton.joint_names)
+    values = np.zeros((3, d))
+    values[:, :3] = 0.15, 0.0, 2.6
+    sigma = np.full((3, j), 0.002)
+    sigma[:, ARM.skeleton.joint_names.index("wrist.R")] = 0.060
+    motion = BodyMotion(
+        frames=np.arange(3), time_s=np.arange(3) / 25, dof_names=ARM.skeleton.dof_names, values=values,
+        covariance=np.tile(np.eye(d) * 1e-4, (3, 1, 1)), joint_names=ARM.skeleton.joint_names,
+        joints_m=np.zeros((3, j, 3)) + [0.15, 0.0, 2.6], joint_sigma_m=sigma, status=("fitted", "fitted", "partial"), sigma0=np.ones(3),
+    )  # fmt: skip
+    given = dict(shape=ARM, motion=motion, iterations=3, converged=True, points=np.zeros((3, 2)), outline_m=np.zeros(0))
+    return BodyFit(**{**given, **changes})  # type: ignore[arg-type]
+
+
+def test_the_verdict_reports_doubt_before_anything_sounds_certain() -> None:
+    record = {"stages": {"measure": {"frames": 3, "points_per_frame": 1234.0, "sigma_mm": 0.4}, "fit": {"not_done": "no clicked joints"}}}
+    assert "1,234 points a frame" in verdict(record, None, 0) and "No body was fitted: no clicked joints." in verdict(record, None, 0)
+    assert "No surface was measured: nothing" in verdict({"stages": {"measure": {"not_done": "nothing"}}}, None, 0)
+    good = verdict(record, fitted(), 0)
+    assert (
+        "fitted in 2 of 3 frames" in good and "largest at wrist.R with 60 mm" in good and good.endswith("No frame stands out as doubtful.")
+    )
+    assert verdict(record, fitted(), 2).endswith("2 frames are doubtful; the worst are shown here.")
+    assert "has not converged" in verdict(record, fitted(converged=False), 0)
+    assert "contradict it in 2 frames" in verdict(record, fitted(contradicted={"forearm.R": (0, 1)}, converged=False), 1)
+
+
+def test_limbs_are_coloured_by_their_sigma(scenes: Any) -> None:
+    """From blue to red; not finite is red. In the picture the forearm, whose wrist is uncertain, is redder than the upper arm."""
+    blue, yellow, red, unknown = known_colours(np.array([0.1, 7.0, 500.0, np.nan])).tolist()
+    assert blue[0] > blue[2] and yellow[1] > 200 and red[2] > 200 and unknown == red
+    body, camera = fitted(), scenes.three_cameras()["C"]
+    assert bone_sigma_mm(body, 0).tolist() == [2.0, 60.0]
+    skin = body_skin(ARM, body.motion.values[0], SkinSettings())
+    place = camera.project(skin.vertices_m)
+    picture = known_body(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), place.mean(axis=0), 90.0)
+    assert picture.shape == (CELL_PX, CELL_PX, 3)
+    redness = picture[..., 2].astype(int) - picture[..., 0]
+    assert redness.min() < -10 and redness.max() > 60 and (redness == 0).mean() > 0.4
+    aside = known_body(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), np.array([900.0, -400.0]), 90.0)
+    assert aside.shape == (CELL_PX, CELL_PX, 3)
+
+
+def test_frames_of_the_strip() -> None:
+    assert strip_frames(100, [50, 3, 7, 9]) == [0, 3, 7, 20, 40, 50, 59, 79, 99] and strip_frames(1, []) == [0]
+
+
+def test_graphs_are_grouped_by_limb() -> None:
+    found = [limb_of(name) for name in ("elbow.R flexion", "toe.L flexion", "neck flexion", "clavicle.L twist")]
+    assert found == ["Right arm", "Left leg", "Trunk and head", "Left arm"]
+
+
+def test_figures_as_a_table() -> None:
+    rows = [{"name": 'length, "arm"', "value": 2.5, "sigma": float("nan"), "unit": "mm", "sigma_of": "x"}]
+    assert figures_csv(rows) == 'name,value,sigma,unit,sigma_of\n"length, ""arm""",2.5,,mm,x\n'
+
+
+def raw(path: Path, status: np.ndarray) -> Path:
+    """A trajectories_raw.npz of points that move to the right, 2 m ahead; NaN where the status is 0."""
+    t, n = status.shape
+    xyz = np.zeros((t, n, 3)) + [0, 0, 2.0]
+    xyz[..., 0] += 0.02 * np.arange(t)[:, None]
+    xyz[..., 1] += 0.05 * np.arange(n)
+    store.save(path, dict(frames=np.arange(t), xyz_m=np.where(status[..., None] > 0, xyz, np.nan).astype(np.float32), status=status), {})
+    return path
+
+
+def test_trails_before_and_after_the_filters(scenes: Any, tmp_path: Path) -> None:
+    camera = scenes.three_cameras()["C"]
+    status = np.full((6, 4), TrackStatus.MEASURED, dtype=np.int8)
+    status[2:, 1], status[:, 2] = TrackStatus.TOO_FAST, TrackStatus.ABSENT
+    (every, before), (removed, red), (kept, green) = trail_pictures(raw(tmp_path / "raw.npz", status), camera)
+    assert "All 18 tracked" in every and "The 4 removed" in removed and "The 14 positions that were kept" in kept
+    assert before.shape == (SIDE_PX, 2 * SIDE_PX, 3)
+
+    def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+        """A pixel between the ground and this colour: lines are as thin as a pixel, and smooth."""
+        over, wanted = picture.astype(float) - GROUND, np.subtract(colour, GROUND)
+        size = np.linalg.norm(over, axis=2)
+        return bool((over @ wanted > 0.99 * size * np.linalg.norm(wanted))[size > 40].any())
+
+    assert has(red, REASONS[TrackStatus.TOO_FAST]) and not has(red, KEPT_COLOUR) and has(green, KEPT_COLOUR)
+    assert before.any() and not has(before, REASONS[TrackStatus.TOO_FAST])
+    assert trail_pictures(tmp_path / "none.npz", camera) == []
+    assert trail_pictures(raw(tmp_path / "empty.npz", np.zeros((3, 2), dtype=np.int8)), camera) == []
+
+
+def page(tmp_path: Path) -> Path:
+    """A page as the report makes it, of an arm, with names that are no names."""
+    take = SimpleNamespace(clicks=SimpleNamespace(frame=1, joints={"elbow.R": {}}), keyframes=())
+    record = {
+        "take": f"/films/{NASTY}", "views": [NASTY, "C"], "frames": [0, 3], "fps": 25.0, "interlaced": "none", "warnings": [NASTY],
+        "stages": {"fit": {"note": NASTY}}, "settings": {"skin": {"k": NASTY}}, "repeat": f"tricap run {NASTY}",
+    }  # fmt: skip
+    report = Report(
+        footage=SimpleNamespace(take=take), record=record, clouds=[], trajectories=None, body=fitted(), silhouettes=Silhouettes(),  # type: ignore[arg-type]
+    )  # fmt: skip
+    rows = [{"name": NASTY, "value": 1.0, "sigma": 0.1, "unit": "mm", "sigma_of": NASTY}]
+    picture = jpeg(np.full((300, 400, 3), 90, np.uint8))
+    files = {f"surface_{i:04d}.png": (f"Frame {i}: {NASTY}", picture) for i in range(3)}
+    path = tmp_path / "report.html"
+    path.write_text(_page(report, rows, files, [(NASTY, picture)] * 6))
+    return path
+
+
+def test_names_are_text(tmp_path: Path) -> None:
+    text = page(tmp_path).read_text()
+    assert NASTY not in text and "&lt;img src=x onerror=alert(1)&gt;" in text
+    assert (
+        not re.search(r'(src|href)="(?!data:)', text) and "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text
+    )
+    assert text.index('class="verdict"') < text.index("<figure>") < text.index("<h2>Over time") < text.index("<h2>All figures")
+
+
+@needs_browser
+@pytest.mark.parametrize(("width", "columns", "scheme"), [(1200, 6, "light"), (500, 2, "dark")])
+def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, scheme: str) -> None:
+    """No error, no scrolling sideways, as many columns as fit, dark where that is asked for, graphs that are read and enlarged."""
+    text = page(tmp_path).read_text()
+    first = "<script>window.failed = []; addEventListener('error', e => failed.push(e.message))</script>"
+    if scheme == "dark":
+        text = text.replace("(prefers-color-scheme:dark)", "all")
+    graph = curve_graph("first", "°", np.arange(11), {"a": 2.0 * np.arange(11)}, np.full(11, 1.0), limits=(-5.0, 15.0), marks=[4])
+    text = text.replace("<h1>", f"{first}{graph}<h1>", 1).replace("</body>", f"<script>{PROBE}</script></body>")
+    (tmp_path / "probe.html").write_text(text)
+    command = [str(BROWSER), "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+               f"--window-size={width},900", "--dump-dom", (tmp_path / "probe.html").as_uri()]  # fmt: skip
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
+    found = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.DOTALL)
+    assert found, dom[-2000:]
+    seen = json.loads(found[1])
+    assert seen["errors"] == [] and seen["width"] <= seen["inner"] and seen["columns"] == columns
+    assert seen["paper"] == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(27, 29, 32)")
+    assert seen["read"] == "frame 10: 20 °" and seen["zoomed"] == ["frame 5", "10"] and seen["whole"] == "frame 0" and seen["open"] >= 6
+
+
+def test_parts_of_a_document() -> None:
+    assert STYLE in document("a < b", "") and "<title>a &lt; b</title>" in document("a < b", "") and "<script>" not in document("a", "")
+    assert 'alt="&quot;x&quot;"' in figure('"x"', b"") and notes(["a & b"]) == '<p class="note">a &amp; b</p>'
+    assert table(["", "v"], [["n", "1"]]).count("<th>") == 3 and "http" not in SCRIPT
