@@ -15,7 +15,7 @@ PUBLISHED, DEFAULT = "published", "default"  # the methods, by the names of thei
 METHODS = (PUBLISHED, DEFAULT)
 HIGHER, LOWER, NEITHER = "higher", "lower", ""  # which values of a measure are better
 EQUAL = 0.02  # relative difference below which neither method is better
-KINDS = ("surface", "cloud", "tracks", "body")  # of pictures
+KINDS = ("trails", "surface", "cloud", "tracks", "body")  # of pictures
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -70,9 +70,8 @@ def _picture_rows(folders: Sequence[Path]) -> list[str]:
     rows = []
     for kind in KINDS:
         for name in (name for name in found[0] if name.startswith(f"{kind}_") and name in found[1]):
-            frame = name.removesuffix(".png").removeprefix(f"{kind}_").replace("_", ", view ")
-            pair = [
-                figure(f"{kind}, frame {frame}: {method}", pictures.jpeg(decoded(files[name]))) for method, files in zip(METHODS, found)
-            ]
+            which = name.removesuffix(".png").removeprefix(f"{kind}_").replace("_", ", view ")
+            label = f"trajectories, {which}" if kind == "trails" else f"{kind}, frame {which}"
+            pair = [figure(f"{label}: {method}", pictures.jpeg(decoded(files[name]))) for method, files in zip(METHODS, found)]
             rows.append(f'<div class="row">{"".join(pair)}</div>')
     return rows

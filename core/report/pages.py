@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..body.motion import BodyFit
-from ..body.skin.contour_skin import SkinSettings
+from ..body.skin.contour_skin import SkinSettings, body_skin
 from ..body.skin.extremities import shape_for_skin
 from ..body.skin.mesh import Skin
 from ..body.skin.posed import skins_in
@@ -76,7 +76,7 @@ def write_report(results: Results, report: Report, monitor: Monitor, pictured: S
     record, fits = report.record, report.silhouettes.fits
     trails = trail_pictures(results.path("trajectories_raw.npz"), report.footage.rig.cameras[report.footage.take.reference])
     skin_at = _skin(report)
-    shown = _pictures(report, skin_at, monitor, pictured) | {
+    shown = _pictures(report, monitor, pictured, skinned=skin_at is not None) | {
         f"trails_{n}.png": trail for n, trail in zip(("all", "removed", "kept"), trails)
     }
     files: dict[str, tuple[str, bytes, bytes]] = {}
@@ -108,14 +108,13 @@ def _skin(report: Report) -> Callable[[np.ndarray], Skin] | None:
         return None
 
 
-def _pictures(
-    report: Report, skin_at: Callable[[np.ndarray], Skin] | None, monitor: Monitor, pictured: Sequence[int]
-) -> dict[str, tuple[str, np.ndarray]]:
+def _pictures(report: Report, monitor: Monitor, pictured: Sequence[int], *, skinned: bool) -> dict[str, tuple[str, np.ndarray]]:
     """File name → (caption, picture), for the frames `pictured`, or the first, a middle and the last."""
     footage, record, clouds, trajectories = report.footage, report.record, report.clouds, report.trajectories
     body, silhouettes = report.body, report.silhouettes
     ref = footage.take.reference
     camera, view = footage.rig.cameras[ref], footage.take.views[ref].name
+    settings = SkinSettings(**record["settings"]["skin"])
     found: dict[str, tuple[str, np.ndarray]] = {}
     chosen = [footage.frames.index(frame) for frame in sorted(set(pictured))] or sorted({0, len(clouds) // 2, len(clouds) - 1})
     total = 2 * len(chosen) * (3 + len(footage.rig.cameras))
@@ -136,8 +135,8 @@ def _pictures(
         if trajectories is not None:
             caption = f"Frame {frame}, view {view}: trajectories of the last {pictures.TAIL_FRAMES} frames, red is fast"
             add(f"tracks_{frame:04d}.png", caption, pictures.tracks_over_footage(images[ref], camera, trajectories, i))
-        if body is not None and skin_at is not None:
-            skin = skin_at(body.motion.values[i])
+        if body is not None and skinned:
+            skin = body_skin(shape_for_skin(body.shape, settings), body.motion.values[i], settings)  # exact, as the silhouettes' figures
             for image, cam, name in zip(images, footage.rig.cameras, (v.name for v in footage.take.views)):
                 person = silhouettes.outlines.get(name, {}).get(frame)
                 picture = pictures.body_over_footage(image, cam, body.shape, body.motion.values[i], skin, person)
