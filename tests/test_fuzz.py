@@ -5,6 +5,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -20,7 +21,8 @@ from tricap.core.foundation.errors import LONGEST, InputError
 from tricap.core.images.sequence import claimed_size, read_image
 from tricap.core.motion.formats.keypoints_json import natural_order, read_keypoints
 from tricap.core.motion.tables import read_joints
-from tricap.core.results.folder import Results
+from tricap.core.results.folder import PARENTS, WRITTEN, Results
+from tricap.core.run.batch import out_folders
 from tricap.core.tracking.point_tables import read_planar, read_points
 
 HERE = Path(__file__).resolve().parent
@@ -127,21 +129,25 @@ def test_sentences_are_fit_for_a_terminal() -> None:
 def test_results_are_not_written_through_links_out_of_their_folder(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "letter.txt").write_text("mine")
-    for name in (
-        "clouds",
-        "cache",
-        "cache/surface",
-        "report",
-        "contours",
-        "fields",
-        "fields/L",
-        "run.json",
-        "points2d.csv",
-        ".tricap-lock",
-    ):
-        out = tmp_path / f"out {Path(name).name}"
-        (out / name).parent.mkdir(parents=True)
-        (out / name).symlink_to(tmp_path / "elsewhere" / ("letter.txt" if Path(name).suffix or name == ".tricap-lock" else ""))
-        with pytest.raises(InputError, match="is a link to a place outside"):
-            Results(out)
+    for name in (*WRITTEN, *(f"{parent}/a" for parent in PARENTS)):
+        for target in ("letter.txt", "", "not there"):
+            out = tmp_path / f"out {name.replace('/', ' ')} {target}"
+            (out / name).parent.mkdir(parents=True)
+            (out / name).symlink_to(tmp_path / "elsewhere" / target)
+            with pytest.raises(InputError, match="is a link to a place outside"):
+                Results(out)
+    (tmp_path / "batch").mkdir()
+    (tmp_path / "batch" / "take").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="is a link to a place outside"):
+        out_folders([tmp_path / "takes" / "take"], tmp_path / "batch")
     assert (tmp_path / "elsewhere" / "letter.txt").read_text() == "mine" and len(list((tmp_path / "elsewhere").iterdir())) == 1
+
+
+def test_every_name_that_is_written_to_is_checked_for_links() -> None:
+    """Each first name in a call of `Results.path`, and of what lies beside it."""
+    sources = [path.read_text(encoding="utf-8") for part in ("core", "addon") for path in (HERE.parent / part).rglob("*.py")]
+    named = {name for source in sources for name in re.findall(r'results\.path\("([^"]+)"', source)}
+    named |= {name for source in sources for name in re.findall(r'self\.path\("([^"]+)"', source)}
+    assert {"clouds", "cache", "run.json", "points3d.csv"} <= named <= {*WRITTEN}, named - {*WRITTEN}
+    fields = (HERE.parent / "addon" / "scene" / "clips.py").read_text(encoding="utf-8")
+    assert "import FIELDS" in fields

@@ -19,6 +19,7 @@ from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
+from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
 from . import action, armature, cameras, clips, metaballs, skin, surroundings
 from .cloud import CloudPoints, add_cloud
@@ -200,7 +201,7 @@ def _opened_clips(scene: bpy.types.Scene, contents: Contents) -> Opened:
     footage = contents.footage
     try:
         for view, camera, sequence in zip(footage.take.views, footage.rig.cameras, footage.sequences) if footage else ():
-            beside_take, in_out = (folder / clips.FIELDS / view.name for folder in (footage.take.folder, contents.out))
+            beside_take, in_out = (folder / FIELDS / view.name for folder in (footage.take.folder, contents.out))
             files = clips.shown_files(sequence, footage.take.field_layout, beside_take if beside_take.is_dir() else in_out)
             opened.append((clips.clip_of_view(scene, view.name, files[0], camera), files))
     except InputError:

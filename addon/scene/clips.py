@@ -9,10 +9,10 @@ from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.images.interlace import FieldLayout, field_pictures
 from ...core.images.sequence import ImageSequence, open_sequence
+from ...core.results.folder import FIELDS
 from .. import folders
 from . import axes
 
-FIELDS = "fields"  # folder of the pictures of single fields
 FIELDS_KEY = "tricap_fields"  # custom property of a clip that shows single fields: the first field
 CLIP_KEY = "tricap_clip"  # custom property of a camera: the clip behind it
 

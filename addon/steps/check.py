@@ -6,8 +6,8 @@ from pathlib import Path
 import bpy
 
 from ...core.checking.findings import Checked
-from ...core.checking.take_check import check_take
 from ...core.foundation.progress import Monitor
+from ...core.run.check import check_take
 from .. import project
 from ..jobs import JobOperator
 from ..session import get_session

@@ -29,6 +29,7 @@ from ..take.clicked_points import clicked_depth
 from ..take.footage import Footage, open_take
 from ..take.take import Take, read_take
 from .findings import Cause, Checked, Finding, doubtful, wrong
+from .openings import opening_findings
 from .rig_check import (
     FEWEST_MATCHES,
     agreeing_share,
@@ -222,7 +223,7 @@ def check_take(folder: Path, monitor: Monitor) -> Checked:
         fitting = from_table(FitSettings, take.settings.get("fitting", {}), "[fitting]")
         footage = open_take(take, click_sigma_px=fitting.click_sigma_px)
         findings, figures = check_footage(footage, monitor)
-        findings += joint_findings(footage.take)
+        findings += [*joint_findings(footage.take), *opening_findings(footage, fitting, monitor)]
     except InputError as error:
         findings, figures = [wrong(Cause.INPUT, str(error))], {}
     return Checked(subject=str(folder), kind="take", findings=tuple(findings), figures=figures)

@@ -32,7 +32,7 @@ def check(subject: Path, monitor: Monitor) -> Checked:
 
         return check_run(subject, monitor)
     if (subject / "take.toml").is_file() or (subject.name == "take.toml" and subject.is_file()):
-        from ..checking.take_check import check_take
+        from ..run.check import check_take
 
         return check_take(subject, monitor)
     if subject.is_file() and subject.suffix.lower() == ".toml":

@@ -23,6 +23,10 @@ RESULTS = (  # files and folders that a run replaces
     "body.blend",
 )  # fmt: skip
 
+FIELDS = "fields"  # the pictures of single fields of interlaced video, for Blender
+PARENTS = ("cache", FIELDS)  # whose folders are written to
+WRITTEN = (*PARENTS, "contours", "points2d.csv", "points3d.csv", "run.json", NAME, *RESULTS)  # every name in OUT that a command writes to
+
 
 def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable[Path] = ()) -> None:
     """Refuse to mix results with footage, because one could replace the other.
@@ -37,7 +41,7 @@ def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable
     for path in footage:
         if where in (path.parent.resolve(), path.resolve().parent):
             raise InputError(f"{out} contains the footage {path.name}; {advice}")
-    if take is not None and any(take.resolve().is_relative_to(where / name) for name in ("cache", "contours", *RESULTS)):
+    if take is not None and any(take.resolve().is_relative_to(where / name) for name in WRITTEN):
         raise InputError(f"The take {take} is inside {out}, where a run replaces files; choose another folder for the results.")
 
 
@@ -49,7 +53,7 @@ def check_not_result(file: Path, out: Path) -> None:
     """
     path, read = Path(file).resolve(), Path(out).resolve()
     own = path.relative_to(read).parts[:1] if path != read and path.is_relative_to(read) else ()
-    if path == read or set(own) & {"cache", "contours", "fields", "run.json", *RESULTS} - {"body.blend"}:
+    if path == read or set(own) & {*WRITTEN} - {"body.blend"}:
         raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
 
 
@@ -61,9 +65,8 @@ class Results:
         bounded.check_name(self.folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
-        outside = [path for path in _written(self.folder) if not _inside(path, self.folder)]
-        if outside:
-            raise InputError(f"{outside[0]} is a link to a place outside {folder}; remove the link, or choose another folder.")
+        for path in _written(self.folder):
+            check_inside(path, self.folder)
         foreign = _not_from_a_run(self.folder)
         if foreign:
             raise InputError(
@@ -169,15 +172,19 @@ class FitCheckpoints:
 
 def _written(folder: Path) -> list[Path]:
     """Every path that a command writes to in a folder of results, and the existing folders of checkpoints and of fields."""
-    names = ("run.json", "contours", "points2d.csv", "points3d.csv", NAME, *RESULTS)
-    parents = (folder / "cache", folder / "fields")
+    parents = [folder / name for name in PARENTS]
     inside = [path for parent in parents if parent.is_dir() and not parent.is_symlink() for path in parent.iterdir()]
-    return [*(folder / name for name in names), *parents, *inside]
+    return [*(folder / name for name in WRITTEN), *inside]
 
 
-def _inside(path: Path, folder: Path) -> bool:
-    """Whether a path, with its links resolved, lies in the folder."""
-    return not path.is_symlink() or path.resolve().is_relative_to(folder)
+def check_inside(path: Path, folder: Path) -> None:
+    """Check that a path to be written to is not a link out of the folder that the user chose (resolved).
+
+    Raises:
+        InputError: it is.
+    """
+    if path.is_symlink() and not path.resolve().is_relative_to(folder):
+        raise InputError(f"{path} is a link to a place outside {folder}; remove the link, or choose another folder.")
 
 
 def _not_from_a_run(folder: Path) -> list[str]:

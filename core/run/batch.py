@@ -24,7 +24,7 @@ from typing import Any
 from ..foundation import store
 from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Monitor
-from ..results.folder import check_separate_folder
+from ..results.folder import check_inside, check_separate_folder
 from . import pipeline, take_run
 
 FORMAT, VERSION = "tricap-batch", 1
@@ -98,7 +98,7 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     """The folder of each take's results: named after the take, with its parent folder's name in front where two takes have the same name.
 
     Raises:
-        InputError: two names are still the same, or results would go into a take.
+        InputError: two names are still the same, or results would go into a take or through a link out of FOLDER.
     """
     folder, takes = Path(folder).resolve(), [Path(take).resolve() for take in takes]
     names = [take.name for take in takes]
@@ -108,6 +108,7 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
         raise InputError(f"The take {twice} is listed twice, or has the name of another one; rename its folder, or leave it out.")
     for out in (folder, *(folder / name for name in names)):
         check_separate_folder(out)
+        check_inside(out, folder)
     return [folder / name for name in names]
 
 

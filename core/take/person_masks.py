@@ -4,7 +4,7 @@ A measured point must lie inside the silhouette of every view that has one and w
 from its background everywhere (black, other light) it has no silhouette.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -37,9 +37,8 @@ def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, fir
         picture = rows.rows(footage.reduced_image(k, read_picture(path, view.name, footage.sizes_px[k])))
         if view.background is not None:
             mask = _unlike(picture, image, rows.step)
-        elif 0 < picture.max() <= WHITE:
-            raise InputError(f"The mask {path} is nowhere brighter than {picture.max():.0f} of 255; paint the person white.")
         else:
+            check_mask(picture, path)
             mask = picture > WHITE
         if mask is not None:
             found.append(Silhouette(camera=camera, rows=rows, mask=mask))
@@ -50,8 +49,27 @@ def silhouettes(footage: Footage, grey: Sequence[np.ndarray], frame: int, *, fir
     return tuple(found)
 
 
+def check_mask(picture: np.ndarray, path: Path) -> None:
+    """Refuse a mask (h, w) with a person who is not white.
+
+    Raises:
+        InputError: it is neither black nor white anywhere.
+    """
+    if 0 < picture.max() <= WHITE:
+        raise InputError(f"The mask {path} is nowhere brighter than {picture.max():.0f} of 255; paint the person white.")
+
+
 def silhouette_file(footage: Footage, view: int, frame: int) -> Path | None:
     """The mask or background image of a view for a frame, if it has one.
+
+    Raises:
+        InputError: there are no masks, or too few.
+    """
+    return next(iter(silhouette_files(footage, view, [frame])), None)
+
+
+def silhouette_files(footage: Footage, view: int, frames: Iterable[int]) -> list[Path]:
+    """The masks of a view for frames, or its one mask or background image; empty if it has none.
 
     Raises:
         InputError: there are no masks, or too few.
@@ -59,12 +77,14 @@ def silhouette_file(footage: Footage, view: int, frame: int) -> Path | None:
     given, folder = footage.take.views[view], footage.take.folder
     if given.masks is None:
         name = given.mask or given.background
-        return None if name is None else folder / name
-    files = open_sequence(folder, images=given.masks, movie=None, view=f"{given.name} (masks)").files()
-    number = footage.number(view, frame)
-    if not 0 <= number < len(files):
-        raise InputError(f"View {given.name} has {len(files)} masks, but none for frame {frame}. There must be one for every image.")
-    return files[number]
+        return [] if name is None else [folder / name]
+    files, found = open_sequence(folder, images=given.masks, movie=None, view=f"{given.name} (masks)").files(), dict[Path, None]()
+    for frame in frames:
+        number = footage.number(view, frame)
+        if not 0 <= number < len(files):
+            raise InputError(f"View {given.name} has {len(files)} masks, but none for frame {frame}. There must be one for every image.")
+        found[files[number]] = None
+    return list(found)
 
 
 def silhouette_sources(footage: Footage) -> str:

@@ -1,0 +1,50 @@
+"""What a run refuses although its footage and rig are in order: settings, the body and its keypoints, the silhouettes of the views."""
+
+from collections.abc import Callable
+
+from ..fitting.inputs.take_inputs import check_body, read_source
+from ..fitting.settings import FitSettings
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..take.footage import Footage
+from ..take.person_masks import check_mask, silhouette_files, silhouettes
+from ..take.sources import read_picture
+from .findings import Cause, Finding, wrong
+from .survey import LONGEST
+
+
+def opening_findings(footage: Footage, fitting: FitSettings, monitor: Monitor) -> list[Finding]:
+    """Every file and value that the stages of a run read besides the images: one finding for each of the first faults of a kind."""
+    checks: list[Callable[[], object]] = [lambda: check_body(footage, fitting)]
+    checks += [lambda source=source: read_source(footage, source) for source in footage.take.keypoints]  # type: ignore[misc]
+    checks += [lambda k=k: _check_silhouettes(footage, k, monitor) for k in range(len(footage.take.views))]  # type: ignore[misc]
+    checks.append(lambda: _silhouettes_of_first(footage))
+    findings = list[Finding]()
+    for check in checks:
+        try:
+            check()
+        except InputError as error:
+            if str(error) not in [finding.sentence for finding in findings]:
+                findings.append(wrong(Cause.INPUT, str(error)))
+    return findings
+
+
+def _silhouettes_of_first(footage: Footage) -> None:
+    frame = footage.frames.start
+    rows = footage.take.rows_at(frame)
+    silhouettes(footage, [rows.rows(image) for image in footage.read(frame)], frame, first=True)
+
+
+def _check_silhouettes(footage: Footage, view: int, monitor: Monitor) -> None:
+    """Find the silhouette's file of a view for every frame, and read those of at most LONGEST frames over the whole take.
+
+    Raises:
+        InputError: one is missing or unusable.
+    """
+    given, paths = footage.take.views[view], silhouette_files(footage, view, footage.frames)
+    chosen = paths[:: max(1, -(-len(paths) // LONGEST))]
+    for n, path in enumerate(chosen):
+        monitor.step(f"checking the masks of {given.name}", n, len(chosen))
+        picture = read_picture(path, given.name, footage.sizes_px[view])
+        if given.background is None:
+            check_mask(picture, path)
