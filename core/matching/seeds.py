@@ -82,15 +82,20 @@ def sweep_seeds(
     *,
     spacing_px: int,
     depth_range_m: tuple[float, float] | None,
+    within_px: tuple[np.ndarray, np.ndarray] | None = None,
     monitor: Monitor,
     pairs: bool = False,
 ) -> Approximations:
     """Automatic seeds on every so many cells of the template grid (about `spacing_px` apart), where the reference image has texture.
 
     `depth_range_m` narrows the search (clicked joints, or the frame before); without it the range comes from the base of the rig. With
-    `pairs`, one search view is enough.
+    `within_px`, a corner (2,) and the opposite one in rows' pixels, only cells in this box are searched. With `pairs`, one search view is
+    enough.
     """
-    xy = _textured(views, settings, grid.every(max(1, round(spacing_px / grid.spacing_px))))
+    xy = grid.every(max(1, round(spacing_px / grid.spacing_px)))
+    if within_px is not None:
+        xy = xy[((xy >= within_px[0]) & (xy <= within_px[1])).all(axis=1)]
+    xy = _textured(views, settings, xy)
     smooth = views.smoothed(SWEEP_SMOOTHING_PX)
     near, far = depth_range_m or _default_range(views.cameras)
     inverse = _inverse_depths(views, near, far)
@@ -138,7 +143,7 @@ def _textured(views: Views, settings: MatchingSettings, xy: np.ndarray) -> np.nd
     image = views.template
     u, v, half = patch_offsets(settings.patch_px, views.rows.step)
     xy = xy[image.inside(xy, np.array(half) + 3.0)]
-    patch = image.sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32))
+    patch = image.look_up((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32))
     return xy[patch.std(axis=1) > max(MIN_CONTRAST, CONTRAST_OVER_NOISE * image.noise)]
 
 
@@ -162,7 +167,7 @@ def _sweep_correlations(views: Views, settings: MatchingSettings, xy: np.ndarray
     u, v, half = patch_offsets(settings.patch_px, views.rows.step)
     sampled = (np.round(u).astype(int) % PATCH_STRIDE == 0) if settings.patch_px > DENSE_PATCH_PX else np.ones(len(u), dtype=bool)
     u, v = u[sampled], v[sampled]
-    f = _normalised(views.template.sample((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
+    f = _normalised(views.template.look_up((xy[:, :1] + u).astype(np.float32), (xy[:, 1:] + v).astype(np.float32)))
     corners = _corners(views.base, views.rows, xy, 1 / inverse[None])
     found = []
     for k in views.search:
@@ -193,7 +198,7 @@ def _correlations(
         s = slice(i, i + CORRELATED)
         c32, A32 = c[s].astype(np.float32), A[s].astype(np.float32)
         g = _normalised(
-            image.sample(c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v)
+            image.look_up(c32[:, :1] + A32[:, 0, :1] * u + A32[:, 0, 1:] * v, c32[:, 1:] + A32[:, 1, :1] * u + A32[:, 1, 1:] * v)
         )
         rho[s] = np.einsum("ij,ij->i", g, f[owner[s]])
     return rho

@@ -25,10 +25,16 @@ def figure_rows(
     silhouettes: Sequence[SilhouetteFit] = (),
 ) -> list[Row]:
     """The rows; `sigma_of` is the origin of each sigma. NaN, where there is none, becomes null in the file."""
+    points, residual_px, sigma_mm = list[float](), list[float](), list[float]()
+    for cloud in clouds:  # read once: each is in a file
+        points.append(float(len(cloud.xyz_m)))
+        if len(cloud.xyz_m):
+            residual_px.append(float(np.median(cloud.residual_px)))
+            sigma_mm.append(1e3 * float(np.median(cloud.sigma_m)))
     per_frame = {
-        ("points a frame", "points"): [float(len(c.xyz_m)) for c in clouds],
-        ("residual of the rays (median)", "px"): [float(np.median(c.residual_px)) for c in clouds if len(c.residual_px)],
-        ("sigma of a point (median)", "mm"): [1e3 * float(np.median(c.sigma_m)) for c in clouds if len(c.sigma_m)],
+        ("points a frame", "points"): points,
+        ("residual of the rays (median)", "px"): residual_px,
+        ("sigma of a point (median)", "mm"): sigma_mm,
     }
     if trajectories is not None:
         per_frame["tracked points a frame", "points"] = trajectories.visible.sum(axis=1).astype(float).tolist()

@@ -33,7 +33,7 @@ from ..take.footage import Footage, footage_frames
 from ..take.person_masks import silhouette_file, silhouette_sources, silhouettes
 from .cloud import OCCLUDED, PointCloud, SurfaceSettings, point_cloud, why_removed
 
-ALGORITHM = "surface 19"  # part of every key: raise it when the same input gives other numbers
+ALGORITHM = "surface 20"  # part of every key: raise it when the same input gives other numbers
 MIN_MOVED = 20  # seeds; with fewer that moved, the person is searched for among all of them
 SEED_SPACING_PX = 24  # without automatic seeds: of those by which the background is found, and of those from the frame before
 SEED_SPEED_M_S = 1.0  # sigma of the speed in depth at which seeds come from the frame before
@@ -214,7 +214,8 @@ def _measure(now: _FrameViews, settings: MeasureSettings, before: MeasuredFrame 
     else:
         where = fg.after(views.base.to_camera(before.cloud.xyz_m)[:, 2], before.foreground)
         automatic = settings.growing.seed_spacing_px > 0
-        seeds = _swept(now, settings, where.depth_range_m, monitor) if automatic else _seeds_of_before(now, settings, before)
+        box = _box_of_person(now, before.cloud.xyz_m)
+        seeds = _swept(now, settings, where.depth_range_m, monitor, box) if automatic else _seeds_of_before(now, settings, before)
     sources = silhouette_sources(now.footage)
     where = replace(where, silhouettes=now.silhouettes, method=f"{where.method}, {sources}" if sources else where.method)
     field = _matched(now, seeds, settings, where, monitor)
@@ -243,7 +244,23 @@ def _matched(now: _FrameViews, seeds: Approximations, settings: MeasureSettings,
     return _single(constrain(field, now.views, matching, foreground=where, monitor=monitor, pairs=growing.pairs))
 
 
-def _swept(now: _FrameViews, settings: MeasureSettings, depth_range_m: tuple[float, float] | None, monitor: Monitor) -> Approximations:
+def _box_of_person(now: _FrameViews, before_m: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where in the reference image (rows' pixels) a person can be whose cloud (N, 3) in the frame before is known; None: anywhere."""
+    if len(before_m) < fg.MIN_CLOUD:
+        return None
+    views = now.views
+    at = views.rows.from_frame(views.base.project(before_m))
+    reach = fg.REACH_M * views.base.focal_px / float(np.median(views.base.to_camera(before_m)[:, 2])) / np.array([1.0, views.rows.step])
+    return at.min(axis=0) - reach, at.max(axis=0) + reach
+
+
+def _swept(
+    now: _FrameViews,
+    settings: MeasureSettings,
+    depth_range_m: tuple[float, float] | None,
+    monitor: Monitor,
+    within_px: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Approximations:
     """The automatic seeds of a frame within a range of depths."""
     growing = settings.growing
     return sweep_seeds(
@@ -252,6 +269,7 @@ def _swept(now: _FrameViews, settings: MeasureSettings, depth_range_m: tuple[flo
         settings.matching,
         spacing_px=growing.seed_spacing_px or SEED_SPACING_PX,
         depth_range_m=depth_range_m,
+        within_px=within_px,
         monitor=monitor,
         pairs=growing.pairs,
     )
