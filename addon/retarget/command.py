@@ -16,6 +16,7 @@ from ...core.results.folder import check_not_result
 # those of programs.py and of core/motion/formats/markers.py, which are imported when a command runs
 PROGRAM_NAMES = ("plain", "mixamo", "unreal", "unity", "maya", "motionbuilder", "opensim")
 UNITS = ("m", "meters", "metres", "dm", "cm", "mm", "um", "in", "inch")
+PLY_FOLDERS = ("skin", "clouds", "tracked")  # of OUT
 FORMATS = ("bvh", "fbx", "glb", "usd", "abc", "trc", "c3d", "csv", "ply")
 
 
@@ -59,6 +60,7 @@ def add_commands(subparsers: Any) -> None:
     parser.add_argument("out", metavar="OUT", type=Path, help="output folder of a run, or a motion: BVH, TRC, C3D, CSV, FBX, glTF, .blend")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--out", dest="file", metavar="FILE", type=Path, required=True, help="the file to write (for ply: a folder)")
+    parser.add_argument("--ply", choices=PLY_FOLDERS, default="", help="which files of ply: skins (default), clouds, or tracked clouds")
     parser.add_argument("--preset", choices=PROGRAM_NAMES, default="plain", help="names, units and axes of a program")
     _add_axes(parser)
     parser.set_defaults(run=_clean(export))
@@ -167,8 +169,11 @@ def export(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     from .export import BY_BLENDER, export_file, named_for
     from .programs import is_imported_by_blender
 
+    if args.ply and args.format != "ply":
+        raise InputError(f"--ply chooses files of --format ply; leave it out for {args.format}.")
     file = named_for(args.format, args.file, args.out)
 
     if args.format in BY_BLENDER or is_imported_by_blender(args.out):
         _need_blender("export")
-    return [f"{file}: {export_file(args.out, args.format, file, args.preset, monitor, up=args.up, unit=args.unit)}"]
+    done = export_file(args.out, args.format, file, args.preset, monitor, up=args.up, unit=args.unit, of=args.ply)
+    return [f"{file}: {done}"]

@@ -42,10 +42,10 @@ def named_for(kind: str, file: Path, out: Path | None) -> Path:
     return file
 
 
-def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor, *, up: str = "", unit: str = "") -> str:
+def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor, *, up: str = "", unit: str = "", of: str = "") -> str:
     """Write the motion or the points in OUT to `file`; returns a summary. For BY_BLENDER on the main thread only.
 
-    `up`, `unit`: of OUT, for `read_motion_source`.
+    `up`, `unit`: of OUT, for `read_motion_source`; `of`: the folder of PLY files to copy, by default skins or else clouds.
 
     Raises:
         InputError: OUT lacks data that the format needs, or the file cannot be written.
@@ -58,7 +58,7 @@ def export_file(out: Path, kind: str, file: Path, preset: str, monitor: Monitor,
 
         return export_played(open_moving(out), kind, file, preset, monitor)
     if kind == "ply":
-        return _copy_skins(out, file)
+        return _copy_ply(out, file, of)
     if kind in POINTS:
         return _write_points(kind, file, points_of(out, up=up, unit=unit), program)
     motion = read_motion_source(out, up=up, unit=unit)
@@ -117,10 +117,11 @@ def _write_points(kind: str, file: Path, markers: Markers, program: Program) -> 
     return f"{len(markers.names)} points in {len(markers.frames)} frames"
 
 
-def _copy_skins(out: Path, folder: Path) -> str:
-    files = sorted((out / "skin").glob("*.ply")) or sorted((out / "clouds").glob("*.ply"))
-    if not files:
-        raise InputError(f"{out} has neither skins nor clouds; run the take first.")
+def _copy_ply(out: Path, folder: Path, of: str) -> str:
+    """Copy skins, clouds or tracked clouds; by default the skins, or else the clouds."""
+    files = next((found for name in ([of] if of else ["skin", "clouds"]) if (found := sorted((out / name).glob("*.ply")))), None)
+    if files is None:
+        raise InputError(f"{out} has {f'no folder {of}/ with files' if of else 'neither skins nor clouds'}; run the take first.")
     for file in files:
         store.write_bytes(folder / file.name, bounded.bytes_of(file, bounded.ARRAYS_BYTES))
     return f"{len(files)} files from {files[0].parent.name}/"

@@ -32,6 +32,11 @@ class FitSettings:
         True,
         "Fit the body to measured points; without them it is fitted to outlines and keypoints alone, and no surface is measured.",
     )
+    cloud: str = knob(
+        "measured",
+        "The points that attract the body: the whole measured surface, or those that were tracked from frame to frame.",
+        choices=("measured", "tracked"),
+    )
     use_trajectories: bool = knob(
         True, "Tracked points stay at their places in the limbs: they determine twist, sliding, centres of the joints."
     )

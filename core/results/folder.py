@@ -19,7 +19,8 @@ from . import run_json
 from .run_json import FORMAT, VERSION
 
 RESULTS = (  # files and folders that a run replaces
-    "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "joints.csv", "motion.csv", "body.toml", "skin", "report",
+    "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "tracked",
+    "joints.csv", "motion.csv", "body.toml", "skin", "report",
     "body.blend",
 )  # fmt: skip
 
@@ -89,7 +90,7 @@ class Results:
             InputError: another run is using it.
         """
         with locked(self.folder):
-            folders = [self.path(name) for name in ("clouds", "skin", "report", "contours")]
+            folders = [self.path(name) for name in ("clouds", "tracked", "skin", "report", "contours")]
             for folder in (self.folder, *folders, *self.path("cache").glob("*/")):
                 for path in [*folder.glob(".*.part"), *folder.glob(".*.part.blend")]:
                     self.remove(str(path.relative_to(self.folder)))

@@ -16,6 +16,7 @@ from ..body.skin.posed import skins_in
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
+from ..fitting.inputs.cloud_points import tracked_clouds
 from ..fitting.inputs.fit_input import FitInput
 from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
 from ..fitting.inputs.take_inputs import check_body, clicks_left_out, fit_input, missing_for_fit
@@ -36,7 +37,7 @@ from ..tracking.corrections import corrected_tracks, missed_clicks
 from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
 from ..tracking.track import TrackingRules, track_frames
-from ..tracking.trajectories import Filtered, Trajectories, write_trajectories
+from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, surface_figures, track_figures
 from .stages import STAGES
 from .take_run import Overrides, Run, open_run
@@ -201,6 +202,8 @@ def _track_points(run: Run, monitor: Monitor, guide: Guide | None = None) -> dic
         steps = track_frames(run.measured_footage, run.measured, rules, run.results, monitor, guide)
         filtered, reasons = trajectories_of(steps, take.fps, s["tracking"], decide)
     run.trajectories = filtered.kept
+    run.results.remove("tracked")
+    write_tracked_clouds(run.results.folder, filtered.kept, monitor)
     write_trajectories(run.results.folder, filtered, take.fps)
     figures, warnings = track_figures(filtered.kept, reasons)
     run.warn(*missed_clicks(take.corrections, hit), *warnings)
@@ -227,7 +230,8 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     """Fit the body and write it, track once more with its help, and compare silhouettes; gives the figures of the tracks, too."""
     fitting = run.settings["fitting"]
     background = background_regions(run.footage, run.results, run.clouds, fitting, monitor)
-    given = fit_input(run.footage, run.clouds, run.trajectories, run.results, background)
+    tracked = tracked_clouds(run.trajectories, run.footage.frames) if fitting.cloud == "tracked" and run.trajectories else None
+    given = fit_input(run.footage, tracked or run.clouds, run.trajectories, run.results, background)
     run.body = body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
     _write_body(run, body, monitor)
     guided = fitting.track_again and run.measured

@@ -66,7 +66,7 @@ def _fit_input(footage: Footage) -> Any:
 
 STAGE_INPUTS: dict[str, StageInput] = {
     "measure": StageInput(settings=("timing", "enhance", "matching", "growing", "surface"), take=_measure_input, files=()),
-    "track": StageInput(settings=("tracking",), take=_track_input, files=("trajectories.npz", "trajectories_raw.npz")),
+    "track": StageInput(settings=("tracking",), take=_track_input, files=("trajectories.npz", "trajectories_raw.npz", "tracked")),
     "fit": StageInput(
         settings=("fitting", "skin"),
         take=_fit_input,

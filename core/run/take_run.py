@@ -108,7 +108,7 @@ class Run:
     def do_without_surface(self, why: str) -> None:
         """Note that there are no clouds and no trajectories."""
         self.surfaceless = True
-        self.results.remove("clouds", "trajectories.npz", "trajectories_raw.npz")
+        self.results.remove("clouds", "trajectories.npz", "trajectories_raw.npz", "tracked")
         for stage in ("measure", "track"):
             self.finish_stage(stage, time.perf_counter(), not_done=why)
 

@@ -22,6 +22,7 @@ from ..foundation import store
 from ..foundation.arrays import frozen
 from ..foundation.progress import Monitor
 from ..images.interlace import frame_time_s
+from ..motion.formats.ply import write_tracked
 from .filters import against_neighbours, against_voxels, cut, over_thresholds
 from .settings import TrackingSettings, TrackStatus
 from .tracked import TrackedFrame, rows_of
@@ -270,3 +271,19 @@ def write_trajectories(out: Path, filtered: Filtered, fps: float) -> None:
     for name, arrays in (("", kept), ("_raw", filtered.arrays())):
         single = {n: a.astype(np.float32) if a.dtype == np.float64 and n != "time_s" else a for n, a in arrays.items()}
         store.save(out / f"trajectories{name}.npz", single, {"format": f"tricap-trajectories{name}", "version": 1, "fps": fps})
+
+
+def write_tracked_clouds(out: Path, kept: Trajectories, monitor: Monitor) -> None:
+    """Write OUT/tracked/NNNN.ply, the points of the kept trajectories in each frame: the surface, cleaned by tracking (D'Apuzzo et al.
+    1999, §2.4.2)."""
+    columns = np.broadcast_to(np.arange(kept.sigma_m.shape[1]), kept.sigma_m.shape) if kept.track is None else kept.track
+    for t, frame in enumerate(kept.frames.tolist()):
+        monitor.step("tracked clouds", t, len(kept.frames))
+        seen = kept.visible[t]
+        write_tracked(
+            out / "tracked" / f"{frame:04d}.ply",
+            xyz_m=kept.xyz_m[t, seen],
+            sigma_m=kept.sigma_m[t, seen],
+            velocity_m_s=kept.velocity_m_s[t, seen],
+            track=columns[t, seen],
+        )

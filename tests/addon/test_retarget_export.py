@@ -100,6 +100,19 @@ def test_a_run_goes_out_in_every_format(empty: ModuleType, small_run: SmallRun, 
     assert file.exists() and "6 f" in said, said
 
 
+def test_clouds_and_tracked_clouds_by_name(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for folder in ("skin", "clouds", "tracked"):
+        (out / folder).mkdir(parents=True)
+        (out / folder / "0003.ply").write_bytes(folder.encode())
+    for of, found in (("", "skin"), ("clouds", "clouds"), ("tracked", "tracked")):
+        assert export_file(out, "ply", tmp_path / f"of {of}", "plain", Monitor(), of=of) == f"1 files from {found}/"
+        assert (tmp_path / f"of {of}" / "0003.ply").read_bytes() == found.encode()
+    (out / "tracked" / "0003.ply").unlink()
+    with pytest.raises(InputError, match="has no folder tracked/ with files; run the take first"):
+        export_file(out, "ply", tmp_path / "none", "plain", Monitor(), of="tracked")
+
+
 def test_names_by_preset(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
     export_file(small_run.out, "bvh", tmp_path / "a.bvh", "mixamo", Monitor())
     assert read_bvh(tmp_path / "a.bvh").rig.names == ("mixamorig:RightArm", "mixamorig:RightForeArm")

@@ -1,9 +1,12 @@
 """A cloud as the fit uses it: finite points, thinned to one per voxel, with a sigma along the surface normal."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+
+from ...tracking.trajectories import Trajectories
 
 VARIANCE_FLOOR_M2 = 1e-12  # of points, rays and steps whose sigma is 0
 LEAST_AGREEMENT = 0.3  # length of a voxel's mean normal; of a shorter one the direction is unknown
@@ -42,6 +45,34 @@ class CloudPoints:
     def take(self, rows: np.ndarray) -> "CloudPoints":
         """Some of the points."""
         return CloudPoints(frame=self.frame, xyz_m=self.xyz_m[rows], normals=self.normals[rows], sigma_m=self.sigma_m[rows])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class TrackedCloud:
+    """The tracked points of one frame as a cloud, without normals."""
+
+    frame: int
+    xyz_m: np.ndarray  # (N, 3)
+    covariance_m2: np.ndarray  # (N, 3, 3)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(N, 3) zero: unknown."""
+        return np.zeros_like(self.xyz_m)
+
+
+def tracked_clouds(trajectories: Trajectories, frames: Sequence[int]) -> list[TrackedCloud]:
+    """The clouds of the kept trajectories in these frames, cleaned by tracking; empty in frames without tracks.
+
+    A sigma is that of the whole vector; its direction is not known, so a third of the variance belongs to each axis.
+    """
+    found, at = [], {frame: t for t, frame in enumerate(trajectories.frames.tolist())}
+    for frame in frames:
+        seen = trajectories.visible[at[frame]] if frame in at else np.zeros(trajectories.sigma_m.shape[1], dtype=bool)
+        t = at.get(frame, 0)
+        variance = trajectories.sigma_m[t, seen] ** 2 / 3
+        found.append(TrackedCloud(frame=frame, xyz_m=trajectories.xyz_m[t, seen], covariance_m2=variance[:, None, None] * np.eye(3)))
+    return found
 
 
 def thinned(cloud: Cloud, voxel_m: float) -> CloudPoints:

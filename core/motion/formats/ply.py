@@ -69,12 +69,29 @@ def write_cloud(
     """
     names = ("x", "y", "z", "sigma", "nx", "ny", "nz", "intensity")
     columns = dict(zip(names, np.column_stack([xyz_m, sigma_m, normals, intensity]).astype("<f4").T))
-    if rays is not None:
-        columns["rays"] = np.asarray(rays, dtype=np.uint8)
+    _write_points(path, columns if rays is None else columns | {"rays": np.asarray(rays, dtype=np.uint8)})
+
+
+def write_tracked(path: Path, *, xyz_m: np.ndarray, sigma_m: np.ndarray, velocity_m_s: np.ndarray, track: np.ndarray) -> None:
+    """Write N tracked points: positions (N, 3), their sigma (N,), velocities (N, 3), numbers of their trajectories (N,).
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    names = ("x", "y", "z", "sigma", "vx", "vy", "vz")
+    columns = dict(zip(names, np.column_stack([xyz_m, sigma_m, velocity_m_s]).astype("<f4").T))
+    _write_points(path, columns | {"track": np.asarray(track, dtype="<i4")})
+
+
+WRITTEN = {"f": "float", "i": "int", "u": "uchar"}  # PLY's names of the numbers in columns, by numpy's kind
+
+
+def _write_points(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Columns (N,) of 4-byte numbers or bytes as vertices."""
     rows = np.zeros(len(columns["x"]), dtype=[(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column
-    kinds = {name: "uchar" if name == "rays" else "float" for name in columns}
+    kinds = {name: WRITTEN[column.dtype.kind] for name, column in columns.items()}
     store.write_bytes(Path(path), _header(len(rows), kinds) + rows.tobytes())
 
 

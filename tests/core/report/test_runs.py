@@ -34,6 +34,7 @@ def test_a_run_without_a_body(finished: Path) -> None:
     assert run["stages"]["fit"]["not_done"] == "no [body] model" and any("No body was fitted" in w for w in run["warnings"])
     assert {"measure", "track", "fit", "report"} <= set(run["stages"]) and run["stages"]["measure"]["residual_px"] < 0.3
     assert (finished / "trajectories.npz").exists()
+    assert sorted(p.name for p in (finished / "tracked").iterdir()) == [f"{i:04d}.ply" for i in range(4)]
     assert not any((finished / name).exists() for name in ("body.toml", "joints.csv", "motion.csv", "skin"))
     page = (finished / "report" / "report.html").read_text()
     assert "No body was fitted" in page and "src=" in page and "http://" not in page.replace("http://www.w3.org", "")
