@@ -16,7 +16,6 @@ from ...motion.formats.markers import Markers, read_points_csv
 from ...motion.formats.trc import read_trc
 from ...motion.retarget.points import joint_of
 from ...results.folder import Results
-from ...surface.cloud import PointCloud
 from ...take.footage import Footage
 from ...take.sources import KeypointSource
 from ...take.take import JOINTS, FrameClicks, Take
@@ -24,6 +23,7 @@ from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import FitSettings
 from .clicks import initial_clicks, read_clicks
+from .cloud_points import Cloud
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
 JOINT_OF_ROLE = {
@@ -44,7 +44,7 @@ LEAST_CONFIDENCE = 0.2  # of a detector's keypoint
 
 def fit_input(
     footage: Footage,
-    clouds: Sequence[PointCloud],
+    clouds: Sequence[Cloud],
     trajectories: Trajectories | None,
     results: Results,
     background: Sequence[BackgroundDistances] = (),
@@ -58,7 +58,7 @@ def fit_input(
     return FitInput(
         rig=footage.rig,
         model=str(take.body_model),
-        clouds=clouds,  # type: ignore[arg-type]
+        clouds=clouds,
         frames=frames,
         time_s=take.time_s(np.array(frames)),
         clicks=clicks_in(footage),
