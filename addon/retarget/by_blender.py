@@ -17,7 +17,6 @@ from typing import Any
 import bpy
 from mathutils import Matrix
 
-from ...core.body.shape import read_body
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
@@ -43,7 +42,8 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
         raise InputError(NO_MESHES)
     with _plain_armature(kind, file, program, motion) as armature_object:
         if out.is_dir():
-            skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, read_body(out / "body.toml"))
+            shape, of_run = skin.skin_of_run(out)
+            skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, shape, prepared=of_run)
             skin_object.data.transform(Matrix.Scale(1.0 / _unit_m(kind, program), 4))
         _write(kind, file, program, armature_object, bone_names(motion.rig, program))
     return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"

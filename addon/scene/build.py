@@ -316,8 +316,9 @@ def _add_body(
     flesh = metaballs.add_metaballs(metaballs.add_collection(collection), armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
-        prepared_skin = contents.prepared.skin if shape is measured_shape and options.detail == DETAIL else None
-        shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, prepared_skin)
+        like = contents.prepared.skin
+        prepared = like and skin.in_rest_pose(like, measured_shape, shape)
+        shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, prepared)
         if contents.skins is not None and blend is not None:
             shown = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
             counts["exact skin faces"] = len(shown.data.polygons)

@@ -15,6 +15,7 @@ from ...core.body.shape import BodyShape, read_body
 from ...core.body.skin.contour_skin import body_skin
 from ...core.body.skin.extremities import shape_for_skin
 from ...core.body.skin.mesh import SkinSettings
+from ...core.body.skin.person_skin import REST
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
@@ -92,7 +93,7 @@ def read_contents(out: Path, monitor: Monitor, *, skins: bool = False) -> Conten
     monitor.step("reading results", 3, 3)
     settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     person = None if shape is None else shape_for_skin(shape, settings)
-    prepared = prepare(clouds, trajectories, person, motion, settings, monitor)
+    prepared = prepare(clouds, trajectories, person, motion, settings, out / "skin" / REST, monitor)
     return Contents(
         out=out,
         run=run,

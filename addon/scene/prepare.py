@@ -5,12 +5,14 @@ The bone of the fitted body that each point belongs to, the velocity of the near
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from ...core.body.shape import BodyShape
-from ...core.body.skin.closed_skin import DETAIL, OneSkin, one_skin
+from ...core.body.skin.closed_skin import OneSkin
 from ...core.body.skin.mesh import SkinSettings
+from ...core.body.skin.person_skin import read_skin, rest_skin
 from ...core.fitting.inputs.cloud_points import CloudPoints
 from ...core.fitting.segmentation import segment
 from ...core.fitting.state import ShapeParameters
@@ -42,11 +44,13 @@ def prepare(
     shape: BodyShape | None,
     motion: MotionTable | None,
     settings: SkinSettings,
+    skin_file: Path,
     monitor: Monitor,
 ) -> Prepared:
-    """Compute all of it.
+    """Compute all of it. `skin_file`: the run's skin of the rest pose; without it a skin is made, without relief.
 
     Raises:
+        InputError: that file is damaged.
         Cancelled: the monitor was cancelled.
     """
     segmentation, velocity, segment_of = _Segmentation(shape, motion), {}, {}
@@ -64,7 +68,7 @@ def prepare(
         bones=segmentation.names,
         velocity_m_s=velocity,
         segment=segment_of,
-        skin=_rest_skin(shape, settings),
+        skin=_rest_skin(shape, settings, skin_file),
         track_segment=None if trajectories is None else tracks.segment,
     )
 
@@ -104,9 +108,11 @@ class _Tracks:
             self.segment[self.rows[frame], self._visible[self.rows[frame]]] = bones
 
 
-def _rest_skin(shape: BodyShape | None, settings: SkinSettings) -> OneSkin | None:
+def _rest_skin(shape: BodyShape | None, settings: SkinSettings, file: Path) -> OneSkin | None:
+    if shape is not None and file.is_file():
+        return read_skin(file, shape)
     try:
-        return None if shape is None else one_skin(shape, settings, DETAIL)
+        return None if shape is None else rest_skin(shape, settings)
     except InputError:
         return None
 

@@ -9,6 +9,7 @@ The implicit surface of the fitted field itself, for checking metaballs and skin
 
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -16,17 +17,24 @@ import numpy as np
 
 from ...core.body.fields import EXPONENTIAL, Potential
 from ...core.body.metaballs import THRESHOLD
-from ...core.body.shape import BodyShape
-from ...core.body.skin.closed_skin import OneSkin, one_skin
-from ...core.body.skin.contour_skin import SkinSettings, body_skin
-from ...core.body.skin.mesh import corner_uv
+from ...core.body.shape import BodyShape, read_body
+from ...core.body.skeleton import bone_frames
+from ...core.body.skin.closed_skin import DETAIL, OneSkin
+from ...core.body.skin.extremities import shape_for_skin
+from ...core.body.skin.mesh import SkinSettings, corner_uv
+from ...core.body.skin.contour_skin import body_skin
+from ...core.body.skin.person_skin import REST, read_skin, resampled, rest_skin
+from ...core.body.skin.posed import Poser
 from ...core.body.skin.whole_surface import field_grid
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
+from ...core.foundation.settings import from_table
+from ...core.results.run_json import read_run
 from . import nodes
 from .contents import FrameSkins
 
+ATTRIBUTES = ("relief_m", "sigma_m")  # of the vertices: measured displacement, and standard deviation of where the surface is
 NAME, EXACT_NAME = "Skin", "Exact skin"
 CACHE_MODIFIER = "Every frame"
 SKIN_COLOUR = (0.80, 0.52, 0.41)
@@ -39,20 +47,44 @@ def add_skin(
     collection: bpy.types.Collection,
     armature_object: bpy.types.Object,
     shape: BodyShape,
-    detail: int = 1,
+    detail: int = DETAIL,
     settings: SkinSettings = SkinSettings(),  # noqa: B008  frozen
     prepared: OneSkin | None = None,
 ) -> bpy.types.Object:
-    """The skin of the rest pose as one closed mesh, bound to the armature, sampled by the run's settings; `detail` subdivides it.
-    `prepared`: the skin, if it was computed before.
+    """The skin of the rest pose as one closed mesh, bound to the armature, with `detail` pieces for each edge of its cage.
+
+    `prepared`: the run's skin, in the rest pose of `shape`; without it one is made, without relief.
 
     Raises:
         InputError: the body has no metaballs.
     """
-    skin = prepared or one_skin(shape, settings, detail)
+    skin = resampled(prepared or rest_skin(shape, settings), detail)
     skin_object = _mesh_object(collection, NAME, skin.vertices_m, skin.faces, skin.uv)
+    for name in ATTRIBUTES:
+        if (values := getattr(skin, name)) is not None:
+            skin_object.data.attributes.new(name, "FLOAT", "POINT").data.foreach_set("value", values.astype(np.float32))
     bind(skin_object, armature_object, skin.bone_names, skin.weights)
     return skin_object
+
+
+def skin_of_run(out: Path) -> tuple[BodyShape, OneSkin | None]:
+    """The body of the results in OUT as its skin shows it, and that skin, if the run wrote one.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    settings = from_table(SkinSettings, read_run(out / "run.json").get("settings", {}).get("skin", {}), "[skin] of run.json")
+    shape = shape_for_skin(read_body(out / "body.toml"), settings)
+    file = out / "skin" / REST
+    return shape, read_skin(file, shape) if file.is_file() else None
+
+
+def in_rest_pose(skin: OneSkin, made: BodyShape, shape: BodyShape) -> OneSkin:
+    """The skin that was made in the rest pose of one body, in that of another with the same bones: `shape`."""
+    if shape is made:
+        return skin
+    rest = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
+    return replace(skin, vertices_m=Poser(made, skin.weights).moved(skin.vertices_m, *rest))
 
 
 def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: FrameSkins, cache: Path) -> bpy.types.Object:

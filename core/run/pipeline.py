@@ -9,10 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..body.motion import BodyFit
+from ..body.motion import FITTED, PARTIAL, BodyFit
 from ..body.shape import write_body
+from ..body.skin.contour_skin import body_skin
 from ..body.skin.extremities import shape_for_skin
-from ..body.skin.posed import skins_in
+from ..body.skin.mesh import SkinSettings
+from ..body.skin.person_skin import REST, cage, rest_skin, with_relief, write_skin
+from ..body.skin.posed import Poser
+from ..body.skin.relief import MOST_FRAMES, SurfacePoints
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
@@ -254,10 +258,30 @@ def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
 
 
 def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> None:
-    """Write skin/NNNN.ply. Raises InputError for a body that has none."""
-    settings, frames = run.settings["skin"], body.motion.frames
-    skin_at = skins_in(shape_for_skin(body.shape, settings), body.motion.values, settings)
-    for i, (frame, values) in enumerate(zip(frames, body.motion.values)):
-        monitor.step("skin", i, len(frames))
-        skin = skin_at(values)
-        write_mesh(run.results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)
+    """The person's skin in the rest pose, with relief, and its cage in the pose of every frame. Raises InputError for a body that has none."""
+    settings: SkinSettings = run.settings["skin"]
+    person = shape_for_skin(body.shape, settings)
+    skin = rest_skin(person, settings)
+    points = _surface_points(run, body) if settings.relief else []
+    if points:
+        skin = with_relief(skin, person, points, settings.mirror, monitor)
+    write_skin(run.results.path("skin", REST), skin)
+    rows, faces = cage(skin)
+    poser, vertices = Poser(person, skin.weights[rows]), skin.vertices_m[rows]
+    for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
+        monitor.step("skin", i, len(body.motion.frames))
+        cast = body_skin(person, values, settings) if settings.exact else None
+        mesh = (cast.vertices_m, cast.faces) if cast else (poser.posed(vertices, values), faces)
+        write_mesh(run.results.path("skin", f"{frame:04d}.ply"), *mesh)
+
+
+def _surface_points(run: Run, body: BodyFit) -> list[SurfacePoints]:
+    """What was measured in frames whose pose is known, evenly over the take."""
+    known = np.flatnonzero(np.isin(body.motion.status, (FITTED, PARTIAL)))
+    found = []
+    for i in np.unique(np.linspace(0, len(known) - 1, min(MOST_FRAMES, len(known))).round().astype(int)):
+        cloud, row = run.clouds[int(known[i])], int(known[i])
+        if len(cloud.xyz_m):
+            sigma = np.sqrt(np.einsum("ni,nij,nj->n", cloud.normals, cloud.covariance_m2, cloud.normals))
+            found.append(SurfacePoints(motion=body.motion.values[row], xyz_m=cloud.xyz_m, normals=cloud.normals, sigma_m=sigma))
+    return found

@@ -187,9 +187,15 @@ class OneSkin:
     weights: np.ndarray  # (V, B) of each bone of the skeleton in a vertex; rows sum to 1
     part: np.ndarray  # (V,) index in `body_parts` of the part to which a vertex belongs
     bone_names: tuple[str, ...]
+    pieces: int = 1  # per edge of the cage; the faces of each quad of the cage follow each other, row by row
+    relief_m: np.ndarray | None = None  # (V,) measured displacement along the normals, and the standard deviation of where the surface is
+    sigma_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         v, f = len(self.vertices_m), len(self.faces)
+        for name in ("relief_m", "sigma_m"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, frozen(value, (v,), name=name))
         object.__setattr__(self, "vertices_m", frozen(self.vertices_m, (v, 3), name="vertices_m"))
         object.__setattr__(self, "faces", frozen(self.faces, (f, 4), np.int64, "faces"))
         object.__setattr__(self, "uv", frozen(self.uv, (f, 4, 2), name="uv"))
@@ -225,8 +231,8 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
         vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, seam, loose]), part, faces, uv, pieces)
         weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1]
         vertices = vertices + kept[:, None] * (surface.projected(vertices, part, CUT_STEPS) - vertices)
-    vertices = faired(_unflipped(vertices, faces, seam > 0), faces, part, kept)
-    return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names)
+    vertices = faired(unflipped(vertices, faces, seam > 0), faces, part, kept)
+    return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names, pieces=pieces)
 
 
 def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneSkin:
@@ -286,7 +292,7 @@ def _unfolded(vertices: np.ndarray, faces: np.ndarray, near: "sparse.csr_matrix"
     return found, loose
 
 
-def _unflipped(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
+def unflipped(vertices: np.ndarray, faces: np.ndarray, may: np.ndarray) -> np.ndarray:
     """Vertices (V, 3): those that `may` move (V,), near flipped quads, move half way to their neighbours' mean until none is flipped."""
     found, near = np.array(vertices), None
     for step in range(UNFLIPPING_STEPS):

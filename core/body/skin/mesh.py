@@ -47,6 +47,9 @@ class SkinSettings:
     anatomy: bool = knob(
         True, "Anatomical heads, hands and feet, with jaw, fingers, heel and toes, instead of the three fitted balls of a bone."
     )
+    fair: bool = knob(True, "Smooth the rings and ledges that come from the metaballs.")
+    relief: bool = knob(True, "Displace the skin to the measured surface of all frames.")
+    mirror: bool = knob(False, "Where only the other side of the body was measured, use its relief, mirrored.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

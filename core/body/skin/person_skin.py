@@ -1,0 +1,152 @@
+"""The skin of a person: made in the rest pose, faired, with the measured relief, and posed in every frame; its file skin/rest.npz.
+
+    metaballs ── one closed mesh (closed_skin) ── without rings and ledges (fairing) ── what all frames measured (relief)
+      ──▶ OneSkin in the rest pose ── posing ──▶ skin/NNNN.ply;  scene and exports bind it to their armature
+
+The mesh of a whole body has DETAIL² quads for each quad of its cage; the skins of the frames have the quads of the cage.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ...foundation import store
+from ...foundation.errors import InputError
+from ...foundation.progress import Monitor
+from ..shape import BodyShape
+from .closed_skin import DETAIL, OneSkin, one_skin, unflipped
+from .contour_skin import MOST_BONES
+from .fairing import anatomical, faired
+from .mesh import SkinSettings
+from .relief import SurfacePoints, measured_relief
+from .surface_operators import vertex_normals
+from .welding import cut
+
+REST = "rest.npz"  # in the folder skin/
+VERSION = 1
+
+
+def rest_skin(shape: BodyShape, settings: SkinSettings) -> OneSkin:
+    """The skin of the rest pose before relief. 5 s for a whole body.
+
+    Raises:
+        InputError: there are no metaballs, or the number of rays is odd.
+    """
+    skin = one_skin(shape, settings, DETAIL)
+    if not settings.fair:
+        return skin
+    return replace(skin, vertices_m=faired(skin.vertices_m, skin.faces, anatomical(shape, skin.weights)))
+
+
+def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mirror: bool, monitor: Monitor) -> OneSkin:
+    """The skin displaced by what the points of all frames show, without flipped quads.
+
+    Raises:
+        Cancelled: the monitor was cancelled.
+    """
+    relief = measured_relief(skin, shape, frames, mirror, monitor)
+    moved = skin.vertices_m + relief.displacement_m[:, None] * vertex_normals(skin.vertices_m, skin.faces)
+    moved = unflipped(moved, skin.faces, np.ones(len(moved), dtype=bool))
+    return replace(skin, vertices_m=moved, relief_m=relief.displacement_m, sigma_m=relief.sigma_m)
+
+
+def cage(skin: OneSkin) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of a skin at the corners of its cage's quads, as indices (V',), and these quads (F', 4) of them."""
+    pieces = skin.pieces
+    grid = skin.faces.reshape(-1, pieces, pieces, 4)
+    corners = np.stack([grid[:, 0, 0, 0], grid[:, 0, -1, 1], grid[:, -1, -1, 2], grid[:, -1, 0, 3]], axis=1)
+    used, faces = np.unique(corners, return_inverse=True)
+    return used, faces.reshape(-1, 4)
+
+
+def resampled(skin: OneSkin, detail: int) -> OneSkin:
+    """The skin with `detail` pieces for each edge of its cage."""
+    skin = skin if detail % skin.pieces == 0 else _only_cage(skin)
+    if detail == skin.pieces:
+        return skin
+    measured = [value[:, None] for value in (skin.relief_m, skin.sigma_m) if value is not None]
+    values, bones, times = np.concatenate([skin.weights, *measured], axis=1), skin.weights.shape[1], detail // skin.pieces
+    vertices, values, part, faces, uv = cut(skin.vertices_m, values, skin.part, skin.faces, skin.uv, times)
+    return replace(
+        skin,
+        vertices_m=vertices,
+        faces=faces,
+        uv=uv,
+        weights=values[:, :bones] / values[:, :bones].sum(axis=1, keepdims=True),
+        part=part,
+        pieces=detail,
+        relief_m=values[:, bones] if measured else None,
+        sigma_m=values[:, bones + 1] if measured else None,
+    )
+
+
+def _only_cage(skin: OneSkin) -> OneSkin:
+    rows, faces = cage(skin)
+    grid = skin.uv.reshape(-1, skin.pieces, skin.pieces, 4, 2)
+    return replace(
+        skin,
+        vertices_m=skin.vertices_m[rows],
+        faces=faces,
+        uv=np.stack([grid[:, 0, 0, 0], grid[:, 0, -1, 1], grid[:, -1, -1, 2], grid[:, -1, 0, 3]], axis=1),
+        weights=skin.weights[rows],
+        part=skin.part[rows],
+        pieces=1,
+        relief_m=None if skin.relief_m is None else skin.relief_m[rows],
+        sigma_m=None if skin.sigma_m is None else skin.sigma_m[rows],
+    )
+
+
+def write_skin(path: Path, skin: OneSkin) -> None:
+    """Write skin/rest.npz.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    bones = np.argsort(-skin.weights, axis=1, kind="stable")[:, :MOST_BONES]
+    arrays: dict[str, np.ndarray] = dict(
+        vertices_m=skin.vertices_m.astype(np.float32),
+        faces=skin.faces.astype(np.int32),
+        uv=skin.uv.astype(np.float32),
+        part=skin.part.astype(np.uint8),
+        bones=bones.astype(np.uint16),
+        weights=np.take_along_axis(skin.weights, bones, axis=1).astype(np.float32),
+    )
+    if skin.relief_m is not None and skin.sigma_m is not None:
+        arrays |= dict(relief_m=skin.relief_m.astype(np.float32), sigma_m=skin.sigma_m.astype(np.float32))
+    store.save(path, arrays, {"skin_version": VERSION, "bone_names": list(skin.bone_names), "pieces": skin.pieces})
+
+
+def read_skin(path: Path, shape: BodyShape) -> OneSkin:
+    """Read skin/rest.npz of a body.
+
+    Raises:
+        InputError: it is missing or damaged, or its bones are not those of the body.
+    """
+    arrays, header = store.load(path)
+    layout = dict(vertices_m=("f", "V3"), faces=("iu", "F4"), uv=("f", "F42"), part=("iu", "V"), bones=("iu", "VK"), weights=("f", "VK"))
+    measured = [name for name in ("relief_m", "sigma_m") if name in arrays]
+    store.check_layout(path, arrays, **layout, **{name: ("f", "V") for name in measured})
+    names, count, pieces = header.get("bone_names"), len(arrays["vertices_m"]), header.get("pieces")
+    if names != [bone.name for bone in shape.skeleton.bones]:
+        raise InputError(f"{path} has other bones than body.toml; run the fit again.")
+    faces, bones, weights = arrays["faces"].astype(np.int64), arrays["bones"].astype(np.int64), arrays["weights"].astype(np.float64)
+    pieces = pieces if isinstance(pieces, int) and pieces > 0 else 0
+    whole = pieces > 0 and len(faces) > 0 and len(faces) % pieces**2 == 0
+    inside = whole and faces.min() >= 0 and faces.max() < count and bones.min() >= 0 and bones.max() < len(names)
+    finite = all(np.isfinite(a).all() for a in (arrays["vertices_m"], arrays["uv"], weights, *(arrays[name] for name in measured)))
+    if not (inside and finite and (weights >= 0).all() and (weights.sum(axis=1) > 0).all()):
+        raise InputError(f"{path} is damaged: its faces, weights or positions cannot be; run the fit again.")
+    table = np.zeros((count, len(names)))
+    np.put_along_axis(table, bones, weights / weights.sum(axis=1, keepdims=True), axis=1)
+    return OneSkin(
+        vertices_m=arrays["vertices_m"],
+        faces=faces,
+        uv=arrays["uv"],
+        weights=table,
+        part=arrays["part"],
+        bone_names=tuple(names),
+        pieces=pieces,
+        relief_m=arrays.get("relief_m"),
+        sigma_m=arrays.get("sigma_m"),
+    )

@@ -1,0 +1,222 @@
+"""The person's own relief: the displacement of the skin along its normals that the measured points of all frames show.
+
+Every measured point X with normal m is compared with the nearest vertex of the posed skin, p with normal n, in the tangential plane of the
+point, so that p need not be opposite to it:
+
+    d = m·(X − p) / (m·n) ,   σ_d² = σ_m² / (m·n)²                                                           (1)
+
+The points of a vertex in one frame are averaged. Over the frames, whose poses have errors of their own, each is an observation of the
+displacement δ of the vertex, which has a Gaussian Markov prior of the Matérn family (Lindgren, Rue & Lindström 2011, J. R. Stat. Soc. B
+73(4)): standard deviation s, range 2.8/κ, so that it is smooth, and returns to zero where nothing was measured:
+
+    Σ ρ( (δ_v − d)/σ ) + δᵀ Q δ → min ,   Q = (κ²M − C) M⁻¹ (κ²M − C) / τ² ,   τ² = 4π κ² s²                (2)
+    σ² = σ_d² + c² σ_f² ,   σ_f: mean absolute deviation of the frames' d from δ nearby, √(π/2) times        (3)
+
+c > 1, because the errors of a frame are alike in all points of a region, so that many points of few frames prove little. Thus the skin is
+detailed where the frames agree (a face), and smooth where they do not (a bending hip).
+
+M, C are the operators of the mesh (surface_operators), ρ is Tukey's biweight. The inverse of the normal matrix is the covariance of δ;
+its diagonal is estimated from samples A⁻¹(Bᵀε) of it (Papandreou & Yuille 2010, NIPS), seed fixed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...foundation.arrays import frozen
+from ...foundation.progress import Monitor
+from ...geometry.robust import TUKEY, mad_sigma
+from ..shape import BodyShape
+from .closed_skin import OneSkin
+from .posed import Poser
+from .surface_operators import laplacian, vertex_normals
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+PRIOR_M = 0.010  # s of (2): how far a body of metaballs lies from a person …
+THIN_PRIOR_M = 0.003  # … and its hands and feet, whose own pose is hardly measured
+KAPPA = 25.0  # κ of (2) [1/m]: a range of 11 cm
+GATE = 4.0  # s; points farther from the skin belong to something else
+LEAST_COSINE = 0.4  # … and so do those whose normals differ more
+CANDIDATES = 6  # nearest vertices of a point
+LEAST_SIGMA_M = 0.0005  # of an observation: the surface's texture
+START_SIGMA_M = 0.004  # σ_f at first
+CORRELATED = 3.0  # c of (3)
+NEARBY_M = 0.03  # over which σ_f is averaged
+ROUNDS = 3  # of finding the points' vertices anew
+REWEIGHTINGS = 2  # in the last round
+SAMPLES = 48  # of the covariance: each sigma to 10 %
+MOST_FRAMES = 120  # evenly over the take
+UNMEASURED = 0.7  # of s: the sigma above which a vertex was hardly measured
+MIRRORED_M = 0.006  # by which the sides of a person differ
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SurfacePoints:
+    """N measured points of one frame [m], with unit normals towards the cameras and standard deviations along them."""
+
+    motion: np.ndarray  # (D,) the pose of the body in this frame
+    xyz_m: np.ndarray  # (N, 3)
+    normals: np.ndarray  # (N, 3)
+    sigma_m: np.ndarray  # (N,)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Relief:
+    """Displacements of V vertices along their normals [m], outwards positive, and the standard deviations of where the skin is."""
+
+    displacement_m: np.ndarray  # (V,)
+    sigma_m: np.ndarray  # (V,) the prior's, where nothing was measured
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "displacement_m", frozen(self.displacement_m, (None,), name="displacement_m"))
+        object.__setattr__(self, "sigma_m", frozen(self.sigma_m, self.displacement_m.shape, name="sigma_m"))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Observed:
+    vertex: np.ndarray  # (M,)
+    d: np.ndarray  # (M,)
+    variance: np.ndarray  # (M,)
+
+
+def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints], mirror: bool, monitor: Monitor) -> Relief:
+    """The relief of a skin made in the rest pose of `shape`. 0.1 s a frame for a whole body, and 5 s.  (1)–(3)
+
+    With `mirror`, where a vertex was hardly measured it follows the mirror image of the other side, with its sigma and `MIRRORED_M`.
+
+    Raises:
+        Cancelled: the monitor was cancelled.
+    """
+    poser, normals = Poser(shape, skin.weights), vertex_normals(skin.vertices_m, skin.faces)
+    size = _prior_sigma(shape, skin)
+    prior, nearby = _prior(skin.vertices_m, skin.faces, size), _Nearby(skin.vertices_m, skin.faces)
+    delta, factor, weight = np.zeros(len(normals)), None, np.zeros(0)
+    for turn in range(ROUNDS):
+        moved = skin.vertices_m + delta[:, None] * normals
+        found = []
+        for i, points in enumerate(frames):
+            monitor.step("relief", turn * len(frames) + i, ROUNDS * len(frames) + 1)
+            found.append(_observed(poser.posed(moved, points.motion), skin.faces, delta, points, GATE * size))
+        seen = _Observed(**{name: np.concatenate([getattr(f, name) for f in found]) for name in _Observed.__slots__})
+        delta, factor, weight = _adjusted(prior, nearby, seen, REWEIGHTINGS if turn == ROUNDS - 1 else 1)
+    sigma = _sigmas(factor, prior, seen, weight)
+    if mirror:
+        seen, weight = _mirrored(skin.vertices_m, normals, delta, sigma, size, seen, weight)
+        total, right = (np.bincount(seen.vertex, w, len(delta)) for w in (weight, weight * seen.d))
+        factor = _factorised(prior.T @ prior, total)
+        delta, sigma = factor.solve(right), _sigmas(factor, prior, seen, weight)
+    return Relief(displacement_m=delta, sigma_m=sigma)
+
+
+class _Nearby:
+    """Means over the neighbourhood of every vertex, by diffusion."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        from scipy import sparse
+
+        C, area = laplacian(vertices, faces)
+        self._factor, self._count = _factorised(sparse.diags(area) - NEARBY_M**2 * C), len(area)
+
+    def scatter(self, vertex: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        """σ_f (V,) of (3) from residuals (M,) at vertices (M,), none of which counts more than GATE times their standard deviation."""
+        size = np.minimum(np.abs(residual), GATE * float(mad_sigma(residual)) if len(residual) else 0.0)
+        total, count = (np.bincount(vertex, w, self._count) for w in (size, np.ones(len(size))))
+        mean = self._factor.solve(total) / np.maximum(self._factor.solve(count), 1e-12)
+        return np.asarray(np.maximum(np.sqrt(np.pi / 2) * mean, LEAST_SIGMA_M))
+
+
+def _prior_sigma(shape: BodyShape, skin: OneSkin) -> np.ndarray:
+    """s (V,) of (2)."""
+    thin = [bone.name.split(".")[0] in ("hand", "foot") for bone in shape.skeleton.bones]
+    return np.asarray(PRIOR_M * (THIN_PRIOR_M / PRIOR_M) ** skin.weights[:, thin].sum(axis=1))
+
+
+def _prior(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray) -> "sparse.csc_matrix":
+    """The square root (V, V) of Q of (2): Q = Hᵀ H, for s (V,)."""
+    from scipy import sparse
+
+    C, area = laplacian(vertices, faces)
+    scale = area**-0.5 / (np.sqrt(4 * np.pi) * KAPPA * size)
+    return sparse.csc_matrix(sparse.diags(scale) @ (KAPPA**2 * sparse.diags(area) - C))
+
+
+def _observed(posed: np.ndarray, faces: np.ndarray, delta: np.ndarray, points: SurfacePoints, gate: np.ndarray) -> _Observed:
+    """(1) of one frame, averaged for every vertex; `delta` (V,) is the displacement that `posed` has, `gate` (V,) the largest."""
+    from scipy.spatial import cKDTree
+
+    normals = vertex_normals(posed, faces)
+    X, m = points.xyz_m, points.normals
+    distance, near = cKDTree(posed).query(X, k=CANDIDATES, distance_upper_bound=float(gate.max()))
+    near = np.minimum(near, len(posed) - 1)
+    cosine = np.einsum("nkc,nc->nk", normals[near], m)
+    best = np.argmin(np.where(cosine > LEAST_COSINE, distance * (2 - cosine), np.inf), axis=1)
+    rows = np.arange(len(X))
+    vertex, cosine, distance = near[rows, best], cosine[rows, best], distance[rows, best]
+    d = delta[vertex] + np.einsum("nc,nc->n", m, X - posed[vertex]) / np.maximum(cosine, LEAST_COSINE)
+    good = (cosine > LEAST_COSINE) & np.isfinite(distance) & (np.abs(d) < gate[vertex])
+    vertex, cosine, d, sigma = vertex[good], cosine[good], d[good], points.sigma_m[good]
+    weight = (cosine / np.maximum(sigma, LEAST_SIGMA_M)) ** 2
+    hit, at = np.unique(vertex, return_inverse=True)
+    total = np.bincount(at, weight)
+    return _Observed(vertex=hit, d=np.bincount(at, weight * d) / total, variance=1 / total)
+
+
+def _adjusted(prior: "sparse.csc_matrix", nearby: "_Nearby", seen: _Observed, reweightings: int) -> tuple[np.ndarray, Any, np.ndarray]:
+    """δ (V,) of (2), the factorised normal matrix, and the observations' weights (M,)."""
+    count, robust = prior.shape[0], np.ones(len(seen.d))
+    spread = np.full(len(seen.d), START_SIGMA_M)
+    delta, factor, weight = np.zeros(count), None, robust
+    for _ in range(1 + reweightings):
+        weight = robust / (seen.variance + (CORRELATED * spread) ** 2)
+        factor = _factorised(prior.T @ prior, np.bincount(seen.vertex, weight, count))
+        delta = factor.solve(np.bincount(seen.vertex, weight * seen.d, count))
+        residual = seen.d - delta[seen.vertex]
+        spread = nearby.scatter(seen.vertex, residual)[seen.vertex]  # (3)
+        robust = np.clip(1 - (residual / (TUKEY * np.sqrt(seen.variance + spread**2))) ** 2, 0, None) ** 2
+    return delta, factor, weight
+
+
+def _factorised(matrix: "sparse.spmatrix", weight: np.ndarray | None = None) -> Any:
+    """The factors of a symmetric matrix (V, V) with `weight` (V,) added to its diagonal."""
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
+    whole = matrix if weight is None else matrix + sparse.diags(weight.astype(np.float64))
+    return splu(sparse.csc_matrix(whole), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
+
+def _mirrored(
+    vertices: np.ndarray, normals: np.ndarray, delta: np.ndarray, sigma: np.ndarray, size: np.ndarray, seen: _Observed, weight: np.ndarray
+) -> tuple[_Observed, np.ndarray]:
+    """The observations and those of measured vertices' mirror images (in the plane x = 0) at vertices that were hardly measured."""
+    from scipy.spatial import cKDTree
+
+    flip = np.array([-1.0, 1.0, 1.0])
+    distance, other = cKDTree(vertices).query(vertices * flip, distance_upper_bound=GATE * PRIOR_M)
+    there = np.flatnonzero(np.isfinite(distance))
+    other = other[there]
+    there, other = (rows[(sigma[there] > UNMEASURED * size[there]) & (sigma[other] < UNMEASURED * size[other])] for rows in (there, other))
+    places = (vertices + delta[:, None] * normals)[other] * flip
+    cosine = np.einsum("nk,nk->n", normals[there], normals[other] * flip)
+    d = np.einsum("nk,nk->n", normals[other] * flip, places - vertices[there]) / np.maximum(cosine, LEAST_COSINE)
+    good = (cosine > LEAST_COSINE) & (np.abs(d) < GATE * size[there])
+    both = _Observed(
+        vertex=np.concatenate([seen.vertex, there[good]]),
+        d=np.concatenate([seen.d, d[good]]),
+        variance=np.concatenate([seen.variance, sigma[other[good]] ** 2 + MIRRORED_M**2]),
+    )
+    return both, np.concatenate([weight, 1 / both.variance[len(weight) :]])
+
+
+def _sigmas(factor: Any, prior: "sparse.csc_matrix", seen: _Observed, weight: np.ndarray) -> np.ndarray:
+    """Standard deviations (V,) of δ, from samples of its distribution."""
+    random, count, square = np.random.default_rng(0), prior.shape[0], 0.0
+    root = np.sqrt(np.bincount(seen.vertex, weight, count))
+    for _ in range(SAMPLES):
+        draw = factor.solve(prior.T @ random.standard_normal(count) + root * random.standard_normal(count))
+        square = square + draw**2
+    return np.asarray(np.sqrt(square / SAMPLES))
