@@ -20,9 +20,9 @@ from ...core.body.metaballs import THRESHOLD
 from ...core.body.shape import BodyShape, read_body
 from ...core.body.skeleton import bone_frames
 from ...core.body.skin.closed_skin import DETAIL, OneSkin
+from ...core.body.skin.contour_skin import body_skin
 from ...core.body.skin.extremities import shape_for_skin
 from ...core.body.skin.mesh import SkinSettings, corner_uv
-from ...core.body.skin.contour_skin import body_skin
 from ...core.body.skin.person_skin import REST, read_skin, resampled, rest_skin
 from ...core.body.skin.posed import Poser
 from ...core.body.skin.whole_surface import field_grid
@@ -73,7 +73,8 @@ def skin_of_run(out: Path) -> tuple[BodyShape, OneSkin | None]:
     Raises:
         InputError: a file is missing or damaged.
     """
-    settings = from_table(SkinSettings, read_run(out / "run.json").get("settings", {}).get("skin", {}), "[skin] of run.json")
+    run = read_run(out / "run.json") if (out / "run.json").is_file() else {}
+    settings = from_table(SkinSettings, run.get("settings", {}).get("skin", {}), "[skin] of run.json")
     shape = shape_for_skin(read_body(out / "body.toml"), settings)
     file = out / "skin" / REST
     return shape, read_skin(file, shape) if file.is_file() else None
@@ -84,7 +85,7 @@ def in_rest_pose(skin: OneSkin, made: BodyShape, shape: BodyShape) -> OneSkin:
     if shape is made:
         return skin
     rest = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dofs)))
-    return replace(skin, vertices_m=Poser(made, skin.weights).moved(skin.vertices_m, *rest))
+    return replace(skin, vertices_m=Poser(made, skin.weights).moved(skin.vertices_m, *rest)[0])
 
 
 def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: FrameSkins, cache: Path) -> bpy.types.Object:

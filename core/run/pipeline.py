@@ -258,7 +258,7 @@ def _write_body(run: Run, body: BodyFit, monitor: Monitor) -> None:
 
 
 def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> None:
-    """The person's skin in the rest pose, with relief, and its cage in the pose of every frame. Raises InputError for a body that has none."""
+    """The person's skin in the rest pose, with relief, and its cage in every frame's pose. Raises InputError for a body that has none."""
     settings: SkinSettings = run.settings["skin"]
     person = shape_for_skin(body.shape, settings)
     skin = rest_skin(person, settings)

@@ -13,9 +13,9 @@ from tricap.core.body.metaballs import field
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin.closed_skin import one_skin
 from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
 from tricap.core.body.skin.extremities import shape_for_skin
+from tricap.core.body.skin.person_skin import rest_skin
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
 
@@ -248,7 +248,7 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
     assert len(families) == 8  # trunk, limbs, where both legs meet the pelvis, and each arm the chest
     skin_object = skin.add_skin(empty.context.scene.collection, body, shape)
     assert skin_object.data.uv_layers and all(len(face.vertices) == 4 for face in skin_object.data.polygons)
-    np.testing.assert_allclose(world_vertices(empty, skin_object), one_skin(shape, SkinSettings()).vertices_m, atol=2e-5)
+    np.testing.assert_allclose(world_vertices(empty, skin_object), rest_skin(shape, SkinSettings()).vertices_m, atol=2e-5)
 
 
 @pytest.mark.slow

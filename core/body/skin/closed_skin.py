@@ -187,7 +187,8 @@ class OneSkin:
     weights: np.ndarray  # (V, B) of each bone of the skeleton in a vertex; rows sum to 1
     part: np.ndarray  # (V,) index in `body_parts` of the part to which a vertex belongs
     bone_names: tuple[str, ...]
-    pieces: int = 1  # per edge of the cage; the faces of each quad of the cage follow each other, row by row
+    pieces: int = 1  # per edge of the cage; if sewn from several chains, the faces of each quad of the cage follow each other, row by row
+    rays: int = 0  # vertices on each contour of a mesh of one chain; 0: sewn from several
     relief_m: np.ndarray | None = None  # (V,) measured displacement along the normals, and the standard deviation of where the surface is
     sigma_m: np.ndarray | None = None
 
@@ -225,14 +226,17 @@ def one_skin(shape: BodyShape, settings: SkinSettings, detail: int = 1) -> OneSk
     uneven = np.union1d(free, within(near, _sparse(whole.vertices_m, faces, whole.part, surface), SEAM_RINGS))
     vertices, loose = _unfolded(_relaxed(whole.vertices_m, near, uneven, free, whole.part, surface), faces, near, free)
     weights = _smoothed(whole.weights, vertices, faces, near, free)
-    part, pieces, kept = whole.part, detail * settings.detail, 1 - loose
+    part, kept = whole.part, 1 - loose
     seam = np.isin(np.arange(len(vertices)), free).astype(np.float64)
-    if pieces > 1:
-        vertices, both, part, faces, uv = cut(vertices, np.column_stack([weights, seam, loose]), part, faces, uv, pieces)
-        weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1]
+    for pieces in (settings.detail, detail):
+        if pieces > 1:
+            columns = np.column_stack([weights, seam, 1 - kept])
+            vertices, both, part, faces, uv = cut(vertices, columns, part, faces, uv, pieces)
+            weights, seam, kept = strongest(both[:, :-2]), both[:, -2], 1 - both[:, -1]
+    if detail * settings.detail > 1:
         vertices = vertices + kept[:, None] * (surface.projected(vertices, part, CUT_STEPS) - vertices)
     vertices = faired(unflipped(vertices, faces, seam > 0), faces, part, kept)
-    return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names, pieces=pieces)
+    return OneSkin(vertices_m=vertices, faces=faces, uv=uv, weights=weights, part=part, bone_names=skin.bone_names, pieces=detail)
 
 
 def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneSkin:
@@ -244,6 +248,8 @@ def _of_one_chain(shape: BodyShape, settings: SkinSettings, detail: int) -> OneS
         uv=corner_uv(skin),
         weights=skin.weights,
         bone_names=skin.bone_names,
+        pieces=detail,
+        rays=skin.rays,
         part=np.zeros(len(skin.vertices_m), dtype=np.int64),
     )
 

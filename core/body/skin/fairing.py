@@ -8,7 +8,7 @@ processing; M, C and the normals n of surface_operators):
     ‖M^(−½) (C x − M h̃ n)‖² + ‖w⁻² M^½ (x − x⁰)‖² → min                                                    (2)
 
 A cylinder or a sphere stays as it is, at any radius, where smoothing of positions would shrink it. Heads, hands and feet, made of
-anatomical balls, keep their shape (w → 0), with a smooth transition.
+anatomical balls, keep their shape (w → 0, and Δx⁰ in place of h̃ n), with a smooth transition.
 """
 
 import numpy as np
@@ -41,9 +41,8 @@ def faired(vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> np.ndar
         M, normals = sparse.diags(area), vertex_normals(found, faces)
         h = np.einsum("vk,vk->v", normals, C @ found) / area
         smooth = splu(sparse.csc_matrix(M - CURVATURE_M**2 * C), permc_spec="MMD_AT_PLUS_A").solve(area * h)
-        smooth = kept * h + (1 - kept) * smooth
-        inverse = sparse.diags(1 / area)
-        normal = sparse.csc_matrix(C.T @ inverse @ C + sparse.diags(tie * area))
-        right = C.T @ (smooth[:, None] * normals) + (tie * area)[:, None] * vertices
+        wanted = kept[:, None] * (C @ found) / area[:, None] + ((1 - kept) * smooth)[:, None] * normals
+        normal = sparse.csc_matrix(C.T @ sparse.diags(1 / area) @ C + sparse.diags(tie * area))
+        right = C.T @ wanted + (tie * area)[:, None] * vertices
         found = splu(normal, permc_spec="MMD_AT_PLUS_A").solve(right)
     return np.asarray(found)

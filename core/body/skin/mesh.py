@@ -134,20 +134,24 @@ def shrinkage(rays: int) -> float:
 
 def corner_uv(skin: Skin) -> np.ndarray:
     """Texture coordinates (F, 4, 2) of the faces' corners: u around the bone, v along the part; parts side by side in u."""
-    uv = np.empty((len(skin.vertices_m), 2))
-    first, strip = 0, 1.0 / len(skin.part_sizes)
-    around = np.empty(len(skin.vertices_m))
-    for i, size in enumerate(skin.part_sizes):
-        rings = (size - 2) // skin.rays
-        ring = np.repeat(np.arange(1, rings + 1), skin.rays)
+    return chains_uv(skin.part_sizes, skin.rays, skin.faces)
+
+
+def chains_uv(sizes: tuple[int, ...], rays: int, faces: np.ndarray) -> np.ndarray:
+    """The same for parts of so many vertices each, on contours of `rays`, with faces (F, 4)."""
+    count, strip = sum(sizes), 1.0 / len(sizes)
+    uv, around, first = np.empty((count, 2)), np.empty(count), 0
+    for i, size in enumerate(sizes):
+        rings = (size - 2) // rays
+        ring = np.repeat(np.arange(1, rings + 1), rays)
         uv[first : first + size, 1] = np.concatenate([[0], ring, [rings + 1]]) / (rings + 1)
         uv[first : first + size, 0] = i * strip
-        around[first : first + size] = np.concatenate([[np.nan], np.tile(np.arange(skin.rays), rings) / skin.rays, [np.nan]])
+        around[first : first + size] = np.concatenate([[np.nan], np.tile(np.arange(rays), rings) / rays, [np.nan]])
         first += size
-    u = around[skin.faces]
+    u = around[faces]
     u = np.where((np.nanmax(u, axis=1) > 0.75)[:, None] & (u < 0.25), u + 1.0, u)  # over the seam
     u = np.where(np.isnan(u), np.nanmean(u, axis=1, keepdims=True), u)
-    return np.stack([uv[skin.faces, 0] + 0.98 * strip * u, uv[skin.faces, 1]], axis=-1)
+    return np.stack([uv[faces, 0] + 0.98 * strip * u, uv[faces, 1]], axis=-1)
 
 
 def _surface(points: np.ndarray, rays: int, detail: int, mode: str) -> tuple[np.ndarray, np.ndarray]:

@@ -18,13 +18,16 @@ from ..shape import BodyShape
 from .closed_skin import DETAIL, OneSkin, one_skin, unflipped
 from .contour_skin import MOST_BONES
 from .fairing import anatomical, faired
-from .mesh import SkinSettings
+from .mesh import SkinSettings, chain_faces, chains_uv
+from .rays import smooth
 from .relief import SurfacePoints, measured_relief
 from .surface_operators import vertex_normals
 from .welding import cut
 
 REST = "rest.npz"  # in the folder skin/
 VERSION = 1
+MOST_PIECES = 64
+END_M = 0.06  # within this distance of its ends a limb keeps its shape
 
 
 def rest_skin(shape: BodyShape, settings: SkinSettings) -> OneSkin:
@@ -36,7 +39,11 @@ def rest_skin(shape: BodyShape, settings: SkinSettings) -> OneSkin:
     skin = one_skin(shape, settings, DETAIL)
     if not settings.fair:
         return skin
-    return replace(skin, vertices_m=faired(skin.vertices_m, skin.faces, anatomical(shape, skin.weights)))
+    kept = anatomical(shape, skin.weights)
+    if skin.rays:  # a limb alone: its ends are no part of a surface that goes on
+        from_end = np.min([np.linalg.norm(skin.vertices_m - skin.vertices_m[pole], axis=1) for pole in (0, -1)], axis=0)
+        kept = np.maximum(kept, 1 - smooth(from_end / END_M - 1))
+    return replace(skin, vertices_m=faired(skin.vertices_m, skin.faces, kept))
 
 
 def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mirror: bool, monitor: Monitor) -> OneSkin:
@@ -53,11 +60,23 @@ def with_relief(skin: OneSkin, shape: BodyShape, frames: list[SurfacePoints], mi
 
 def cage(skin: OneSkin) -> tuple[np.ndarray, np.ndarray]:
     """The vertices of a skin at the corners of its cage's quads, as indices (V',), and these quads (F', 4) of them."""
-    pieces = skin.pieces
-    grid = skin.faces.reshape(-1, pieces, pieces, 4)
-    corners = np.stack([grid[:, 0, 0, 0], grid[:, 0, -1, 1], grid[:, -1, -1, 2], grid[:, -1, 0, 3]], axis=1)
-    used, faces = np.unique(corners, return_inverse=True)
+    if skin.rays:
+        return _cage_of_chain(len(skin.vertices_m), skin.rays, skin.pieces)
+    used, faces = np.unique(_corners(skin.faces, skin.pieces), return_inverse=True)
     return used, faces.reshape(-1, 4)
+
+
+def _cage_of_chain(count: int, rays: int, pieces: int) -> tuple[np.ndarray, np.ndarray]:
+    """The cage of a mesh of `count` vertices on contours of `rays`, between poles."""
+    contours = np.arange(pieces - 1, (count - 2) // rays, pieces)
+    rows = np.concatenate([[0], (1 + contours[:, None] * rays + np.arange(0, rays, pieces)).ravel(), [count - 1]])
+    return rows, chain_faces(len(rows), rays // pieces)
+
+
+def _corners(values: np.ndarray, pieces: int) -> np.ndarray:
+    """The values (F', 4, …) at the corners of the cage's quads, of those (F, 4, …) of the quads that they are cut into."""
+    grid = values.reshape(-1, pieces, pieces, *values.shape[1:])
+    return np.stack([grid[:, 0, 0, 0], grid[:, 0, -1, 1], grid[:, -1, -1, 2], grid[:, -1, 0, 3]], axis=1)
 
 
 def resampled(skin: OneSkin, detail: int) -> OneSkin:
@@ -76,6 +95,7 @@ def resampled(skin: OneSkin, detail: int) -> OneSkin:
         weights=values[:, :bones] / values[:, :bones].sum(axis=1, keepdims=True),
         part=part,
         pieces=detail,
+        rays=0,
         relief_m=values[:, bones] if measured else None,
         sigma_m=values[:, bones + 1] if measured else None,
     )
@@ -83,15 +103,16 @@ def resampled(skin: OneSkin, detail: int) -> OneSkin:
 
 def _only_cage(skin: OneSkin) -> OneSkin:
     rows, faces = cage(skin)
-    grid = skin.uv.reshape(-1, skin.pieces, skin.pieces, 4, 2)
+    rays = skin.rays // skin.pieces
     return replace(
         skin,
         vertices_m=skin.vertices_m[rows],
         faces=faces,
-        uv=np.stack([grid[:, 0, 0, 0], grid[:, 0, -1, 1], grid[:, -1, -1, 2], grid[:, -1, 0, 3]], axis=1),
+        uv=chains_uv((len(rows),), rays, faces) if rays else _corners(skin.uv, skin.pieces),
         weights=skin.weights[rows],
         part=skin.part[rows],
         pieces=1,
+        rays=rays,
         relief_m=None if skin.relief_m is None else skin.relief_m[rows],
         sigma_m=None if skin.sigma_m is None else skin.sigma_m[rows],
     )
@@ -114,7 +135,7 @@ def write_skin(path: Path, skin: OneSkin) -> None:
     )
     if skin.relief_m is not None and skin.sigma_m is not None:
         arrays |= dict(relief_m=skin.relief_m.astype(np.float32), sigma_m=skin.sigma_m.astype(np.float32))
-    store.save(path, arrays, {"skin_version": VERSION, "bone_names": list(skin.bone_names), "pieces": skin.pieces})
+    store.save(path, arrays, {"skin_version": VERSION, "bone_names": list(skin.bone_names), "pieces": skin.pieces, "rays": skin.rays})
 
 
 def read_skin(path: Path, shape: BodyShape) -> OneSkin:
@@ -127,13 +148,18 @@ def read_skin(path: Path, shape: BodyShape) -> OneSkin:
     layout = dict(vertices_m=("f", "V3"), faces=("iu", "F4"), uv=("f", "F42"), part=("iu", "V"), bones=("iu", "VK"), weights=("f", "VK"))
     measured = [name for name in ("relief_m", "sigma_m") if name in arrays]
     store.check_layout(path, arrays, **layout, **{name: ("f", "V") for name in measured})
-    names, count, pieces = header.get("bone_names"), len(arrays["vertices_m"]), header.get("pieces")
+    names, count = header.get("bone_names"), len(arrays["vertices_m"])
     if names != [bone.name for bone in shape.skeleton.bones]:
         raise InputError(f"{path} has other bones than body.toml; run the fit again.")
     faces, bones, weights = arrays["faces"].astype(np.int64), arrays["bones"].astype(np.int64), arrays["weights"].astype(np.float64)
-    pieces = pieces if isinstance(pieces, int) and pieces > 0 else 0
-    whole = pieces > 0 and len(faces) > 0 and len(faces) % pieces**2 == 0
-    inside = whole and faces.min() >= 0 and faces.max() < count and bones.min() >= 0 and bones.max() < len(names)
+    pieces, rays = (n if isinstance(n := header.get(name), int) and n >= 0 else -1 for name in ("pieces", "rays"))
+    inside = (
+        _is_mesh(count, len(faces), pieces, rays)
+        and faces.min() >= 0
+        and faces.max() < count
+        and bones.min() >= 0
+        and bones.max() < len(names)
+    )
     finite = all(np.isfinite(a).all() for a in (arrays["vertices_m"], arrays["uv"], weights, *(arrays[name] for name in measured)))
     if not (inside and finite and (weights >= 0).all() and (weights.sum(axis=1) > 0).all()):
         raise InputError(f"{path} is damaged: its faces, weights or positions cannot be; run the fit again.")
@@ -147,6 +173,17 @@ def read_skin(path: Path, shape: BodyShape) -> OneSkin:
         part=arrays["part"],
         bone_names=tuple(names),
         pieces=pieces,
+        rays=rays,
         relief_m=arrays.get("relief_m"),
         sigma_m=arrays.get("sigma_m"),
     )
+
+
+def _is_mesh(vertices: int, faces: int, pieces: int, rays: int) -> bool:
+    """Whether a skin can have so many vertices and faces."""
+    if not 0 < pieces <= MOST_PIECES or faces < 1:
+        return False
+    if rays == 0:
+        return faces % pieces**2 == 0
+    contours = (vertices - 2) // rays if rays > 0 else 0
+    return contours > 0 and rays % (2 * pieces) == 0 and vertices == contours * rays + 2 and (contours + 1) % pieces == 0

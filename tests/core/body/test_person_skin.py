@@ -10,9 +10,10 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
-from tricap.core.body.skin.closed_skin import OneSkin, flipped, mean_of_neighbours
+from tricap.core.body.skin.closed_skin import DETAIL, OneSkin, flipped, mean_of_neighbours
+from tricap.core.body.skin.contour_skin import body_skin
 from tricap.core.body.skin.fairing import faired
-from tricap.core.body.skin.mesh import SkinSettings
+from tricap.core.body.skin.mesh import SkinSettings, corner_uv
 from tricap.core.body.skin.person_skin import REST, cage, read_skin, resampled, rest_skin, with_relief, write_skin
 from tricap.core.body.skin.posed import Poser
 from tricap.core.body.skin.relief import PRIOR_M, SurfacePoints
@@ -161,13 +162,23 @@ def test_the_file_of_a_skin(tmp_path: Path) -> None:
         read_skin(tmp_path / REST, default_shape(read_model("leg.R")))
 
 
+def test_the_cage_of_a_limb_is_its_contours() -> None:
+    shape, skin = arm()
+    rows, faces = cage(skin)
+    contours = body_skin(shape, np.zeros(len(shape.skeleton.dofs)), FEW)
+    assert np.array_equal(faces, contours.faces)
+    assert np.median(np.linalg.norm(skin.vertices_m[rows] - contours.vertices_m, axis=1)) < 0.003  # faired
+    coarse, fine = resampled(skin, 1), resampled(skin, 4)
+    assert np.allclose(coarse.uv, corner_uv(contours)) and len(fine.faces) == 4 * len(skin.faces)
+
+
 @pytest.mark.slow
 def test_a_whole_body_has_no_ledges_and_comes_in_any_detail() -> None:
     shape = default_shape(read_model("full"))
     skin = rest_skin(shape, FEW)
     assert not flipped(skin.vertices_m, skin.faces).any()
     rows, faces = cage(skin)
-    assert len(faces) * skin.pieces**2 == len(skin.faces)
+    assert skin.pieces == DETAIL and len(faces) * skin.pieces**2 == len(skin.faces)
     coarse, fine = resampled(skin, 1), resampled(skin, 4)
     np.testing.assert_array_equal(coarse.vertices_m, skin.vertices_m[rows])
     assert len(fine.faces) == 4 * len(skin.faces) and np.allclose(fine.weights.sum(axis=1), 1)
