@@ -9,6 +9,7 @@ which keeps the volume at bent joints as Blender's armature does. On a walker in
 skin that is cast in the frame itself, and 95 % within 5 mm; the others are near armpits and crotch, or inside the body.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -75,3 +76,12 @@ class PosedSkin:
         R, head = bone_frames(self._shape.skeleton, self._shape.lengths_m, pose)
         vertices, normals = self._poser.moved(self._skin.vertices_m, R, head, self._skin.normals)
         return replace(self._skin, vertices_m=vertices, normals=normals)
+
+
+def skins_in(shape: BodyShape, motion: np.ndarray, settings: SkinSettings) -> Callable[[np.ndarray], Skin]:
+    """The skin as a function of the pose (D,), as the settings ask for it: posed, or cast anew in every frame. `motion` (T, D).
+
+    Raises:
+        InputError: see `body_skin`.
+    """
+    return (lambda pose: body_skin(shape, pose, settings)) if settings.exact else PosedSkin(shape, motion, settings).at
