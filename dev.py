@@ -30,7 +30,7 @@ STAMP = "tricap-setup.txt"
 LONG_BENCHES = ("resume", "surface", "clip")  # run when they are named only
 # What an extension consists of; everything else in the repository is for developers.
 SHIPPED_FILES = ("blender_manifest.toml", "__init__.py", "__main__.py", "LICENSE")
-SHIPPED_FOLDERS = {"core": (".py", ".toml"), "addon": (".py", ".toml", ".json")}
+SHIPPED_FOLDERS = {"core": (".py", ".toml", ".csv"), "addon": (".py", ".toml", ".json")}
 ANY = "any"  # the platform of a wheel in Python alone
 PLATFORM_OF_TAG = {"x86_64": "linux-x64", "amd64": "windows-x64", "arm64": "macos-arm64", ANY: ANY}  # how a wheel's name ends
 

@@ -13,6 +13,7 @@ import bpy
 
 from ...core.body.model_file import read_model
 from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
+from ...core.fitting.settings import START_ALONE
 from ...core.foundation.errors import InputError
 from ...core.geometry.rig import read_rig
 from ...core.images.sequence import ImageSequence, open_sequence
@@ -198,6 +199,9 @@ def _clicks(scene: bpy.types.Scene, found: _Project) -> State:
     if found.footage is not None:
         _check_clicks(found.footage)
     complete = [name for name in wanted if len(clicked.get(name, {})) >= 2]
+    if take.body_model in START_ALONE and len(complete) < len(wanted):
+        others = f"{len(complete)} of {len(wanted)} joints are clicked, the others are" if complete else "The joints are"
+        return State(status=Status.DONE, message=f"{others} found by the fit, which asks for a click where it is not certain.")
     if len(complete) < min(NEEDED_JOINTS, len(wanted)):
         return State(status=Status.READY, message=f"Click each joint in at least two views: {len(complete)} of {len(wanted)} so far.")
     missing = [name for name in wanted if name not in complete]

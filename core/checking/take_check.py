@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from ..body.model_file import read_model
-from ..fitting.settings import FitSettings
+from ..fitting.settings import START_ALONE, FitSettings
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..foundation.settings import from_table
@@ -52,7 +52,7 @@ LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joint
 
 
 def joint_findings(take: Take) -> list[Finding]:
-    """A body, or limbs of it, without clicks: clicks decide which way the fit bends a limb.
+    """A limb without clicks: clicks decide which way the fit bends it. A person, or the upper half, starts by itself.
 
     Raises:
         InputError: there is no such body model.
@@ -62,13 +62,18 @@ def joint_findings(take: Take) -> list[Finding]:
     joints = read_model(take.body_model).skeleton.joint_names
     clicked = {name for frame in (take.clicks, *take.keyframes) for name, at in frame.joints.items() if len(at) > 1}
     advice = "Click them in Blender (step 3), or write them under [seeds.joints] of take.toml, in two views at least."
+    if not clicked and take.body_model in START_ALONE:
+        return []
     if not clicked:
-        sentence = f"No joint of the body “{take.body_model}” is clicked: the result will have surface and tracks, but no body."
+        sentence = (
+            f"No joint of the body “{take.body_model}” is clicked. It starts by itself only where the whole upper body is visible; "
+            "otherwise the result will have surface and tracks, but no body."
+        )
         return [doubtful(Cause.NO_CLICKS, sentence, advice)]
     bare = [limb for limb, names in LIMBS.items() if {*names} <= {*joints} and len(clicked & {*names}) < 2]
     if not bare:
         return []
-    sentence = f"Fewer than two joints are clicked of: {', '.join(bare)}. The fit has to guess their pose."
+    sentence = f"Fewer than two joints are clicked of: {', '.join(bare)}. The fit has to find their pose."
     return [doubtful(Cause.FEW_CLICKS, sentence, advice)]
 
 

@@ -37,7 +37,7 @@ def build_parser(adders: tuple[Adder, ...] = ()) -> argparse.ArgumentParser:
     """The parser with all commands, those of the core and those that `adders` add."""
     parser = argparse.ArgumentParser(prog="tricap", description="Measure a moving person from the video of calibrated cameras.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_new, _stages, _check, _calibrate, _track2d, _contour, _compare, _batch, _fields, *adders):
+    for add in (_new, _stages, _joints, _check, _calibrate, _track2d, _contour, _compare, _batch, _fields, *adders):
         add(commands)
     for sub in commands.choices.values():
         for argument in sub._actions:
@@ -101,6 +101,14 @@ def _stages(commands: Any) -> None:
         commands, "demo", "make a synthetic recording, run all stages on it, and compare with the truth", action("stages", "demo")
     )
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
+
+
+def _joints(commands: Any) -> None:
+    joints = _command(commands, "joints", "find the person's joints in one frame, without clicks", action("joints"))
+    _take_argument(joints)
+    joints.add_argument("--write", action="store_true", help="write them into take.toml as clicks, where they are certain")
+    joints.add_argument("--json", action="store_true", help="print them as JSON")
+    _set_argument(joints)
 
 
 def _check(commands: Any) -> None:

@@ -21,7 +21,7 @@ from .inputs.cloud_points import CloudPoints
 from .inputs.silhouettes import nearest_to_segment
 from .limb import Limb
 from .segmentation import facing_bone, gap_to_bone, near_pairs
-from .state import BodyState, free_bones
+from .state import BodyState, ShapeParameters, free_bones
 
 MOST_POINTS = 500  # of a frame
 COARSE = 3  # points and cells as one, for a first choice among many poses
@@ -138,10 +138,15 @@ def limb_gains(evidence: Evidence, limb: Limb, poses: np.ndarray, vector: np.nda
     """(2) of a limb in N poses (N, D), of a body with the shape vector (S,)."""
     state = limb.parameters.state(poses[0], vector)
     capsules = _limb_capsules(evidence, limb, poses, state)
-    gain = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
-    for view, share in zip(evidence.cells, evidence.taken_cells):
-        gain += evidence.cell_area(view, capsules.first_m[0, 0]) * _gain_of_cells(view, capsules, share, width_m)
-    return gain - _misplaced(evidence, capsules, state, _others(limb, state))
+    return _explained_by(evidence, capsules, width_m) - _misplaced(evidence, capsules, state, _others(limb, state))
+
+
+def body_gains(evidence: Evidence, parameters: ShapeParameters, poses: np.ndarray, vector: np.ndarray, width_m: float) -> np.ndarray:
+    """(2) of a whole body with the shape vector (S,) in N poses (N, D)."""
+    state = parameters.state(poses[0], vector)
+    R, head = bone_frames(parameters.skeleton, state.lengths_m, poses)
+    body = _Capsules.of(evidence, state, np.array(sorted(state.profiles)), free_bones(parameters), head, R)
+    return _explained_by(evidence, body, width_m) - _misplaced(evidence, body, state, np.zeros(0, np.intp))
 
 
 def misplaced(evidence: Evidence, limb: Limb, state: BodyState) -> float:
@@ -194,6 +199,14 @@ def _limb_capsules(evidence: Evidence, limb: Limb, poses: np.ndarray, state: Bod
 def _others(limb: Limb, state: BodyState) -> np.ndarray:
     """The bones in whose flesh a limb cannot lie."""
     return np.array([b for b in sorted(state.profiles) if b != limb.parent and b not in limb.outer], dtype=np.intp)
+
+
+def _explained_by(evidence: Evidence, capsules: _Capsules, width_m: float) -> np.ndarray:
+    """The first sum of (2) for capsules in N poses (N,)."""
+    gain = evidence.point_area * _gain_of_points(evidence.points, capsules, evidence.taken, width_m)
+    for view, share in zip(evidence.cells, evidence.taken_cells):
+        gain += evidence.cell_area(view, capsules.first_m[0, 0]) * _gain_of_cells(view, capsules, share, width_m)
+    return gain
 
 
 def _points_explained(points: CloudPoints, state: BodyState, bones: np.ndarray, width_m: float) -> np.ndarray:

@@ -6,6 +6,7 @@ from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
 ALGORITHM = "body 5"  # part of the fit's key: raise it when the same input gives another body
+START_ALONE = ("full", "upper_body")  # models whose joints need no clicks; a limb is found where such a body is visible
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,6 +66,9 @@ class FitSettings:
         unit="px",
         low=0.1,
         high=100.0,
+    )
+    least_start_probability: float = knob(
+        0.95, "Without clicks: a start that is less probable is not used; the fit asks for the click that decides.", low=0.0, high=1.0
     )
     length_sigma: float = knob(
         0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.", low=0.001, high=1.0

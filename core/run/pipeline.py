@@ -23,9 +23,10 @@ from ..checking.timing import synchronised
 from ..fitting.inputs.cloud_points import tracked_clouds
 from ..fitting.inputs.fit_input import FitInput
 from ..fitting.inputs.no_surface import background_regions, can_fit_without_surface, outline_polygons
-from ..fitting.inputs.take_inputs import check_body, clicks_left_out, fit_input, missing_for_fit
+from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_sequence
+from ..fitting.stages.set_up import NobodyFound, with_start
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..matching.foreground import Foreground
@@ -42,7 +43,7 @@ from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
 from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
-from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, surface_figures, track_figures
+from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .stages import STAGES
 from .take_run import Overrides, Run, open_run
 
@@ -92,10 +93,10 @@ def track(run: Run, monitor: Monitor) -> None:
 def fit(run: Run, monitor: Monitor) -> None:
     """The body's shape and motion: body.toml, joints.csv, motion.csv, skin/. Measures and tracks first where that is needed.
 
-    A take without a model or clicked joints has no body; run.json says so.
+    A take without a model has no body; run.json says so. Without clicked joints the body starts by itself where that is certain.
 
     Raises:
-        InputError: the clicks contradict each other, or the limb has no points.
+        InputError: the clicks contradict each other, more are needed for a start, or the limb has no points.
         Cancelled: surface and tracks are kept.
     """
     _prepare_fit(run, monitor)
@@ -107,10 +108,15 @@ def fit(run: Run, monitor: Monitor) -> None:
     try:
         with run.resumable(*BODY_FILES, stopped=lambda: "Stopped during the fit: surface and tracks are kept; run it again to go on."):
             given, body, tracked_again = _fit_body(run, monitor)
+    except NobodyFound as error:
+        if clicks_in(run.footage):
+            raise
+        return _no_body(run, "no clicked joints", began, str(error))
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.summaries[0].frame) if run.measured else error from error
     run.warn(*fit_warnings(body), *check_fit(given, body, run.settings["fitting"].click_sigma_px))
-    run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again))
+    start = {"start": start_figures(given.start)} if given.start is not None else {}
+    run.finish_stage("fit", began, **fit_figures(body, by_view(run.silhouettes.fits), tracked_again), **start)
 
 
 def report(run: Run, monitor: Monitor) -> None:
@@ -223,10 +229,10 @@ def _prepare_fit(run: Run, monitor: Monitor) -> None:
         track(run, monitor)
 
 
-def _no_body(run: Run, missing: str, began: float) -> None:
+def _no_body(run: Run, missing: str, began: float, why: str = "") -> None:
     """Record that there is nothing to fit; a take that wants no body is not warned."""
     if not run.footage.take.no_body:
-        run.warn(f"No body was fitted: take.toml has {missing}.")
+        run.warn(f"No body was fitted: take.toml has {missing}. {why}".strip())
     run.finish_stage("fit", began, not_done=missing)
 
 
@@ -236,6 +242,7 @@ def _fit_body(run: Run, monitor: Monitor) -> tuple[FitInput, BodyFit, dict[str, 
     background = background_regions(run.footage, run.results, run.clouds, fitting, monitor)
     tracked = tracked_clouds(run.trajectories, run.footage.frames) if fitting.cloud == "tracked" and run.trajectories else None
     given = fit_input(run.footage, tracked or run.clouds, run.trajectories, run.results, background)
+    given = with_start(given, fitting, monitor)
     run.body = body = fit_sequence(given, fitting, monitor, FitCheckpoints(run.results, run.keys["fit"]))
     _write_body(run, body, monitor)
     guided = fitting.track_again and run.measured

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..body.motion import FITTED, BodyFit
+from ..fitting.inputs.start_joints import StartJoints
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
@@ -99,6 +100,18 @@ def fit_figures(body: BodyFit, silhouettes: Mapping[str, Any], tracked_again: Ma
 
 LIMBS = {"upper_arm": "arm", "forearm": "forearm", "thigh": "leg", "shin": "lower leg"}
 FEW_FRAMES = 5  # that are not worth a warning
+
+
+def start_figures(start: StartJoints) -> dict[str, Any]:
+    """The start that was found without clicks, for run.json."""
+    return {
+        "frame": start.frame,
+        "model": start.model,
+        "probability": round(start.probability, 4),
+        "rivals": {name: round(p, 4) for name, p in start.rivals.items()},
+        "stature": round(start.stature, 4),
+        "joints_m": {name: np.round(xyz, 4).tolist() for name, xyz in start.xyz_m.items()},
+    }
 
 
 def frame_states(body: BodyFit) -> dict[str, int]:

@@ -13,6 +13,7 @@ from ...foundation.errors import InputError
 from ...geometry.rig import Rig
 from .cloud_points import Cloud
 from .material_tracks import Trajectories
+from .start_joints import StartJoints
 
 IN_MEMORY = 1 << 24  # bytes of packed images; more go to a temporary file
 ClickedAt = Mapping[str, Mapping[str, Sequence[float]]]  # joint -> view -> (x, y) full-frame pixels
@@ -151,6 +152,7 @@ class FitInput:
     locked: Sequence[str] = ()  # degrees of freedom that stay at their rest value
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # rad, by degree of freedom
     frames: Sequence[int] = ()  # the take's numbers (T); without them those of the clouds
+    start: StartJoints | None = None  # where the fit begins without clicks, if that was found before
 
     def __post_init__(self) -> None:
         times = np.asarray(self.time_s, dtype=np.float64)

@@ -22,7 +22,7 @@ from ...take.take import JOINTS, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
 from ..settings import FitSettings
-from .clicks import initial_clicks, read_clicks
+from .clicks import read_clicks
 from .cloud_points import Cloud
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
@@ -81,17 +81,14 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
     """Check that clicks and degrees of freedom are those of the take's body model, before hours of computation.
 
     Raises:
-        InputError: the model has no such degree of freedom, clicks contradict each other, or too few joints are clicked.
+        InputError: the model has no such degree of freedom, or clicks contradict each other.
     """
     take, clicks = footage.take, clicks_in(footage)
     if missing_for_fit(footage):
         return
     model = with_limits(read_model(str(take.body_model)), take.limits, take.locked)
-    names = model.skeleton.joint_names
-    places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
-    if not take.keypoints:
-        best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
-        initial_clicks(places.get(take.clicks.frame, places[best]), names, [])
+    for at in clicks.values():
+        read_clicks(footage.rig, model.skeleton.joint_names, at, settings.click_sigma_px)
 
 
 def missing_for_fit(footage: Footage) -> str:
@@ -99,9 +96,7 @@ def missing_for_fit(footage: Footage) -> str:
     take = footage.take
     if take.body_model is None:
         return 'model = "none" under [body]' if take.no_body else "no [body] model"
-    if take.keypoints or clicks_in(footage):
-        return ""
-    return "no clicked joints" + (f" in the frames {footage.frames.start} to {footage.frames.stop - 1}" if _with_joints(take) else "")
+    return ""
 
 
 def clicks_left_out(footage: Footage) -> list[str]:
@@ -109,7 +104,7 @@ def clicks_left_out(footage: Footage) -> list[str]:
     outside = [s.frame for s in _with_joints(footage.take) if s.frame not in footage.frames]
     if not outside or missing_for_fit(footage):
         return []
-    begins = "; the fit begins at other clicks or keypoints" if footage.take.clicks.frame in outside else ""
+    begins = "; the fit begins at other clicks or keypoints, or by itself" if footage.take.clicks.frame in outside else ""
     return [
         f"The joints clicked in {'frame' if len(outside) == 1 else 'frames'} {', '.join(map(str, sorted(outside)))} are not used: only "
         f"frames {footage.frames.start} to {footage.frames.stop - 1} are fitted{begins}."

@@ -17,29 +17,22 @@ joints. The prior that bones are as long as other people's counts for all frames
 (`shape_priors`). A body of one ellipsoid a bone has far larger errors: there the whole prior counts for all frames.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from ...body.complete import complete_shape
-from ...body.model_file import read_model, with_limits
 from ...body.motion import BRIDGED, FITTED, PARTIAL, SUSPECT, BodyFit, BodyMotion
-from ...body.shape import default_shape, one_ball_shape, scaled_shape
 from ...foundation.arrays import LazySequence
 from ...foundation.progress import Monitor
 from ..context import NO_SHAPE, FitContext
-from ..inputs.background import BackgroundRegions
-from ..inputs.clicks import initial_clicks, read_clicks
 from ..inputs.cloud_points import VARIANCE_FLOOR_M2, CloudPoints, thinned
 from ..inputs.fit_input import FitInput
-from ..inputs.keypoints import JointTracks
 from ..inputs.material_tracks import MaterialTracks
-from ..inputs.silhouettes import Silhouettes
 from ..observations import Observation
 from ..observations.joints import StandingFeet
-from ..observations.self_collision import CollisionPairs
 from ..segmentation import SegmentationCache
 from ..settings import FitSettings
 from ..smooth_radii import smooth_radii
@@ -49,7 +42,7 @@ from ..solve.time_priors import LEAST, Acceleration, Coupling, MarginalPrior, ma
 from ..state import BodyState, ShapeParameters, free_bones
 from .click_frame import ALTERNATION_STEPS, clicked_lengths, fit_click_frame
 from .contradicted import contradicted_frames
-from .inverse_kinematics import clicked_stature, dof_priors, shared_over_time
+from .inverse_kinematics import shared_over_time
 from .limb_paths import follow_limbs
 from .long_sequence import (
     AT_ONCE,
@@ -70,8 +63,9 @@ from .long_sequence import (
     sample,
 )
 from .pose_tracking import Checkpoints, PoseTracking, track_poses
+from .set_up import fit_context, with_start
 
-__all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_sequence"]
+__all__ = ["BodyFit", "BodyMotion", "FitInput", "FitSettings", "fit_context", "fit_sequence"]
 
 ADJUST = "adjust the sequence"  # stages of the progress report
 SIGMAS = "sigmas of the fit"
@@ -89,11 +83,12 @@ def fit_sequence(
     With `checkpoints`, the state of pose tracking is stored from time to time, and each adjusted stretch; the fit resumes from them.
 
     Raises:
-        InputError: the model or a degree of freedom is unknown, clicks are missing or contradict each other, or the limb has no points
-            where the fit begins.
+        InputError: the model or a degree of freedom is unknown, clicks contradict each other, it is not certain where the body starts
+            without more clicks, or the limb has no points where the fit begins.
         Cancelled: the user asked to stop.
     """
     settings, monitor = settings or FitSettings(), monitor or Monitor()
+    given = with_start(given, settings, monitor)
     fit = replace(fit_context(given, settings), monitor=monitor)
     points: Sequence[CloudPoints] = LazySequence(given.clouds, partial(thinned, voxel_m=settings.voxel_m))
     if len(points) <= AT_ONCE:
@@ -257,52 +252,6 @@ def _completed(fit: FitContext, vector: np.ndarray) -> FitContext:
     """The same context for the complete model of a simplified body (S,)."""
     shape = complete_shape(fit.parameters.shape(vector, np.full(len(vector), np.nan)))
     return replace(fit, parameters=ShapeParameters(shape, fit.settings.weights), settings=replace(fit.settings, radius_sigma=MUSCLE_SIGMA))
-
-
-def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
-    """What stays the same throughout the fit.
-
-    Raises:
-        InputError: see `fit_sequence`.
-    """
-    model = with_limits(read_model(given.model), given.limits, given.locked)
-    names, frames = model.skeleton.joint_names, given.frames
-    tracks, clicked, places = JointTracks(given, names), {}, {}
-    for frame, joints in given.clicks.items():
-        clicked[frames.index(frame)], places[frames.index(frame)] = read_clicks(given.rig, names, joints, settings.click_sigma_px)
-    wanted = given.click_frame if given.click_frame in given.clicks else None
-    begin = _best_located(places, tracks) if wanted is None else frames.index(wanted)
-    located = tracks.located(begin)
-    located = np.where(np.isfinite(places[begin]), places[begin], located) if begin in places else located
-    clicks = initial_clicks(located, names, [*([clicked[begin]] if begin in clicked else []), *tracks.observe(begin)])
-    priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
-    shape = one_ball_shape(default_shape(model)) if settings.balls == "one" else default_shape(model)
-    stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
-    shape = scaled_shape(shape, stature)
-    parameters = ShapeParameters(shape, settings.weights)
-    return FitContext(
-        cameras=given.rig.cameras,
-        model=model,
-        parameters=parameters,
-        settings=settings,
-        clicks=clicks,
-        click=begin,
-        priors=priors,
-        clicked=clicked,
-        places=places,
-        tracks=tracks,
-        stature_sigma=stature_sigma,
-        frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
-        located=np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), clicks.xyz_m)], axis=0),
-        silhouettes=Silhouettes(given, model.surface, settings),
-        background=BackgroundRegions(given, parameters, settings),
-        collisions=CollisionPairs(model.skeleton, shape.metaballs.bone_index),
-    )
-
-
-def _best_located(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
-    """The frame index with most clicked joints; without clicks, the one with most keypoints."""
-    return max(places, key=lambda t: int(np.isfinite(places[t]).sum())) if places else tracks.best_frame()
 
 
 def _loosest(fit: FitContext) -> np.ndarray:

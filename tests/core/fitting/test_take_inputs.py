@@ -58,15 +58,15 @@ def test_a_missing_file_shifts_no_other(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "seeds", "keyframes", "used", "missing", "said"),
+    ("frames", "seeds", "keyframes", "used", "said"),
     [
-        (range(0, 9), 2, (5,), [2, 5], "", ""),
-        (range(0, 4), 2, (5,), [2], "", "in frame 5 are not used: only frames 0 to 3 are fitted."),
-        (range(4, 9), 2, (5,), [5], "", "in frame 2 .* begins at other clicks"),
-        (range(6, 9), 2, (5,), [], "in the frames 6 to 8", ""),
+        (range(0, 9), 2, (5,), [2, 5], ""),
+        (range(0, 4), 2, (5,), [2], "in frame 5 are not used: only frames 0 to 3 are fitted."),
+        (range(4, 9), 2, (5,), [5], "in frame 2 .* begins at other clicks"),
+        (range(6, 9), 2, (5,), [], "in frames 2, 5 are not used.* or by itself"),
     ],
 )
-def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, missing, said) -> None:
+def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, said) -> None:
     joints = {"knee.R": {"L": np.zeros(2)}}
     take = SimpleNamespace(
         clicks=FrameClicks(frame=seeds, joints=joints),
@@ -76,7 +76,7 @@ def test_clicks_outside_the_frames_are_left_out(frames, seeds, keyframes, used, 
     )
     footage = SimpleNamespace(take=take, frames=frames)
     assert sorted(clicks_in(footage)) == used
-    assert missing in missing_for_fit(footage) and bool(missing) == bool(missing_for_fit(footage))
+    assert not missing_for_fit(footage)  # without clicks the body starts by itself
     warnings = clicks_left_out(footage)
     assert len(warnings) == bool(said) and all(re.search(said, w) for w in warnings)
 

@@ -1,0 +1,190 @@
+"""What a fit begins with: its context from the input, and the start from clicks and keypoints, or without them (`start`)."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from ...body.model_file import BodyModel, read_model, with_limits
+from ...body.shape import BodyShape, default_shape, one_ball_shape, scaled_shape
+from ...foundation.errors import InputError
+from ...foundation.progress import Monitor
+from ..context import FitContext
+from ..inputs.background import BackgroundRegions
+from ..inputs.clicks import Clicks, initial_clicks, read_clicks
+from ..inputs.cloud_points import CloudPoints, thinned
+from ..inputs.fit_input import FitInput
+from ..inputs.keypoints import JointTracks
+from ..inputs.silhouettes import Silhouettes
+from ..inputs.start_joints import StartJoints
+from ..observations import ClickedJoints, Keypoints, Observation
+from ..observations.self_collision import CollisionPairs
+from ..settings import START_ALONE, FitSettings
+from ..start.find import find_start
+from ..state import ShapeParameters
+from .inverse_kinematics import LEAST_TRUNK_JOINTS, clicked_stature, dof_priors, trunk_joints
+from .long_sequence import AT_ONCE
+
+FOUND_STATURE_SIGMA = 0.03  # relative, of the start without clicks
+WHOLE, UPPER = START_ALONE
+
+
+class NobodyFound(InputError):
+    """There are too few clicks for a start, and no frame in which somebody can be found without them."""
+
+
+def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
+    """What stays the same throughout the fit.
+
+    Raises:
+        InputError: see `fit_sequence`.
+    """
+    model = with_limits(read_model(given.model), given.limits, given.locked)
+    names, frames = model.skeleton.joint_names, given.frames
+    tracks = JointTracks(given, names)
+    clicked, places = _clicked(given, names, settings)
+    wanted = given.click_frame if given.click_frame in given.clicks else None
+    if given.start is not None:
+        begin = frames.index(given.start.frame)
+    else:
+        begin = _best_located(places, tracks) if wanted is None else frames.index(wanted)
+    located = tracks.located(begin)
+    located = np.where(np.isfinite(places[begin]), places[begin], located) if begin in places else located
+    measured = [clicked[begin]] if begin in clicked else []
+    clicks = Clicks(observations=(*measured, *tracks.observe(begin)), xyz_m=located)
+    clicks = _found_clicks(clicks, given.start, names) if given.start is not None else initial_clicks(located, names, clicks.observations)
+    priors = dof_priors(model.skeleton, np.radians(settings.limit_sigma_deg), np.nanmean(clicks.xyz_m, axis=0))
+    shape = _model_shape(model, settings)
+    if given.start is not None:
+        stature, stature_sigma = given.start.stature, FOUND_STATURE_SIGMA
+    else:
+        stature, stature_sigma = clicked_stature(ShapeParameters(shape), clicks, priors)
+    own = {"clicks": clicks, "click": begin, "priors": priors, "clicked": clicked, "places": places, "tracks": tracks}
+    where = np.any([np.isfinite(xyz).all(axis=1) for xyz in (*places.values(), located)], axis=0)
+    return _context(given, settings, model, scaled_shape(shape, stature), stature_sigma=stature_sigma, located=where, **own)
+
+
+def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitInput:
+    """The input with the start that is found without clicks, or with few of them, where the fit needs one.
+
+    Raises:
+        NobodyFound: no frame has enough points of a person.
+        InputError: it is not certain how the person stands: the sentence asks for the click that decides.
+        Cancelled: the user asked to stop.
+    """
+    if given.start is not None or not needs_start(given, settings):
+        return given
+    start = find_joints(given, settings, monitor)
+    if start is None:
+        raise NobodyFound(
+            "The body cannot start by itself: no frame has enough measured points of a person who is inside the middle view from head to "
+            "hips. Click at least two of its joints in two views each, under [seeds.joints] or in Blender (step 3)."
+        )
+    if start.probability < settings.least_start_probability:
+        raise InputError(start.question)
+    return replace(given, start=start)
+
+
+def needs_start(given: FitInput, settings: FitSettings) -> bool:
+    """Whether clicks and keypoints do not suffice for a start: fewer than two located joints, or than three of a trunk."""
+    if given.keypoints:
+        return False
+    skeleton = with_limits(read_model(given.model), given.limits, given.locked).skeleton
+    _, places = _clicked(given, skeleton.joint_names, settings)
+    trunk = trunk_joints(skeleton)
+    of_trunk = np.array([name in trunk for name in skeleton.joint_names])
+    most = max((int(np.isfinite(xyz).all(axis=1).sum()) for xyz in places.values()), default=0)
+    most_of_trunk = max((int((np.isfinite(xyz).all(axis=1) & of_trunk).sum()) for xyz in places.values()), default=0)
+    return most < 2 or (len(trunk) > LEAST_TRUNK_JOINTS and most_of_trunk < LEAST_TRUNK_JOINTS)
+
+
+def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, without: tuple[str, ...] = ()) -> StartJoints | None:
+    """The joints of the person in the easiest frame, and how sure they are; None where nobody is found.
+
+    Clicks are observations; where there are some, the start is in one of their frames. `without`: see `pose_dictionary`.
+
+    Raises:
+        InputError: clicks contradict each other.
+        Cancelled: the user asked to stop.
+    """
+    model = given.model if given.model in (WHOLE, UPPER) else UPPER if "hip.L" not in _joints_of(given.model) else WHOLE
+    given = given if model == given.model else replace(given, model=model, limits={}, locked=())
+    clouds = given.clouds
+
+    @lru_cache(maxsize=64)
+    def points_of(t: int) -> CloudPoints:
+        return thinned(clouds[t], settings.voxel_m)
+
+    middle = points_of(len(clouds) // 2).xyz_m
+    found = with_limits(read_model(given.model), given.limits, given.locked)
+    names = found.skeleton.joint_names
+    clicked, places = _clicked(given, names, settings)
+    nowhere = np.full((len(names), 3), np.nan)
+    fit = _context(
+        given,
+        settings,
+        found,
+        _model_shape(found, settings),
+        stature_sigma=FOUND_STATURE_SIGMA,
+        located=np.zeros(len(names), dtype=bool),
+        clicks=Clicks(observations=(), xyz_m=nowhere),
+        click=0,
+        priors=dof_priors(found.skeleton, np.radians(settings.limit_sigma_deg), np.median(middle, axis=0) if len(middle) else np.zeros(3)),
+        clicked=clicked,
+        places=places,
+        tracks=JointTracks(given, names),
+    )
+    return find_start(replace(fit, monitor=monitor), points_of, given.frames, given.time_s, monitor, without)
+
+
+def _context(given: FitInput, settings: FitSettings, model: BodyModel, shape: BodyShape, **own: object) -> FitContext:
+    """A context of this input; `own`: what depends on the start."""
+    parameters = ShapeParameters(shape, settings.weights)
+    return FitContext(
+        cameras=given.rig.cameras,
+        model=model,
+        parameters=parameters,
+        settings=settings,
+        frames=1 if settings.balls == "one" else min(len(given.clouds), AT_ONCE),
+        silhouettes=Silhouettes(given, model.surface, settings),
+        background=BackgroundRegions(given, parameters, settings),
+        collisions=CollisionPairs(model.skeleton, shape.metaballs.bone_index),
+        **own,  # type: ignore[arg-type]
+    )
+
+
+def _model_shape(model: BodyModel, settings: FitSettings) -> BodyShape:
+    return one_ball_shape(default_shape(model)) if settings.balls == "one" else default_shape(model)
+
+
+def _joints_of(model: str) -> tuple[str, ...]:
+    return read_model(model).skeleton.joint_names
+
+
+def _clicked(given: FitInput, names: tuple[str, ...], settings: FitSettings) -> tuple[dict[int, ClickedJoints], dict[int, np.ndarray]]:
+    """The clicks of each frame index, and the joints' places (J, 3), NaN without two views."""
+    clicked, places = dict[int, ClickedJoints](), dict[int, np.ndarray]()
+    for frame, joints in given.clicks.items():
+        t = given.frames.index(frame)
+        clicked[t], places[t] = read_clicks(given.rig, names, joints, settings.click_sigma_px)
+    return clicked, places
+
+
+def _found_clicks(clicks: Clicks, start: StartJoints, names: tuple[str, ...]) -> Clicks:
+    """The clicks, with the other joints where the start has them, as observations with its sigma.
+
+    Raises:
+        InputError: the start has fewer than two joints of the model.
+    """
+    places, observations = np.array(clicks.xyz_m), list[Observation](clicks.observations)
+    rows = [j for j, name in enumerate(names) if name in start.xyz_m and not np.isfinite(places[j]).all()]
+    if rows:
+        places[rows] = [start.xyz_m[names[j]] for j in rows]
+        observations.append(Keypoints(joint=np.array(rows), xyz_m=places[rows], sigma_m=np.full(len(rows), start.sigma_m)))
+    return initial_clicks(places, names, observations)
+
+
+def _best_located(places: Mapping[int, np.ndarray], tracks: JointTracks) -> int:
+    """The frame index with most clicked joints; without clicks, the one with most keypoints."""
+    return max(places, key=lambda t: int(np.isfinite(places[t]).sum())) if places else tracks.best_frame()

@@ -1,0 +1,126 @@
+"""From a hypothesis to an adjusted pose, and to the rival that explains the same limbs with the sides exchanged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...foundation.progress import Monitor
+from ..context import FitContext
+from ..inputs.clicks import Clicks
+from ..inputs.cloud_points import CloudPoints
+from ..observations import Keypoints, Observation
+from ..segmentation import SegmentationCache, crop
+from ..solve.problem import Estimate
+from ..solve.solver import FURTHEST, solve
+from ..stages.hidden_limbs import reacquired_poses
+from ..stages.inverse_kinematics import inverse_kinematics
+from ..state import BodyState
+from .search import click_penalty, scaled_vector
+
+REACH_M = 0.25  # of the points that take part, from the body
+ROUNDS = ((2.5, 6), (1.5, 6))  # gate_scale, steps
+LIMB_STEPS = 4
+LENGTH_STEPS = 8
+MOST_POINTS = 700
+LEFT_BEHIND = ("toe", "crown")  # joints that show where the person faces
+SIGMA_M = 0.03  # of the joints of a rival
+STAGE = "find the person"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Explanation:
+    """A pose (D,) of a body with the shape vector (S,) in frame index `t`, and how much it explains [voxels]."""
+
+    t: int
+    pose: np.ndarray
+    vector: np.ndarray
+    score: float
+    joints_m: np.ndarray  # (J, 3)
+
+
+def explanation(fit: FitContext, t: int, points: CloudPoints, pose: np.ndarray, vector: np.ndarray) -> Explanation:
+    """A pose with its score: `FitContext.score`, less the penalty for missed clicks."""
+    joints, score = fit.parameters.state(pose, vector).joints_m, fit.score(t, points, pose, vector)
+    if t in fit.clicked:
+        clicks = fit.clicked[t]
+        score -= sum(float(click_penalty(clicks, j, joints[j][None])[0]) for j in np.unique(clicks.joint).tolist())
+    return Explanation(t=t, pose=pose, vector=vector, score=score, joints_m=joints)
+
+
+def thinned_points(points: CloudPoints) -> CloudPoints:
+    """Not more than `MOST_POINTS`, evenly from the order of the voxels."""
+    return points.take(np.arange(0, len(points.xyz_m), 1 + (len(points.xyz_m) - 1) // MOST_POINTS)) if len(points.xyz_m) else points
+
+
+def adjusted(
+    fit: FitContext,
+    points: CloudPoints,
+    start: Explanation,
+    rounds: Sequence[tuple[float, int]] = ROUNDS,
+    monitor: Monitor | None = None,
+    free: str | None = None,
+) -> Explanation:
+    """The pose adjusted to what is seen in its frame; with `free` also these parameters of the shape.
+
+    Raises:
+        Cancelled: the user asked to stop.
+    """
+    near = crop(points, fit.parameters.state(start.pose, start.vector), REACH_M)
+    found = Estimate(motion=start.pose[None], vector=start.vector)
+    for gate_scale, steps in rounds:
+        cache = SegmentationCache()
+
+        def observe(_: int, state: BodyState, scale: float = gate_scale, cache: SegmentationCache = cache) -> list[Observation]:
+            return [
+                *fit.surface_observations(start.t, near, state, scale, cache),
+                *fit.joints(start.t),
+                *fit.background.observe(start.t),
+                *fit.pose_observations(state),
+            ]
+
+        found = solve(fit.problem(observe, free), found, steps=steps, furthest=FURTHEST, monitor=monitor, stage=STAGE)
+    return explanation(fit, start.t, points, found.motion[0], found.vector)
+
+
+def with_limbs(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> Explanation:
+    """The same, or better with limbs that were looked for all around where they explain what no other part does."""
+    best = found
+    for pose in reacquired_poses(fit, found.t, points, found.pose, found.vector, monitor):
+        other = adjusted(fit, points, explanation(fit, found.t, points, pose, found.vector), ROUNDS[-1:], monitor)
+        best = max(best, other, key=lambda one: one.score)
+    return best
+
+
+def exchanged(fit: FitContext, points: CloudPoints, found: Explanation, parts: Sequence[str], monitor: Monitor) -> Explanation:
+    """The rival with the sides of some joints (by their names without the side) exchanged, adjusted in the same way.
+
+    If hips and shoulders are among them, the person faces the other way.
+    """
+    skeleton, names = fit.model.skeleton, list(fit.model.skeleton.joint_names)
+    places = np.array(found.joints_m)
+    for j, name in enumerate(names):
+        part, _, side = name.partition(".")
+        if side and part in parts:
+            places[j] = found.joints_m[names.index(f"{part}.{'L' if side == 'R' else 'R'}")]
+        if part in LEFT_BEHIND:
+            places[j] = np.nan
+    rows = np.flatnonzero(np.isfinite(places).all(axis=1))
+    there = Keypoints(joint=rows, xyz_m=places[rows], sigma_m=np.full(len(rows), SIGMA_M))
+    clicks = Clicks(observations=(there,), xyz_m=places)
+    pose = inverse_kinematics(fit.parameters, clicks, fit.priors, fit.proportions).motion[0]
+    pose[skeleton.locked] = found.pose[skeleton.locked]
+    rival = adjusted(fit, points, explanation(fit, found.t, points, pose, found.vector), monitor=monitor)
+    return with_limbs(fit, points, rival, monitor)
+
+
+def with_lengths(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> tuple[Explanation, float]:
+    """Pose and bone lengths adjusted together, and the person's stature over the template's."""
+    near = adjusted(fit, points, found, ((1.5, LENGTH_STEPS),), monitor, "lengths")
+    lengths = fit.parameters.layout.group("lengths")
+    return near, float(np.exp(np.mean(near.vector[lengths] - fit.parameters.vector()[lengths])))
+
+
+def of_hypothesis(fit: FitContext, t: int, points: CloudPoints, pose: np.ndarray, stature: float, monitor: Monitor) -> Explanation:
+    """A hypothesis of the search, adjusted."""
+    return adjusted(fit, points, explanation(fit, t, points, pose, scaled_vector(fit.parameters, stature)), monitor=monitor)

@@ -1,0 +1,94 @@
+"""The joints of the person in one frame, found without clicks: `tricap joints`."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..fitting.inputs.background import find_background
+from ..fitting.inputs.no_surface import empty_clouds
+from ..fitting.inputs.start_joints import StartJoints
+from ..fitting.inputs.take_inputs import fit_input
+from ..fitting.stages.set_up import find_joints
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..results.folder import Results
+from ..surface.cloud import PointCloud
+from ..surface.measure import MeasureSettings, NothingMeasured, measure_frames
+from ..surface.resolution import measured_footage
+from ..take.footage import Footage, open_take
+from ..take.take import read_take
+from ..take.writing import read_table, write_table
+from .take_run import Overrides, only_frames, settings_of
+
+MEASURED = 6  # frames, of which the easiest are searched
+CLICKED = ("pelvis", "neck", "head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # what people click
+
+
+def joints_of_take(take_folder: Path, overrides: Overrides | None, monitor: Monitor) -> tuple[Footage, StartJoints, Mapping[str, Any]]:
+    """The footage of a take, the joints that are found in one of its frames, and the settings; a few frames are measured for it.
+
+    Raises:
+        InputError: the take needs fixing, or nobody is found.
+        Cancelled: the user asked to stop.
+    """
+    take = read_take(take_folder)
+    settings = settings_of(take.settings, overrides or {}, str(take.folder / "take.toml"))
+    footage = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px)
+    if take.body_model is None:
+        raise InputError(
+            'take.toml has no [body] model, so there are no joints to find; write model = "full" or "upper_body" under [body].'
+        )
+    clouds = _some_clouds(footage, settings, monitor.part("surface", 0, 2))
+    background = find_background(footage, clouds, monitor) if settings["fitting"].use_background else []
+    with tempfile.TemporaryDirectory() as empty:
+        given = fit_input(footage, clouds, None, Results(Path(empty)), background)
+    start = find_joints(given, settings["fitting"], monitor.part("find the person", 1, 2))
+    if start is None:
+        raise InputError(
+            "Nobody was found: no frame has enough measured points of a person who is inside the middle view from head to hips."
+        )
+    return footage, start, settings
+
+
+def _some_clouds(footage: Footage, settings: Mapping[str, Any], monitor: Monitor) -> Sequence[PointCloud]:
+    """Clouds of all frames, measured in a few of them and empty in the others; those with clicked joints are among them."""
+    frames = footage.frames
+    clicked = sorted({c.frame for c in (footage.take.clicks, *footage.take.keyframes) if c.joints and c.frame in frames})
+    chosen = clicked or np.unique(np.linspace(frames.start, frames.stop - 1, min(MEASURED, len(frames))).round().astype(int)).tolist()
+    measured = dict[int, PointCloud]()
+    for i, frame in enumerate(chosen):
+        one = only_frames(footage, (frame, frame + 1))
+        small = measured_footage(one, settings["surface"].quality, settings["growing"].spacing_px)
+        with tempfile.TemporaryDirectory() as folder, Results(Path(folder)).opened() as results:
+            try:
+                for found in measure_frames(small, MeasureSettings.of(settings), results, monitor.part("surface", i, len(chosen))):
+                    measured[frame] = found.cloud
+            except NothingMeasured:
+                continue  # the person may enter later
+    return [measured.get(cloud.frame, cloud) for cloud in empty_clouds(footage)]
+
+
+def pixels_of(footage: Footage, start: StartJoints) -> dict[str, dict[str, list[float]]]:
+    """The found joints that people click, in the pixels of the views that show them."""
+    found = dict[str, dict[str, list[float]]]()
+    for name, xyz in start.xyz_m.items():
+        if name.partition(".")[0] in CLICKED:
+            at = {c.name: c.project(xyz[None])[0] for c in footage.rig.cameras}
+            found[name] = {view: np.round(xy, 1).tolist() for view, xy in at.items() if footage.rig[view].sees(xy)}
+    return {name: at for name, at in found.items() if len(at) > 1}
+
+
+def write_joints_as_clicks(folder: Path, frame: int, joints: Mapping[str, Mapping[str, list[float]]]) -> bool:
+    """Write joints into [seeds.joints] of take.toml; joints that are clicked in that frame stay as they are. False: nothing changed.
+
+    Raises:
+        InputError: the file cannot be read or written.
+    """
+    table = read_table(folder)
+    seeds = dict(table.get("seeds", {}))
+    own = seeds.get("joints", {}) if seeds.get("frame", 0) == frame else {}
+    seeds |= {"frame": frame, "joints": {**{name: dict(at) for name, at in joints.items()}, **own}}
+    return write_table(folder, {**table, "seeds": seeds})

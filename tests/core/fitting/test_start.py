@@ -1,0 +1,165 @@
+"""The start without clicks: the person is found, rivals get probabilities, and what is uncertain is asked."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.fitting.inputs.fit_input import FitInput
+from tricap.core.fitting.inputs.start_joints import StartJoints
+from tricap.core.fitting.settings import FitSettings
+from tricap.core.fitting.stages import set_up
+from tricap.core.fitting.stages.set_up import NobodyFound, find_joints, needs_start, with_start
+from tricap.core.fitting.start import find, search
+from tricap.core.fitting.start.find import _agreed, _decisive, _difference, judged
+from tricap.core.fitting.start.pose_dictionary import known_poses
+from tricap.core.fitting.start.refine import Explanation
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Cancelled, Monitor
+from tricap.core.run.joints import write_joints_as_clicks
+from tricap.core.take.writing import read_table
+
+from .limb_scene import front_rig, measured_cloud
+
+MODEL = read_model("full")
+SHAPE = default_shape(MODEL)
+SKELETON, NAMES = SHAPE.skeleton, SHAPE.skeleton.joint_names
+RARE = ("fair1_dab", "fair1_zombie", "rokoko_jesse_dance", "02_06_bend_scoop_lift_arm", "11_01_kick_soccer_ball", "cgspeed_05_06_dance")
+SETTINGS = FitSettings()
+STANDING = {"shoulder.R flexion": 50, "elbow.R flexion": 70, "shoulder.L abduction": -20, "hip.R flexion": 25, "knee.R flexion": 35}
+
+
+def _pose(heading_deg: float) -> np.ndarray:
+    pose = np.zeros(len(SKELETON.dofs))
+    for name, degrees in (STANDING | {"pelvis rotation": heading_deg}).items():
+        pose[SKELETON.layout[name]] = np.radians(degrees)
+    return pose
+
+
+def _input(pose: np.ndarray, **changes) -> FitInput:
+    rng = np.random.default_rng(0)
+    cloud = measured_cloud(SHAPE, pose, 0, rng, points=900, noise=0.002, gross=0.01)
+    return FitInput(**{"rig": front_rig(), "model": "full", "clouds": [cloud], "time_s": np.zeros(1), **changes})
+
+
+def _joints(pose: np.ndarray) -> np.ndarray:
+    return np.stack([*joint_positions(SKELETON, SHAPE.lengths_m, pose).values()])
+
+
+def test_the_dictionary_has_poses_with_their_mirror_images() -> None:
+    poses = known_poses(SKELETON)
+    low, high = np.degrees([dof.limits for dof in SKELETON.dofs]).T
+    assert len(poses) > 200 and not poses[:, :3].any() and len(known_poses(SKELETON, RARE)) < len(poses) / 2
+    assert (np.degrees(poses) > low - 15).all() and (np.degrees(poses) < high + 15).all()
+    one, other = (_joints(pose) for pose in poses[:2])
+    sides = [NAMES.index(n.replace(".L", ".X").replace(".R", ".L").replace(".X", ".R")) for n in NAMES]
+    assert np.allclose(other[sides] * [-1, 1, 1], one, atol=1e-9)
+    assert known_poses(read_model("upper_body").skeleton).shape[1] == len(read_model("upper_body").skeleton.dofs)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A coarser search among fewer poses."""
+    monkeypatch.setattr(search, "HEADINGS", 12)
+    monkeypatch.setattr(find, "TRIED", 4)
+    monkeypatch.setattr(find, "COMPLETED", 2)
+
+
+def test_a_person_is_found_from_points_alone(quick) -> None:
+    pose = _pose(30.0)
+    found = find_joints(_input(pose), SETTINGS, Monitor(), RARE)
+    assert found is not None and found.frame == 0 and abs(found.stature - 1) < 0.06
+    off = {name: np.linalg.norm(found.xyz_m[name] - place) for name, place in zip(NAMES, _joints(pose)) if name[:-2] in find.JUDGED}
+    assert max(off.values()) < 0.15, off
+    assert 0 < found.probability <= 1 and "elbow" not in found.rivals
+
+
+def test_points_of_nobody_ask_for_clicks(make_scene) -> None:
+    scene = make_scene(points=50)
+    given = FitInput(rig=scene.rig, model="arm.R", clouds=scene.clouds, time_s=np.zeros(1))
+    with pytest.raises(NobodyFound, match="cannot start by itself.*at least two of its joints in two views"):
+        with_start(given, SETTINGS, Monitor())
+
+
+def test_a_search_can_be_cancelled() -> None:
+    monitor = Monitor()
+    monitor.cancel()
+    with pytest.raises(Cancelled):
+        find_joints(_input(_pose(0.0)), SETTINGS, monitor)
+
+
+def test_a_start_is_needed_without_three_joints_of_the_trunk() -> None:
+    given, at = _input(_pose(0.0)), dict(zip(NAMES, _joints(_pose(0.0))))
+    clicks = {name: {c.name: c.project(xyz) for c in front_rig().cameras} for name, xyz in at.items()}
+
+    def clicked(*names: str) -> FitInput:
+        return replace(given, clicks={0: {name: clicks[name] for name in names}})
+
+    assert needs_start(given, SETTINGS) and needs_start(clicked("elbow.R", "wrist.R"), SETTINGS)
+    assert not needs_start(clicked("hip.R", "hip.L", "neck", "wrist.R"), SETTINGS)
+    arm = replace(clicked("shoulder.R", "elbow.R"), model="arm.R")
+    assert not needs_start(arm, SETTINGS)
+
+
+def test_an_uncertain_start_is_not_used(monkeypatch) -> None:
+    joints = dict(zip(NAMES, _joints(_pose(0.0))))
+    start = StartJoints(frame=0, xyz_m=joints, stature=1.0, model="full", probability=0.7, rivals={"front and back": 0.28}, ask="elbow.R")
+    monkeypatch.setattr(set_up, "find_joints", lambda *_: start)
+    given = _input(_pose(0.0))
+    with pytest.raises(InputError, match=r"not certain.*front and back. Click the right elbow in two views of frame 0"):
+        with_start(given, SETTINGS, Monitor())
+    monkeypatch.setattr(set_up, "find_joints", lambda *_: replace(start, probability=0.99))
+    used = with_start(given, SETTINGS, Monitor())
+    fit = set_up.fit_context(used, SETTINGS)
+    assert fit.click == 0 and not fit.located.any() and np.allclose(fit.clicks.xyz_m, _joints(_pose(0.0)))
+
+
+def _explained(joints: np.ndarray, score: float, t: int = 0) -> Explanation:
+    return Explanation(t=t, pose=np.zeros(1), vector=np.zeros(1), score=score, joints_m=joints)
+
+
+def _turned(joints: np.ndarray) -> np.ndarray:
+    """The same limbs of a person who faces the other way."""
+    sides = [NAMES.index(n.replace(".L", ".X").replace(".R", ".L").replace(".X", ".R")) for n in NAMES]
+    return joints[sides]
+
+
+class _Fit:
+    model = MODEL
+
+
+def test_probabilities_and_the_click_that_decides() -> None:
+    right, moved = _joints(_pose(0.0)), _joints(_pose(0.0))
+    moved[NAMES.index("wrist.R")] += [0.4, 0.0, 0.0]
+    frame = judged(_Fit(), [_explained(right, 1000.0), _explained(right + 0.01, 990.0), _explained(moved, 1000.0 - find.TAU)], np.zeros(3))
+    assert len(frame.explanations) == 2 and np.allclose(frame.probability, [1 / (1 + np.exp(-1)), 1 / (1 + np.exp(1))])
+    assert _decisive(frame, NAMES) == "wrist.R" and _difference(*frame.explanations, NAMES) == "where the right arm is"
+    back = judged(_Fit(), [_explained(right, 1000.0), _explained(_turned(right), 1000.0)], np.array([0.0, -1.0, 0.0]))
+    assert back.probability[0] > 0.9 and back.explanations[0].joints_m is right  # who walks faces forwards
+    assert _difference(*back.explanations, NAMES) == "front and back"
+
+
+def test_frames_near_in_time_agree_which_way_somebody_faces() -> None:
+    right, times = _joints(_pose(0.0)), np.array([0.0, 0.4, 9.0])
+    doubtful = judged(_Fit(), [_explained(right, 1000.0), _explained(_turned(right), 990.0)], np.zeros(3))
+    sure = judged(_Fit(), [_explained(_turned(right), 1200.0, 1), _explained(right, 1000.0, 1)], np.zeros(3))
+    far = judged(_Fit(), [_explained(_turned(right), 1200.0, 2), _explained(right, 1000.0, 2)], np.zeros(3))
+    turned, _ = _agreed([doubtful, sure], NAMES, times)
+    assert turned.explanations[0].joints_m is not right and turned.probability[0] > 0.9
+    kept, _ = _agreed([doubtful, far], NAMES, times)
+    assert kept.explanations[0].joints_m is right and np.allclose(kept.probability, doubtful.probability)
+
+
+def test_found_joints_are_written_as_clicks_beside_clicked_ones(tmp_path: Path) -> None:
+    views = "".join(f'[[views]]\nname = "{v}"\nimages = "{v}/*.png"\n' for v in "LR")
+    seeds = '[seeds]\nframe = 3\n[seeds.joints]\n"elbow.R" = { L = [1.0, 2.0], R = [3.0, 4.0] }\n'
+    (tmp_path / "take.toml").write_text(f'format = "tricap-take"\nversion = 1\nfps = 25.0\nrig = "rig.toml"\n{views}{seeds}')
+    found = {"elbow.R": {"L": [9.0, 9.0], "R": [9.0, 9.0]}, "knee.L": {"L": [5.0, 6.0], "R": [7.0, 8.0]}}
+    assert write_joints_as_clicks(tmp_path, 3, found)
+    joints = read_table(tmp_path)["seeds"]["joints"]
+    assert joints == {"elbow.R": {"L": [1.0, 2.0], "R": [3.0, 4.0]}, "knee.L": {"L": [5.0, 6.0], "R": [7.0, 8.0]}}
+    assert not write_joints_as_clicks(tmp_path, 3, found)
