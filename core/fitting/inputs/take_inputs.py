@@ -21,8 +21,8 @@ from ...take.sources import KeypointSource
 from ...take.take import JOINTS, FrameClicks, Take
 from ...tracking.contour import ContourTable
 from ...tracking.trajectories import Trajectories
-from ..settings import FitSettings
-from .clicks import read_clicks
+from ..settings import START_ALONE, FitSettings
+from .clicks import initial_clicks, read_clicks
 from .cloud_points import Cloud
 from .fit_input import BackgroundDistances, ClickedAt, FitInput, JointPlaces, Outline
 
@@ -81,14 +81,17 @@ def check_body(footage: Footage, settings: FitSettings) -> None:
     """Check that clicks and degrees of freedom are those of the take's body model, before hours of computation.
 
     Raises:
-        InputError: the model has no such degree of freedom, or clicks contradict each other.
+        InputError: the model has no such degree of freedom, clicks contradict each other, or too few joints of a limb are clicked.
     """
     take, clicks = footage.take, clicks_in(footage)
     if missing_for_fit(footage):
         return
     model = with_limits(read_model(str(take.body_model)), take.limits, take.locked)
-    for at in clicks.values():
-        read_clicks(footage.rig, model.skeleton.joint_names, at, settings.click_sigma_px)
+    names = model.skeleton.joint_names
+    places = {frame: read_clicks(footage.rig, names, at, settings.click_sigma_px)[1] for frame, at in clicks.items()}
+    if places and not take.keypoints and take.body_model not in START_ALONE:
+        best = max(places, key=lambda frame: int(np.isfinite(places[frame]).sum()))
+        initial_clicks(places.get(take.clicks.frame, places[best]), names, [])
 
 
 def missing_for_fit(footage: Footage) -> str:
