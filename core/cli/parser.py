@@ -97,6 +97,7 @@ def _stages(commands: Any) -> None:
     track.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
     everything.add_argument("--restart", action="store_true", help="start again instead of resuming")
     everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="frames to show in the report")
+    everything.add_argument("--film", action="store_true", help="also write film.mp4: the body over every frame of every view")
     demo = _command(
         commands, "demo", "make a synthetic recording, run all stages on it, and compare with the truth", action("stages", "demo")
     )

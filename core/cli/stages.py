@@ -6,6 +6,7 @@ import json
 
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..report.film import write_film
 from ..results.folder import check_separate_folder
 from ..run import pipeline, take_run
 from ..surface.measure import MeasureSettings, first_seeds
@@ -62,10 +63,13 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     with take_run.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
         if not args.pictures and pipeline.is_complete(job) and _has_scene(job, args):
             job.record["warnings"] = job.results.read_run().get("warnings", [])
-            return _summary(job, args.json) + ([] if args.json else ["Nothing has changed since that run; --restart begins anew."])
-        pipeline.all_stages(job, monitor)
-        scene = _build_scene(job, args, monitor)
-        return _summary(job, args.json) + ([] if args.json else scene)
+            lines = ["Nothing has changed since that run; --restart begins anew."]
+        else:
+            pipeline.all_stages(job, monitor)
+            lines = _build_scene(job, args, monitor)
+        if args.film and not job.results.path("film.mp4").is_file():
+            lines.append(f"Film: {write_film(job.footage, job.results, monitor)}")
+        return _summary(job, args.json) + ([] if args.json else lines)
 
 
 def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:

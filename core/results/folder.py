@@ -20,7 +20,7 @@ from .run_json import FORMAT, VERSION
 
 RESULTS = (  # files and folders that a run replaces
     "clouds", "frames.csv", "trajectories.npz", "trajectories_raw.npz", "tracked",
-    "joints.csv", "motion.csv", "body.toml", "skin", "report",
+    "joints.csv", "motion.csv", "body.toml", "skin", "report", "film.mp4",
     "body.blend",
 )  # fmt: skip
 

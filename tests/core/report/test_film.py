@@ -1,0 +1,67 @@
+"""The movie of the body over every frame of every view, from the files of a run."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import default_shape, write_body
+from tricap.core.body.skeleton import joint_positions
+from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Cancelled, Monitor
+from tricap.core.motion.formats.ply import write_mesh
+from tricap.core.report.film import BAR_PX, write_film
+from tricap.core.results.folder import Results
+from tricap.core.take.footage import open_take
+from tricap.core.take.take import read_take
+
+ARM = default_shape(read_model("arm.R"))
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Results:
+    """The files of a fitted arm in two frames of the plane's take."""
+    results, rows = Results(tmp_path / "out"), ["frame,time_s,joint,x,y,z,sigma"]
+    for frame in (1, 2):
+        values = np.zeros(len(ARM.skeleton.dofs))
+        values[:3] = 0.15, 0.0, 1.9
+        skin = body_skin(ARM, values, SkinSettings())
+        write_mesh(results.path("skin", f"{frame:04d}.ply"), skin.vertices_m, skin.faces)
+        places = joint_positions(ARM.skeleton, ARM.lengths_m, values).items()
+        rows += [f"{frame},{frame / 25},{name}," + ",".join(f"{v:.4f}" for v in xyz) + ",0.004" for name, xyz in places]
+    results.path("joints.csv").write_text("\n".join(rows) + "\n")
+    write_body(results.path("body.toml"), ARM)
+    return results
+
+
+def test_the_body_is_over_every_frame(plane_take: Path, results: Results) -> None:
+    footage = open_take(read_take(plane_take))
+    movie = cv2.VideoCapture(str(write_film(footage, results, Monitor())))
+    pictures = [picture for ok, picture in (movie.read() for _ in range(3)) if ok]
+    width, height = footage.rig.cameras[0].size_px
+    assert len(pictures) == 2 and pictures[0].shape == ((height + BAR_PX) // 2 * 2, 3 * width // 2 * 2, 3)
+    assert movie.get(cv2.CAP_PROP_FPS) == footage.take.fps
+    for k in range(3):  # the skin is orange; the footage is grey
+        panel = pictures[0][:height, k * width : (k + 1) * width].astype(int)
+        assert 0.01 < (panel[..., 2] - panel[..., 0] > 30).mean() < 0.5
+    assert not results.path("cache", "film.mp4").exists()
+
+
+def test_a_stopped_film_is_no_film(plane_take: Path, results: Results) -> None:
+    monitor = Monitor()
+    footage = open_take(read_take(plane_take))
+    results.path("film.mp4").write_bytes(b"before")
+    monitor.cancel()
+    with pytest.raises(Cancelled):
+        write_film(footage, results, monitor)
+    assert results.path("film.mp4").read_bytes() == b"before" and not results.path("cache", "film.mp4").exists()
+
+
+def test_a_film_needs_a_body(plane_take: Path, results: Results, scenes: Any) -> None:
+    results.remove("skin")
+    with pytest.raises(InputError, match="no fitted body with a skin"):
+        write_film(open_take(read_take(plane_take)), results, Monitor())
