@@ -102,6 +102,8 @@ def _stages(commands: Any) -> None:
         commands, "demo", "make a synthetic recording, run all stages on it, and compare with the truth", action("stages", "demo")
     )
     demo.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the recording and the results")
+    about = "a setting, such as matching.patch_px=17, or of the recording: sample.noise=2, sample.texture=0.3, sample.seed=7"
+    demo.add_argument("--set", action="append", default=[], metavar="GROUP.NAME=VALUE", help=about)
 
 
 def _joints(commands: Any) -> None:

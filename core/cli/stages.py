@@ -6,12 +6,13 @@ import json
 
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..foundation.settings import from_table
 from ..report.film import write_film
 from ..results.folder import check_separate_folder
 from ..run import pipeline, take_run
 from ..surface.measure import MeasureSettings, first_seeds
 from ..surface.resolution import measured_footage
-from ..synthetic.arm import make_arm_take
+from ..synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
 from ..synthetic.score import score_run
 from ..take.footage import open_take
 from ..take.take import read_take
@@ -73,12 +74,14 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 
 def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    """Make the synthetic arm, run all stages, and compare with the truth."""
-    take, out = args.out / "take", args.out
+    """Make the synthetic arm, run all stages, and compare with the truth. Settings of the group `sample` are those of the recording."""
+    take, out, given = args.out / "take", args.out, overrides(args.set)
+    sample: ArmTakeSettings = from_table(ArmTakeSettings, given.pop("sample", {}), "[sample]")
+    take_run.settings_of({}, given, "")
     check_separate_folder(out)
-    if not (take / "take.toml").exists():
-        make_arm_take(take, monitor=monitor)
-    job = pipeline.run(take, out, None, monitor)
+    if not is_arm_take(take, sample):
+        make_arm_take(take, sample, monitor)
+    job = pipeline.run(take, out, given, monitor)
     lines = _build_scene(job, args, monitor)
     return [
         str(job),

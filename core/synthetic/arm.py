@@ -4,12 +4,14 @@ The folder has a complete take (docs/formats.md: take.toml with clicks, rig.toml
 
     vertices_m (T, V, 3) f4, triangles (F, 3) i4, textured (V,) bool (cloth), visible (T, ⌈V/8⌉) u1 packed bits: visible in all three
     cameras, joints_m (T, J, 3), joint_names (those of motion capture files), time_s (T,), and the values of the body model:
-    dof_names, motion_values (T, D) rad and m, bone_names, lengths_m (B,), radii_m (M, 3), ball_bone (M,)
+    dof_names, motion_values (T, D) rad and m, bone_names, lengths_m (B,), radii_m (M, 3), ball_bone (M,);
+    settings (JSON of ArmTakeSettings)
 
 all at the instants of the field that take.toml selects; the other field is exposed half a frame later.
 """
 
 import io
+import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,14 +26,14 @@ from ..body.skeleton import joint_positions
 from ..foundation import bounded, store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
-from ..foundation.settings import knob
+from ..foundation.settings import knob, to_table
 from ..geometry.camera import Camera
 from ..geometry.rig import Rig, write_rig
 from ..geometry.rotation import axis_rotation
 from ..images.interlace import BOTH, INTERLACE, field_layout, frame_time_s
 from .figure import Part, arm_parts, joined, torso_parts, wall
 from .film import Layer, Sensor, SolidNoise, digitize, expose, paint, solid_noise, visible_vertices
-from .truth import motion_capture_name
+from .truth import motion_capture_name, read_truth
 
 STAGE = "sample recording"
 SHOULDER_M = np.array([-0.185, -0.010, 1.450])
@@ -55,6 +57,8 @@ class ArmTakeSettings:
     width_px: int = knob(768, "Width of the pictures; the height is three quarters of it.", unit="px", low=96, high=4096)
     interlaced: str = knob("odd", "Lines that take.toml keeps; the others are exposed half a frame later.", choices=(*INTERLACE, BOTH))
     noise: float = knob(1.0, "Multiplies the sensors' noise.", low=0.0, high=20.0)
+    texture: float = knob(1.0, "Multiplies the contrast of all textures; 0.2 is as weak as bare skin.", low=0.0, high=2.0)
+    swing_s: float = knob(SWING_S, "Duration of a swing of the arm, there and back.", unit="s", low=0.2, high=1000.0)
     click_error_px: float = knob(4.0, "Largest error of the joint clicks, in x and in y.", unit="px", low=0.0, high=100.0)
     late_frames: float = knob(0.0, "Frame offset of view R relative to the others.", unit="frames", low=-100.0, high=100.0)
     seed: int = knob(1, "Seed of the random textures, noise and clicks.", low=0, high=2**31 - 1)
@@ -73,7 +77,7 @@ class _Studio:
 
     def body(self, time_s: float) -> tuple[Part, ...]:
         """The person at one moment."""
-        motion = arm_motion(time_s)
+        motion = arm_motion(time_s, self.settings.swing_s)
         return (*arm_parts(self.shape, motion, self.at_rest), *torso_parts(motion[:3]))
 
 
@@ -99,9 +103,11 @@ def make_arm_take(folder: Path, settings: ArmTakeSettings | None = None, monitor
     monitor.step(STAGE, 1, 1)
 
 
-def is_arm_take(folder: Path) -> bool:
-    """True for a complete recording that `make_arm_take` made."""
-    return (folder / "take.toml").is_file() and _made_here(folder)
+def is_arm_take(folder: Path, settings: ArmTakeSettings | None = None) -> bool:
+    """True for a complete recording that `make_arm_take` made, with these settings if they are given."""
+    if not (folder / "take.toml").is_file() or not _made_here(folder):
+        return False
+    return settings is None or read_truth(folder).settings == json.dumps(to_table(settings))
 
 
 def _made_here(folder: Path) -> bool:
@@ -111,7 +117,7 @@ def _made_here(folder: Path) -> bool:
 
 
 def _studio(settings: ArmTakeSettings) -> _Studio:
-    rig, shape, noise = arm_rig(settings.width_px), arm_shape(), solid_noise(settings.seed)
+    rig, shape, noise = arm_rig(settings.width_px), arm_shape(), solid_noise(settings.seed).scaled(settings.texture)
     return _Studio(
         settings=settings,
         rig=rig,
@@ -136,11 +142,11 @@ def arm_shape() -> BodyShape:
     )
 
 
-def arm_motion(time_s: np.ndarray | float) -> np.ndarray:
-    """True values (…, D) of the degrees of freedom [m, rad]: half a swing takes 0.68 s, the wrist reaches 0.95 m/s."""
+def arm_motion(time_s: np.ndarray | float, swing_s: float = SWING_S) -> np.ndarray:
+    """True values (…, D) of the degrees of freedom [m, rad]: in swings of 1.36 s the wrist reaches 0.95 m/s."""
     time = np.asarray(time_s, dtype=np.float64)
-    swing = 0.5 - 0.5 * np.cos(2 * np.pi * time / SWING_S)  # 0 … 1 … 0
-    late = 0.5 - 0.5 * np.cos(2 * np.pi * (time - 0.10) / SWING_S)
+    swing = 0.5 - 0.5 * np.cos(2 * np.pi * time / swing_s)  # 0 … 1 … 0
+    late = 0.5 - 0.5 * np.cos(2 * np.pi * (time - 0.10) / swing_s)
     columns = {
         "shoulder.R x": SHOULDER_M[0] - 0.010 * swing,
         "shoulder.R y": SHOULDER_M[1] - 0.008 * late,
@@ -225,7 +231,7 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
 def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
     shape, per = studio.shape, field_layout(studio.settings.interlaced).per_image
     time = frame_time_s(np.arange(per * studio.settings.frames), per * studio.settings.fps)
-    motion, bodies = arm_motion(time), [studio.body(moment) for moment in time]
+    motion, bodies = arm_motion(time, studio.settings.swing_s), [studio.body(moment) for moment in time]
     joints = joint_positions(shape.skeleton, shape.lengths_m, motion)
     textured = np.concatenate([np.full(len(p.vertices_m), p.material.textured) for p in bodies[0]])
     arrays = dict(
@@ -242,6 +248,7 @@ def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
         lengths_m=shape.lengths_m,
         radii_m=shape.metaballs.radii_m,
         ball_bone=shape.metaballs.bone_index,
+        settings=np.array(json.dumps(to_table(studio.settings))),
     )
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
@@ -251,7 +258,7 @@ def _truth(studio: _Studio, visible: np.ndarray) -> bytes:
 def _take_toml(studio: _Studio) -> str:
     settings, rig, shape = studio.settings, studio.rig, studio.shape
     rng = np.random.default_rng([settings.seed, 77])
-    joints = joint_positions(shape.skeleton, shape.lengths_m, arm_motion(0.0))
+    joints = joint_positions(shape.skeleton, shape.lengths_m, arm_motion(0.0, settings.swing_s))
     lines = [
         'format = "tricap-take"',
         "version = 1",

@@ -11,7 +11,7 @@ amplitude ∝ |k|^(−3/2) in three dimensions. It repeats after the volume's wi
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -31,6 +31,10 @@ class SolidNoise:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", frozen(self.values, (None, None, None), np.float32, "values"))
+
+    def scaled(self, factor: float) -> "SolidNoise":
+        """The same noise with another standard deviation."""
+        return replace(self, values=self.values * np.float32(factor))
 
     def __call__(self, xyz_m: np.ndarray) -> np.ndarray:
         """The noise (N,) at points (N, 3), trilinear between the grid's cells."""

@@ -42,6 +42,7 @@ class Truth:
     motion: dict[str, np.ndarray] | None = None  # (T,) by DOF
     lengths_m: dict[str, float] | None = None  # by bone
     radii_m: np.ndarray | None = None  # (M, 3)
+    settings: str = ""  # of the recording, as JSON
 
     def closest(self, frame: int, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The nearest surface points: distance (N,) [m], triangle (N,), weights of its corners (N, 3)."""
@@ -74,6 +75,7 @@ def read_truth(take: Path) -> Truth:
         motion=dict(zip(data["dof_names"].tolist(), data["motion_values"].T)) if "dof_names" in data else None,
         lengths_m=dict(zip(data["bone_names"].tolist(), data["lengths_m"].tolist())) if "bone_names" in data else None,
         radii_m=data.get("radii_m"),
+        settings=str(data.get("settings", "")),
     )
 
 
