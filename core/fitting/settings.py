@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ..foundation.settings import knob
 from ..geometry.intersection import CLICK_SIGMA_PX
 
-ALGORITHM = "body 5"  # part of the fit's key: raise it when the same input gives another body
+ALGORITHM = "body 6"  # part of the fit's key: raise it when the same input gives another body
 START_ALONE = ("full", "upper_body")  # models whose joints need no clicks; a limb is found where such a body is visible
 
 
@@ -70,6 +70,7 @@ class FitSettings:
     least_start_probability: float = knob(
         0.95, "Without clicks: a start that is less probable is not used; the fit asks for the click that decides.", low=0.0, high=1.0
     )
+    place_joints: bool = knob(True, "Joints lie in the body where they were clicked, in any frame.")
     length_sigma: float = knob(
         0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.", low=0.001, high=1.0
     )

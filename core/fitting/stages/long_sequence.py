@@ -23,6 +23,7 @@ from ..solve.solver import Solution
 from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
 from .contradicted import misplaced_limbs, widened
+from .joint_places import JointPlaces, joints_as_clicked
 from .pose_tracking import Checkpoints
 
 A = TypeVar("A")
@@ -63,6 +64,18 @@ class Recording:
             tracks=self.tracks and self.tracks.stretch(frames),
             feet=self.feet and self.feet.stretch(frames),
         )
+
+    def places(self, solution: Solution) -> JointPlaces | None:
+        """Where the joints lie by their clicks, if that is asked for."""
+        wanted = self.fit.settings.place_joints
+        return joints_as_clicked(self.fit, solution.motion, solution.vector, self.time_s) if wanted else None
+
+    def with_places(self, solution: Solution, places: JointPlaces | None) -> tuple["Recording", Solution]:
+        """The recording and its solution with the joints in their places, if there are others."""
+        if places is None:
+            return self, solution
+        fit, solution = places.applied(self.fit, solution)
+        return replace(self, fit=fit), solution
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -203,12 +216,14 @@ class ShapeResult:
     simplified: np.ndarray  # (S',) of the simplified body, from which the complete model is made
     vector: np.ndarray  # (S,)
     covariance: np.ndarray  # (S, S)
+    places: JointPlaces | None  # of the joints, by their clicks
     convergence: Convergence
 
     def save(self, checkpoints: Checkpoints | None) -> None:
         """Store it."""
         if checkpoints is not None:
             arrays = {"simplified": self.simplified, "vector": self.vector, "covariance": self.covariance}
+            arrays |= _table("places", self.places) if self.places is not None else {}
             checkpoints.save("shape_of_blocks", {**arrays, **self.convergence.arrays()})
 
     @staticmethod
@@ -221,6 +236,7 @@ class ShapeResult:
             simplified=found["simplified"],
             vector=found["vector"],
             covariance=found["covariance"],
+            places=_value(JointPlaces, "places", found) if "places.vector" in found else None,
             convergence=Convergence.loaded(found),
         )
 

@@ -6,6 +6,7 @@
 4. One adjustment over the whole sequence: one shape, a pose per frame, coupled over time by tracked points and weak accelerations. Frames
    whose residuals stay suspicious restart once from between their neighbours.
 5. Where the complete model is asked for, it is made from that body (`body.complete`), and step 4 is repeated with its radii.
+6. The joints move in the body to where they were clicked (`joint_places`).
 
 A recording of more than `AT_ONCE` frames is adjusted stretch by stretch, so that memory does not grow with its length (`_in_stretches`).
 
@@ -132,6 +133,7 @@ def _at_once(whole: Recording, start: Estimate, monitor: Monitor) -> BodyFit:
     monitor.step(SIGMAS, 1, 3)
     covariance = _covariance(problem, solution, factors)
     monitor.step(SIGMAS, 2, 3)
+    part, solution = part.with_places(solution, part.places(solution))
     results = frame_results(part, solution, covariance, frames)
     return _result(part, results, solution.vector, covariance[2], [Convergence.of(solution)])
 
@@ -180,7 +182,10 @@ def _in_stretches(whole: Recording, start: Estimate, monitor: Monitor, checkpoin
     if whole.fit.settings.balls == "complete":
         whole = replace(whole, fit=_completed(whole.fit, shape.simplified))
     results, convergence = _poses(whole, start.motion, shape, monitor, checkpoints)
-    return _result(whole, results, shape.vector, shape.covariance, [shape.convergence, *convergence])
+    if shape.places is not None:
+        whole = replace(whole, fit=shape.places.placed(whole.fit))
+    vector = shape.vector if shape.places is None else shape.places.vector
+    return _result(whole, results, vector, shape.covariance, [shape.convergence, *convergence])
 
 
 def _shape_of_blocks(whole: Recording, start: Estimate, monitor: Monitor) -> ShapeResult:
@@ -190,7 +195,13 @@ def _shape_of_blocks(whole: Recording, start: Estimate, monitor: Monitor) -> Sha
     part, problem, solutions = _adjusted(blocks, replace(start, motion=start.motion[frames]), monitor)
     last = solutions[-1]
     covariance = _covariance(problem, last, _factors(part, problem, last))[2]
-    return ShapeResult(simplified=solutions[0].vector, vector=last.vector, covariance=covariance, convergence=Convergence.of(last))
+    return ShapeResult(
+        simplified=solutions[0].vector,
+        vector=last.vector,
+        covariance=covariance,
+        places=part.places(last),
+        convergence=Convergence.of(last),
+    )
 
 
 def _poses(
@@ -230,8 +241,9 @@ def _stretch(
         coupling = Coupling(acceleration=Acceleration(time_s=part.time_s, sigma=part.sigma), prior=earlier)
         return marginal_prior(problem, solution, local, coupling, ahead=ahead, factors=factors)
 
+    placed, moved = part.with_places(solution, shape.places)
     return StretchResult(
-        results=frame_results(part, solution, covariance, local),
+        results=frame_results(placed, moved, covariance, local),
         convergence=Convergence.of(solution),
         priors={
             d: MarginalPriors(adjustment=prior(priors.adjustment, d > 0), covariance=prior(priors.covariance, d > 0, factors))
