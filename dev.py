@@ -1,7 +1,8 @@
 """Set-up, demo, tests, packages: `python3 dev.py --help`. The standard library is all it needs.
 
 The Python that runs this file decides which Blender is installed beside the code (as the `bpy` module):
-Python 3.11 gets Blender 4.5 LTS, Python 3.13 gets Blender 5.2 LTS, each in its own .venv/pyX.Y.
+Python 3.11 gets Blender 4.5 LTS, Python 3.13 gets Blender 5.2 LTS, each in its own .venv/pyX.Y. Any other Python goes on with one of
+these two, if the machine has one. Otherwise everything but Blender runs in an environment of its own: Python 3.11 or newer will do.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ REQUIREMENTS = {
     (3, 13): ["bpy==5.2.3", "numpy>=2.2,<3", "scipy==1.18.1", "threadpoolctl==3.8.0", *TOOLS],
 }
 OPENCV = "opencv-python-headless==5.0.0.93"  # as shipped; it asks pip for numpy 2, and works with the numpy 1 of Blender 4.5
+WITHOUT_BLENDER = ["numpy>=2.2,<3", "scipy>=1.18", "threadpoolctl==3.8.0", *TOOLS]  # of any other Python
+OLDEST = (3, 11)
 BLENDER = {(3, 11): "4.5 LTS", (3, 13): "5.2 LTS"}
 WINDOWS = os.name == "nt"
 STAMP = "tricap-setup.txt"
@@ -39,22 +42,56 @@ PLATFORM_OF_TAG = {"x86_64": "linux-x64", "amd64": "windows-x64", "arm64": "maco
 
 
 def python_version() -> tuple[int, int]:
-    """The running Python's (major, minor), or the end of the program with a sentence about what to do."""
-    version = sys.version_info[:2]
-    if version not in REQUIREMENTS:
-        have = [name for name in ("python3.13", "python3.11") if _runs(name)]
-        todo = f"This machine has {' and '.join(have)}" if have else "Install one of them"
-        sys.exit(
-            f"Tricap needs Python 3.11 (for Blender 4.5 LTS) or 3.13 (for Blender 5.2 LTS); this is Python {version[0]}.{version[1]}. "
-            f"{todo}: run `{(have or ['python3.13'])[0]} dev.py {' '.join(sys.argv[1:])}`."
-        )
-    return version
+    """The running Python's (major, minor)."""
+    return sys.version_info[:2]
 
 
-def _runs(name: str) -> bool:
-    if shutil.which(name) is None:
+def has_blender() -> bool:
+    """Whether there is a Blender as a module for the running Python."""
+    return python_version() in REQUIREMENTS
+
+
+def requirements() -> list[str]:
+    """What is installed for the running Python."""
+    return REQUIREMENTS.get(python_version(), WITHOUT_BLENDER)
+
+
+def change_python() -> None:
+    """Go on with a Python that Blender exists for, if this is none and the machine has one; end where this one is too old."""
+    if has_blender():
+        return
+    other = fitting_python()
+    this = "Python {}.{}".format(*python_version())
+    if other is not None:
+        say(f"Going on with {other}, for there is no Blender for {this}.")
+        sys.exit(subprocess.run([other, str(ROOT / "dev.py"), *sys.argv[1:]]).returncode)
+    if python_version() < OLDEST:
+        sys.exit(f"Tricap needs Python 3.11 or newer, best 3.13, for which there is a Blender; this is {this}. Install that.")
+    say(f"There is no Blender for {this}: all runs but what needs Blender. For that, install Python 3.13 or 3.11, then run this again.")
+
+
+def fitting_python() -> str | None:
+    """A program of this machine that is a Python which Blender exists for: on the path, of pyenv, or of the Windows launcher."""
+    for major, minor in sorted(REQUIREMENTS, reverse=True):
+        name = f"python{major}.{minor}"
+        pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+        tried = [shutil.which(name), *sorted(map(str, pyenv.glob(f"{major}.{minor}.*/bin/{name}")))]
+        if WINDOWS and shutil.which("py"):
+            line = ["py", f"-{major}.{minor}", "-c", "import sys; print(sys.executable)"]
+            tried.append(subprocess.run(line, capture_output=True, text=True).stdout.strip())
+        for program in filter(None, tried):
+            if _is_python(program, (major, minor)):
+                return program
+    return None
+
+
+def _is_python(program: str, version: tuple[int, int]) -> bool:
+    """Whether a program runs, is Python of that version, and can make environments (Debian's may lack that part)."""
+    code = f"import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != {version!r})"
+    try:
+        return subprocess.run([program, "-c", code], capture_output=True).returncode == 0
+    except OSError:
         return False
-    return subprocess.run([name, "-c", "import venv"], capture_output=True).returncode == 0
 
 
 def venv_folder() -> Path:
@@ -74,7 +111,7 @@ def site_packages() -> Path:
 
 def requirements_digest() -> str:
     """Changes when the environment has to be made or mended: other requirements, a moved folder."""
-    text = "\n".join([str(ROOT), *REQUIREMENTS[python_version()], OPENCV])
+    text = "\n".join([str(ROOT), *requirements(), OPENCV])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -105,10 +142,10 @@ def make_venv() -> None:
 
 def install_requirements() -> None:
     """pip install, in one command so that numpy stays the one that Blender was built for; OpenCV after it, without asking for another."""
-    version = python_version()
-    say(f"Installing Blender {BLENDER[version]} (as a Python module, about 400 MB) and the tools into {venv_folder()}; about a minute.")
+    blender = f"Blender {BLENDER[python_version()]} (as a Python module, about 400 MB) and " if has_blender() else ""
+    say(f"Installing {blender}the tools into {venv_folder()}; about a minute.")
     pip = [str(venv_program("python")), "-m", "pip", "install", "-q", "--disable-pip-version-check", "--no-input"]
-    if any(subprocess.run([*pip, *what], cwd=ROOT).returncode for what in (REQUIREMENTS[version], ["--no-deps", OPENCV])):
+    if any(subprocess.run([*pip, *what], cwd=ROOT).returncode for what in (requirements(), ["--no-deps", OPENCV])):
         sys.exit("pip could not install the packages (see above). Check the network and the free space (2 GB), then run this again.")
 
 
@@ -300,6 +337,8 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 def blender_extension(command: str, *arguments: object) -> None:
     """Run Blender's extension tool (the one inside the bpy module) with the tags that Blender allows."""
+    if not has_blender():
+        sys.exit("Only Blender can pack its extensions: install Python 3.13 or 3.11, for which it exists as a module, and run this again.")
     (scripts,) = site_packages().glob("bpy/*/scripts")
     tool = scripts / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
     tags = scripts / "modules" / "_bpy_internal" / "extensions" / "tags.py"
@@ -358,10 +397,10 @@ def parser() -> argparse.ArgumentParser:
 
 def main() -> int:
     """Run one command; its exit code."""
-    python_version()
     options, rest = parser().parse_known_args()
     if rest and options.command != "test":
         parser().error(f"unknown arguments: {' '.join(rest)}")
+    change_python()
     setup()
     if options.command == "demo":
         return demo(options.out)

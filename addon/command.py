@@ -73,7 +73,9 @@ def scene(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         Cancelled: the monitor was cancelled; no file was written.
     """
     if importlib.util.find_spec("bpy") is None:
-        raise InputError("`tricap scene` needs Blender: install bpy in this Python, or use `blender --command tricap scene …`.")
+        raise InputError(
+            "`tricap scene` needs Blender: use `blender --command tricap scene …`, or Python 3.11 or 3.13 with the module bpy."
+        )
     with standard_output_kept_clean(args):
         import bpy
 

@@ -1,19 +1,31 @@
 """Packaging: what the extension's zip and the Python package hold, and that the set-up mends itself."""
 
+import os
 import shutil
 import subprocess
 import sys
 import tomllib
 import zipfile
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 MANIFEST = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+BELONGS = {*"addon core docs tests blender_manifest.toml __init__.py __main__.py LICENSE README.md CHANGELOG.md CONTRIBUTING.md".split(),
+           "dev.py", "pyproject.toml"}  # fmt: skip
 NOT_SOURCE = shutil.ignore_patterns(".git", ".venv", "wheels", "dist", "out", "build", "__pycache__", ".*_cache", ".gui")
+
+
+def copied(folder: Path) -> None:
+    """A copy of the repository without what lies about in its root."""
+
+    def strangers(where: str, names: list[str]) -> set[str]:
+        return {*NOT_SOURCE(where, names), *(name for name in names if Path(where) == ROOT and name not in BELONGS)}
+
+    shutil.copytree(ROOT, folder, ignore=strangers)
 
 
 @pytest.fixture
@@ -101,7 +113,7 @@ def test_zip_holds_the_shipped_files_and_nothing_else(extension_zip: Path, dev: 
 
 
 def test_blenders_builder_run_on_the_source_ships_the_same(dev: ModuleType, tmp_path: Path) -> None:
-    shutil.copytree(ROOT, tmp_path / "copy", ignore=NOT_SOURCE)
+    copied(tmp_path / "copy")
     manifest = {key: value for key, value in MANIFEST.items() if key not in ("wheels", "platforms")}
     text = dev.toml_text({key: value for key, value in manifest.items() if key != "build"})
     text += f"[build]\npaths_exclude_pattern = {manifest['build']['paths_exclude_pattern']}\n"
@@ -124,6 +136,44 @@ def test_a_faulty_manifest_is_refused(dev: ModuleType, tmp_path: Path, fault: st
 def test_an_unknown_platform_is_named(dev: ModuleType, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="“beos”.*linux-x64, windows-x64, macos-arm64"):
         dev.build(["beos"], str(tmp_path), with_wheels=False)
+
+
+def test_another_python_goes_on_with_one_that_blender_exists_for(
+    dev: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    started: list[list[str]] = []
+    monkeypatch.setattr(dev, "python_version", lambda: (3, 12))
+    monkeypatch.setattr(dev, "fitting_python", lambda: "/usr/bin/python3.13")
+    monkeypatch.setattr(dev.subprocess, "run", lambda line: started.append(line) or SimpleNamespace(returncode=7))
+    monkeypatch.setattr(sys, "argv", ["dev.py", "test", "-k", "a b"])
+    with pytest.raises(SystemExit) as ended:
+        dev.change_python()
+    assert ended.value.code == 7 and started == [["/usr/bin/python3.13", str(ROOT / "dev.py"), "test", "-k", "a b"]]
+    monkeypatch.setattr(dev, "fitting_python", lambda: None)
+    dev.change_python()
+    assert "no Blender for Python 3.12" in capsys.readouterr().out and not any("bpy" in line for line in dev.requirements())
+    with pytest.raises(SystemExit, match="install Python 3.13"):
+        dev.blender_extension("build")
+    monkeypatch.setattr(dev, "python_version", lambda: (3, 10))
+    with pytest.raises(SystemExit, match="needs Python 3.11 or newer"):
+        dev.change_python()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="programs of Unix")
+def test_a_python_is_found_on_the_path_and_in_pyenv(dev: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    monkeypatch.setattr(dev, "REQUIREMENTS", {sys.version_info[:2]: []})
+    monkeypatch.setenv("PATH", str(tmp_path / "a path"))
+    monkeypatch.setenv("PYENV_ROOT", str(tmp_path / "pyenv"))
+    assert dev.fitting_python() is None
+    for folder in (tmp_path / "a path", tmp_path / "pyenv" / "versions" / f"{name.removeprefix('python')}.1" / "bin"):
+        folder.mkdir(parents=True)
+        (folder / name).symlink_to(sys.executable)
+    assert dev.fitting_python() == str(tmp_path / "a path" / name)
+    (tmp_path / "a path" / name).unlink()
+    assert "pyenv" in dev.fitting_python()
+    monkeypatch.setattr(dev, "REQUIREMENTS", {(3, 99): []})
+    assert dev.fitting_python() is None
 
 
 @pytest.mark.slow

@@ -82,13 +82,14 @@ def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if not is_arm_take(take, sample):
         make_arm_take(take, sample, monitor)
     job = pipeline.run(take, out, given, monitor)
-    lines = _build_scene(job, args, monitor)
+    lines, blend = _build_scene(job, args, monitor), out / "body.blend"
     return [
         str(job),
         *lines,
+        *([] if blend.is_file() else [f"Note: {job.record['warnings'][-1]}"]),
         "Compared with the truth of the recording:",
         str(score_run(take, out, monitor)),
-        f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}   Blender file: {out / 'body.blend'}",
+        f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}" + (f"   Blender file: {blend}" if blend.is_file() else ""),
     ]
 
 
