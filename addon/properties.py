@@ -14,7 +14,7 @@ import numpy as np
 from ..core.foundation import settings as knobs
 from ..core.run import take_run
 from . import take_properties
-from .scene import metaballs
+from .scene import metaballs, standing
 from .session import get_session
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
@@ -139,6 +139,14 @@ def register() -> None:
             get=lambda group: metaballs.shown(group.id_data),
             set=lambda group, value: metaballs.show(group.id_data, value),
             description="Show the metaballs behind the skin. Blender then computes them in every frame, which slows playback",
+        ),
+        "path": bpy.props.EnumProperty(
+            name="Path",
+            items=[(path.value, title, about) for path, title, about in standing.PATHS],
+            options=set(),
+            get=lambda group: list(standing.Path).index(standing.path_of(group.id_data)),
+            set=lambda group, value: standing.carry_path(group.id_data, list(standing.Path)[value]),
+            description="What carries the path of the body over the floor",
         ),
     }
     annotations |= take_properties.annotations()

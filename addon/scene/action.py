@@ -14,6 +14,7 @@ from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone
 from ...core.motion.retarget.rig import needed_keys
 from . import armature
+from .standing import Standing
 
 NAME, SIMPLE_NAME = "Measured motion", "Simplified motion"
 MEASURED_KEY = "tricap_measured_motion"  # custom property of the armature: the measured action while another one plays
@@ -22,21 +23,27 @@ LIMITS_TOLERANCE_RAD = 1e-6  # overstepping below this is rounding
 
 
 def add_action(
-    armature_object: bpy.types.Object, shape: BodyShape, frames: np.ndarray, dof_names: Sequence[str], values: np.ndarray, sigma: np.ndarray
+    armature_object: bpy.types.Object,
+    shape: BodyShape,
+    frames: np.ndarray,
+    dof_names: Sequence[str],
+    values: np.ndarray,
+    sigma: np.ndarray,
+    stand: Standing | None = None,
 ) -> bpy.types.Action:
     """Key the armature with the motion: frames (T,), values and sigma (T, D) in radians and metres. NaN gets no key."""
     action = bpy.data.actions.new(NAME)
     armature_object.animation_data_create().action = action
-    channels = armature.channel_of(shape)
+    channels = armature.channel_of(shape, stand)
     for column, name in enumerate(dof_names):
-        bone_name, channel, index = channels[name]
+        bone_name, channel, index, sign, offset = channels[name]
         pose_bone = armature_object.pose.bones[bone_name]
         path = pose_bone.path_from_id()
-        key(action, armature_object, f"{path}.{channel}", index, frames, values[:, column])
+        key(action, armature_object, f"{path}.{channel}", index, frames, sign * values[:, column] + offset)
         pose_bone[f"sigma {name}"] = 0.0
         key(action, armature_object, f'{path}["sigma {name}"]', 0, frames, sigma[:, column])
     motion = {name: values[:, column] for column, name in enumerate(dof_names)}
-    for bone in shape.skeleton.bones:
+    for bone in armature.rig_bones(shape):
         _mute_exceeded_limits(armature_object.pose.bones[bone.name], bone, motion)
     return action
 
@@ -48,6 +55,7 @@ def add_simplified(
     dof_names: Sequence[str],
     values: np.ndarray,
     tolerance_deg: float,
+    stand: Standing | None = None,
 ) -> bpy.types.Action:
     """Give the armature a second action with fewer keys, with every angle of `values` (T, D) within `tolerance_deg`.
 
@@ -56,14 +64,14 @@ def add_simplified(
     armature_object[MEASURED_KEY] = armature_object.animation_data.action  # the property counts as a user, so that the action is saved
     action = bpy.data.actions.new(SIMPLE_NAME)
     armature_object.animation_data.action = action
-    channels = armature.channel_of(shape)
+    channels = armature.channel_of(shape, stand)
     for column, name in enumerate(dof_names):
-        bone_name, channel, index = channels[name]
+        bone_name, channel, index, sign, offset = channels[name]
         known = np.flatnonzero(np.isfinite(values[:, column]))
         tolerance = np.radians(tolerance_deg) * (1.0 if channel == "rotation_euler" else METRES_PER_RADIAN)
         kept = known[needed_keys(frames[known], values[known, column], tolerance)]
         path = f"{armature_object.pose.bones[bone_name].path_from_id()}.{channel}"
-        key(action, armature_object, path, index, frames[kept], values[kept, column])
+        key(action, armature_object, path, index, frames[kept], sign * values[kept, column] + offset)
     return action
 
 

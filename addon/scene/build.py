@@ -12,6 +12,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...core.body.fields import EXPONENTIAL, potential_named
 from ...core.body.skin.closed_skin import DETAIL
@@ -21,7 +22,7 @@ from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
-from . import action, armature, cameras, clips, metaballs, skin, surroundings
+from . import action, armature, cameras, clips, metaballs, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import with_rest_pose
@@ -105,7 +106,7 @@ def write_scene(
     if surface is not None:
         skin.add_implicit(collection, *surface, potential_named(options.field))
     surroundings.add_lights(collection)
-    if contents.footage is not None and contents.footage.rig.metadata.get("floor") is True:
+    if _has_floor(contents):
         surroundings.add_floor(collection)
     if contents.bar is not None:
         counts["positions of the bar"] = _add_bar(collection, contents.frames[0], *contents.bar)
@@ -190,6 +191,11 @@ def _relative_caches(path: Path) -> Iterator[None]:
     finally:
         for modifier, file in absolute:
             modifier.filepath = file
+
+
+def _has_floor(contents: Contents) -> bool:
+    """Whether the world frame of the calibration lies on the floor."""
+    return contents.footage is not None and contents.footage.rig.metadata.get("floor") is True
 
 
 Opened = list[tuple[bpy.types.MovieClip, list[Path]]]
@@ -312,13 +318,19 @@ def _add_body(
     values, sigma = (motion.values, motion.sigma) if motion is not None else (np.zeros((0, n)), np.zeros((0, n)))
     measured_shape = shape
     shape, values, sigma = with_rest_pose(shape, values, sigma, options.rest_pose)
-    armature_object = armature.add_armature(collection, shape)
+    known_floor = 0.0 if _has_floor(contents) else None
+    frames = motion.frames if motion is not None else np.zeros(0)
+    rest_skin = contents.prepared.skin
+    stand = standing.standing(shape, rest_skin.vertices_m if rest_skin else None, values, frames, contents.fps, known_floor)
+    armature_object = armature.add_armature(collection, shape, stand)
     flesh = metaballs.add_metaballs(metaballs.add_collection(collection), armature_object, shape)
     counts = {"bones": len(shape.skeleton.bones), "metaball parts": len(flesh)}
     try:
         like = contents.prepared.skin
         prepared = like and skin.in_rest_pose(like, measured_shape, shape)
         shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, prepared)
+        if stand is not None:
+            skin_object.data.transform(Matrix.Translation((0.0, 0.0, stand.lift_m)))
         if contents.skins is not None and blend is not None:
             shown = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
             counts["exact skin faces"] = len(shown.data.polygons)
@@ -331,8 +343,8 @@ def _add_body(
         metaballs.show(bpy.context.scene, False)
         counts["skin faces"] = len(skin_object.data.polygons)
     if motion is not None:
-        action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma)
+        action.add_action(armature_object, shape, motion.frames, motion.dof_names, values, sigma, stand)
         counts["frames of motion"] = len(motion.frames)
         if options.simplify_deg > 0:
-            action.add_simplified(armature_object, shape, motion.frames, motion.dof_names, values, options.simplify_deg)
+            action.add_simplified(armature_object, shape, motion.frames, motion.dof_names, values, options.simplify_deg, stand)
     return counts

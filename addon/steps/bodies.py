@@ -14,7 +14,7 @@ from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
 from ..panels import sentence
 from ..retarget.panel import draw_retarget
-from ..scene import metaballs
+from ..scene import metaballs, standing
 from . import check, states, watch
 from .person import draw_person
 from .states import Fix, Status
@@ -177,10 +177,12 @@ def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, op
 
 
 def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Build the scene, whose options are in the redo panel (F9); show its metaballs."""
+    """Build the scene, whose options are in the redo panel (F9); what carries the path; show its metaballs."""
     column = layout.column()
     column.enabled = watch.current(context.scene).states["surface"].status != Status.EMPTY or bool(context.scene.tricap.out)
     primary(column, "tricap.build_scene", is_next, icon="OUTLINER_OB_ARMATURE", text="Build Rig and Scene")
+    if any(standing.bodies(context.scene)):
+        layout.prop(context.scene.tricap, "path")
     if metaballs.exist(context.scene):
         layout.prop(context.scene.tricap, "show_metaballs")
 

@@ -68,7 +68,7 @@ def played_angles_deg(bpy: ModuleType, run: SmallRun) -> float:
     body, worst = bpy.data.objects["Body"], 0.0
     for row in rows(run.out / "motion.csv"):
         bpy.context.scene.frame_set(int(row["frame"]))
-        for name, (bone, channel, index) in channel_of(run.shape).items():
+        for name, (bone, channel, index, *_) in channel_of(run.shape).items():
             unit = np.degrees if channel == "rotation_euler" else float
             pose_bone = body.pose.bones[bone]
             worst = max(worst, abs(unit(getattr(pose_bone, channel)[index]) - float(row[name])))

@@ -242,7 +242,7 @@ def test_a_whole_body_is_sorted_and_has_parts_of_its_own(empty: ModuleType) -> N
     shape = default_shape(read_model("full"))
     body = animated(empty, shape, np.zeros((1, len(shape.skeleton.dof_names))), np.arange(1))
     names = {c.name for c in body.data.collections}
-    assert names == {"Base", "Trunk", "Arm right", "Leg right", "Arm left", "Leg left"}
+    assert names == {"Root", "Trunk", "Arm right", "Leg right", "Arm left", "Leg left"}
     flesh = metaballs.add_metaballs(empty.context.scene.collection, body, shape)
     families = [part for part in flesh if len(world_vertices(empty, part))]
     assert len(families) == 8  # trunk, limbs, where both legs meet the pelvis, and each arm the chest

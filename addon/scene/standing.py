@@ -1,0 +1,112 @@
+"""Where a person stands: the floor under the feet, the rest pose on it, and what carries the path over it.
+
+A whole body rests with its soles at z = 0 of its armature, whose object stands on the floor. The bone `root` on the floor carries the
+path: its location is where the base of the skeleton is, seen from above. The height belongs to the base bone, the pelvis. So the channels
+are the degrees of freedom of motion.csv, but for a constant in the height.
+
+The path is two F-curves (x and y), which can be moved to the armature object, as game engines expect root motion, or muted, so that the
+person moves in place. Edited keys stay.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+import bpy
+import numpy as np
+
+from ...core.body.shape import BodyShape
+from ...core.body.skeleton import bone_frames
+from ...core.motion.floor import floor_height
+from ..session import get_session
+
+ROOT = "root"
+LIFT_KEY = "tricap_lift_m"  # custom property of armature data: by how much the rest pose of a standing body is raised
+OBJECT_PATH = "location"
+FEET = ("foot.L", "foot.R")
+
+
+class Path(StrEnum):
+    """What carries the path over the floor."""
+
+    BONE = "BONE"
+    OBJECT = "OBJECT"
+    IN_PLACE = "IN_PLACE"
+
+
+PATHS = (
+    (Path.BONE, "Root Bone", "The root bone travels over the floor"),
+    (Path.OBJECT, "Object", "The armature object travels: root motion for game engines"),
+    (Path.IN_PLACE, "In Place", "The person moves in place; the path is muted"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """How a person's armature stands: `lift_m`, by how much the rest pose is raised so that its soles are at zero, and the floor's z."""
+
+    lift_m: float = 0.0
+    floor_m: float = 0.0
+
+
+def standing(
+    shape: BodyShape, skin_m: np.ndarray | None, values: np.ndarray, frames: np.ndarray, fps: float, floor_m: float | None
+) -> Standing | None:
+    """How the person stands; None for a part of a body, which has no feet, and for a model whose base is not upright.
+
+    `skin_m` (V, 3): the skin in the rest pose, which has the soles; `values` (T, D): the motion; `floor_m`: the floor where it is known.
+    """
+    bones = {bone.name: b for b, bone in enumerate(shape.skeleton.bones)}
+    if skin_m is None or not set(FEET) <= set(bones) or base_height(shape) is None:
+        return None
+    _, head_m = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dof_names)))
+    lowest = float(skin_m[:, 2].min())
+    ankle = float(np.mean([head_m[bones[foot], 2] for foot in FEET]))
+    found = floor_m if floor_m is not None else floor_height(shape, values, frames, fps, ankle - lowest)
+    return Standing(lift_m=-lowest, floor_m=0.0 if found is None else found)
+
+
+def base_height(shape: BodyShape) -> tuple[str, int, float] | None:
+    """The bone, index and sign of the location channel that is the height of the skeleton's base; None if no axis of it is vertical."""
+    roots = [bone for bone in shape.skeleton.bones if not bone.parent]
+    if len(roots) != 1 or len(shape.skeleton.base_dofs) != 3:
+        return None
+    up = roots[0].R_rest[2]  # the world's z in the bone's axes
+    index = int(np.argmax(np.abs(up)))
+    return (roots[0].name, index, float(np.sign(up[index]))) if abs(up[index]) > 1 - 1e-9 else None
+
+
+def bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
+    """The armatures of Tricap's own bodies that stand on a floor."""
+    return (thing for thing in scene.objects if thing.type == "ARMATURE" and LIFT_KEY in thing.data)
+
+
+def path_of(scene: bpy.types.Scene) -> Path:
+    """What carries the path of the scene's body."""
+    curves = [curve for body in bodies(scene) for curve in _path_curves(body)]
+    if any(curve.data_path == OBJECT_PATH for curve in curves):
+        return Path.OBJECT
+    return Path.IN_PLACE if curves and all(curve.mute for curve in curves) else Path.BONE
+
+
+def carry_path(scene: bpy.types.Scene, by: Path) -> None:
+    """Let the root bone or the object of the scene's bodies carry the path, or nothing."""
+    for body in bodies(scene):
+        root = body.pose.bones[ROOT]
+        for curve in _path_curves(body):
+            curve.data_path = OBJECT_PATH if by == Path.OBJECT else root.path_from_id("location")
+            curve.mute = by == Path.IN_PLACE
+        root.location[:2] = body.location[:2] = (0.0, 0.0)
+        body.update_tag()
+    scene.frame_set(scene.frame_current)
+    get_session().file.changed = True
+
+
+def _path_curves(body: bpy.types.Object) -> list[bpy.types.FCurve]:
+    """The curves of x and y of the path, in every action that the body plays."""
+    data = body.animation_data
+    strips = [strip.action for track in data.nla_tracks for strip in track.strips] if data is not None else []
+    actions = {action for action in (data.action if data is not None else None, *strips) if action is not None}
+    paths = (OBJECT_PATH, body.pose.bones[ROOT].path_from_id("location"))
+    bags = [bag for action in actions for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
+    return [curve for bag in bags for curve in bag.fcurves if curve.data_path in paths and curve.array_index < 2]

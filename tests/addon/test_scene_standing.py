@@ -1,0 +1,124 @@
+"""The rest pose on the floor, and the root bone that carries the path."""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.body.model_file import read_model
+from tricap.core.body.shape import BodyShape, default_shape
+from tricap.core.body.skeleton import bone_frames
+from tricap.core.body.skin.extremities import shape_for_skin
+from tricap.core.body.skin.mesh import SkinSettings
+from tricap.core.body.skin.person_skin import rest_skin
+from tricap.core.foundation import store
+from tricap.core.motion.floor import floor_height
+from tricap.core.motion.sources import from_run
+
+from .conftest import FPS, write_result
+
+FLOOR_M = -0.3  # of the world frame of these cameras
+STEP_M, FRAMES = 0.04, 12
+
+
+@pytest.fixture(scope="module")
+def person() -> tuple[BodyShape, float]:
+    """The default person, and how far its soles lie below the pelvis in the rest pose."""
+    shape = default_shape(read_model("full"))
+    shown = shape_for_skin(shape, SkinSettings())
+    return shape, -float(rest_skin(shown, SkinSettings()).vertices_m[:, 2].min())
+
+
+def walk(shape: BodyShape, hip_m: float) -> np.ndarray:
+    """A person who slides over the floor, standing still in the second half, one arm moving."""
+    values = np.zeros((FRAMES, len(shape.skeleton.dof_names)))
+    values[:, 0] = 0.5 + STEP_M * np.minimum(np.arange(FRAMES), FRAMES // 2)
+    values[:, 1] = -0.1 * np.arange(FRAMES) / FRAMES
+    values[:, 2] = FLOOR_M + hip_m
+    values[:, shape.skeleton.layout["shoulder.R flexion"]] = np.linspace(0, 1, FRAMES)
+    return values
+
+
+@pytest.fixture
+def out(person: tuple[BodyShape, float], tmp_path: Path) -> Path:
+    """Results of a run whose take is not there."""
+    shape, hip_m = person
+    values = walk(shape, hip_m)
+    write_result(tmp_path / "out", shape, np.arange(FRAMES), values, np.full(values.shape, 1e-3))
+    store.write_json(tmp_path / "out" / "run.json", {"format": "tricap-run", "version": 1, "take": str(tmp_path / "none")})
+    return tmp_path / "out"
+
+
+def test_the_floor_is_found_from_standing_feet(person: tuple[BodyShape, float]) -> None:
+    shape, hip_m = person
+    foot = next(b for b, bone in enumerate(shape.skeleton.bones) if bone.name == "foot.R")
+    _, head_m = bone_frames(shape.skeleton, shape.lengths_m, np.zeros(len(shape.skeleton.dof_names)))
+    values = walk(shape, hip_m)
+    found = floor_height(shape, values, np.arange(FRAMES), FPS, float(head_m[foot, 2]) + hip_m)
+    assert found == pytest.approx(FLOOR_M, abs=1e-6)
+    assert floor_height(shape, np.full_like(values, np.nan), np.arange(FRAMES), FPS, 0.1) is None
+    arm = default_shape(read_model("arm.R"))
+    assert floor_height(arm, np.zeros((3, len(arm.skeleton.dof_names))), np.arange(3), FPS, 0.1) is None
+
+
+def placed(bpy: ModuleType, body: Any, names: tuple[str, ...]) -> np.ndarray:
+    """Matrices (T, B, 4, 4) of bones in the world."""
+    found = []
+    for frame in range(FRAMES):
+        bpy.context.scene.frame_set(frame)
+        found.append([body.matrix_world @ body.pose.bones[name].matrix for name in names])
+    return np.array(found)
+
+
+def test_the_rest_pose_stands_on_the_floor_and_the_root_carries_the_path(empty: ModuleType, out: Path) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    build_scene(out)
+    body, motion = empty.data.objects["Body"], from_run(out)
+    skin = np.array([v.co for v in empty.data.objects["Skin"].data.vertices])
+    assert abs(skin[:, 2].min()) < 1e-6 and body.location.z == pytest.approx(FLOOR_M, abs=1e-5)
+    bones = {name: np.array(bone.head_local) for name, bone in body.data.bones.items()}
+    for name, head in bones.items():
+        if name.endswith(".R"):
+            np.testing.assert_allclose(head * (-1, 1, 1), bones[name[:-1] + "L"], atol=1e-6)
+    rows = [b for b, name in enumerate(motion.rig.names) if name in body.pose.bones]
+    found = placed(empty, body, tuple(motion.rig.names[b] for b in rows))
+    np.testing.assert_allclose(found[..., :3, 3], motion.head_m[:, rows], atol=5e-6)
+    np.testing.assert_allclose(found[..., :3, :3], motion.R[:, rows], atol=1e-5)
+    root = placed(empty, body, ("root",))[:, 0, :3, 3]
+    np.testing.assert_allclose(root[:, :2], motion.head_m[:, 0, :2], atol=1e-6)
+    np.testing.assert_allclose(root[:, 2], FLOOR_M, atol=1e-5)
+    assert {bone.color.palette for bone in body.data.bones} == {"THEME01", "THEME04", "THEME09"}
+
+
+def test_the_path_moves_to_the_object_and_back_with_its_edits(blender: ModuleType, out: Path) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    assert blender.ops.tricap.build_scene(out=str(out)) == {"FINISHED"}
+    scene, body = blender.context.scene, blender.data.objects["Body"]
+    names = ("pelvis", "hand.R")
+    curve = body.animation_data.action.fcurve_ensure_for_datablock(body, 'pose.bones["root"].location', index=0)
+    for point in curve.keyframe_points:
+        point.co.y += 0.25  # an edit that must not be lost
+    before = placed(blender, body, names)
+    assert scene.tricap.path == "BONE"
+    scene.tricap.path = "OBJECT"
+    assert scene.tricap.path == "OBJECT"
+    np.testing.assert_allclose(placed(blender, body, names), before, atol=1e-6)
+    assert np.ptp([point.co.y for point in curve.keyframe_points]) > 0.2 and curve.data_path == "location"
+    np.testing.assert_allclose(body.pose.bones["root"].location, 0, atol=1e-7)
+    scene.tricap.path = "IN_PLACE"
+    still = placed(blender, body, names)
+    np.testing.assert_allclose(still[:, 0, :2, 3], 0, atol=1e-6)
+    np.testing.assert_allclose(still[..., 2, 3], before[..., 2, 3], atol=1e-6)
+    scene.tricap.path = "BONE"
+    np.testing.assert_allclose(placed(blender, body, names), before, atol=1e-6)
+
+
+def test_a_part_of_a_body_stands_nowhere(blender: ModuleType, small_run: Any) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    assert blender.ops.tricap.build_scene(out=str(small_run.out)) == {"FINISHED"}
+    assert blender.data.objects["Body"].location.z == 0 and blender.context.scene.tricap.path == "BONE"
+    blender.context.scene.tricap.path = "OBJECT"  # there is nothing to move
+    assert blender.context.scene.tricap.path == "BONE"
