@@ -17,6 +17,7 @@ from typing import Any
 import bpy
 from mathutils import Matrix
 
+from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
@@ -29,7 +30,7 @@ from .programs import Program, bone_names
 FORWARD = {"Y up": "-Z", "Z up": "Y", "OpenSim": "-X"}  # the axis of the file that is Blender's Y
 UP = {"Y up": "Y", "Z up": "Z", "OpenSim": "Y"}
 NO_MESHES = "Alembic stores meshes, and this motion has none; choose fbx, glb or usd."
-TEMPORARY = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "collections")
+TEMPORARY = ("scenes", "objects", "armatures", "meshes", "actions", "materials", "images", "collections")
 
 
 def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Motion) -> str:
@@ -43,7 +44,8 @@ def export_motion(kind: str, out: Path, file: Path, program: Program, motion: Mo
     with _plain_armature(kind, file, program, motion) as armature_object:
         if out.is_dir():
             shape, of_run = skin.skin_of_run(out)
-            skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, shape, prepared=of_run)
+            picture = out / "skin" / TEXTURE if of_run is not None else None
+            skin_object = skin.add_skin(bpy.context.scene.collection, armature_object, shape, prepared=of_run, texture=picture)
             skin_object.data.transform(Matrix.Scale(1.0 / _unit_m(kind, program), 4))
         _write(kind, file, program, armature_object, bone_names(motion.rig, program))
     return f"{len(motion.rig.names)} bones in {len(motion.frames)} frames"
@@ -146,6 +148,8 @@ def _fbx(path: str, program: Program) -> None:
         bake_anim_force_startend_keying=True,
         bake_anim_step=1.0,
         bake_anim_simplify_factor=0.0,
+        path_mode="COPY",
+        embed_textures=True,
     )
 
 

@@ -16,13 +16,14 @@ from mathutils import Matrix
 
 from ...core.body.fields import EXPONENTIAL, potential_named
 from ...core.body.skin.closed_skin import DETAIL
+from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
 from ...core.results.folder import FIELDS
 from ...core.run.stages import STAGES
-from . import action, armature, cameras, clips, metaballs, skin, standing, surroundings
+from . import action, armature, cameras, clips, metaballs, nodes, skin, standing, surroundings
 from .cloud import CloudPoints, add_cloud
 from .contents import Contents, read_contents
 from .rest_pose import with_rest_pose
@@ -135,12 +136,15 @@ def remove_earlier() -> None:
         used |= {clip for o in objects if o.type == "CAMERA" and (clip := clips.clip_behind(o.data)) is not None}
         used |= {modifier.node_group for o in objects for modifier in o.modifiers if modifier.type == "NODES" and modifier.node_group}
         used |= {m for o in objects if hasattr(o.data, "materials") for m in o.data.materials if m}
+        used |= {image for material in used if isinstance(material, bpy.types.Material) for image in nodes.images_of(material)}
         if scene.active_clip in used:
             scene.active_clip = None
         inside = [child for child in collection.children_recursive if metaballs.COLLECTION_KEY in child]
         bpy.data.batch_remove(objects)
         bpy.data.batch_remove([*inside, collection])
-        for _ in range(2):  # materials have no users only once their meshes and node groups are removed
+        for _ in range(
+            3
+        ):  # materials have no users only once their meshes and node groups are removed, and images once their materials are
             free = {id_ for id_ in used if id_.users == 0}
             used -= free
             bpy.data.batch_remove(free)
@@ -328,7 +332,8 @@ def _add_body(
     try:
         like = contents.prepared.skin
         prepared = like and skin.in_rest_pose(like, measured_shape, shape)
-        shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, prepared)
+        texture = contents.out / "skin" / TEXTURE if prepared is not None else None
+        shown = skin_object = skin.add_skin(collection, armature_object, shape, options.detail, contents.skin_settings, prepared, texture)
         if stand is not None:
             skin_object.data.transform(Matrix.Translation((0.0, 0.0, stand.lift_m)))
         if contents.skins is not None and blend is not None:

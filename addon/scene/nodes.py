@@ -1,8 +1,11 @@
 """Node trees: geometry nodes with their sockets joined by name, and materials of one colour or of a named attribute's colours."""
 
+from pathlib import Path
 from typing import Any
 
 import bpy
+
+from ...core.foundation.errors import InputError
 
 
 def new_group(name: str) -> tuple[bpy.types.NodeTree, bpy.types.Node, bpy.types.Node]:
@@ -74,6 +77,33 @@ def plain_material(name: str, colour: tuple[float, float, float], roughness: flo
     shader.inputs["Base Color"].default_value = (*colour, 1.0)
     shader.inputs["Roughness"].default_value = roughness
     return material
+
+
+def image_material(name: str, file: Path, roughness: float = 0.7) -> bpy.types.Material:
+    """The colours of an image file, which is packed, on the first texture coordinates; also in solid shading by textures.
+
+    Raises:
+        InputError: the file is no image.
+    """
+    image = bpy.data.images.load(str(file))
+    if not image.size[0]:
+        bpy.data.images.remove(image)
+        raise InputError(f"{file} is no readable image; run the fit again, or remove it.")
+    image.pack()
+    image.name = f"{name} texture.png"
+    material = plain_material(name, (0.8, 0.8, 0.8), roughness)
+    tree = material.node_tree
+    node = tree.nodes.new("ShaderNodeTexImage")
+    node.image, node.location = image, (-320.0, 280.0)
+    tree.links.new(node.outputs["Color"], _shader(material).inputs["Base Color"])
+    tree.nodes.active = node
+    return material
+
+
+def images_of(material: bpy.types.Material) -> list[bpy.types.Image]:
+    """The images in the nodes of a material."""
+    tree = material.node_tree
+    return [node.image for node in tree.nodes if node.type == "TEX_IMAGE" and node.image] if tree else []
 
 
 def attribute_material(name: str, attribute: str, scale: float) -> bpy.types.Material:

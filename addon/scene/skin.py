@@ -50,16 +50,18 @@ def add_skin(
     detail: int = DETAIL,
     settings: SkinSettings = SkinSettings(),  # noqa: B008  frozen
     prepared: OneSkin | None = None,
+    texture: Path | None = None,
 ) -> bpy.types.Object:
     """The skin of the rest pose as one closed mesh, bound to the armature, with `detail` pieces for each edge of its cage.
 
-    `prepared`: the run's skin, in the rest pose of `shape`; without it one is made, without relief.
+    `prepared`: the run's skin, in the rest pose of `shape`; without it one is made, without relief. `texture`: its picture.
 
     Raises:
-        InputError: the body has no metaballs.
+        InputError: the body has no metaballs, or the picture cannot be read.
     """
     skin = resampled(prepared or rest_skin(shape, settings), detail)
-    skin_object = _mesh_object(collection, NAME, skin.vertices_m, skin.faces, skin.uv)
+    painted = nodes.image_material(NAME, texture) if texture is not None and texture.is_file() else None
+    skin_object = _mesh_object(collection, NAME, skin.vertices_m, skin.faces, skin.uv, painted)
     for name in ATTRIBUTES:
         if (values := getattr(skin, name)) is not None:
             skin_object.data.attributes.new(name, "FLOAT", "POINT").data.foreach_set("value", values.astype(np.float32))
@@ -109,14 +111,19 @@ def add_exact_skin(collection: bpy.types.Collection, shape: BodyShape, skins: Fr
 
 
 def _mesh_object(
-    collection: bpy.types.Collection, name: str, vertices_m: np.ndarray, faces: np.ndarray, uv: np.ndarray
+    collection: bpy.types.Collection,
+    name: str,
+    vertices_m: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    material: bpy.types.Material | None = None,
 ) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(vertices_m.tolist(), [], faces.tolist())
     mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), dtype=bool))
     layer = mesh.uv_layers.new(name="UVMap")
     layer.data.foreach_set("uv", uv.astype(np.float32).ravel())
-    mesh.materials.append(nodes.plain_material(name, SKIN_COLOUR))
+    mesh.materials.append(material or nodes.plain_material(name, SKIN_COLOUR))
     mesh.update()
     skin_object = bpy.data.objects.new(name, mesh)
     collection.objects.link(skin_object)

@@ -85,6 +85,10 @@ class Recent:
         """The files behind the frames."""
         return self._sequence.files()
 
+    def read_colour(self, index: int) -> np.ndarray:
+        """RGB values (h, w, 3) float32 of frame `index`."""
+        return self._sequence.read_colour(index)
+
     def read(self, index: int) -> np.ndarray:
         """Grey values (h, w) float32 of frame `index`."""
         if index not in self._cache:

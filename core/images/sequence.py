@@ -141,6 +141,9 @@ class ImageSequence(Protocol):
     def read(self, index: int) -> np.ndarray:
         """Grey values (h, w) float32 of frame `index`."""
 
+    def read_colour(self, index: int) -> np.ndarray:
+        """RGB values (h, w, 3) float32 of frame `index`; equal ones in footage without colours."""
+
     def files(self) -> tuple[Path, ...]:
         """The files behind the frames."""
 
@@ -173,6 +176,10 @@ class ImageFiles:
             InputError: the file is gone or is not an image.
         """
         return read_image(self._paths[index], self._white())
+
+    def read_colour(self, index: int) -> np.ndarray:
+        """RGB values (h, w, 3) float32 of file `index`; see `read`."""
+        return colour(decoded(self._paths[index]), self._white())
 
     def _white(self) -> float:
         """The grey value of white: cameras of 10 or 12 bits often write files of 16 bits."""
@@ -242,6 +249,11 @@ class Movie:
             self._next += 1
         self._last = image
         return grey(image)
+
+    def read_colour(self, index: int) -> np.ndarray:
+        """RGB values (h, w, 3) float32 of frame `index`; see `read`."""
+        self.read(index)
+        return colour(self._last)
 
     @property
     def shown(self) -> int:
@@ -349,6 +361,13 @@ def grey(image: np.ndarray, white: float = 0.0) -> np.ndarray:
     if image.dtype.kind == "f":
         return np.ascontiguousarray(np.nan_to_num(image, nan=0.0) * 255.0, dtype=np.float32)
     return image.astype(np.float32)
+
+
+def colour(image: np.ndarray, white: float = 0.0) -> np.ndarray:
+    """RGB values (h, w, 3) float32 0…255 of an image as for `grey`."""
+    if image.ndim == 2 or image.shape[2] < 3:
+        return np.repeat(grey(image, white)[:, :, None], 3, axis=2)
+    return np.ascontiguousarray(np.stack([grey(image[:, :, channel], white) for channel in (2, 1, 0)], axis=2))
 
 
 def _check_movie(path: Path) -> None:

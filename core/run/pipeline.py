@@ -11,12 +11,14 @@ import numpy as np
 
 from ..body.motion import FITTED, PARTIAL, BodyFit
 from ..body.shape import write_body
+from ..body.skin import texture
 from ..body.skin.contour_skin import body_skin
 from ..body.skin.extremities import shape_for_skin
 from ..body.skin.mesh import SkinSettings
 from ..body.skin.person_skin import REST, cage, rest_skin, with_relief, write_skin
 from ..body.skin.posed import Poser
 from ..body.skin.relief import MOST_FRAMES, SurfacePoints
+from ..body.skin.texture import TextureBaker
 from ..checking.run_check import check_fit
 from ..checking.take_check import causes_of_failure, check_clouds, with_cause
 from ..checking.timing import synchronised
@@ -273,6 +275,8 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> None:
     if points:
         skin = with_relief(skin, person, points, settings.mirror, monitor)
     write_skin(run.results.path("skin", REST), skin)
+    if settings.texture_px:
+        _write_texture(run, body, TextureBaker(skin, person, settings.texture_px, len(run.footage.rig.cameras)), monitor)
     rows, faces = cage(skin)
     poser, vertices = Poser(person, skin.weights[rows]), skin.vertices_m[rows]
     for i, (frame, values) in enumerate(zip(body.motion.frames, body.motion.values)):
@@ -282,12 +286,29 @@ def _write_skins(run: Run, body: BodyFit, monitor: Monitor) -> None:
         write_mesh(run.results.path("skin", f"{frame:04d}.ply"), *mesh)
 
 
-def _surface_points(run: Run, body: BodyFit) -> list[SurfacePoints]:
-    """What was measured in frames whose pose is known, evenly over the take."""
+def _write_texture(run: Run, body: BodyFit, baker: TextureBaker, monitor: Monitor) -> None:
+    """skin/texture.png from all views."""
+    rows = _known_poses(body, texture.MOST_FRAMES)
+    for done, row in enumerate(rows):
+        monitor.step("texture", done, len(rows))
+        images = run.footage.read_colour(int(body.motion.frames[row]))
+        views = [texture.View(camera=camera, rgb=rgb) for camera, rgb in zip(run.footage.rig.cameras, images)]
+        baker.add(body.motion.values[row], views)
+    if rows:
+        texture.write_texture(run.results.path("skin"), baker.finished())
+
+
+def _known_poses(body: BodyFit, most: int) -> list[int]:
+    """Frames whose pose is known, as rows of the motion, evenly over the take."""
     known = np.flatnonzero(np.isin(body.motion.status, (FITTED, PARTIAL)))
+    return known[np.unique(np.linspace(0, len(known) - 1, min(most, len(known))).round().astype(int))].tolist() if len(known) else []
+
+
+def _surface_points(run: Run, body: BodyFit) -> list[SurfacePoints]:
+    """What was measured in frames whose pose is known."""
     found = []
-    for i in np.unique(np.linspace(0, len(known) - 1, min(MOST_FRAMES, len(known))).round().astype(int)):
-        cloud, row = run.clouds[int(known[i])], int(known[i])
+    for row in _known_poses(body, MOST_FRAMES):
+        cloud = run.clouds[row]
         if len(cloud.xyz_m):
             sigma = np.sqrt(np.einsum("ni,nij,nj->n", cloud.normals, cloud.covariance_m2, cloud.normals))
             found.append(SurfacePoints(motion=body.motion.values[row], xyz_m=cloud.xyz_m, normals=cloud.normals, sigma_m=sigma))

@@ -40,9 +40,20 @@ class Footage:
         Raises:
             InputError: an image is missing, damaged, or of another size than its camera.
         """
-        images = [s.read(self.number(k, frame)) for k, s in enumerate(self.sequences)]
+        return self._checked(frame, [s.read(self.number(k, frame)) for k, s in enumerate(self.sequences)])
+
+    def read_colour(self, frame: int) -> list[np.ndarray]:
+        """The RGB images (h, w, 3) float32 of all views at one frame of the take; the rows of the other field are interpolated.
+
+        Raises:
+            InputError: as `read`.
+        """
+        images = self._checked(frame, [s.read_colour(self.number(k, frame)) for k, s in enumerate(self.sequences)])
+        return [self.take.rows_at(frame).whole(image) for image in images]
+
+    def _checked(self, frame: int, images: list[np.ndarray]) -> list[np.ndarray]:
         for image, size, view in zip(images, self.sizes_px, self.take.views):
-            if image.shape[::-1] != size:
+            if image.shape[1::-1] != size:
                 raise InputError(
                     f"Frame {frame} of view {view.name} has {image.shape[1]}×{image.shape[0]} pixels, but its camera in "
                     f"{self.take.rig_path.name} has {size[0]}×{size[1]}; use the footage as it was calibrated."

@@ -15,9 +15,11 @@ from tricap.core.body.shape import default_shape
 from tricap.core.body.skeleton import bone_frames
 from tricap.core.body.skin.contour_skin import SkinSettings, body_skin
 from tricap.core.body.skin.extremities import shape_for_skin
-from tricap.core.body.skin.person_skin import rest_skin
+from tricap.core.body.skin.person_skin import REST, rest_skin, write_skin
+from tricap.core.body.skin.texture import TEXTURE
 from tricap.core.foundation import store
 from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Monitor
 
 from .conftest import FRAMES, SmallRun
 from .test_scene_body import animated, curves, world_vertices
@@ -114,6 +116,30 @@ def test_a_stout_knee_bends_as_far_as_a_slender_one(empty: ModuleType) -> None:
     body.pose.bones["shin.L"].rotation_euler[0] = np.radians(140)
     empty.context.view_layer.update()
     assert crossing_faces(empty, bent) == 0
+
+
+def test_the_texture_is_packed_and_exported(empty: ModuleType, small_run: SmallRun, tmp_path: Path) -> None:
+    from tricap.addon.retarget.export import export_file
+    from tricap.addon.scene.build import build_scene
+
+    shape, colour = shape_for_skin(small_run.shape, SkinSettings()), (200, 60, 20)  # RGB
+    made = rest_skin(shape, SkinSettings())
+    v = len(made.vertices_m)
+    write_skin(small_run.out / "skin" / REST, replace(made, relief_m=np.zeros(v), sigma_m=np.full(v, 0.003)))
+    cv2.imwrite(str(small_run.out / "skin" / TEXTURE), np.full((16, 16, 3), colour[::-1], np.uint8))
+    for _ in range(2):  # nothing of the first remains
+        build_scene(small_run.out)
+    images = [image for image in empty.data.images if image.packed_file]
+    skin_object = empty.data.objects["Skin"]
+    assert len(images) == 1 and skin_object.data.materials[0].node_tree.nodes.active.image is images[0]
+    assert np.allclose(np.array(images[0].pixels[:3]) * 255, colour, atol=1)
+    assert skin_object.data.attributes["sigma_m"].data[5].value == pytest.approx(0.003)
+    export_file(small_run.out, "glb", tmp_path / "a.glb", "plain", Monitor())
+    empty.ops.wm.read_factory_settings(use_empty=True)
+    empty.ops.import_scene.gltf(filepath=str(tmp_path / "a.glb"))
+    assert [tuple(image.size) for image in empty.data.images if image.packed_file] == [(16, 16)]
+    (small_run.out / "skin" / TEXTURE).write_bytes(b"no image")
+    assert any("no readable image" in w for w in build_scene(small_run.out).warnings)
 
 
 def test_one_skin_is_shown_and_metaballs_are_excluded_behind_it(empty: ModuleType, small_run: SmallRun) -> None:

@@ -49,6 +49,7 @@ class SkinSettings:
     )
     fair: bool = knob(True, "Smooth the rings and ledges that come from the metaballs.")
     relief: bool = knob(True, "Displace the skin to the measured surface of all frames.")
+    texture_px: int = knob(1024, "Width and height of the texture from the footage; 0: none.", unit="px", low=0, high=8192)
     mirror: bool = knob(False, "Where only the other side of the body was measured, use its relief, mirrored.")
 
 

@@ -50,6 +50,17 @@ def test_colour_becomes_luma(tmp_path: Path, dtype: type, channels: int) -> None
     assert np.allclose(got[0, [0, 3, 6]], [0.114 * 255, 0.587 * 255, 0.299 * 255], atol=0.6)  # Rec. 601; 8 bits are rounded
 
 
+@pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 3), (np.uint16, 4)])
+def test_colours_stay_colours(tmp_path: Path, dtype: type, channels: int) -> None:
+    top = np.iinfo(dtype).max
+    image = np.zeros((8, 9, channels), dtype)
+    image[:, :3, 0], image[:, 3:6, 1], image[:, 6:, 2] = top, top, top  # blue, green, red
+    got = ImageFiles((write(tmp_path / "a.png", image),), "*.png").read_colour(0)
+    assert got.dtype == np.float32 and got[0, [0, 3, 6]].tolist() == [[0, 0, 255], [0, 255, 0], [255, 0, 0]]
+    plain = ImageFiles((write(tmp_path / "b.png", image[:, :, 0]),), "*.png").read_colour(0)
+    assert plain.shape == (8, 9, 3) and (plain[:, :, 0] == plain[:, :, 2]).all()
+
+
 def test_floats_of_one_are_white() -> None:
     for dtype in (np.float32, np.float64):
         for shape in ((4, 5), (4, 5, 3)):
@@ -171,6 +182,7 @@ def test_a_movie_gives_the_frames_that_were_written_in_any_order(tmp_path: Path)
     assert movie.count == 7 and movie.files() == (path,)
     for i in (0, 1, 2, 6, 3, 3, 0, 5):
         assert np.abs(movie.read(i) - pictures[i]).mean() < 2.0, i  # neighbours differ by 20
+    assert np.abs(movie.read_colour(3).mean(axis=2) - pictures[3]).mean() < 2.0
     files = ImageFiles(tuple(write(tmp_path / f"{i}.png", p) for i, p in enumerate(pictures)), "*.png")
     assert max(float(np.abs(movie.read(i) - files.read(i)).mean()) for i in range(7)) < 2.0
 

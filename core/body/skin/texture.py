@@ -1,0 +1,263 @@
+"""The person's own texture: what the footage of all views and frames shows of the skin, on its texture coordinates.
+
+A texel is a place of the skin. In each frame it is projected into every view in which it is visible: it faces the camera, and nothing of
+the posed skin is nearer, with a margin at edges. Its colour there has the weight
+
+    w = (cos ϑ · f/z)² / (1 + (σ/σ_0)²) ,                                                                   (1)
+
+ϑ: angle between normal and ray, f/z: pixels per metre, σ: standard deviation of the skin's place there (relief). The `KEPT` colours of
+the largest weights are kept, divided by the exposure of their view, and averaged with weights that decrease with their distance from the
+average, so that a hand before the hip, or background beside a misplaced limb, counts little. The exposures g_v follow from the median
+ratios of vertices that two views show at the same time,
+
+    ln g_a − ln g_b = median ln(I_a / I_b) ,   Σ ln g_v = 0                                                 (2)
+
+Texels that no view showed, or whose place was not measured, get colours from around them: the solution of Laplace's equation on the skin
+with the colours of the texels that were seen as boundary values. The mask distinguishes both.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ...foundation import store
+from ...foundation.arrays import frozen
+from ...geometry.camera import Camera
+from ..shape import BodyShape
+from .closed_skin import OneSkin
+from .person_skin import cage
+from .posed import Poser
+from .surface_operators import laplacian, vertex_normals
+
+TEXTURE, MASK = "texture.png", "texture_mask.png"  # in the folder skin/
+LEAST_COSINE = 0.3  # between normal and ray
+KEPT = 8  # colours of a texel
+SHARPNESS = 1.0  # exponent of (1) in the average
+ROBUST_GREY = 40.0  # distance from the average at which a colour's weight is halved
+REWEIGHTINGS = 4
+SIGMA_M = 0.004  # σ_0 of (1)
+LEAST_TRUST = 0.2  # 1/(1 + (σ/σ_0)²): where less is known of the skin's place, σ > 8 mm, its colour may be the background's
+NEARER_M = 0.025  # by which another surface must be nearer to hide a texel
+EDGE_PX = 2  # margin at the edges of nearer surfaces
+DARKEST = 4.0  # grey values that count for the exposures
+FEWEST = 30  # common vertices of two views
+PADDING_PX = 6  # around the islands
+STIFF, WEAK = 100.0, 1e-6  # ties of vertices that were seen to their colours, and of all to the mean
+MOST_FRAMES = 24  # evenly over the take
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class View:
+    """The image of one view in one frame."""
+
+    camera: Camera
+    rgb: np.ndarray  # (h, w, 3) float32, 0…255
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Texture:
+    """A picture on the skin's texture coordinates; row 0 is at the top, v = 1."""
+
+    rgb: np.ndarray  # (S, S, 3) uint8
+    seen: np.ndarray  # (S, S) bool: from footage; elsewhere filled from around, or no part of the skin
+    covered: np.ndarray  # (S, S) bool: part of the skin
+    exposures: np.ndarray  # (K,) of the views, by which their colours were divided
+
+    def __post_init__(self) -> None:
+        side = self.rgb.shape[:2]
+        object.__setattr__(self, "rgb", frozen(self.rgb, (*side, 3), np.uint8, "rgb"))
+        object.__setattr__(self, "seen", frozen(self.seen, side, np.bool_, "seen"))
+        object.__setattr__(self, "covered", frozen(self.covered, side, np.bool_, "covered"))
+        object.__setattr__(self, "exposures", frozen(self.exposures, (None,), name="exposures"))
+
+
+class TextureBaker:
+    """Collects the colours of a skin, frame by frame."""
+
+    def __init__(self, skin: OneSkin, shape: BodyShape, size_px: int, views: int) -> None:
+        self._skin, self._poser, self._size = skin, Poser(shape, skin.weights), size_px
+        self._rows, self._cage = cage(skin)
+        self.texel, self._corners, self._shares = _texels(skin, size_px)
+        n = len(self.texel)
+        self._weight = np.zeros((n, KEPT), dtype=np.float32)
+        self._rgb = np.zeros((n, KEPT, 3), dtype=np.uint8)
+        self._view = np.zeros((n, KEPT), dtype=np.uint8)
+        sigma = skin.sigma_m if skin.sigma_m is not None else np.zeros(len(skin.vertices_m))
+        self._trust = 1 / (1 + (self._at(sigma) / SIGMA_M) ** 2)
+        self._ratios: dict[tuple[int, int], list[np.ndarray]] = {(a, b): [] for b in range(views) for a in range(b)}
+        self._views = views
+
+    def add(self, motion: np.ndarray, views: list[View]) -> None:
+        """The images of all views in one frame, in which the body has the pose `motion` (D,)."""
+        posed = self._poser.posed(self._skin.vertices_m, motion)
+        normals = vertex_normals(posed, self._skin.faces)
+        places, across = self._at(posed), self._at(normals)
+        on_cage = []
+        for v, view in enumerate(views):
+            depth = nearest_depth(view.camera, posed[self._rows], self._cage)
+            rows, xy, size = _visible(view.camera, places, across, depth)
+            self._keep(rows, _sampled(view, xy), (size * self._trust[rows]).astype(np.float32), v)
+            shown, xy, _ = _visible(view.camera, posed[self._rows], normals[self._rows], depth)
+            grey = np.full(len(self._rows), np.nan)
+            grey[shown] = _sampled(view, xy).mean(axis=1)
+            on_cage.append(grey)
+        for (a, b), found in self._ratios.items():
+            both = (on_cage[a] > DARKEST) & (on_cage[b] > DARKEST)
+            found.append(np.log(on_cage[a][both] / on_cage[b][both]))
+
+    def finished(self) -> Texture:
+        """The texture of what was added."""
+        gain = self._exposures()
+        seen = self._weight[:, 0] > 0
+        placed = seen & (self._trust > LEAST_TRUST)
+        seen = placed if placed.any() else seen
+        colour = np.zeros((len(self.texel), 3))
+        colour[seen] = self._averaged(np.flatnonzero(seen), gain)
+        colour[~seen] = self._filled(colour, seen)[~seen]
+        side = (self._size, self._size)
+        rgb, mask, covered = np.zeros((*side, 3)), np.zeros(side, dtype=bool), np.zeros(side, dtype=bool)
+        rgb.reshape(-1, 3)[self.texel] = colour
+        mask.ravel()[self.texel], covered.ravel()[self.texel] = seen, True
+        return Texture(rgb=_padded(np.clip(np.rint(rgb), 0, 255).astype(np.uint8), covered), seen=mask, covered=covered, exposures=gain)
+
+    def _at(self, values: np.ndarray) -> np.ndarray:
+        """Values (V, …) of the vertices at the texels (N, …)."""
+        return np.asarray(sum(self._shares[:, i].reshape(-1, *[1] * (values.ndim - 1)) * values[self._corners[:, i]] for i in range(3)))
+
+    def _keep(self, rows: np.ndarray, rgb: np.ndarray, weight: np.ndarray, view: int) -> None:
+        """Put colours in place of the ones with the smallest weights; slots are sorted, largest weight first."""
+        slot = KEPT - 1
+        better = weight > self._weight[rows, slot]
+        rows, rgb, weight = rows[better], rgb[better], weight[better]
+        self._weight[rows, slot], self._rgb[rows, slot], self._view[rows, slot] = weight, np.rint(rgb).astype(np.uint8), view
+        order = np.argsort(-self._weight[rows], axis=1, kind="stable")
+        for table in (self._weight, self._view):
+            table[rows] = np.take_along_axis(table[rows], order, axis=1)
+        self._rgb[rows] = np.take_along_axis(self._rgb[rows], order[:, :, None], axis=1)
+
+    def _exposures(self) -> np.ndarray:
+        """(K,) g of (2)."""
+        equations, right = [np.ones(self._views)], [0.0]
+        for (a, b), found in self._ratios.items():
+            ratios = np.concatenate(found) if found else np.zeros(0)
+            if len(ratios) >= FEWEST:
+                row = np.zeros(self._views)
+                row[a], row[b] = 1.0, -1.0
+                equations.append(row)
+                right.append(float(np.median(ratios)))
+        return np.exp(np.linalg.lstsq(np.stack(equations), np.array(right), rcond=None)[0])
+
+    def _averaged(self, rows: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """Colours (N, 3) of texels that were seen."""
+        rgb = self._rgb[rows] / gain[self._view[rows]][:, :, None]
+        weight = (self._weight[rows] / self._weight[rows, :1]) ** SHARPNESS
+        robust = weight
+        for _ in range(REWEIGHTINGS):
+            mean = np.einsum("nk,nkc->nc", robust, rgb) / robust.sum(axis=1, keepdims=True)
+            robust = weight / (1 + (np.linalg.norm(rgb - mean[:, None], axis=2) / ROBUST_GREY) ** 2)
+        return np.asarray(np.einsum("nk,nkc->nc", robust, rgb) / robust.sum(axis=1, keepdims=True))
+
+    def _filled(self, colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """Colours (N, 3) of all texels from a smooth continuation of those that were seen."""
+        from scipy import sparse
+        from scipy.sparse.linalg import splu
+
+        C, _ = laplacian(self._skin.vertices_m, self._skin.faces)
+        nearest = self._corners[np.arange(len(seen)), self._shares.argmax(axis=1)]
+        count = np.bincount(nearest[seen], minlength=len(self._skin.vertices_m))
+        total = np.stack([np.bincount(nearest[seen], colour[seen, k], len(self._skin.vertices_m)) for k in range(3)], axis=1)
+        middle = colour[seen].mean(axis=0) if seen.any() else np.full(3, 127.0)
+        tie = STIFF * (count > 0)
+        right = tie[:, None] * total / np.maximum(count, 1)[:, None] + WEAK * middle
+        return self._at(splu(sparse.csc_matrix(sparse.diags(tie + WEAK) - C), permc_spec="MMD_AT_PLUS_A").solve(right))
+
+
+def nearest_depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Depths (h, w) [m] of the nearest quads (F, 4) of a mesh, infinite where there is none: of each its mean, the farthest drawn first."""
+    width, height = camera.size_px
+    z = camera.to_camera(vertices_m)[:, 2]
+    with np.errstate(invalid="ignore"):
+        xy = camera.project(vertices_m)
+    corner = xy[faces]
+    a, b = corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1]
+    towards = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0) & (z[faces] > 0).all(axis=1) & np.isfinite(corner).all(axis=(1, 2))
+    inside = (corner.min(axis=1) < [width, height]).all(axis=1) & (corner.max(axis=1) > 0).all(axis=1)
+    drawn = np.flatnonzero(towards & inside)
+    far = z[faces[drawn]].mean(axis=1)
+    order = np.argsort(-far, kind="stable")
+    image = np.full((height, width), np.inf, dtype=np.float32)
+    places = np.ascontiguousarray(np.rint(16 * corner[drawn[order]]), dtype=np.int32)
+    for place, depth in zip(places, far[order].tolist()):
+        cv2.fillConvexPoly(image, place, depth, shift=4)
+    return image
+
+
+def _visible(camera: Camera, places: np.ndarray, normals: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rows (M,) of places (N, 3) that a view shows, their pixels (M, 2), and (cos ϑ f/z)² of (1)."""
+    ray = camera.centre_m - places
+    distance = np.linalg.norm(ray, axis=1)
+    cosine = np.einsum("nk,nk->n", ray, normals) / np.maximum(distance, 1e-9)
+    rows = np.flatnonzero(cosine > LEAST_COSINE)
+    xy = camera.project(places[rows])
+    inside = camera.sees(xy, EDGE_PX + 1)
+    rows, xy = rows[inside], xy[inside]
+    pixel = np.rint(xy).astype(np.int64)
+    near = cv2.erode(depth, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8))
+    z = camera.to_camera(places[rows])[:, 2]
+    free = (z > 0) & (z < near[pixel[:, 1], pixel[:, 0]] + NEARER_M)
+    rows, z = rows[free], z[free]
+    return rows, xy[free], (cosine[rows] * camera.focal_px / z) ** 2
+
+
+def _sampled(view: View, xy: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) at full-frame pixels (N, 2)."""
+    at = np.ascontiguousarray(xy, dtype=np.float32)
+    found = [
+        cv2.remap(view.rgb, part[:, None, 0], part[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        for part in (at[i : i + 30000] for i in range(0, len(at), 30000))  # of at most 32767 rows
+    ]
+    return np.concatenate(found) if found else np.zeros((0, 3), dtype=np.float32)
+
+
+def _texels(skin: OneSkin, size_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The texels (N,) that the skin covers, row · S + column, the vertices (N, 3) around each, and their weights (N, 3)."""
+    triangles = np.concatenate([skin.faces[:, [0, 1, 2]], skin.faces[:, [0, 2, 3]]])
+    uv = np.concatenate([skin.uv[:, [0, 1, 2]], skin.uv[:, [0, 2, 3]]])
+    xy = uv * [size_px, -size_px] + [-0.5, size_px - 0.5]  # texel centres at whole numbers, v upwards
+    owner = np.full((size_px, size_px), -1, dtype=np.int32)
+    for t, place in enumerate(np.ascontiguousarray(np.rint(16 * xy), dtype=np.int32)):
+        cv2.fillConvexPoly(owner, place, t, shift=4)
+    texel = np.flatnonzero(owner.ravel() >= 0)
+    triangle = owner.ravel()[texel]
+    at = np.stack([texel % size_px, texel // size_px], axis=1) - xy[triangle, 0]
+    e1, e2 = xy[triangle, 1] - xy[triangle, 0], xy[triangle, 2] - xy[triangle, 0]
+    area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    area = np.where(np.abs(area) < 1e-9, np.inf, area)
+    s = (at[:, 0] * e2[:, 1] - at[:, 1] * e2[:, 0]) / area
+    t = (e1[:, 0] * at[:, 1] - e1[:, 1] * at[:, 0]) / area
+    shares = np.clip(np.stack([1 - s - t, s, t], axis=1), 0, None)
+    return texel, triangles[triangle], shares / shares.sum(axis=1, keepdims=True)
+
+
+def _padded(rgb: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """The picture with the islands continued outwards, so that filters of renderers do not mix in what lies between them."""
+    found, there = rgb.copy(), covered.astype(np.uint8)
+    for _ in range(PADDING_PX):
+        count = cv2.boxFilter(there.astype(np.float32), -1, (3, 3), normalize=False)
+        total = cv2.boxFilter(found.astype(np.float32) * there[..., None], -1, (3, 3), normalize=False)
+        new = (there == 0) & (count > 0)
+        found[new] = np.rint(total[new] / count[new][:, None]).astype(np.uint8)
+        there[new] = 1
+    return found
+
+
+def write_texture(folder: Path, texture: Texture) -> None:
+    """Write texture.png, and texture_mask.png: white where the texture is from footage.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    for name, picture in ((TEXTURE, texture.rgb[:, :, ::-1]), (MASK, 255 * texture.seen.astype(np.uint8))):
+        store.write_bytes(folder / name, cv2.imencode(".png", picture)[1].tobytes())
