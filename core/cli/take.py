@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ..body.model_file import read_model
 from ..calibration.rig_files import read_any
+from ..fitting.settings import START_ALONE
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..take.bar_file import read_bar, write_bar
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     if rig and (bar := read_bar(args.rig, rig)):
         write_bar(folder / "rig.toml", rig, *bar)
     todo = [] if rig else ["copy or calibrate rig.toml into it"]
-    todo += ["click joints in Blender, or write them into its take.toml"] if take.body_model else []
+    todo += ["click joints in Blender, or write them into its take.toml"] if take.body_model and take.body_model not in START_ALONE else []
     return [
         f"{folder}: a take of {len(views)} views, {args.fps:g} images per second. Next: {', '.join([*todo, f'tricap check {folder}'])}."
     ]

@@ -28,7 +28,7 @@ from ..fitting.inputs.no_surface import background_regions, can_fit_without_surf
 from ..fitting.inputs.take_inputs import check_body, clicks_in, clicks_left_out, fit_input, missing_for_fit
 from ..fitting.inputs.track_guide import BodyGuide
 from ..fitting.stages.sequence import fit_sequence
-from ..fitting.stages.set_up import NobodyFound, with_start
+from ..fitting.stages.set_up import NeedsClick, NobodyFound, with_start
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..matching.foreground import Foreground
@@ -114,6 +114,8 @@ def fit(run: Run, monitor: Monitor) -> None:
         if clicks_in(run.footage):
             raise
         return _no_body(run, "no clicked joints", began, str(error))
+    except NeedsClick:
+        raise
     except InputError as error:
         raise with_cause(error, run.footage, run.measured.summaries[0].frame) if run.measured else error from error
     run.warn(*fit_warnings(body), *check_fit(given, body, run.settings["fitting"].click_sigma_px))

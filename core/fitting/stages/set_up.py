@@ -34,6 +34,10 @@ class NobodyFound(InputError):
     """There are too few clicks for a start, and no frame in which somebody can be found without them."""
 
 
+class NeedsClick(InputError):
+    """It is not certain how the person stands; the sentence asks for the click that decides."""
+
+
 def fit_context(given: FitInput, settings: FitSettings) -> FitContext:
     """What stays the same throughout the fit.
 
@@ -70,7 +74,7 @@ def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitI
 
     Raises:
         NobodyFound: no frame has enough points of a person.
-        InputError: it is not certain how the person stands: the sentence asks for the click that decides.
+        NeedsClick: it is not certain how the person stands.
         Cancelled: the user asked to stop.
     """
     if given.start is not None or not needs_start(given, settings):
@@ -82,7 +86,7 @@ def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitI
             "hips. Click at least two of its joints in two views each, under [seeds.joints] or in Blender (step 3)."
         )
     if start.probability < settings.least_start_probability:
-        raise InputError(start.question)
+        raise NeedsClick(start.question)
     return replace(given, start=start)
 
 
@@ -108,7 +112,8 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
         InputError: clicks contradict each other.
         Cancelled: the user asked to stop.
     """
-    model = given.model if given.model in (WHOLE, UPPER) else UPPER if "hip.L" not in _joints_of(given.model) else WHOLE
+    legs = any(name.startswith(("hip", "knee", "ankle")) for name in read_model(given.model).skeleton.joint_names)
+    model = given.model if given.model in START_ALONE else WHOLE if legs else UPPER
     given = given if model == given.model else replace(given, model=model, limits={}, locked=())
     clouds = given.clouds
 
@@ -156,10 +161,6 @@ def _context(given: FitInput, settings: FitSettings, model: BodyModel, shape: Bo
 
 def _model_shape(model: BodyModel, settings: FitSettings) -> BodyShape:
     return one_ball_shape(default_shape(model)) if settings.balls == "one" else default_shape(model)
-
-
-def _joints_of(model: str) -> tuple[str, ...]:
-    return read_model(model).skeleton.joint_names
 
 
 def _clicked(given: FitInput, names: tuple[str, ...], settings: FitSettings) -> tuple[dict[int, ClickedJoints], dict[int, np.ndarray]]:

@@ -23,15 +23,15 @@ from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
 from .pose_dictionary import known_poses
 from .refine import STAGE, Explanation, exchanged, of_hypothesis, thinned_points, with_lengths, with_limbs
-from .search import hypotheses, is_whole
+from .search import hypotheses, is_inside, is_whole
 
 LOOKED_AT, SEARCHED = 24, 2  # frames of which the easiest are chosen, and how many are searched
 APART = 0.25  # of the recording, between the frames that are searched
-TRIED, DIFFERENT_M, AMONG = 6, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
+TRIED, DIFFERENT_M, AMONG = 5, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
 COMPLETED = 3  # of them, whose limbs are looked for
 SAME_M = 0.15  # between the joints of explanations that are one
 TAU = 40.0  # voxels for a probability ratio of e
-FORWARD, MOST_FORWARD = 3.0, 1.5  # log odds per m/s of walking forwards, and at most
+FORWARD, MOST_FORWARD = 3.0, 1.0  # log odds per m/s of walking forwards, and at most
 TURN_S, MOST_AGREEMENT = 1.0, 5.0  # between frames in which a person faces about the same way; the most log odds from another frame
 WALK_S = 0.3  # before and after a frame, for the velocity
 LEAST_POINTS = 100  # of a frame, for a start
@@ -89,7 +89,10 @@ def find_start(
 
 
 def easiest_frames(fit: FitContext, points_of: Callable[[int], CloudPoints], count: int, monitor: Monitor) -> list[int]:
-    """The frame indices to search: those with clicks, or else the easiest ones apart from each other; only frames with enough points."""
+    """The frame indices to search: those with clicks, or else the easiest ones apart from each other.
+
+    Only frames with enough points, in which the image shows the person from the head downwards.
+    """
     some = sorted(fit.clicked) or np.unique(np.linspace(0, count - 1, min(LOOKED_AT, count)).round().astype(int)).tolist()
     ease = dict[int, float]()
     for i, t in enumerate(some):
@@ -99,9 +102,10 @@ def easiest_frames(fit: FitContext, points_of: Callable[[int], CloudPoints], cou
             ease[t] = _ease(fit, t, points)
     chosen: list[int] = []
     for t in sorted(ease, key=lambda t: -ease[t]):
-        if all(abs(t - other) >= APART * count for other in chosen):
+        apart = all(abs(t - other) >= APART * count for other in chosen)
+        if len(chosen) < SEARCHED and apart and is_inside(fit.seen(t, points_of(t))):
             chosen.append(t)
-    return chosen[:SEARCHED]
+    return chosen
 
 
 def _ease(fit: FitContext, t: int, points: CloudPoints) -> float:

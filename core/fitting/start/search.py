@@ -17,7 +17,7 @@ from ..explained import Evidence, body_gains
 from ..observations import ClickedJoints
 from ..state import BodyState, ShapeParameters
 
-HEADINGS = 20  # 18° apart: the adjustment converges from half of that
+HEADINGS = 16  # 22.5° apart: the adjustment converges from half of that
 WIDTH_M = 0.06  # of the weights of what a pose explains
 COARSER = 2  # times the evidence is thinned
 ALONG = np.array([0.1, 0.5, 0.9])  # of a bone, where its flesh is sampled
@@ -93,10 +93,20 @@ def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray, w
 
 def is_whole(evidence: Evidence) -> bool:
     """Whether the middle view shows the person down to the feet: the region does not touch the lower border of the image."""
-    if not evidence.cells:
-        return True
+    return not evidence.cells or not _at_borders(evidence)[1, 1]
+
+
+def is_inside(evidence: Evidence) -> bool:
+    """Whether no other border of the image than the lower one cuts the person in the middle view."""
+    return not evidence.cells or int(_at_borders(evidence).sum()) == int(_at_borders(evidence)[1, 1])
+
+
+def _at_borders(evidence: Evidence) -> np.ndarray:
+    """Whether the person's region in the middle view is at the borders (2, 2): left and upper, right and lower."""
     view = evidence.cells[len(evidence.cells) // 2]
-    return bool(view.xy_px[:, 1].max() < view.camera.size_px[1] - 1 - BORDER * view.distance.step_px)
+    near = BORDER * view.distance.step_px
+    size = np.array(view.camera.size_px)
+    return np.stack([view.xy_px.min(axis=0) < near, view.xy_px.max(axis=0) > size - 1 - near])
 
 
 def _region(evidence: Evidence, camera: Camera) -> _Region:

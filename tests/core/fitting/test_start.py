@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,6 +93,16 @@ def test_a_search_can_be_cancelled() -> None:
         find_joints(_input(_pose(0.0)), SETTINGS, monitor)
 
 
+def test_a_person_cut_by_the_image_is_not_looked_for() -> None:
+    def seen(low: tuple[float, float], high: tuple[float, float]) -> SimpleNamespace:
+        camera, distance = SimpleNamespace(size_px=(640, 480)), SimpleNamespace(step_px=4)
+        return SimpleNamespace(cells=[SimpleNamespace(xy_px=np.array([low, high]), camera=camera, distance=distance)])
+
+    assert search.is_inside(seen((100, 50), (300, 400))) and search.is_whole(seen((100, 50), (300, 400)))
+    assert search.is_inside(seen((100, 50), (300, 477))) and not search.is_whole(seen((100, 50), (300, 477)))
+    assert not any(search.is_inside(seen(*at)) for at in (((2, 50), (300, 400)), ((100, 2), (300, 400)), ((100, 50), (637, 400))))
+
+
 def test_a_start_is_needed_without_three_joints_of_the_trunk() -> None:
     given, at = _input(_pose(0.0)), dict(zip(NAMES, _joints(_pose(0.0))))
     clicks = {name: {c.name: c.project(xyz) for c in front_rig().cameras} for name, xyz in at.items()}
@@ -139,7 +150,7 @@ def test_probabilities_and_the_click_that_decides() -> None:
     assert len(frame.explanations) == 2 and np.allclose(frame.probability, [1 / (1 + np.exp(-1)), 1 / (1 + np.exp(1))])
     assert _decisive(frame, NAMES) == "wrist.R" and _difference(*frame.explanations, NAMES) == "where the right arm is"
     back = judged(_Fit(), [_explained(right, 1000.0), _explained(_turned(right), 1000.0)], np.array([0.0, -1.0, 0.0]))
-    assert back.probability[0] > 0.9 and back.explanations[0].joints_m is right  # who walks faces forwards
+    assert back.probability[0] > 0.85 and back.explanations[0].joints_m is right  # who walks faces forwards
     assert _difference(*back.explanations, NAMES) == "front and back"
 
 
