@@ -1,6 +1,7 @@
 """Packaging: what the extension's zip and the Python package hold, and that the set-up mends itself."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -221,3 +222,14 @@ def test_it_installs_as_the_package_tricap(tmp_path: Path) -> None:
     assert modules == ours | models | {"__init__.py", "__main__.py"}
     asked = subprocess.run([target / "bin" / "tricap", "--help"], env={"PYTHONPATH": str(target)}, capture_output=True, text=True)
     assert asked.returncode == 0 and "usage: tricap" in asked.stdout, asked.stderr
+
+
+def test_every_promise_of_the_security_page_names_tests_that_exist() -> None:
+    rows = [line for line in (ROOT / "docs" / "security.md").read_text(encoding="utf-8").splitlines() if line.startswith("| **")]
+    assert len(rows) > 10
+    for row in rows:
+        held = re.findall(r"`(tests/[\w/.]+)`", row)
+        assert held or "the same" in row, row
+        assert all((ROOT / name).is_file() for name in held), row
+    rules = (ROOT / "tests" / "test_architecture.py").read_text(encoding="utf-8")
+    assert all(f"def {rule}(" in rules for row in rows for rule in re.findall(r"\(`(\w+)`\)", row))

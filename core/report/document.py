@@ -1,6 +1,7 @@
 """One self-contained HTML document: style, pictures and graphs inside, no network. Readable in dark mode, on paper and on a phone."""
 
 import base64
+import hashlib
 import html
 from collections.abc import Iterable
 
@@ -24,10 +25,13 @@ figure,svg,tr{break-inside:avoid}}
 
 
 def document(title: str, body: str, script: str = "") -> str:
-    """The page. `title` is text, `body` HTML, `script` JavaScript of our own."""
+    """The page. `title` is text, `body` HTML, `script` JavaScript of our own. Its policy lets a browser run that script alone, and load
+    nothing."""
     code = f"<script>{script}</script>" if script else ""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}"><meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>{body}{code}</body></html>\n"
     )
 

@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -173,3 +174,18 @@ def test_the_summary() -> None:
     lost = Outcome(take="/t/bb", out="/o/bb", status=Status.LOST, said="")
     lines = summary([fine, lost])
     assert lines[0].startswith("a   done") and "61.0 s  fine" in lines[0] and lines[-1] == "2 takes: 1 done, 1 lost"
+
+
+def test_the_workers_of_this_machine_cannot_be_reached_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    import distributed
+
+    given: dict[str, Any] = {}
+
+    def cluster(**settings: Any) -> Any:
+        given.update(settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(distributed, "LocalCluster", cluster)
+    with pytest.raises(KeyboardInterrupt), batch._client(Engine(workers=1)):
+        pass
+    assert given["host"] == "127.0.0.1" and given["dashboard_address"] is None
