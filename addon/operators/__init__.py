@@ -3,7 +3,7 @@
 import bpy
 
 from .. import jobs
-from . import build_scene, import_tracks, run, stages
+from . import build_scene, control_rig, import_tracks, run, stages
 
 CLASSES = (
     run.LoadSample,
@@ -12,6 +12,7 @@ CLASSES = (
     stages.Fit,
     run.Run,
     build_scene.BuildScene,
+    *control_rig.CLASSES,
     import_tracks.ImportTracks2d,
     run.Cancel,
 )

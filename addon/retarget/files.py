@@ -17,7 +17,7 @@ from ...core.motion.retarget.rest_pose import with_person_like_rest
 from ...core.motion.retarget.rig import Motion
 from ...core.motion.retarget.roles import read_humanoid
 from ...core.motion.sources import read_motion_source
-from ..scene.armature import ROLES_KEY
+from ..scene.armature import ROLES_KEY, SNAPS_KEY
 from .build import build_armature
 from .programs import is_imported_by_blender
 from .read import action_frames, read_motion, read_rig, with_residual_motion
@@ -63,7 +63,8 @@ def open_moving(path: Path) -> bpy.types.Object:
         InputError: it cannot be read, or has no such armature or several.
     """
     open_rig(path)
-    moving = [o for o in bpy.data.objects if o.type == "ARMATURE" and (data := o.animation_data) and (data.action or data.nla_tracks)]
+    armatures = [o for o in bpy.data.objects if o.type == "ARMATURE" and SNAPS_KEY not in o]  # those of a body count, not their controls
+    moving = [o for o in armatures if (data := o.animation_data) and (data.action or data.nla_tracks)]
     if len(moving) != 1:
         raise InputError(f"{path.name} has {len(moving)} armatures with an action; it must have exactly one.")
     if path.suffix.lower() != ".blend":

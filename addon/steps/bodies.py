@@ -12,6 +12,7 @@ from ...core.run.stages import STAGE_INPUTS
 from .. import clicks, project, properties
 from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
+from ..operators import control_rig
 from ..panels import sentence
 from ..retarget.panel import draw_retarget
 from ..scene import metaballs, standing
@@ -177,12 +178,13 @@ def _stage(layout: bpy.types.UILayout, context: bpy.types.Context, step: str, op
 
 
 def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -> None:
-    """Build the scene, whose options are in the redo panel (F9); what carries the path; show its metaballs."""
+    """Build the scene, whose options are in the redo panel (F9); what carries the path; its control rig; show its metaballs."""
     column = layout.column()
     column.enabled = watch.current(context.scene).states["surface"].status != Status.EMPTY or bool(context.scene.tricap.out)
     primary(column, "tricap.build_scene", is_next, icon="OUTLINER_OB_ARMATURE", text="Build Rig and Scene")
     if any(standing.bodies(context.scene)):
         layout.prop(context.scene.tricap, "path")
+        control_rig.draw(layout, context)
     if metaballs.exist(context.scene):
         layout.prop(context.scene.tricap, "show_metaballs")
 

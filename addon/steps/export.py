@@ -16,6 +16,7 @@ from ..retarget.export import BY_BLENDER, export_file, export_played, named_for
 from ..retarget.operators import armature_of
 from ..retarget.programs import PROGRAMS
 from ..retarget.properties import EXPORTED
+from ..scene.armature import SNAPS_KEY
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 KINDS = (
@@ -96,7 +97,7 @@ class Export(JobOperator, bpy.types.Operator):
         chosen = context.scene.tricap_retarget.export
         if self.armature or chosen is not None:
             return armature_of(self.armature, chosen, "armature to export")
-        armatures = [o for o in context.scene.objects if o.type == "ARMATURE"]
+        armatures = [o for o in context.scene.objects if o.type == "ARMATURE" and SNAPS_KEY not in o]
         if not armatures:
             raise InputError("The scene has no armature to export. Build the rig first (step 7), or choose Measured Motion.")
         if len(armatures) > 1:

@@ -93,10 +93,22 @@ def test_the_rest_pose_stands_on_the_floor_and_the_root_carries_the_path(empty: 
     assert {bone.color.palette for bone in body.data.bones} == {"THEME01", "THEME04", "THEME09"}
 
 
-def test_the_path_moves_to_the_object_and_back_with_its_edits(blender: ModuleType, out: Path) -> None:
-    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
-    assert blender.ops.tricap.build_scene(out=str(out)) == {"FINISHED"}
-    scene, body = blender.context.scene, blender.data.objects["Body"]
+def walker(bpy: ModuleType) -> Any:
+    """The walking person in an empty scene, without a skin."""
+    from tricap.addon.scene import action, armature
+    from tricap.addon.scene.standing import Standing
+
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    scene, shape = bpy.context.scene, default_shape(read_model("full"))
+    stand = Standing(lift_m=0.96, floor_m=FLOOR_M)
+    body, values = armature.add_armature(scene.collection, shape, stand), walk(shape, 0.96)
+    action.add_action(body, shape, np.arange(FRAMES), shape.skeleton.dof_names, values, np.full(values.shape, 0.01), stand)
+    scene.frame_start, scene.frame_end = 0, FRAMES - 1
+    return body
+
+
+def test_the_path_moves_to_the_object_and_back_with_its_edits(blender: ModuleType) -> None:
+    body, scene = walker(blender), blender.context.scene
     names = ("pelvis", "hand.R")
     curve = body.animation_data.action.fcurve_ensure_for_datablock(body, 'pose.bones["root"].location', index=0)
     for point in curve.keyframe_points:

@@ -1,0 +1,77 @@
+"""bpy.ops.tricap.make_control_rig(), bpy.ops.tricap.snap_limbs(to="IK", limbs="upper_arm.L, thigh.R")"""
+
+import bpy
+
+from ...core.foundation.errors import InputError
+from ..retarget import control_rig
+from ..scene import standing
+
+
+def body_of(context: bpy.types.Context) -> bpy.types.Object:
+    """Tricap's body that is selected, else the first one of the scene.
+
+    Raises:
+        InputError: there is none that stands on a floor.
+    """
+    bodies = list(standing.bodies(context.scene))
+    if not bodies:
+        raise InputError("A control rig needs a whole body; build the rig of a fitted person first (step 7).")
+    return next((body for body in bodies if body.select_get()), bodies[0])
+
+
+class MakeControlRig(bpy.types.Operator):
+    """Make controls with IK and FK by Rigify. The measured motion is their base layer, with an empty layer for corrections over it"""
+
+    bl_idname = "tricap.make_control_rig"
+    bl_label = "Make Control Rig"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Make it."""
+        try:
+            if context.mode != "OBJECT":
+                bpy.ops.object.mode_set(mode="OBJECT")
+            made = control_rig.make_control_rig(body_of(context))
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"“{made.rig.name}” plays the motion within {made.angle_deg:.3f}° and {made.place_mm:.2f} mm.")
+        return {"FINISHED"}
+
+
+class SnapLimbs(bpy.types.Operator):
+    """Switch arms and legs between IK and FK in this frame, without moving the body. Auto Keying keys the controls"""
+
+    bl_idname = "tricap.snap_limbs"
+    bl_label = "Snap Limbs"
+    bl_options = {"REGISTER", "UNDO"}
+
+    to: bpy.props.EnumProperty(name="To", items=[("IK", "IK", "Pose limbs by hand and foot"), ("FK", "FK", "Pose limbs by rotations")])  # type: ignore[valid-type]
+    limbs: bpy.props.StringProperty(name="Limbs", description="Such as upper_arm.L, thigh.R; empty: all four")  # type: ignore[valid-type]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Do it."""
+        limbs = [limb.strip() for limb in self.limbs.split(",") if limb.strip()]
+        try:
+            count = control_rig.snap(body_of(context), self.to, limbs)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{count} limbs are in {self.to} now.")
+        return {"FINISHED"}
+
+
+def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The buttons of the control rig in step 7."""
+    body = next(standing.bodies(context.scene), None)
+    if body is None:
+        return
+    if control_rig.rig_of(body) is None:
+        layout.operator("tricap.make_control_rig", icon="OUTLINER_OB_ARMATURE")
+        return
+    row = layout.row(align=True)
+    for to in ("IK", "FK"):
+        row.operator("tricap.snap_limbs", text=f"Snap to {to}", icon="SNAP_ON").to = to
+
+
+CLASSES = (MakeControlRig, SnapLimbs)

@@ -1,0 +1,90 @@
+"""*Make Control Rig*: Rigify's controls play the motion and drive the body; IK and FK snap to each other; corrections are layered."""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tricap.core.geometry.rotation import angle_of, transposed
+from tricap.core.motion.formats.bvh import read_bvh
+
+from .test_scene_standing import FRAMES, walker
+
+ANGLE_DEG, PLACE_M = 0.2, 1e-3  # promised of the motion; measured 6e-5° and 5e-7 m
+SNAP_DEG, SNAP_M = 0.1, 1e-4  # promised of snapping; measured 4e-5° and 4e-7 m
+
+
+def pose(body: Any) -> tuple[np.ndarray, np.ndarray]:
+    """World rotations (B, 3, 3) and heads (B, 3) of the body's bones now."""
+    M = np.array([body.matrix_world @ bone.matrix for bone in body.pose.bones])
+    return M[:, :3, :3], M[:, :3, 3]
+
+
+def check_same(found: tuple[np.ndarray, np.ndarray], wanted: tuple[np.ndarray, np.ndarray], angle_deg: float, place_m: float) -> None:
+    assert np.degrees(angle_of(transposed(found[0]) @ wanted[0])).max() < angle_deg
+    assert np.abs(found[1] - wanted[1]).max() < place_m
+
+
+def test_the_controls_play_the_motion_and_limbs_snap(blender: ModuleType, tmp_path: Path) -> None:
+    body, scene = walker(blender), blender.context.scene
+    bend(body)
+    wanted = []
+    for frame in range(FRAMES):
+        scene.frame_set(frame)
+        wanted.append(pose(body))
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    rig = blender.data.objects["Body controls"]
+    assert {"upper_arm_fk.L", "hand_ik.R", "foot_ik.L", "pelvis", "root"} <= set(rig.pose.bones.keys())
+    data = rig.animation_data
+    assert len(data.nla_tracks) == 1 and data.nla_tracks[0].lock and data.action.name == "Corrections" and not data.action.layers
+    for frame in range(FRAMES):
+        scene.frame_set(frame)
+        check_same(pose(body), wanted[frame], ANGLE_DEG, PLACE_M)
+    scene.frame_set(7)
+    for to, switch in (("IK", 0.0), ("FK", 1.0)):
+        assert blender.ops.tricap.snap_limbs(to=to) == {"FINISHED"}
+        assert rig.pose.bones["thigh_parent.L"]["IK_FK"] == switch
+        check_same(pose(body), wanted[7], SNAP_DEG, SNAP_M)
+    a_correction_is_layered_and_exported(blender, rig, body, wanted, tmp_path)
+    with pytest.raises(RuntimeError, match="has the control rig “Body controls” already"):
+        blender.ops.tricap.make_control_rig()
+    with pytest.raises(RuntimeError, match="no limb “tail”"):
+        blender.ops.tricap.snap_limbs(to="IK", limbs="tail")
+
+
+def bend(body: Any) -> None:
+    """Give elbows, forearms and knees angles, as a measurement does."""
+    for name, angles in {"forearm.R": (1.2, 0.5), "forearm.L": (0.7, -0.4), "shin.R": (0.9, 0.1), "shin.L": (0.02, 0.0)}.items():
+        for index, angle in enumerate(angles):
+            curve = body.animation_data.action.fcurve_ensure_for_datablock(body, f'pose.bones["{name}"].rotation_euler', index=index)
+            for k, point in enumerate(curve.keyframe_points):
+                point.co.y += angle * (0.8 + 0.02 * k)
+
+
+def a_correction_is_layered_and_exported(bpy: ModuleType, rig: Any, body: Any, wanted: list[Any], folder: Path) -> None:
+    from mathutils import Quaternion
+
+    bpy.context.scene.frame_set(5)
+    bone = rig.pose.bones["upper_arm_fk.L"]
+    bone.rotation_quaternion = bone.rotation_quaternion @ Quaternion((1, 0, 0), 0.3)
+    bone.keyframe_insert("rotation_quaternion")
+    for frame in (0, 5, 11):  # the same correction everywhere, over the motion
+        bpy.context.scene.frame_set(frame)
+        row = list(body.pose.bones.keys()).index("upper_arm.L")
+        turned = np.degrees(angle_of(pose(body)[0][row].T @ wanted[frame][0][row]))
+        assert turned == pytest.approx(np.degrees(0.3), abs=0.5)
+    assert bpy.ops.tricap.export(kind="bvh", filepath=str(folder / "a.bvh")) == {"FINISHED"}
+    found = read_bvh(folder / "a.bvh", unit_m=1.0, up="Y")
+    hand = list(body.pose.bones.keys()).index("hand.L")
+    assert np.abs(found.head_m[11, found.rig.index["hand.L"]] - pose(body)[1][hand]).max() < 1e-4
+
+
+def test_a_control_rig_needs_a_whole_body(blender: ModuleType, small_run: Any) -> None:
+    blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    assert blender.ops.tricap.build_scene(out=str(small_run.out)) == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="needs a whole body"):
+        blender.ops.tricap.make_control_rig()
+    with pytest.raises(RuntimeError, match="needs a whole body"):
+        blender.ops.tricap.snap_limbs(to="FK")
