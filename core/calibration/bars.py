@@ -20,6 +20,7 @@ The focal length does not follow from the fundamental matrix when the axes of th
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ from ..foundation.arrays import frozen
 from ..geometry.camera import Camera
 from ..geometry.robust import mad_sigma
 from ..geometry.small_matrices import invert_spd
-from .bundle import Network
+from .network import BarNetwork
 
 REWEIGHTINGS = 4  # of (4)
 PAIR_TOLERANCE = 0.008  # of the image width: the points are still distorted
@@ -169,6 +170,11 @@ class BarObservations:
     frames: np.ndarray  # (N,) frame numbers
     labelled: bool = True
 
+    noun: ClassVar[str] = "bar"
+    tested_together: ClassVar[tuple[int, ...]] = (1, 2)
+    fewest_positions: ClassVar[int] = 10
+    good_positions: ClassVar[int] = 100
+
     def __post_init__(self) -> None:
         C = len(self.names)
         object.__setattr__(self, "size_px", frozen(self.size_px, (C, 2), name="size_px"))
@@ -184,6 +190,32 @@ class BarObservations:
     def complete(self) -> np.ndarray:
         """(N, C) whether both ends are visible."""
         return self.visible.all(axis=-1)
+
+    @property
+    def described(self) -> dict[str, float]:
+        """The length, for files."""
+        return {"bar_length_m": self.length_m}
+
+    @property
+    def tested_pairs(self) -> tuple[tuple[int, int, float], ...]:
+        """The two ends and the length."""
+        return ((0, 1, self.length_m),)
+
+    def views(self, used: np.ndarray) -> np.ndarray:
+        """(N, C) whether both ends are used."""
+        return used.all(axis=2)
+
+    def measured(self, used: np.ndarray) -> np.ndarray:
+        """(N,) whether each end is used in two cameras at least."""
+        return (used.sum(axis=1) >= 2).all(axis=1)
+
+    def supported(self, used: np.ndarray) -> np.ndarray:
+        """`used` without the ends that fewer than two cameras show."""
+        return enough_rays(used)
+
+    def meeting(self, cameras: tuple[Camera, ...], tolerance_px: float) -> np.ndarray:
+        """The image points (N, C, 2) of ends whose rays meet within the tolerance."""
+        return met_ends(cameras, self, tolerance_px)[1]
 
     def part(self, positions: np.ndarray | Sequence[int]) -> "BarObservations":
         """Some of the positions: indices or a mask (N,)."""
@@ -201,7 +233,7 @@ class BarObservations:
         )
 
 
-def with_bars(network: Network, observations: BarObservations, tolerance_px: float = TOLERANCE_PX) -> tuple[Network, np.ndarray]:
+def with_bars(network: BarNetwork, observations: BarObservations, tolerance_px: float = TOLERANCE_PX) -> tuple[BarNetwork, np.ndarray]:
     """The cameras of `network` with the bar positions of `observations`, and which image points (N, C, 2) fit them.
 
     As `met_ends`; a bar of the wrong length loses the end with fewer rays, or both.
@@ -293,7 +325,7 @@ def enough_rays(used: np.ndarray) -> np.ndarray:
     return used & (used.sum(axis=1, keepdims=True) >= 2)
 
 
-def _bars(network: Network, ends: np.ndarray, used: np.ndarray) -> tuple[Network, np.ndarray]:
+def _bars(network: BarNetwork, ends: np.ndarray, used: np.ndarray) -> tuple[BarNetwork, np.ndarray]:
     """Middles and directions of ends (N, 2, 3); where only one end is known, the direction is arbitrary."""
     known = used.any(axis=1)  # (N, 2)
     difference = ends[:, 0] - ends[:, 1]
@@ -306,7 +338,7 @@ def _bars(network: Network, ends: np.ndarray, used: np.ndarray) -> tuple[Network
     return replace(network, middle=middle, direction=direction), used
 
 
-def labelled_ends(network: Network, observations: BarObservations, tolerance_px: float) -> BarObservations:
+def labelled_ends(network: BarNetwork, observations: BarObservations, tolerance_px: float) -> BarObservations:
     """The observations with the ends in the same order in all cameras: at each position the order that fits the cameras best.  (2)"""
     cameras = network.cameras(observations.names, observations.size_px)
     C, N = len(cameras), len(observations.xy_px)

@@ -1,27 +1,27 @@
-"""Self-calibrating bundle adjustment of a reference bar (Maas 1998; D'Apuzzo et al. 2000, §2.2), points eliminated by Schur's complement.
+"""Self-calibrating bundle adjustment of a reference bar (Maas 1998; D'Apuzzo et al. 2000, §2.2) or a board, by Schur's complement.
 
-A bar position i is a middle M_i and a unit vector d_i; its length L holds exactly, and no weight mixes millimetres with pixels:
-
-    X_i± = M_i ± (L / 2) d_i                                                   (1)   5 unknowns
-    x_ick + v = F_c(X_ik) ,   Σ w v² + Σ ((p − p0) / σ_p)² s² → min            (2)   6 + up to 10 unknowns per camera
+    x_ick + v = F_c(X_ik) ,   Σ w v² + Σ ((p − p0) / σ_p)² s² → min            (1)   6 + up to 10 unknowns per camera; X_ik: `network`
     [V  W ] [Δc]   [g_c]
-    [Wᵀ U ] [Δb] = [g_b] ,   U_i = L_i L_iᵀ ,   Y_i = L_i⁻¹ W_iᵀ                (3)   U: 5×5 blocks
-    S = V − Σ Y_iᵀ Y_i ,   S Δc = g_c − Σ Y_iᵀ L_i⁻¹ g_i                       (4)
-    (S + μ G Gᵀ) Δc = …                                                        (5)   G: turning and shifting the whole (free network)
+    [Wᵀ U ] [Δb] = [g_b] ,   U_i = L_i L_iᵀ ,   Y_i = L_i⁻¹ W_iᵀ                (2)   U: q×q blocks, q unknowns of a position
+    S = V − Σ Y_iᵀ Y_i ,   S Δc = g_c − Σ Y_iᵀ L_i⁻¹ g_i                       (3)
+    (S + μ G Gᵀ) Δc = …                                                        (4)   G: turning and shifting the whole (free network)
 
-The second sum of (2) is the prior of the interior unknowns, as pseudo-observations (`reference_bar.lens_prior`); s is the sigma of the
-image points. The scale comes from L, so G has six columns. All normal equations are float64; one step costs O(N C²). Internally, positions
-are the last axis of every array and are processed in blocks: the small products of (3) and (4) then run over many positions at once, which
-is several times as fast as one position after the other.
+The second sum of (1) is the prior of the interior unknowns, as pseudo-observations (`reference_bar.lens_prior`); s is the sigma of the
+image points. The scale comes from the object, so G has six columns. All normal equations are float64; one step costs O(N C² + N C K).
+Internally, positions are the last axis of every array and are processed in blocks: the small products of (2) and (3) then run over many
+positions at once, which is several times as fast as one position after the other.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
-from ..geometry.camera import INTERIOR, Camera, camera_of, columns_of_derivatives, columns_of_exterior, image_of, interior_of
+from ..geometry.camera import INTERIOR, columns_of_derivatives, columns_of_exterior, image_of
 from ..geometry.rotation import cross_matrix, rotation_from_vector
+from .network import Network
+
+AnyNetwork = TypeVar("AnyNetwork", bound=Network)
 
 BLOCK = 256  # positions
 BEHIND_PX = 1e4  # residual of a point behind the camera
@@ -30,46 +30,6 @@ DAMPING = 1e-3  # of the first step, relative to the diagonal of the normal matr
 MIN_DAMPING = 1e-9
 MAX_DAMPING = 1e6  # no step lowers the sum of squares any more
 CONVERGED = 1e-4  # decrease of the sum of squares in units of σ0² per unknown
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Network:
-    """Cameras and bar positions: the unknowns of the adjustment."""
-
-    interior: np.ndarray  # (C, 10), see INTERIOR
-    R: np.ndarray  # (C, 3, 3) world → camera
-    t: np.ndarray  # (C, 3) m
-    middle: np.ndarray  # (N, 3) m
-    direction: np.ndarray  # (N, 3) unit vectors from end 1 to end 0
-    length_m: float
-
-    @property
-    def ends_m(self) -> np.ndarray:
-        """(N, 2, 3) the bar's ends.  (1)"""
-        half = self.direction * (self.length_m / 2)
-        return np.stack([self.middle + half, self.middle - half], axis=1)
-
-    def cameras(self, names: Sequence[str], size_px: np.ndarray) -> tuple[Camera, ...]:
-        """The cameras as values of the geometry package."""
-        return tuple(
-            camera_of(name, (int(size[0]), int(size[1])), p, R, t)
-            for name, size, p, R, t in zip(names, size_px, self.interior, self.R, self.t)
-        )
-
-    def blocks(self) -> Iterator[tuple[slice, "Network"]]:
-        """Blocks of positions, each with its part of the network."""
-        for start in range(0, len(self.middle), BLOCK):
-            at = slice(start, start + BLOCK)
-            yield at, replace(self, middle=self.middle[at], direction=self.direction[at])
-
-    def with_cameras(self, cameras: Sequence[Camera]) -> "Network":
-        """The same positions with other cameras."""
-        return replace(
-            self,
-            interior=np.stack([interior_of(c) for c in cameras]),
-            R=np.stack([c.R_cam_world for c in cameras]),
-            t=np.stack([c.t_cam_world_m for c in cameras]),
-        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -92,20 +52,20 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Normals:
-    """The normal equations at one state, reduced to the cameras: (3), (4)."""
+    """The normal equations at one state, reduced to the cameras: (2), (3)."""
 
     V: np.ndarray  # (C p, C p)
     g_c: np.ndarray  # (C p,)
-    U: np.ndarray  # (5, 5, N)
-    g_b: np.ndarray  # (5, N)
-    W: np.ndarray  # (5, C p, N), transposed: its rows are the bars' unknowns
+    U: np.ndarray  # (q, q, N)
+    g_b: np.ndarray  # (q, N)
+    W: np.ndarray  # (q, C p, N), transposed: its rows are the positions' unknowns
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Adjusted:
-    """An adjusted network. `residual_px` (N, C, 2, 2) observed − computed; `weight` (N, C, 2), 0: not used."""
+class Adjusted(Generic[AnyNetwork]):
+    """An adjusted network. `residual_px` (N, C, K, 2) observed − computed; `weight` (N, C, K), 0: not used."""
 
-    network: Network
+    network: AnyNetwork
     residual_px: np.ndarray
     weight: np.ndarray
     cost: float
@@ -123,23 +83,22 @@ class LevenbergMarquardt:
 
 
 def residuals(network: Network, xy_px: np.ndarray) -> np.ndarray:
-    """Observed − computed (N, C, 2, 2); NaN where there is no observation, huge where a point lies behind its camera."""
+    """Observed − computed (N, C, K, 2); NaN where there is no observation, huge where a point lies behind its camera."""
     p = _in_cameras(network)
     ahead = p[:, 2:] > NEAREST_M
-    image = image_of(network.interior, np.moveaxis(np.where(ahead, p, 1.0), 1, 2))  # (C, 2 N, 2)
-    image = np.where(ahead[:, 0, :, None], image, BEHIND_PX).reshape(len(p), 2, -1, 2)
+    image = image_of(network.interior, np.moveaxis(np.where(ahead, p, 1.0), 1, 2))  # (C, K N, 2)
+    image = np.where(ahead[:, 0, :, None], image, BEHIND_PX).reshape(len(p), xy_px.shape[2], -1, 2)
     with np.errstate(invalid="ignore"):
         return np.clip(xy_px - image.transpose(2, 0, 1, 3), -BEHIND_PX, BEHIND_PX)
 
 
 def _in_cameras(network: Network) -> np.ndarray:
-    """The ends in each camera's frame (C, 3, 2 N): end 0 of all bars, then end 1.  (1)"""
-    middle, half = network.middle.T, network.direction.T * (network.length_m / 2)
-    return network.R @ np.concatenate([middle + half, middle - half], axis=1) + network.t[..., None]
+    """The object's points in each camera's frame (C, 3, K N): point 0 of all positions, then point 1 …"""
+    return network.R @ network.columns_m.reshape(3, -1) + network.t[..., None]
 
 
 def weights_of(residual_px: np.ndarray, cauchy_px: float | None, used: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weights (N, C, 2) of the image points and their part of the sum (2); Cauchy's weights if a width is given (Huber 1981)."""
+    """Weights (N, C, K) of the image points and their part of the sum (1); Cauchy's weights if a width is given (Huber 1981)."""
     square = np.where(used, np.sum(np.nan_to_num(residual_px) ** 2, axis=-1), 0.0)
     if cauchy_px is None:
         return used.astype(np.float64), float(square.sum())
@@ -147,39 +106,26 @@ def weights_of(residual_px: np.ndarray, cauchy_px: float | None, used: np.ndarra
     return used / (1 + u), float(cauchy_px**2 * np.log1p(u).sum())
 
 
-def tangents(direction: np.ndarray) -> np.ndarray:
-    """Two unit vectors (2, 3, N) perpendicular to each direction (N, 3) and to each other (Duff et al. 2017)."""
-    x, y, z = direction.T
-    sign = np.copysign(1.0, z)
-    a = -1 / (sign + z)
-    b = x * y * a
-    return np.array([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]])
-
-
 def design(network: Network, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image points (C, 2, 2, N) (x and y, ends, positions) and their derivatives to the free camera unknowns (C, p, 2, 2, N) and to
-    those of the bar (C, 5, 2, 2, N)."""
+    """Image points (C, 2, K, N) (x and y, points, positions) and their derivatives to the free camera unknowns (C, p, 2, K, N) and to
+    those of the position (C, q, 2, K, N)."""
     p = _in_cameras(network)
-    C, N = len(p), len(network.middle)
+    C, N = len(p), network.count
     p = np.where(p[:, 2:] > NEAREST_M, p, [[0.0], [0.0], [1e3]])
     image, J_interior, G = columns_of_derivatives(network.interior, p)
     J = np.concatenate([J_interior[:, np.flatnonzero(unknowns.free)], columns_of_exterior(G, p)], axis=1)
-    GR = (network.R.transpose(0, 2, 1)[:, None] @ G).reshape(C, 2, 3, 2, N).swapaxes(1, 2)
-    B = np.empty((C, 5, 2, 2, N))
-    B[:, :3] = GR
-    for i, tangent in enumerate(tangents(network.direction) * (network.length_m / 2)):
-        B[:, 3 + i] = GR[:, 0] * tangent[0] + GR[:, 1] * tangent[1] + GR[:, 2] * tangent[2]
-    B[:, 3:, :, 1] *= -1
-    return image.reshape(C, 2, 2, N), J.reshape(C, -1, 2, 2, N), B
+    K = p.shape[-1] // max(N, 1)
+    GR = (network.R.transpose(0, 2, 1)[:, None] @ G).reshape(C, 2, 3, K, N).swapaxes(1, 2)
+    return image.reshape(C, 2, K, N), J.reshape(C, -1, 2, K, N), network.derivatives(GR)
 
 
 def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarray, unknowns: Unknowns, unit_px: float) -> Normals:
-    """The normal equations (3) with pseudo-observations; `unit_px` is the sigma s of an image coordinate."""
+    """The normal equations (2) with pseudo-observations; `unit_px` is the sigma s of an image coordinate."""
     from scipy.linalg import block_diag
 
-    C, N, p = len(network.R), len(network.middle), len(unknowns.columns)
+    C, N, p, q = len(network.R), network.count, len(unknowns.columns), network.unknowns
     V, g_c = np.zeros((C, p, p)), np.zeros((C, p))
-    U, g_b, W = np.empty((5, 5, N)), np.empty((5, N)), np.empty((5, C, p, N))
+    U, g_b, W = np.empty((q, q, N)), np.empty((q, N)), np.empty((q, C, p, N))
     for at, part in network.blocks():
         J, B, v = _weighted(part, residual_px[at], weight[at], unknowns)
         flat = J.reshape(C, p, -1)
@@ -188,20 +134,20 @@ def normal_equations(network: Network, residual_px: np.ndarray, weight: np.ndarr
         U[..., at] = np.einsum("ckrn,clrn->kln", B, B)
         g_b[:, at] = np.einsum("ckrn,crn->kn", B, v)
         W[..., at] = np.einsum("ckrn,cprn->kcpn", B, J)
-    normals = Normals(V=block_diag(*V), g_c=g_c.ravel(), U=U + 1e-3 * np.eye(5)[..., None], g_b=g_b, W=W.reshape(5, C * p, N))
+    normals = Normals(V=block_diag(*V), g_c=g_c.ravel(), U=U + 1e-3 * np.eye(q)[..., None], g_b=g_b, W=W.reshape(q, C * p, N))
     _add_pseudo_observations(normals.V, normals.g_c, network, unknowns, unit_px)
     return normals
 
 
 def _weighted(network: Network, residual_px: np.ndarray, weight: np.ndarray, unknowns: Unknowns) -> tuple[np.ndarray, ...]:
-    """Derivatives (C, p, 4, N), (C, 5, 4, N) and residuals (C, 4, N), times the square roots of the weights."""
+    """Derivatives (C, p, 2 K, N), (C, q, 2 K, N) and residuals (C, 2 K, N), times the square roots of the weights."""
     _, J, B = design(network, unknowns)
     root = np.sqrt(weight.transpose(1, 2, 0))[:, None]  # (C, 1, 2, N)
     v = np.where(weight[..., None] > 0, residual_px, 0.0).transpose(1, 3, 2, 0) * root
     J *= root[:, None]
     B *= root[:, None]
-    C, p, _, _, N = J.shape
-    return J.reshape(C, p, 4, N), B.reshape(C, 5, 4, N), v.reshape(C, 4, N)
+    C, p, _, K, N = J.shape
+    return J.reshape(C, p, 2 * K, N), B.reshape(C, -1, 2 * K, N), v.reshape(C, 2 * K, N)
 
 
 def _add_pseudo_observations(V: np.ndarray, g_c: np.ndarray, network: Network, unknowns: Unknowns, unit_px: float) -> None:
@@ -215,7 +161,7 @@ def _add_pseudo_observations(V: np.ndarray, g_c: np.ndarray, network: Network, u
 
 
 def pseudo_cost(network: Network, unknowns: Unknowns, unit_px: float) -> float:
-    """The second sum of (2)."""
+    """The second sum of (1)."""
     off = ((network.interior - unknowns.expected) / unknowns.sigma)[:, unknowns.free]
     return float(unit_px**2 * np.sum(off**2))
 
@@ -231,8 +177,8 @@ def free_network(network: Network, unknowns: Unknowns) -> np.ndarray:
 
 
 def reduce_to_cameras(normals: Normals, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """S and its right side (4), and L⁻¹ (5, 5, N), from which the steps of the bars follow."""
-    inverse = inverse_factors(normals.U * (1 + damping * np.eye(5)[..., None]))
+    """S and its right side (3), and L⁻¹ (q, q, N), from which the steps of the positions follow."""
+    inverse = inverse_factors(normals.U * (1 + damping * np.eye(len(normals.U))[..., None]))
     S, rhs = normals.V.copy(), normals.g_c.copy()
     for start in range(0, normals.U.shape[-1], BLOCK):
         at = slice(start, start + BLOCK)
@@ -244,8 +190,8 @@ def reduce_to_cameras(normals: Normals, damping: float = 0.0) -> tuple[np.ndarra
 
 
 def eliminated(inverse: np.ndarray, W: np.ndarray) -> np.ndarray:
-    """Y = L⁻¹ Wᵀ (5, q, N) of lower triangles L⁻¹ (5, 5, N) and W (5, q, N).  (3)"""
-    return np.stack([np.einsum("kn,kqn->qn", row[: j + 1], W[: j + 1]) for j, row in enumerate(inverse)])
+    """Y = L⁻¹ Wᵀ (q, m, N) of lower triangles L⁻¹ (q, q, N) and W (q, m, N).  (2)"""
+    return np.stack([np.einsum("kn,kmn->mn", row[: j + 1], W[: j + 1]) for j, row in enumerate(inverse)])
 
 
 def inverse_factors(U: np.ndarray) -> np.ndarray:
@@ -263,7 +209,7 @@ def inverse_factors(U: np.ndarray) -> np.ndarray:
 
 
 def solve_step(network: Network, normals: Normals, unknowns: Unknowns, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """The step of the cameras (C p,) and of the bars (5, N).  (5)"""
+    """The step of the cameras (C p,) and of the positions (q, N).  (4)"""
     S, rhs, inverse = reduce_to_cameras(normals, damping)
     S = S + damping * np.diag(np.diag(normals.V))
     scale = 1 / np.sqrt(np.maximum(np.diag(normals.V), 1e-12))
@@ -282,27 +228,19 @@ def _solved(A: np.ndarray, rhs: np.ndarray) -> np.ndarray:
         return np.asarray(np.linalg.lstsq(A, rhs, rcond=1e-15)[0])
 
 
-def moved(network: Network, unknowns: Unknowns, step: np.ndarray, bars: np.ndarray) -> Network:
-    """The network after a step of the cameras (C p,) and of the bars (5, N)."""
+def moved(network: AnyNetwork, unknowns: Unknowns, step: np.ndarray, positions: np.ndarray) -> AnyNetwork:
+    """The network after a step of the cameras (C p,) and of the positions (q, N)."""
     C = len(network.R)
     step = step.reshape(C, -1)
     interior = network.interior.copy()
     interior[:, unknowns.free] += step[:, :-6]
     turn = rotation_from_vector(step[:, -6:-3])
-    first, second = tangents(network.direction)
-    direction = network.direction + (first * bars[3] + second * bars[4]).T
-    return replace(
-        network,
-        interior=interior,
-        R=turn @ network.R,
-        t=(turn @ network.t[..., None])[..., 0] + step[:, -3:],
-        middle=network.middle + bars[:3].T,
-        direction=direction / np.linalg.norm(direction, axis=1, keepdims=True),
-    )
+    R, t = turn @ network.R, (turn @ network.t[..., None])[..., 0] + step[:, -3:]
+    return replace(network.stepped(positions), interior=interior, R=R, t=t)
 
 
 def adjust(
-    network: Network,
+    network: AnyNetwork,
     xy_px: np.ndarray,
     used: np.ndarray,
     unknowns: Unknowns,
@@ -310,8 +248,8 @@ def adjust(
     cauchy_px: float | None = None,
     unit_px: float = 0.1,
     iteration: LevenbergMarquardt = LevenbergMarquardt(),  # noqa: B008  frozen
-) -> Adjusted:
-    """Minimise (2) by Levenberg–Marquardt from `network`, with the image points `used` (N, C, 2)."""
+) -> Adjusted[AnyNetwork]:
+    """Minimise (1) by Levenberg–Marquardt from `network`, with the image points `used` (N, C, K)."""
     iterations, converged, damping = 0, False, iteration.damping
     v = residuals(network, xy_px)
     weight, cost = weights_of(v, cauchy_px, used)

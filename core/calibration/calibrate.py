@@ -17,9 +17,10 @@ from ..foundation.progress import Monitor
 from ..geometry.rig import Rig
 from ..images.interlace import FieldLayout, field_layout
 from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, open_sequence, read_image
-from . import report
-from . import report as verdict
+from . import report, verdict
 from .bars import BarObservations
+from .boards.calibration import calibrate_boards
+from .boards.observations import BoardObservations
 from .quality import Quality, assess
 from .report import pictures
 from .self_calibration import Calibration, calibrate
@@ -74,9 +75,27 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, f
         InputError: the folder is missing, has fewer than two views, or views of different length; a mask belongs to no camera.
     """
     folder = Path(folder)
+    names, sequences = open_views(folder, "bar")
+    counts = {name: s.count for name, s in zip(names, sequences)}
+    if len(set(counts.values())) > 1:
+        lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
+    masks = () if mask is None else _masks(Path(mask), names)
+    return BarFootage(
+        folder=folder, names=names, sequences=sequences, interlaced=interlaced, masks=masks, first_field=first_field
+    )
+
+
+def open_views(folder: Path, noun: str, gaps: bool = False) -> tuple[tuple[str, ...], tuple[ImageSequence, ...]]:
+    """Names and sequences of the cameras in a folder that has a folder of images, or a movie, for each; `gaps`: images may be missing.
+
+    Raises:
+        InputError: the folder is missing, or has fewer than two views.
+    """
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; give the folder that has one folder of images or one movie of the bar per camera.")
-    names, sequences = [], []
+        raise InputError(f"{folder} is no folder; give the folder that has one folder of images or one movie of the {noun} per camera.")
+    names: list[str] = []
+    sequences: list[ImageSequence] = []
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):
             continue
@@ -85,7 +104,7 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, f
             if endings:
                 ending = max(sorted(endings), key=lambda e: sum(1 for _ in path.glob(f"*{e}")))
                 names.append(path.name)
-                sequences.append(open_sequence(folder, images=f"{path.name}/*{ending}", movie=None, view=path.name))
+                sequences.append(open_sequence(folder, images=f"{path.name}/*{ending}", movie=None, view=path.name, gaps=gaps))
         elif path.suffix.lower() in MOVIE_ENDINGS:
             names.append(path.stem)
             sequences.append(open_sequence(folder, images=None, movie=path.name, view=path.stem))
@@ -94,17 +113,10 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, f
             f"{folder} has {'no views' if not names else 'only the view ' + names[0]}; "
             "it needs a folder of images, or a movie, for each of at least two cameras."
         )
-    counts = {name: s.count for name, s in zip(names, sequences)}
-    if len(set(counts.values())) > 1:
-        lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
-    masks = () if mask is None else _masks(Path(mask), names)
-    return BarFootage(
-        folder=folder, names=tuple(names), sequences=tuple(sequences), interlaced=interlaced, masks=masks, first_field=first_field
-    )
+    return tuple(names), tuple(sequences)
 
 
-def _masks(path: Path, names: list[str]) -> tuple[np.ndarray | None, ...]:
+def _masks(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray | None, ...]:
     if not path.is_dir():
         shown = read_image(path) > 0
         return (shown,) * len(names)
@@ -219,21 +231,28 @@ class CalibratedRig:
 
     @property
     def bar(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames (T,) in which both ends of the bar were measured, and the ends (T, 2, 3) [m] in the world."""
-        known = (self.calibration.used.sum(axis=1) >= 2).all(axis=1)
-        return self.calibration.observations.frames[known], self.calibration.network.ends_m[known]
+        """Frames (T,) in which the bar or the board was measured, and its points (T, K, 3) [m] in the world."""
+        known = self.calibration.observations.measured(self.calibration.used)
+        return self.calibration.observations.frames[known], self.calibration.network.points_m[known]
 
 
 def calibrate_rig(
-    observations: BarObservations, monitor: Monitor, *, focal_px: float | None = None, world: WorldChoice | None = None
+    observations: BarObservations | BoardObservations,
+    monitor: Monitor,
+    *,
+    focal_px: float | None = None,
+    world: WorldChoice | None = None,
 ) -> CalibratedRig:
-    """Calibrate from the observations of the bar, judge the result, and put it into the world's frame.
+    """Calibrate from the observations of the bar or the board, judge the result, and put it into the world's frame.
 
     Raises:
         InputError: the data do not determine the rig or the world's frame; the message names what is missing.
     """
     world = world or WorldChoice()
-    calibration = calibrate(observations, monitor, focal_px)
+    if isinstance(observations, BarObservations):
+        calibration = calibrate(observations, monitor, focal_px)
+    else:
+        calibration = calibrate_boards(observations, monitor, focal_px)
     verdict.refuse_if_useless(calibration)
     calibration = in_world(calibration, world)
     quality = assess(calibration, monitor)
@@ -242,7 +261,7 @@ def calibrate_rig(
     metadata = {
         "unit": "m",
         "sigma0_px": calibration.sigma0_px,
-        "bar_length_m": observations.length_m,
+        **observations.described,
         "positions": verdict.positions_used(calibration),
         "predicted_error_m": quality.predicted.rms_m,
         "held_out_length_rms_m": quality.held_out.rms_m,
@@ -263,11 +282,10 @@ def in_world(calibration: Calibration, world: WorldChoice) -> Calibration:
     """
     observations, network = calibration.observations, calibration.network
     cameras = network.cameras(observations.names, observations.size_px)
-    known = (calibration.used.sum(axis=1) >= 2).all(axis=1)
-    frame = frame_of_bar(world, cameras, observations.frames[known], network.ends_m[known])
-    moved = network.with_cameras([frame.camera(c) for c in cameras])
-    moved = replace(moved, middle=frame.points(network.middle), direction=network.direction @ frame.R.T)
-    return replace(calibration, network=moved)
+    known = observations.measured(calibration.used)
+    frame = frame_of_bar(world, cameras, observations.frames[known], network.points_m[known])
+    moved = network.transformed(frame.R, frame.shift_m)
+    return replace(calibration, network=moved.with_cameras([frame.camera(c) for c in cameras]))
 
 
 def write_report(folder: Path, result: CalibratedRig) -> list[Path]:

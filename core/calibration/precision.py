@@ -21,7 +21,8 @@ import numpy as np
 
 from ..geometry.camera import INTERIOR, Camera, exterior_derivatives, image_with_derivatives, interior_of
 from ..geometry.rotation import cross_matrix
-from .bundle import NEAREST_M, Network, Normals, Unknowns, free_network, reduce_to_cameras
+from .bundle import NEAREST_M, Normals, Unknowns, free_network, reduce_to_cameras
+from .network import Network
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -17,8 +17,8 @@ from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR, Camera
 from ..geometry.intersection import forward_intersection
 from ..geometry.robust import finite_median
-from .bars import BarObservations, met_ends
-from .bundle import LevenbergMarquardt, Network, adjust
+from .bundle import LevenbergMarquardt, adjust
+from .network import Network, Observations
 from .precision import PredictedError, predicted_error
 from .self_calibration import GROSS, Calibration
 
@@ -35,9 +35,10 @@ FEWEST_LENGTHS = 8  # for a drift
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Lengths:
-    """Bar lengths less the known length, from ends intersected without using it: (n,) [m], and the middles of the bars (n, 3)."""
+    """Lengths less the known length, from points intersected without using it: (n,) [m], and the middles between these points (n, 3)."""
 
     residual_m: np.ndarray
+    sigma_per_px_m: np.ndarray  # (n,) sigma of each for image points of sigma 1 px and cameras without error
     middle_m: np.ndarray
     frames: np.ndarray
 
@@ -96,9 +97,10 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     """The quality of a calibration, which should be in its final world frame."""
     observations, network, used = calibration.observations, calibration.network, calibration.used
     cameras = network.cameras(observations.names, observations.size_px)
-    ends = network.ends_m[used.any(axis=1)]
+    points = network.points_m
+    ends = points[used.any(axis=1)]
     box = np.percentile(ends, BOX_PERCENTILES, axis=0)
-    values, axes = np.linalg.eigh(_scatter(network, used))
+    values, axes = np.linalg.eigh(_scatter(network, observations.measured(used)))
     monitor.step("quality", 0, 3)
     held_out, untested = held_out_lengths(calibration)
     monitor.step("quality", 1, 3)
@@ -106,17 +108,17 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     monitor.step("quality", 2, 3)
     count = np.maximum(used.sum(axis=(0, 2)), 1)
     square = np.sum(np.where(used[..., None], calibration.residual_px, 0.0) ** 2, axis=(0, 2, 3))
-    depth = [cameras[c].to_camera(network.ends_m[used[:, c]])[:, 2] for c in range(len(cameras))]
-    both = used.all(axis=2).astype(int)
-    tests = test_bars(box, network.length_m)
+    depth = [cameras[c].to_camera(points[used[:, c]])[:, 2] for c in range(len(cameras))]
+    both = observations.views(used).astype(int)
+    tests = test_bars(box, observations.length_m)
     predicted = predicted_error(cameras, calibration.every_unknown, calibration.considered, tests)
-    whole = (used.sum(axis=1) >= 2).all(axis=1)
+    whole = observations.measured(used)
     quality = Quality(
         predicted=predicted,
         box_m=box,
-        visited=_visited(network.ends_m[whole].reshape(-1, 3), box),
+        visited=_visited(points[whole].reshape(-1, 3), box),
         seen_by_two=len(predicted.xyz_m) / (2 * len(tests)),
-        rejected=int(((observations.complete.sum(axis=1) >= 2) & ~whole).sum()),
+        rejected=int(((observations.views(observations.visible).sum(axis=1) >= 2) & ~whole).sum()),
         used_lengths=_lengths(observations, used, cameras, np.ones(len(used), dtype=bool)),
         held_out=held_out,
         held_out_untested=untested,
@@ -133,9 +135,8 @@ def assess(calibration: Calibration, monitor: Monitor) -> Quality:
     return quality
 
 
-def _scatter(network: Network, used: np.ndarray) -> np.ndarray:
-    d = network.direction[(used.sum(axis=1) >= 2).all(axis=1)]
-    return d.T @ d / max(len(d), 1)
+def _scatter(network: Network, measured: np.ndarray) -> np.ndarray:
+    return network.spread[measured].sum(axis=0) / max(int(measured.sum()), 1)
 
 
 def _ratio(depth: np.ndarray) -> float:
@@ -158,15 +159,31 @@ def test_bars(box_m: np.ndarray, length_m: float) -> np.ndarray:
     return np.stack([points, points + inward * length_m], axis=1)
 
 
-def _lengths(observations: BarObservations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
-    """Lengths of the positions `which` (N,) from their ends' image points `used` (N, C, 2), each end intersected independently.  (1)"""
-    rows = np.flatnonzero(which & (used.sum(axis=1) >= 2).all(axis=1))
-    xy = np.where(used[rows][..., None], observations.xy_px[rows], np.nan)
+def _lengths(observations: Observations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray) -> Lengths:
+    """Lengths of the positions `which` (N,) from the image points `used` (N, C, K), each point intersected independently.  (1)"""
+    parts = [_lengths_between(observations, used, cameras, which, pair) for pair in observations.tested_pairs]
+    return _together(parts)
+
+
+def _lengths_between(
+    observations: Observations, used: np.ndarray, cameras: tuple[Camera, ...], which: np.ndarray, pair: tuple[int, int, float]
+) -> Lengths:
+    of_pair = list(pair[:2])
+    rows = np.flatnonzero(which & (used[:, :, of_pair].sum(axis=1) >= 2).all(axis=1))
+    xy = np.where(used[rows][..., None], observations.xy_px[rows], np.nan)[:, :, of_pair]
     xy = np.moveaxis(xy, 2, 1).reshape(2 * len(rows), len(cameras), 2)
-    ends = forward_intersection(cameras, xy, np.broadcast_to(np.eye(2), (*xy.shape, 2))).xyz_m.reshape(-1, 2, 3)
-    residual = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) - observations.length_m
-    finite = np.isfinite(residual)
-    return Lengths(residual_m=residual[finite], middle_m=ends.mean(axis=1)[finite], frames=observations.frames[rows][finite])
+    found = forward_intersection(cameras, xy, np.broadcast_to(np.eye(2), (*xy.shape, 2)))
+    ends = found.xyz_m.reshape(-1, 2, 3)
+    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    along = (ends[:, 0] - ends[:, 1]) / length[:, None]
+    variance = np.einsum("ni,nkij,nj->n", along, found.covariance_m2.reshape(-1, 2, 3, 3), along)
+    finite = np.isfinite(length)
+    return Lengths(
+        residual_m=(length - pair[2])[finite],
+        sigma_per_px_m=np.sqrt(variance[finite]),
+        middle_m=ends.mean(axis=1)[finite],
+        frames=observations.frames[rows][finite],
+    )
 
 
 def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
@@ -174,9 +191,9 @@ def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
     observations = calibration.observations
     parts, untested = [], []
     for fold in range(FOLDS):
-        out = np.arange(len(calibration.used)) % FOLDS == fold
+        out = np.unique(observations.frames, return_inverse=True)[1] % FOLDS == fold
         done = adjust(
-            _of_positions(calibration.network, ~out),
+            calibration.network.at(~out),
             observations.part(~out).xy_px,
             calibration.used[~out],
             calibration.unknowns,
@@ -186,7 +203,7 @@ def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
         cameras = done.network.cameras(observations.names, observations.size_px)
         parts.append(_lengths(observations, calibration.used, cameras, out))
         left = observations.part(out)
-        _, meet = met_ends(cameras, left, GROSS * calibration.sigma0_px)
+        meet = left.meeting(cameras, GROSS * calibration.sigma0_px)
         untested.append(_lengths(left, meet, cameras, np.ones(len(meet), dtype=bool)))
     return _together(parts), _together(untested)
 
@@ -194,32 +211,23 @@ def held_out_lengths(calibration: Calibration) -> tuple[Lengths, Lengths]:
 def _together(parts: list[Lengths]) -> Lengths:
     return Lengths(
         residual_m=np.concatenate([p.residual_m for p in parts]),
+        sigma_per_px_m=np.concatenate([p.sigma_per_px_m for p in parts]),
         middle_m=np.concatenate([p.middle_m for p in parts]),
         frames=np.concatenate([p.frames for p in parts]),
     )
-
-
-def _of_positions(network: Network, positions: np.ndarray) -> Network:
-    return replace(network, middle=network.middle[positions], direction=network.direction[positions])
 
 
 def mirrored(calibration: Calibration) -> float:
     """Sum of squares of the solution with reversed depth over that of this one: far above 1 where perspective distinguishes them.  (3)"""
     some = np.unique(np.linspace(0, len(calibration.used) - 1, MIRROR_POSITIONS).astype(int))
     part, used = calibration.observations.part(some), calibration.used[some]
-    network = _of_positions(calibration.network, some)
-    middle = network.middle[used.any(axis=(1, 2))].mean(axis=0)
+    network = calibration.network.at(some)
+    middle = network.points_m[used.any(axis=1)].mean(axis=0)
     view = network.R[:, 2].mean(axis=0)
     view /= np.linalg.norm(view)
     H = np.eye(3) - 2 * np.outer(view, view)
     R = np.diag([1.0, 1.0, -1.0]) @ network.R @ H
-    start = replace(
-        network,
-        R=R,
-        t=network.R @ middle + network.t - R @ middle,
-        middle=(network.middle - middle) @ H + middle,
-        direction=network.direction @ H,
-    )
+    start = replace(network.transformed(H, middle - H @ middle), R=R, t=network.R @ middle + network.t - R @ middle)
     unknowns, sigma = calibration.unknowns.only("f"), calibration.sigma0_px
     other = adjust(start, part.xy_px, used, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=15, tolerance=1.0))
     this = adjust(network, part.xy_px, used, calibration.unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=2))

@@ -16,7 +16,8 @@ import numpy as np
 from ..foundation.errors import InputError
 from ..geometry.camera import INTERIOR
 from .bars import PAIR_TOLERANCE, BarObservations, PairGuesses, agreeing, sampson, try_guesses, undistorted, with_bars
-from .bundle import Adjusted, LevenbergMarquardt, Network, Unknowns, adjust
+from .bundle import Adjusted, LevenbergMarquardt, Unknowns, adjust
+from .network import BarNetwork
 
 FOCAL_GRID = np.geomspace(0.45, 3.2, 12)  # of the image width
 ROUGH_FOCALS = np.array([0.75, 0.87, 1.0, 1.15, 1.33])  # of a given rough focal length
@@ -79,7 +80,7 @@ class Pair:
         return xi, xj, len(at)
 
 
-def initial_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted:
+def initial_network(observations: BarObservations, focal_px: float | None = None) -> Adjusted[BarNetwork]:
     """The best start, adjusted on a part of the positions.
 
     Raises:
@@ -87,7 +88,7 @@ def initial_network(observations: BarObservations, focal_px: float | None = None
     """
     tree = spanning_tree(observations)
     guesses = {(p.i, p.j): _pair_guesses(observations, p, focal_px) for p in tree}
-    best: Adjusted | None = None
+    best: Adjusted[BarNetwork] | None = None
     trials = [_trial(observations, tree, network) for network in _starts(observations, tree, guesses, focal_px)]
     for trial in trials:
         if best is None or trial.cost < best.cost:
@@ -191,7 +192,7 @@ def _grid(observations: BarObservations, focal_px: float | None) -> np.ndarray:
 
 def _starts(
     observations: BarObservations, tree: list[Pair], guesses: dict[tuple[int, int], Guesses], focal_px: float | None
-) -> list[Network]:
+) -> list[BarNetwork]:
     """Networks without bars of the best guesses, one per focal length of the first camera and κ."""
     grid = _grid(observations, focal_px)
     root = tree[0].i
@@ -228,7 +229,7 @@ def _chained(
     k: int,
     chosen: dict[int, int],
     grid: np.ndarray,
-) -> Network:
+) -> BarNetwork:
     C = len(observations.names)
     interior = np.zeros((C, len(INTERIOR)))
     R, t = np.tile(np.eye(3), (C, 1, 1)), np.zeros((C, 3))
@@ -241,10 +242,10 @@ def _chained(
         _, R_ij, t_ij = guesses[pair.i, pair.j][k, chosen[pair.i], chosen[pair.j]]
         R[pair.j], t[pair.j] = R_ij @ R[pair.i], R_ij @ t[pair.i] + t_ij
     empty = np.zeros((0, 3))
-    return Network(interior=interior, R=R, t=t, middle=empty, direction=empty, length_m=observations.length_m)
+    return BarNetwork(interior=interior, R=R, t=t, middle=empty, direction=empty, length_m=observations.length_m)
 
 
-def _trial(observations: BarObservations, tree: list[Pair], network: Network) -> Adjusted:
+def _trial(observations: BarObservations, tree: list[Pair], network: BarNetwork) -> Adjusted[BarNetwork]:
     """A short robust adjustment of f, k1 and the poses on bars on which the pairs of the tree agree."""
     part = trial_part(observations, tree)
     prior = lens_prior(part.size_px, network.interior[:, 0]).only("f", "k1")

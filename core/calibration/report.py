@@ -1,186 +1,24 @@
-"""The report of a calibration: a verdict with advice, a page of text, the same figures as JSON, and pictures.
+"""The report of a calibration: a page of text, the same figures as JSON, and pictures.
 
-The verdict follows from the predicted error in space. The pictures show the coverage of each image with its residuals, a map of the
-predicted error, and the lengths of the bars that were left out.
+The pictures show the coverage of each image with its residuals, a map of the
+predicted error, and the lengths that were left out.
 """
 
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 
 import cv2
 import numpy as np
 
-from ..foundation.errors import InputError
 from ..geometry.camera import EXTERIOR, INTERIOR
 from .precision import predicted_error
 from .quality import CELLS, Lengths, Quality
 from .self_calibration import Calibration
+from .verdict import Verdict, positions_used
 
-GOOD_PART = 5e-4  # of the mean distance from the cameras: 1 mm at 2 m
-FAIR_PART = 2e-3  # of that distance: 4 mm at 2 m
-USELESS_PART = 8e-3  # of that distance
-FLAT_SCATTER = 0.004  # smallest eigenvalue of the bar's directions below which the focal lengths are not determined
-GOOD_SCATTER = 0.05
-MIN_POSITIONS = 10
-GOOD_POSITIONS = 100
-GOOD_COVERAGE = 0.45  # of the cells of an image
-GOOD_DEPTH = 1.15  # largest by smallest depth
-MIRROR = 4.0  # times the sum of squares: a mirrored rig must fit worse than that
-MIN_FITTING = 0.4  # of the image points
 INK, PALE, RED, GREEN, BLUE = (60, 60, 60), (225, 225, 225), (60, 60, 220), (90, 170, 80), (200, 120, 40)  # BGR
 PANEL_PX = 420
 MAP_CELLS = 28  # along each side of the error map
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-
-
-class Light(StrEnum):
-    """Quality of a calibration."""
-
-    GREEN = "green"
-    YELLOW = "yellow"
-    RED = "red"
-
-
-WORDS = {Light.GREEN: "Good", Light.YELLOW: "Usable", Light.RED: "Poor"}
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Verdict:
-    """`sentence` is the accuracy to expect, `advice` what would improve it most."""
-
-    light: Light
-    sentence: str
-    advice: str
-
-
-def positions_used(calibration: Calibration) -> int:
-    """Number of positions with both ends in the adjustment."""
-    return int((calibration.used.sum(axis=1) >= 2).all(axis=1).sum())
-
-
-def refuse_if_useless(calibration: Calibration) -> None:
-    """Raise InputError if too few image points fit the adjustment.
-
-    Raises:
-        InputError: too few positions fit one rig, or a camera has none.
-    """
-    visible, used = calibration.observations.visible, calibration.used
-    for c, name in enumerate(calibration.observations.names):
-        if used[:, c].sum() < 2 * MIN_POSITIONS:
-            raise InputError(
-                f"The image points of camera {name} do not agree with the other cameras (only {int(used[:, c].sum())} of "
-                f"{int(visible[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same bar."
-            )
-    fits = used.sum() / max(visible.sum(), 1)
-    if fits < MIN_FITTING or positions_used(calibration) < MIN_POSITIONS:
-        raise InputError(
-            f"Only {positions_used(calibration)} bar positions fit one rig ({100 * fits:.0f} % of the image points); check that the "
-            "sequences start at the same instant, and that nothing but the bar's two targets is bright."
-        )
-
-
-def refuse_if_undetermined(calibration: Calibration, quality: Quality) -> None:
-    """Raise InputError if the data do not determine the rig; the message names the missing motion of the bar.
-
-    Raises:
-        InputError: the bar's directions lie in a plane, the predicted error is useless, or a mirrored rig fits as well.
-    """
-    if quality.scatter[0] < FLAT_SCATTER:
-        raise InputError(
-            f"The bar was always {_attitude(calibration, quality)} (smallest direction scatter {quality.scatter[0]:.3f}, "
-            f"{GOOD_SCATTER} is good), so the focal lengths are not determined; {_tilt(calibration, quality)}."
-        )
-    if not quality.predicted.rms_m <= USELESS_PART * _distance(calibration):
-        raise InputError(
-            f"With these bar positions the error would be about {1e3 * quality.predicted.rms_m:.0f} mm in space, which is useless; "
-            f"{advice(calibration, quality)}."
-        )
-    if quality.mirror < MIRROR:
-        raise InputError(
-            "A mirrored rig, with near and far swapped, fits the images as well; wave the bar closer to the cameras and further away, too."
-        )
-
-
-def judge(calibration: Calibration, quality: Quality) -> Verdict:
-    """The verdict, from the predicted error over the volume."""
-    error, distance = quality.predicted.rms_m, _distance(calibration)
-    light = Light.GREEN if error <= GOOD_PART * distance else Light.YELLOW if error <= FAIR_PART * distance else Light.RED
-    size = " × ".join(f"{s:.1f}" for s in np.ptp(quality.box_m, axis=0))
-    tested = quality.held_out
-    sentence = (
-        f"{WORDS[light]}: the cameras place points within {_mm(error)} (RMS) in the {size} m in which the bar was waved, "
-        f"{distance:.1f} m away; the length of bars left out is right within {_mm(tested.rms_m)}."
-    )
-    if not calibration.converged:
-        light, sentence = Light.RED, f"The adjustment did not converge, so its figures may be too good. {sentence}"
-    return Verdict(light=light, sentence=sentence, advice=advice(calibration, quality))
-
-
-def advice(calibration: Calibration, quality: Quality) -> str:
-    """The one thing that would improve the calibration most."""
-    names, used = calibration.observations.names, positions_used(calibration)
-    worst = int(np.argmin(quality.covered))
-    improvements = [
-        (quality.scatter[0] / GOOD_SCATTER, _tilt(calibration, quality)),
-        (used / GOOD_POSITIONS, f"wave the bar for longer: {used} positions were used, {GOOD_POSITIONS} or more are good"),
-        (
-            (quality.depth_ratio.min() - 1) / (GOOD_DEPTH - 1),
-            "wave the bar closer to the cameras and further away, too",
-        ),
-        (
-            quality.covered[worst] / GOOD_COVERAGE,
-            f"wave the bar {_empty_side(quality.coverage[worst])} of the image of camera {names[worst]}, too",
-        ),
-    ]
-    urgency, text = min(improvements, key=lambda entry: entry[0])
-    return text if urgency < 1 else "nothing needs to be improved; more positions would reduce the error further"
-
-
-def _mm(metres: float) -> str:
-    mm = 1e3 * metres
-    return f"{mm:.2f} mm" if mm < 1 else f"{mm:.1f} mm" if mm < 10 else f"{mm:.0f} mm"
-
-
-def _distance(calibration: Calibration) -> float:
-    network = calibration.network
-    centres = -np.einsum("cji,cj->ci", network.R, network.t)
-    middle = np.median(network.middle[calibration.used.any(axis=(1, 2))], axis=0)
-    return float(np.linalg.norm(centres - middle, axis=1).mean())
-
-
-def _missing(calibration: Calibration, quality: Quality) -> str:
-    """The direction in which the bar points least, from the cameras: depth, upright or crosswise."""
-    axes = calibration.network.R.mean(axis=0)  # rows: right, down, forward
-    return ("crosswise", "upright", "depth")[int(np.argmax(np.abs(axes @ quality.missing_direction)))]
-
-
-def _attitude(calibration: Calibration, quality: Quality) -> str:
-    return {
-        "depth": "parallel to the image planes",
-        "upright": "level",
-        "crosswise": "in the plane of the viewing direction and the vertical",
-    }[_missing(calibration, quality)]
-
-
-def _tilt(calibration: Calibration, quality: Quality) -> str:
-    return {
-        "depth": "tilt the bar towards the cameras, too",
-        "upright": "hold the bar upright, too",
-        "crosswise": "hold the bar crosswise, too",
-    }[_missing(calibration, quality)]
-
-
-def _empty_side(cells: np.ndarray) -> str:
-    """The half of an image with the fewest points."""
-    h, w = cells.shape
-    halves = {
-        "in the upper half": cells[: h // 2],
-        "in the lower half": cells[h // 2 :],
-        "in the left half": cells[:, : w // 2],
-        "in the right half": cells[:, w // 2 :],
-    }
-    return min(halves, key=lambda name: float((halves[name] > 0).mean()))
 
 
 def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dict[str, Any]:
@@ -192,7 +30,7 @@ def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dic
         "light": verdict.light.value,
         "verdict": verdict.sentence,
         "advice": verdict.advice,
-        "bar_length_m": observations.length_m,
+        **observations.described,
         "positions": len(observations.xy_px),
         "positions_used": positions_used(calibration),
         "image_points": int(observations.visible.sum()),
@@ -212,6 +50,7 @@ def figures(calibration: Calibration, quality: Quality, verdict: Verdict) -> dic
         "volume_seen_by_two": quality.seen_by_two,
         "bars_rejected": quality.rejected,
         "decisions": list(calibration.decisions),
+        "remarks": list(calibration.remarks),
         "correlations": [list(entry) for entry in quality.correlations],
         "cameras": {name: _camera_figures(calibration, quality, c) for c, name in enumerate(observations.names)},
     }
@@ -280,19 +119,19 @@ def page(calibration: Calibration, quality: Quality, verdict: Verdict) -> str:
         verdict.sentence,
         f"To improve: {verdict.advice}.",
         "",
-        f"{positions_used(calibration)} of {len(observations.xy_px)} bar positions, {int(calibration.used.sum())} of "
+        f"{positions_used(calibration)} of {len(observations.xy_px)} {observations.noun} positions, {int(calibration.used.sum())} of "
         f"{int(observations.visible.sum())} image points; sigma0 {calibration.sigma0_px:.4f} px, redundancy {calibration.redundancy:.0f}.",
         f"Predicted error in space {1e3 * quality.predicted.rms_m:.3f} mm RMS, largest {1e3 * quality.predicted.sigma_m.max():.3f} mm; "
-        f"of a bar's length {1e3 * quality.predicted.length_rms_m:.3f} mm.",
-        _length_line("Bars left out of the adjustment", quality.held_out),
-        _length_line("The same with bars that were rejected as outliers although their rays meet", quality.held_out_untested),
-        _length_line("Bars of the adjustment", quality.used_lengths),
-        f"{quality.rejected} bars with both ends visible to two cameras were rejected as outliers.",
+        f"of a {observations.noun}'s length {1e3 * quality.predicted.length_rms_m:.3f} mm.",
+        _length_line(f"{observations.noun.capitalize()}s left out of the adjustment", quality.held_out),
+        _length_line(f"The same with {observations.noun}s that were rejected as outliers although their rays meet", quality.held_out_untested),
+        _length_line(f"{observations.noun.capitalize()}s of the adjustment", quality.used_lengths),
+        f"{quality.rejected} {observations.noun}s visible to two cameras were rejected as outliers.",
         f"{100 * quality.seen_by_two:.0f} % of the volume is visible to two cameras or more; "
-        f"the bar reached {100 * quality.visited:.0f} % of it.",
-        f"Scatter of the bar's directions {quality.scatter.round(3).tolist()} (smallest: 0.05 is good, 0 fails); "
+        f"the {observations.noun} reached {100 * quality.visited:.0f} % of it.",
+        f"Scatter of the {observations.noun}'s directions {quality.scatter.round(3).tolist()} (smallest: 0.05 is good, 0 fails); "
         f"a mirrored rig fits {quality.mirror:.3g} times worse.",
-        *(f"{decision[0].upper()}{decision[1:]}." for decision in calibration.decisions),
+        *(f"{line[0].upper()}{line[1:]}." for line in (*calibration.decisions, *calibration.remarks)),
         "",
         *(line for c in range(len(observations.names)) for line in _camera_lines(calibration, quality, c)),
         *(f"Camera {name}: {a} and {b} are correlated by {rho:+.3f}." for name, a, b, rho in quality.correlations),
@@ -337,7 +176,7 @@ def _panel(title: str, width: int, height: int) -> np.ndarray:
 
 
 def _coverage(calibration: Calibration, quality: Quality, c: int) -> np.ndarray:
-    """The cells that the bar reached, its image points, and the residuals as arrows."""
+    """The cells that the object reached, its image points, and the residuals as arrows."""
     size = calibration.observations.size_px[c]
     scale = PANEL_PX / size[0]
     height = round(size[1] * scale)
@@ -397,14 +236,14 @@ def _heat_panel(title: str, mm: np.ndarray) -> np.ndarray:
 
 
 def _lengths(quality: Quality) -> np.ndarray:
-    """Length of every bar that was left out, minus the known length, over the frames."""
+    """Every length that was left out, minus the known length, over the frames."""
     width, height = 2 * PANEL_PX, PANEL_PX // 2
     mm, frames = quality.held_out.residual_m * 1e3, quality.held_out.frames
     if not len(mm):
-        return _panel("no bars were left out", width, height)
+        return _panel("nothing was left out", width, height)
     reach = max(float(np.abs(mm).max()), 1e-9)
     image = _panel(
-        f"length of bars left out, less the known one: lines at +-{reach:.2g} mm, frames {frames.min()} to {frames.max()}", width, height
+        f"lengths left out, less the known one: lines at +-{reach:.2g} mm, frames {frames.min()} to {frames.max()}", width, height
     )
     for level in (-1, 0, 1):
         y = 30 + round(height / 2 - level * (height / 2 - 5))

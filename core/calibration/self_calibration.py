@@ -11,6 +11,7 @@
 6  the predicted precision accounts for parameters that were left out (`precision.with_left_out`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,8 +19,9 @@ import numpy as np
 from ..foundation.progress import Monitor
 from ..geometry.camera import INTERIOR
 from ..geometry.robust import mad_sigma
-from .bars import BarObservations, enough_rays, labelled_ends, with_bars
-from .bundle import Adjusted, LevenbergMarquardt, Network, Unknowns, adjust, design, eliminated, inverse_factors, normal_equations
+from .bars import BarObservations, labelled_ends, with_bars
+from .bundle import Adjusted, AnyNetwork, LevenbergMarquardt, Unknowns, adjust, design, eliminated, inverse_factors, normal_equations
+from .network import BarNetwork, Network, Observations
 from .precision import camera_covariance, group_of, with_left_out
 from .reference_bar import COARSE_CAUCHY_PX, initial_network, lens_prior
 
@@ -38,10 +40,10 @@ MIN_SIGMA_PX = 0.004
 class Calibration:
     """An adjusted network, and what its quality is judged by."""
 
-    observations: BarObservations  # with the ends in order
+    observations: Observations  # with the points in order
     network: Network
-    used: np.ndarray  # (N, C, 2) image points that take part
-    residual_px: np.ndarray  # (N, C, 2, 2)
+    used: np.ndarray  # (N, C, K) image points that take part
+    residual_px: np.ndarray  # (N, C, K, 2)
     unknowns: Unknowns
     sigma0_px: float
     redundancy: float
@@ -49,6 +51,8 @@ class Calibration:
     considered: np.ndarray  # (16 C, 16 C) of all sixteen unknowns per camera, the uncertainty of those left out included
     decisions: tuple[str, ...]  # why unknowns were left out
     converged: bool
+    remarks: tuple[str, ...] = ()  # lines of the report
+    doubt: str = ""  # why the cameras may be wrong although the figures are good
 
     @property
     def every_unknown(self) -> Unknowns:
@@ -79,10 +83,11 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
         iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.05),
     )
     monitor.step("calibration", 3, 5)
-    return without_insignificant(*without_outliers(first, labelled, used, prior), labelled, monitor)
+    tested = without_outliers(first, labelled, used, prior, lambda bars, tolerance_px: with_bars(bars, labelled, tolerance_px))
+    return without_insignificant(*tested, labelled, monitor)
 
 
-def refined_start(network: Network, observations: BarObservations) -> tuple[Network, BarObservations, float]:
+def refined_start(network: BarNetwork, observations: BarObservations) -> tuple[BarNetwork, BarObservations, float]:
     """The cameras, adjusted with all unknowns on a part of the positions; all observations with their ends in order; sigma [px]."""
     prior = lens_prior(observations.size_px, network.interior[:, 0])
     some = np.unique(np.linspace(0, len(observations.xy_px) - 1, PART).astype(int))
@@ -104,7 +109,7 @@ def refined_start(network: Network, observations: BarObservations) -> tuple[Netw
     return network, _ordered(network, observations, 2 * cauchy), sigma
 
 
-def _ordered(network: Network, observations: BarObservations, tolerance_px: float) -> BarObservations:
+def _ordered(network: BarNetwork, observations: BarObservations, tolerance_px: float) -> BarObservations:
     return observations if observations.labelled else labelled_ends(network, observations, tolerance_px)
 
 
@@ -114,22 +119,22 @@ def robust_sigma(residual_px: np.ndarray, used: np.ndarray) -> float:
 
 
 def redundant_parts(network: Network, used: np.ndarray, unknowns: Unknowns, unit_px: float) -> np.ndarray:
-    """q_vv (N, C, 2, 2) of all image coordinates of weight 1; 1 for those that are not used.  (1), (2)"""
+    """q_vv (N, C, K, 2) of all image coordinates of weight 1; 1 for those that are not used.  (1), (2)"""
     zero = np.zeros((*used.shape, 2))
     normals = normal_equations(network, zero, used.astype(np.float64), unknowns, unit_px)
     root = _root(camera_covariance(network, normals, unknowns)).T
-    C, N = len(network.R), len(network.middle)
-    parts = np.ones((C, 4, N))
+    N, C, K = used.shape
+    parts = np.ones((C, 2 * K, N))
     for at, block in network.blocks():
         _, J, B = design(block, unknowns)
-        rows = J.reshape(C, -1, J[0, 0].size)  # (C, p, 4 n)
+        rows = J.reshape(C, -1, J[0, 0].size)  # (C, p, 2 K n)
         inverse = inverse_factors(normals.U[..., at])
-        by_cameras = root @ eliminated(inverse, normals.W[..., at])  # (5, q, n)
-        b = np.einsum("jkn,ckrn->cjrn", inverse, B.reshape(C, 5, 4, -1))  # L⁻¹ bᵀ
+        by_cameras = root @ eliminated(inverse, normals.W[..., at])  # (q, C p, n)
+        b = np.einsum("jkn,ckrn->cjrn", inverse, B.reshape(C, len(inverse), 2 * K, -1))  # L⁻¹ bᵀ
         for c, of in enumerate(np.split(root, C, axis=1)):
-            a = (of @ rows[c]).reshape(len(root), 4, -1) - np.einsum("jrn,jqn->qrn", b[c], by_cameras)
+            a = (of @ rows[c]).reshape(len(root), 2 * K, -1) - np.einsum("jrn,jqn->qrn", b[c], by_cameras)
             parts[c, :, at] -= np.einsum("qrn,qrn->rn", a, a) + np.einsum("jrn,jrn->rn", b[c], b[c])
-    return np.where(used[..., None], parts.reshape(C, 2, 2, N).transpose(3, 0, 2, 1), 1.0)
+    return np.where(used[..., None], parts.reshape(C, 2, K, N).transpose(3, 0, 2, 1), 1.0)
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
@@ -138,15 +143,22 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 
 
 def without_outliers(
-    first: Adjusted, observations: BarObservations, used: np.ndarray, unknowns: Unknowns
-) -> tuple[Adjusted, np.ndarray, float, float]:
-    """Least squares with data snooping: the adjustment, the image points used, sigma0 and the redundancy.  (1)"""
+    first: Adjusted[AnyNetwork],
+    observations: Observations,
+    used: np.ndarray,
+    unknowns: Unknowns,
+    again: Callable[[AnyNetwork, float], tuple[AnyNetwork, np.ndarray]],
+) -> tuple[Adjusted[AnyNetwork], np.ndarray, float, float]:
+    """Least squares with data snooping: the adjustment, the image points used, sigma0 and the redundancy.  (1)
+
+    `again` measures the positions with the cameras of a network, and selects the image points that fit within a tolerance [px].
+    """
     state, keep = first, used
     sigma = robust_sigma(first.residual_px, used)
     for number in range(ROUNDS):
         network = state.network
         if number < RETRIED_ROUNDS:  # image points that did not fit the cameras of the start are used again
-            network, keep = with_bars(network, observations, GROSS * sigma)
+            network, keep = again(network, GROSS * sigma)
         state = adjust(
             network, observations.xy_px, keep, unknowns, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=10, tolerance=1e-2)
         )
@@ -155,21 +167,21 @@ def without_outliers(
         redundancy = max(1.0, float(parts[keep].sum()))
         sigma = max(float(np.sqrt(square / redundancy)), 1e-6)
         w = _tested(state.residual_px, parts, sigma)
-        worst = (w > CRITICAL_W) & keep & (w >= np.where(keep, w, 0.0).max(axis=(1, 2), keepdims=True))
+        worst = (w > CRITICAL_W) & keep & (w >= np.where(keep, w, 0.0).max(axis=observations.tested_together, keepdims=True))
         if number and not worst.any():
             break
-        keep = enough_rays(keep & ~worst)
+        keep = observations.supported(keep & ~worst)
     return state, keep, sigma, redundancy
 
 
 def _tested(residual_px: np.ndarray, parts: np.ndarray, sigma: float) -> np.ndarray:
-    """w (N, C, 2) of the image points, the larger of both coordinates."""
+    """w (N, C, K) of the image points, the larger of both coordinates."""
     w = np.abs(residual_px) / (sigma * np.sqrt(np.maximum(parts, SMALLEST_Q)))
     return np.nan_to_num(w.max(axis=-1))
 
 
 def without_insignificant(
-    state: Adjusted, keep: np.ndarray, sigma: float, redundancy: float, observations: BarObservations, monitor: Monitor
+    state: Adjusted[AnyNetwork], keep: np.ndarray, sigma: float, redundancy: float, observations: Observations, monitor: Monitor
 ) -> Calibration:
     """Leave out the groups of lens parameters that are not significant, with a new adjustment after each.  (3)"""
     unknowns = lens_prior(observations.size_px, state.network.interior[:, 0])
@@ -211,7 +223,7 @@ def without_insignificant(
     )
 
 
-def _covariance(state: Adjusted, keep: np.ndarray, unknowns: Unknowns, sigma: float) -> np.ndarray:
+def _covariance(state: Adjusted[AnyNetwork], keep: np.ndarray, unknowns: Unknowns, sigma: float) -> np.ndarray:
     normals = normal_equations(state.network, state.residual_px, keep.astype(np.float64), unknowns, sigma)
     return camera_covariance(state.network, normals, unknowns) * sigma**2
 

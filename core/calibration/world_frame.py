@@ -144,7 +144,7 @@ class WorldChoice:
 
     def __post_init__(self) -> None:
         if sum(map(bool, (self.floor_frames, self.level_frames, self.points, self.like))) > 1:
-            raise InputError("The world's frame is given twice; choose the floor, level bars, three points, or another rig.")
+            raise InputError("The world's frame is given twice; choose the floor, level bars or boards, three points, or another rig.")
 
     @property
     def on_floor(self) -> bool:
@@ -153,7 +153,7 @@ class WorldChoice:
 
 
 def frame_of_bar(choice: WorldChoice, cameras: Sequence[Camera], frames: np.ndarray, ends_m: np.ndarray) -> WorldFrame:
-    """The chosen frame, from the ends of the bar (T, 2, 3) in the frames (T,) in which they were measured.
+    """The chosen frame, from the points of the bar or the board (T, K, 3) in the frames (T,) in which they were measured.
 
     Raises:
         InputError: the chosen frames do not show the bar, or do not determine a frame.
@@ -165,12 +165,12 @@ def frame_of_bar(choice: WorldChoice, cameras: Sequence[Camera], frames: np.ndar
     for wanted, doing in ((choice.floor_frames, "to lie on the floor"), (choice.level_frames, "to be level")):
         missing = sorted(set(wanted) - set(frames.tolist()))
         if missing:
-            raise InputError(f"Frame {missing[0]}, in which the bar is supposed {doing}, does not show both of its ends; choose another.")
+            raise InputError(f"In frame {missing[0]}, in which it is supposed {doing}, the bar or board was not measured; choose another.")
     if choice.floor_frames:
         return frame_on_floor(ends_m[np.isin(frames, choice.floor_frames)].reshape(-1, 3), cameras)
     if choice.level_frames:
         level = ends_m[np.isin(frames, choice.level_frames)]
-        along = level[:, 1] - level[:, 0]
+        along = np.concatenate([level[:, k] - level[:, 0] for k in {1, level.shape[1] - 1}])
         return frame_of_level_bar(along / np.linalg.norm(along, axis=1, keepdims=True), cameras, np.median(ends_m.reshape(-1, 3), axis=0))
     return frame_of_cameras(cameras, ends_m)
 

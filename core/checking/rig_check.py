@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration.report import Light
+from ..calibration.verdict import Light
 from ..foundation.errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.intersection import CLICK_SIGMA_PX

@@ -279,8 +279,8 @@ def _capture(path: Path) -> Any:
     return capture
 
 
-def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: str) -> ImageSequence:
-    """The sequence of one view of the take in `folder`.
+def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: str, gaps: bool = False) -> ImageSequence:
+    """The sequence of one view of the take in `folder`. `gaps`: numbers may be missing among its images.
 
     Raises:
         InputError: there is no such footage, or a path leads out of the folder.
@@ -304,7 +304,8 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         inside = pattern and (folder / pattern).is_dir()
         hint = f"“{pattern}” is a folder; write “{pattern.rstrip('/')}/*.png” for its PNG files." if inside else "Correct `images` there."
         raise InputError(f"View {view} has no images: nothing in {folder} matches “{pattern}” of take.toml. {hint}")
-    _check_numbering(paths, view)
+    if not gaps:
+        _check_numbering(paths, view)
     for path in paths:
         _check_signature(path)
     return ImageFiles(paths, pattern)

@@ -27,7 +27,8 @@ sys.path.insert(0, str(HERE.parent / "core" / "calibration"))
 from truth import TEST_BARS, bound, error_m, observed, rigid
 
 from tricap.core.calibration.bars import enough_rays, with_bars
-from tricap.core.calibration.bundle import LevenbergMarquardt, Network, adjust
+from tricap.core.calibration.bundle import LevenbergMarquardt, adjust
+from tricap.core.calibration.network import Network
 from tricap.core.calibration.precision import predicted_error
 from tricap.core.calibration.reference_bar import initial_network, lens_prior
 from tricap.core.calibration.self_calibration import GROSS, PART, calibrate

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from tricap.core.calibration.bars import BarObservations
-from tricap.core.calibration.bundle import Network, Unknowns, normal_equations, residuals
+from tricap.core.calibration.bundle import Unknowns, normal_equations, residuals
+from tricap.core.calibration.network import BarNetwork
 from tricap.core.calibration.precision import PredictedError, camera_covariance, predicted_error
 from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.intersection import forward_intersection
@@ -26,9 +27,9 @@ def observed(waved: WavedBar, labelled: bool = True) -> BarObservations:
     )
 
 
-def true_network(waved: WavedBar) -> Network:
+def true_network(waved: WavedBar) -> BarNetwork:
     C = len(waved.cameras)
-    empty = Network(
+    empty = BarNetwork(
         interior=np.zeros((C, 10)),
         R=np.zeros((C, 3, 3)),
         t=np.zeros((C, 3)),

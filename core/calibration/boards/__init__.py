@@ -1,0 +1,1 @@
+"""Cameras from a chessboard or a ChArUco board."""

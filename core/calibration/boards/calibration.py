@@ -1,0 +1,240 @@
+"""Self-calibration from image points of a board, with the adjustment, tests and selection of lens parameters of `self_calibration`.
+
+1  initial values from nothing (`start`);
+2  f, k1 → + principal point, k2, p1, p2 → all unknowns, robustly;
+3  positions again with the cameras fixed: a view that does not fit the others was not synchronised, and becomes a position of its own;
+4  the shape of the board, if its deviations from the nominal corners are significant: each corner adjusted in three dimensions with the rest
+   fixed, then the rest again, until it rests; a shift, a turn and a scale of the whole are removed, so the squares keep their mean size
+   F = ((SS₀ − SS₁) / m) / (SS₁ / r) > F_{1−α}(m, r) ,   m = 3 K − 7                                                              (1)
+5  least squares, data snooping, significance, precision as for a bar.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...foundation.progress import Monitor
+from ...geometry.camera import INTERIOR, image_with_derivatives
+from ..bundle import NEAREST_M, Adjusted, LevenbergMarquardt, Unknowns, adjust, inverse_factors, normal_equations, residuals, weights_of
+from ..network import BoardNetwork
+from ..reference_bar import COARSE_CAUCHY_PX, lens_prior
+from ..self_calibration import GROSS, Calibration, robust_sigma, without_insignificant, without_outliers
+from .observations import BoardObservations
+from .start import initial_network, without_wild
+
+SHAPE_POSITIONS = 8  # of the board that show its shape
+SHAPE_ROUNDS = 6
+SHAPE_ALPHA = 1e-3  # α of (1)
+MANY_APART = 0.25  # of the images of a camera
+MOST_LISTED = 8  # frames
+BENT = 0.004  # of the diagonal
+POSE_STEPS = 8  # of positions with the cameras fixed
+APART = 2.5  # times the median residual of views with positions of their own: a view beyond it does not fit the others of its position
+APART_SHARED = 2.0  # times that of views with shared positions, which contains the errors of the lens and of slight asynchrony
+
+
+def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px: float | None = None) -> Calibration:
+    """Calibrate the cameras from the corners and the size of the squares alone.
+
+    Raises:
+        InputError: a camera shares too few positions of the board with the others.
+    """
+    monitor.step("calibration", 0, 5)
+    started = initial_network(without_wild(observations), focal_px)
+    monitor.step("calibration", 1, 5)
+    network, sigma = _refined(started.network, started.observations, monitor)
+    network, labelled = split_apart(network, started.observations, sigma)
+    monitor.step("calibration", 2, 5)
+    prior = lens_prior(labelled.size_px, network.interior[:, 0])
+    network, used = with_boards(network, labelled, max(10 * sigma, 1.0))
+    first = adjust(
+        network, labelled.xy_px, used, prior, cauchy_px=3 * sigma, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.05)
+    )
+    sigma = robust_sigma(first.residual_px, used)
+    network, again = split_apart(first.network, labelled, sigma)
+    if len(again.frames) > len(labelled.frames):
+        network, used = with_boards(network, again, max(10 * sigma, 1.0))
+        labelled, first = again, adjust(network, again.xy_px, used, prior, cauchy_px=3 * sigma, unit_px=sigma)
+    monitor.step("calibration", 3, 5)
+    first, used = shaped(first, labelled, used, prior)
+    monitor.step("calibration", 4, 5)
+    tested = without_outliers(first, labelled, used, prior, lambda boards, tolerance_px: with_boards(boards, labelled, tolerance_px))
+    done = without_insignificant(*tested, labelled, monitor)
+    remarks, doubt = _remarks(labelled, tested[0].network.corners_m)
+    return replace(done, remarks=remarks, doubt=doubt)
+
+
+def _remarks(labelled: BoardObservations, corners_m: np.ndarray) -> tuple[tuple[str, ...], str]:
+    """Lines about unsynchronised views and the shape of the board, and the doubt that they raise."""
+    lines, doubt = [], ""
+    apart = _apart(labelled)
+    shown = labelled.views(labelled.visible).sum(axis=0)
+    for c, name in enumerate(labelled.names):
+        frames = apart[apart[:, 1] == c, 0]
+        if len(frames):
+            listed = ", ".join(map(str, frames[:MOST_LISTED])) + (" …" if len(frames) > MOST_LISTED else "")
+            lines.append(f"camera {name} was not synchronised with the others, or was moved, in {len(frames)} of {shown[c]} images: {listed}")
+        if len(frames) > MANY_APART * shown[c]:
+            doubt = f"camera {name} disagrees in {len(frames)} of its {shown[c]} images: was it moved, or is it not synchronised?"
+    deviation = corners_m - labelled.board.corners_m
+    largest, length = float(np.linalg.norm(deviation, axis=1).max()), labelled.length_m
+    if largest > 0:
+        along, across = np.sqrt(np.mean(deviation[:, :2] ** 2)), np.sqrt(np.mean(deviation[:, 2] ** 2))
+        lines.append(
+            f"the board differs from its plan by {1e3 * along:.3f} mm RMS in the plane and {1e3 * across:.3f} mm RMS across it, at most "
+            f"{1e3 * largest:.3f} mm; the adjustment allows for it"
+        )
+    if largest > BENT * length:
+        doubt = f"the board is bent or printed unevenly by {1e3 * largest:.1f} mm: glue it to a flat plate, and measure its squares both ways"
+    return tuple(lines), doubt
+
+
+def shaped(
+    first: Adjusted[BoardNetwork], observations: BoardObservations, used: np.ndarray, unknowns: Unknowns
+) -> tuple[Adjusted[BoardNetwork], np.ndarray]:
+    """The adjustment with the shape of the board, if it is significant, and the image points used.  (1)"""
+    from scipy.special import fdtrc
+
+    if observations.measured(used).sum() < SHAPE_POSITIONS:
+        return first, used
+    sigma = robust_sigma(first.residual_px, used)
+    network, used = with_boards(first.network, observations, GROSS * sigma)
+    iteration = LevenbergMarquardt(max_iterations=6, tolerance=0.05)
+    flat = state = adjust(network, observations.xy_px, used, unknowns, unit_px=sigma, iteration=iteration)
+    for _ in range(SHAPE_ROUNDS):
+        network = replace(state.network, corners_m=_corners(state.network, state.residual_px, used, observations.board.corners_m))
+        state = adjust(network, observations.xy_px, used, unknowns, unit_px=sigma, iteration=iteration)
+    free = 3 * len(network.corners_m) - 7
+    redundancy = 2 * used.sum() - 6 * network.count - 16 * len(network.R) - free
+    F = (flat.cost - state.cost) / free / (state.cost / max(redundancy, 1))
+    return (state, used) if redundancy > 0 and fdtrc(free, redundancy, F) < SHAPE_ALPHA else (flat, used)
+
+
+def _corners(network: BoardNetwork, residual_px: np.ndarray, used: np.ndarray, plan_m: np.ndarray) -> np.ndarray:
+    """The corners (K, 3) in the board's frame after one Gauss–Newton step of each, as similar to the plan as possible."""
+    X = network.points_m
+    N, b = np.zeros((len(plan_m), 3, 3)), np.zeros((len(plan_m), 3))
+    for c, (interior, R, t) in enumerate(zip(network.interior, network.R, network.t)):
+        p = X @ R.T + t
+        shown = used[:, c] & (p[..., 2] > NEAREST_M)
+        _, _, G = image_with_derivatives(interior, np.where(shown[..., None], p, [0.0, 0.0, 1.0]))
+        J = np.where(shown[..., None, None], G @ R @ network.R_board[:, None], 0.0)
+        v = np.where(shown[..., None], residual_px[:, c], 0.0)
+        N += np.einsum("nkai,nkaj->kij", J, J)
+        b += np.einsum("nkai,nka->ki", J, v)
+    weak = np.trace(N, axis1=1, axis2=2)[:, None, None] * 1e-6 * np.eye(3) + 1e-9 * np.eye(3)
+    moved = network.corners_m + np.linalg.solve(N + weak, b[..., None])[..., 0]
+    return _similar(moved, plan_m)
+
+
+def _similar(moved: np.ndarray, plan_m: np.ndarray) -> np.ndarray:
+    """Points (K, 3) after the similarity that brings them closest to the plan (Umeyama 1991)."""
+    A, B = moved - moved.mean(axis=0), plan_m - plan_m.mean(axis=0)
+    U, _, Vt = np.linalg.svd(A.T @ B)
+    R = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt).T
+    turned = A @ R.T
+    return turned * (np.sum(turned * B) / np.sum(turned * turned)) + plan_m.mean(axis=0)
+
+
+def _apart(labelled: BoardObservations) -> np.ndarray:
+    """Frame and camera of every view that is in a position of its own, although another camera shows the board in the frame."""
+    shown = labelled.views(labelled.visible)
+    rows = []
+    for frame in np.unique(labelled.frames):
+        at = np.flatnonzero(labelled.frames == frame)
+        main = at[np.argmax(shown[at].sum(axis=1))]
+        rows += [(frame, c) for n in at if n != main for c in np.flatnonzero(shown[n])]
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def _refined(network: BoardNetwork, observations: BoardObservations, monitor: Monitor) -> tuple[BoardNetwork, float]:
+    """Robust adjustment with more and more unknowns; sigma [px]."""
+    prior = lens_prior(observations.size_px, network.interior[:, 0])
+    cauchy, sigma = COARSE_CAUCHY_PX, 1.0
+    for names in (("f", "k1"), ("f", "cx", "cy", "k1", "k2", "p1", "p2"), INTERIOR):
+        monitor.step("calibration", 1, 5)
+        done = adjust(
+            network, observations.xy_px, observations.visible, prior.only(*names), cauchy_px=cauchy, unit_px=0.3 * cauchy,
+            iteration=LevenbergMarquardt(max_iterations=10, tolerance=0.1),
+        )  # fmt: skip
+        network, sigma = done.network, robust_sigma(done.residual_px, observations.visible)
+        cauchy = float(np.clip(3 * sigma, 0.3, cauchy))
+    return network, sigma
+
+
+def positioned(network: BoardNetwork, xy_px: np.ndarray, used: np.ndarray, cauchy_px: float) -> BoardNetwork:
+    """The positions adjusted robustly with the cameras fixed (Gauss–Newton)."""
+    none = Unknowns(free=np.zeros(len(INTERIOR), dtype=bool), expected=network.interior, sigma=np.ones_like(network.interior))
+    for _ in range(POSE_STEPS):
+        v = residuals(network, xy_px)
+        weight, _ = weights_of(v, cauchy_px, used)
+        normals = normal_equations(network, v, weight, none, 1.0)
+        inverse = inverse_factors(normals.U)
+        network = network.stepped(np.einsum("jkn,jn->kn", inverse, np.einsum("jkn,kn->jn", inverse, normals.g_b)))
+    return network
+
+
+def with_boards(network: BoardNetwork, observations: BoardObservations, tolerance_px: float) -> tuple[BoardNetwork, np.ndarray]:
+    """The positions adjusted with the cameras fixed, and which image points (N, C, K) lie within the tolerance."""
+    network = positioned(network, observations.xy_px, observations.visible, tolerance_px / GROSS * 3)
+    off = np.linalg.norm(residuals(network, observations.xy_px), axis=-1)
+    with np.errstate(invalid="ignore"):
+        return network, observations.supported(observations.visible & (off < tolerance_px))
+
+
+def view_residuals(network: BoardNetwork, observations: BoardObservations) -> np.ndarray:
+    """Median distance [px] of the corners of each view (N, C) from those of the network; 0 where a camera does not show the board."""
+    off = np.linalg.norm(residuals(network, observations.xy_px), axis=-1)
+    shown = observations.views(observations.visible)
+    return np.where(shown, np.nanmedian(np.where(shown[..., None], off, 0.0), axis=-1), 0.0)
+
+
+def split_apart(network: BoardNetwork, observations: BoardObservations, sigma_px: float) -> tuple[BoardNetwork, BoardObservations]:
+    """The observations with every view that does not fit the others of its position as a position of its own."""
+    cauchy = 3 * sigma_px
+    network = positioned(network, observations.xy_px, observations.visible, cauchy)
+    limit = _limit_px(network, observations, cauchy)
+    while True:
+        shown = observations.views(observations.visible)
+        disputed = np.flatnonzero((view_residuals(network, observations) > limit).any(axis=1) & (shown.sum(axis=1) >= 2))
+        if not len(disputed):
+            return network, observations
+        C = shown.shape[1]
+        without = np.array([(n, c) for n in disputed for c in range(C) if shown[n, c]])
+        left = observations.xy_px[without[:, 0]]
+        left[np.arange(len(without)), without[:, 1]] = np.nan
+        trial = observations.changed(left, observations.frames[without[:, 0]])
+        tried = positioned(network.at(without[:, 0]), trial.xy_px, trial.visible, cauchy)
+        cost = view_residuals(tried, trial).max(axis=1)
+        drop = np.array([rows[np.argmin(cost[rows])] for n in disputed for rows in [np.flatnonzero(without[:, 0] == n)]])
+        network, observations = _moved_apart(network, observations, without[drop], cauchy)
+
+
+def _limit_px(network: BoardNetwork, observations: BoardObservations, cauchy_px: float) -> float:
+    """The median residual beyond which a view does not fit the others of its position."""
+    shown = observations.views(observations.visible)
+    shared = shown & (shown.sum(axis=1, keepdims=True) >= 2)
+    if not shared.any():
+        return np.inf
+    together = float(np.median(view_residuals(network, observations)[shared]))
+    views = np.argwhere(shared)
+    alone = np.full((len(views), *observations.xy_px.shape[1:]), np.nan)
+    alone[np.arange(len(views)), views[:, 1]] = observations.xy_px[views[:, 0], views[:, 1]]
+    single = observations.changed(alone, observations.frames[views[:, 0]])
+    own = view_residuals(positioned(network.at(views[:, 0]), alone, single.visible, cauchy_px), single)
+    return max(APART * float(np.median(own[np.arange(len(views)), views[:, 1]])), APART_SHARED * together)
+
+
+def _moved_apart(
+    network: BoardNetwork, observations: BoardObservations, views: np.ndarray, cauchy_px: float
+) -> tuple[BoardNetwork, BoardObservations]:
+    """The views (n, 2), position and camera, as positions at the end."""
+    xy = observations.xy_px.copy()
+    own = np.full((len(views), *xy.shape[1:]), np.nan)
+    rows = np.arange(len(views))
+    own[rows, views[:, 1]] = xy[views[:, 0], views[:, 1]]
+    xy[views[:, 0], views[:, 1]] = np.nan
+    frames = np.concatenate([observations.frames, observations.frames[views[:, 0]]])
+    observations = observations.changed(np.concatenate([xy, own]), frames)
+    first = network.at(np.concatenate([np.arange(network.count), views[:, 0]]))
+    return positioned(first, observations.xy_px, observations.visible, cauchy_px), observations

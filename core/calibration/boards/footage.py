@@ -1,0 +1,171 @@
+"""The images of a board: one folder of images, or one movie, per camera; images of the same number belong together."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...foundation.errors import InputError
+from ...foundation.progress import Monitor
+from ...images.sequence import ImageFiles, ImageSequence
+from .board import DICTIONARIES, Board, BoardKind
+from .detection import MIRRORED, VARIANTS, Variant, find_corners, find_variant
+from .observations import BoardObservations
+
+Note = Callable[[str, int, int], None]  # view, images searched, images with the board
+MOST_IMAGES = 600  # of a view that are searched, evenly spread
+MOST_STILLS = 60  # of a view: so few images are searched thoroughly
+TRIED_IMAGES = 24  # in which the variant is looked for
+MOST_POSITIONS = 240  # that are adjusted
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BoardFootage:
+    """The opened sequences, one per camera, and the number of each of their images."""
+
+    folder: Path
+    names: tuple[str, ...]
+    sequences: tuple[ImageSequence, ...]
+    numbers: tuple[np.ndarray, ...]  # (count,) of each
+
+
+def numbered(folder: Path, names: tuple[str, ...], sequences: tuple[ImageSequence, ...]) -> BoardFootage:
+    """Images with their numbers: those in the names of the files, or their order where the names have none.
+
+    Raises:
+        InputError: movies have different lengths, or no image belongs to another one.
+    """
+    numbers = [_numbers(s) for s in sequences]
+    if any(n is None for n in numbers):
+        counts = {name: s.count for name, s in zip(names, sequences)}
+        if len(set(counts.values())) > 1:
+            lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
+            raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
+        numbers = [np.arange(s.count) for s in sequences]
+    known = [n for n in numbers if n is not None]
+    return BoardFootage(folder=folder, names=names, sequences=sequences, numbers=tuple(known))
+
+
+def _numbers(sequence: ImageSequence) -> np.ndarray | None:
+    """The numbers in the names of image files that differ from file to file; None for a movie, or where there is not exactly one."""
+    if not isinstance(sequence, ImageFiles):
+        return None
+    parts = [re.findall(r"\d+", path.stem) for path in sequence.files()]
+    if len({len(p) for p in parts}) != 1 or not parts[0]:
+        return None
+    counting = [column for column in zip(*parts) if len(set(column)) == len(parts)]
+    if len(counting) != 1 or max(map(len, counting[0])) > 15:
+        return None
+    return np.array([int(n) for n in counting[0]])
+
+
+def measure_boards(footage: BoardFootage, board: Board, monitor: Monitor, note: Note | None = None) -> BoardObservations:
+    """Find the corners of the board in the images; `note` is called with the number of images of a view that show it.
+
+    Raises:
+        InputError: images cannot be read, or a camera never shows the board; the message names the board that is visible, if there is one.
+    """
+    wanted = _wanted(footage)
+    variant = _variant(footage, wanted, board, monitor)
+    found: list[dict[int, np.ndarray]] = []
+    sizes = []
+    for c, name in enumerate(footage.names):
+        corners, size = _view(footage, c, wanted, board, variant, monitor, note)
+        if not corners:
+            _refuse(footage, c, wanted, board)
+        found.append(corners)
+        sizes.append(size)
+    frames = _chosen(found)
+    K = len(board.corners_m)
+    xy = np.full((len(frames), len(found), K, 2), np.nan)
+    for c, corners in enumerate(found):
+        for i, frame in enumerate(frames):
+            if frame in corners:
+                xy[i, c] = corners[frame]
+    return BoardObservations(names=footage.names, size_px=np.array(sizes, dtype=float), xy_px=xy, frames=np.array(frames), board=board)
+
+
+def _wanted(footage: BoardFootage) -> np.ndarray:
+    """The numbers of the images that are searched."""
+    every = np.unique(np.concatenate(footage.numbers))
+    return every[np.unique(np.linspace(0, len(every) - 1, MOST_IMAGES).astype(int))]
+
+
+def _variant(footage: BoardFootage, wanted: np.ndarray, board: Board, monitor: Monitor) -> Variant:
+    """How the board looks, from some images of each view; a chessboard looks the same inverted."""
+    if board.kind is BoardKind.CHESSBOARD:
+        return Variant()
+    images = []
+    for c in range(len(footage.names)):
+        at = np.flatnonzero(np.isin(footage.numbers[c], wanted))
+        for i in at[np.unique(np.linspace(0, len(at) - 1, TRIED_IMAGES).astype(int))]:
+            monitor.step("board", len(images), TRIED_IMAGES * len(footage.names))
+            images.append(footage.sequences[c].read(int(i)))
+    return find_variant(images, board)[0]
+
+
+def _view(
+    footage: BoardFootage, c: int, wanted: np.ndarray, board: Board, variant: Variant, monitor: Monitor, note: Note | None
+) -> tuple[dict[int, np.ndarray], tuple[int, int]]:
+    """The corners by image number of one view, and the size of its images."""
+    name, sequence = footage.names[c], footage.sequences[c]
+    at = np.flatnonzero(np.isin(footage.numbers[c], wanted))
+    thorough = len(at) <= MOST_STILLS
+    corners: dict[int, np.ndarray] = {}
+    size = (0, 0)
+    for done, i in enumerate(at):
+        monitor.step(f"board {name}", done, len(at))
+        image = sequence.read(int(i))
+        if done and image.shape[::-1] != size:
+            raise InputError(f"The images of view {name} have different sizes, from frame {i} on; use one sequence of one camera.")
+        size = (image.shape[1], image.shape[0])
+        xy = find_corners(image, board, variant, thorough)
+        if np.isfinite(xy).any():
+            corners[int(footage.numbers[c][i])] = xy
+        if note is not None:
+            note(name, done + 1, len(corners))
+    monitor.step(f"board {name}", len(at), len(at))
+    return corners, size
+
+
+def _chosen(found: list[dict[int, np.ndarray]]) -> list[int]:
+    """The frames that are adjusted: at most MOST_POSITIONS of those that most cameras show, evenly spread, and single views to fill up."""
+    frames = sorted({frame for corners in found for frame in corners})
+    cameras = np.array([sum(frame in corners for corners in found) for frame in frames])
+    several = np.flatnonzero(cameras >= 2)
+    single = np.flatnonzero(cameras < 2)
+    chosen = _even(several, MOST_POSITIONS)
+    chosen = np.concatenate([chosen, _even(single, MOST_POSITIONS - len(chosen))])
+    return [frames[i] for i in np.sort(chosen)]
+
+
+def _even(index: np.ndarray, count: int) -> np.ndarray:
+    if len(index) <= count:
+        return index
+    return index[np.unique(np.linspace(0, len(index) - 1, count).astype(int))] if count > 0 else index[:0]
+
+
+def _refuse(footage: BoardFootage, c: int, wanted: np.ndarray, board: Board) -> None:
+    """Say why a view never shows the board."""
+    at = np.flatnonzero(np.isin(footage.numbers[c], wanted))
+    images = [footage.sequences[c].read(int(i)) for i in at[np.unique(np.linspace(0, len(at) - 1, TRIED_IMAGES).astype(int))]]
+    start = f"View {footage.names[c]} in {footage.folder} never shows the {board.kind.value} of {board.label}"
+    counted = "inner corners" if board.kind is BoardKind.CHESSBOARD else "squares"
+    if board.kind is BoardKind.CHARUCO:
+        if find_variant(images, board, MIRRORED)[1]:
+            raise InputError(f"{start}, but its images are mirrored; flip them horizontally.")
+        for other in DICTIONARIES:
+            if other != board.dictionary and (guess := _other_markers(board, other)) and find_variant(images, guess, VARIANTS[:1])[1]:
+                raise InputError(f"{start} with {board.dictionary}, but one of {other}; give --dictionary {other}.")
+    raise InputError(
+        f"{start} {counted}; check the numbers of {counted} across and down, and hold the whole board in the image, flat, lit and not too far away."
+    )
+
+
+def _other_markers(board: Board, dictionary: str) -> Board | None:
+    try:
+        return Board(kind=board.kind, squares=board.squares, square_m=board.square_m, dictionary=dictionary, marker_m=board.marker_m)
+    except InputError:  # too few markers for this board
+        return None
