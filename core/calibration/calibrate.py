@@ -20,6 +20,7 @@ from ..images.sequence import IMAGE_ENDINGS, MOVIE_ENDINGS, ImageSequence, open_
 from . import report, verdict
 from .bars import BarObservations
 from .boards.calibration import calibrate_boards
+from .boards.footage import BoardFootage, numbered
 from .boards.observations import BoardObservations
 from .quality import Quality, assess
 from .report import pictures
@@ -81,9 +82,7 @@ def open_bar(folder: Path, interlaced: str = "none", mask: Path | None = None, f
         lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"The views in {folder} have different numbers of frames ({lengths}); trim them to the same instants.")
     masks = () if mask is None else _masks(Path(mask), names)
-    return BarFootage(
-        folder=folder, names=names, sequences=sequences, interlaced=interlaced, masks=masks, first_field=first_field
-    )
+    return BarFootage(folder=folder, names=names, sequences=sequences, interlaced=interlaced, masks=masks, first_field=first_field)
 
 
 def open_views(folder: Path, noun: str, gaps: bool = False) -> tuple[tuple[str, ...], tuple[ImageSequence, ...]]:
@@ -114,6 +113,15 @@ def open_views(folder: Path, noun: str, gaps: bool = False) -> tuple[tuple[str, 
             "it needs a folder of images, or a movie, for each of at least two cameras."
         )
     return tuple(names), tuple(sequences)
+
+
+def open_boards(folder: Path) -> BoardFootage:
+    """Open the sequences of a board in BOARDDIR: one folder of images, or one movie, per camera; images of the same number belong together.
+
+    Raises:
+        InputError: the folder is missing, has fewer than two views, or movies of different length.
+    """
+    return numbered(Path(folder), *open_views(Path(folder), "board", gaps=True))
 
 
 def _masks(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray | None, ...]:

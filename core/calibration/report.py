@@ -124,7 +124,9 @@ def page(calibration: Calibration, quality: Quality, verdict: Verdict) -> str:
         f"Predicted error in space {1e3 * quality.predicted.rms_m:.3f} mm RMS, largest {1e3 * quality.predicted.sigma_m.max():.3f} mm; "
         f"of a {observations.noun}'s length {1e3 * quality.predicted.length_rms_m:.3f} mm.",
         _length_line(f"{observations.noun.capitalize()}s left out of the adjustment", quality.held_out),
-        _length_line(f"The same with {observations.noun}s that were rejected as outliers although their rays meet", quality.held_out_untested),
+        _length_line(
+            f"The same with {observations.noun}s that were rejected as outliers although their rays meet", quality.held_out_untested
+        ),
         _length_line(f"{observations.noun.capitalize()}s of the adjustment", quality.used_lengths),
         f"{quality.rejected} {observations.noun}s visible to two cameras were rejected as outliers.",
         f"{100 * quality.seen_by_two:.0f} % of the volume is visible to two cameras or more; "

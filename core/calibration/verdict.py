@@ -80,17 +80,17 @@ def refuse_if_useless(calibration: Calibration) -> None:
     Raises:
         InputError: too few positions fit one rig, or a camera has none.
     """
-    visible, used = calibration.observations.visible, calibration.used
+    visible, used, noun = calibration.observations.visible, calibration.used, calibration.observations.noun
     for c, name in enumerate(calibration.observations.names):
         if calibration.observations.views(used)[:, c].sum() < calibration.observations.fewest_positions:
             raise InputError(
                 f"The image points of camera {name} do not agree with the other cameras (only {int(used[:, c].sum())} of "
-                f"{int(visible[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same {calibration.observations.noun}."
+                f"{int(visible[:, c].sum())} fit); check that its sequence starts at the same instant and shows the same {noun}."
             )
     fits = used.sum() / max(visible.sum(), 1)
     if fits < MIN_FITTING or positions_used(calibration) < calibration.observations.fewest_positions:
         raise InputError(
-            f"Only {positions_used(calibration)} {calibration.observations.noun} positions fit one rig ({100 * fits:.0f} % of the image points); "
+            f"Only {positions_used(calibration)} {noun} positions fit one rig ({100 * fits:.0f} % of the image points); "
             f"check that the sequences start at the same instant, and {_words(calibration)['other']}."
         )
 
@@ -113,9 +113,7 @@ def refuse_if_undetermined(calibration: Calibration, quality: Quality) -> None:
             f"{advice(calibration, quality)}."
         )
     if quality.mirror < MIRROR:
-        raise InputError(
-            f"A mirrored rig, with near and far swapped, fits the images as well; {_words(calibration)['deeper']}."
-        )
+        raise InputError(f"A mirrored rig, with near and far swapped, fits the images as well; {_words(calibration)['deeper']}.")
 
 
 def judge(calibration: Calibration, quality: Quality) -> Verdict:
@@ -183,7 +181,11 @@ def _contradiction(calibration: Calibration, quality: Quality) -> str:
     if not len(tested.residual_m):
         return "no length could be tested"
     ratio = float(np.sqrt(np.median((tested.residual_m / np.hypot(tested.sigma_per_px_m * calibration.sigma0_px, expected)) ** 2)))
-    return "" if ratio < MOST_RATIO else f"that is {ratio:.0f} times as much as the images allow, so the {calibration.observations.noun} is not as given"
+    return (
+        ""
+        if ratio < MOST_RATIO
+        else f"that is {ratio:.0f} times as much as the images allow, so the {calibration.observations.noun} is not as given"
+    )
 
 
 def _empty_side(cells: np.ndarray) -> str:

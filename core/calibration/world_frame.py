@@ -165,7 +165,9 @@ def frame_of_bar(choice: WorldChoice, cameras: Sequence[Camera], frames: np.ndar
     for wanted, doing in ((choice.floor_frames, "to lie on the floor"), (choice.level_frames, "to be level")):
         missing = sorted(set(wanted) - set(frames.tolist()))
         if missing:
-            raise InputError(f"In frame {missing[0]}, in which it is supposed {doing}, the bar or board was not measured; choose another.")
+            raise InputError(
+                f"Frame {missing[0]}, in which the bar or board is supposed {doing}, does not show enough of it; choose another."
+            )
     if choice.floor_frames:
         return frame_on_floor(ends_m[np.isin(frames, choice.floor_frames)].reshape(-1, 3), cameras)
     if choice.level_frames:

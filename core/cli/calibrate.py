@@ -1,11 +1,16 @@
-"""`tricap calibrate`: a rig from the images of a waved bar, or from another tool's calibration."""
+"""`tricap calibrate`: a rig from the images of a waved bar or of a board, or from another tool's calibration; and boards to print."""
 
 import argparse
 import json
+import re
 from dataclasses import replace
 
 from ..calibration import report
-from ..calibration.calibrate import calibrate_rig, measure_bar, open_bar, write_report
+from ..calibration.bars import BarObservations
+from ..calibration.boards.board import Board, BoardKind, write_board
+from ..calibration.boards.footage import measure_boards
+from ..calibration.boards.observations import BoardObservations
+from ..calibration.calibrate import calibrate_rig, measure_bar, open_bar, open_boards, write_report
 from ..calibration.rig_files import read_any, write_as
 from ..calibration.world_frame import WorldChoice, frame_like, frame_of_clicks
 from ..foundation.errors import InputError
@@ -22,9 +27,42 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     Raises:
         InputError: the arguments or the recording are faulty.
     """
+    board = _board(args)
+    if args.printed is not None:
+        return _print(args, board)
     if (args.bar is None) == (args.source is None):
-        raise InputError("Give either the folder of the bar's images, or --import with another tool's calibration.")
-    return _convert(args) if args.source is not None else _calibrate(args, monitor)
+        raise InputError("Give either the folder of the images of the bar or board, or --import with another tool's calibration.")
+    if args.out is None:
+        raise InputError("Give --out with the rig to write, such as --out rig.toml.")
+    return _convert(args) if args.source is not None else _calibrate(args, board, monitor)
+
+
+def _board(args: argparse.Namespace) -> Board | None:
+    """The board that was described, or None for a bar."""
+    if args.board is None:
+        if args.squares or args.square or args.printed:
+            raise InputError("--squares, --square and --print describe a board; give --board chessboard or --board charuco, too.")
+        return None
+    for given, flag in ((args.bar_length, "--bar-length"), (args.target_diameter, "--target-diameter"), (args.mask, "--mask")):
+        if given is not None:
+            raise InputError(f"{flag} belongs to a bar, and --board was given; leave one of them out.")
+    if args.interlaced != "none":
+        raise InputError("Boards are measured in whole images; leave out --interlaced, or calibrate interlaced cameras with a bar.")
+    numbers = re.fullmatch(r"(\d{1,3})[x×](\d{1,3})", args.squares or "")
+    if numbers is None or args.square is None:
+        raise InputError("Describe the board with --squares, such as 9x6, and --square, the side of a square in metres, such as 0.03.")
+    across, down = (int(n) for n in numbers.groups())
+    return Board(kind=BoardKind(args.board), squares=(across, down), square_m=args.square, dictionary=args.dictionary, marker_m=args.marker)
+
+
+def _print(args: argparse.Namespace, board: Board | None) -> list[str]:
+    if board is None or args.bar is not None or args.source is not None:
+        raise InputError("--print writes a board only; calibrate in a second call, when it is printed.")
+    write_board(args.printed, board)
+    return [
+        f"{args.printed}: a {board.kind.value} of {board.label}. "
+        "Print it without scaling, glue it to a flat plate, and measure its squares."
+    ]
 
 
 def _convert(args: argparse.Namespace) -> list[str]:
@@ -44,17 +82,18 @@ def _convert(args: argparse.Namespace) -> list[str]:
     return [*lines, f"The scale of {args.source}: {rig.metadata['scale']}."] if "scale" in rig.metadata else lines
 
 
-def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
-    if args.bar_length is None:
-        raise InputError("The bar's length is missing; give --bar-length with the distance between its two targets in metres.")
+def _calibrate(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> list[str]:
+    if board is None and args.bar_length is None:
+        raise InputError(
+            "The bar's length is missing; give --bar-length with the distance between its two targets in metres, or --board with --squares "
+            "and --square."
+        )
     if args.focal_px is not None and not 10 < args.focal_px < 1e6:
         raise InputError(f"--focal-px is {args.focal_px:g}; give the focal length in pixels, such as 1200, or leave it out.")
     if not args.format and args.out.is_dir():
         raise InputError(f"--out {args.out} is a folder; give the file of the rig to write, such as {args.out / 'rig.toml'}.")
     world = _world(args)
-    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field)
-    measured = measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter)
-    result = calibrate_rig(measured.observations, monitor, focal_px=args.focal_px, world=world)
+    result = calibrate_rig(_observed(args, board, monitor), monitor, focal_px=args.focal_px, world=world)
     written = [args.out]
     if args.report:
         written += write_report(args.report, result)[:1]
@@ -62,10 +101,19 @@ def _calibrate(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         write_as(args.out, result.rig, args.format)
     else:
         write_rig(args.out, result.rig)
-        written.append(write_bar(args.out, result.rig, *result.bar))
+        if board is None:
+            written.append(write_bar(args.out, result.rig, *result.bar))
     if args.json:
         return [json.dumps(report.figures(result.calibration, result.quality, result.verdict), indent=1, ensure_ascii=False)]
-    return [result.verdict.sentence, f"To improve: {result.verdict.advice}.", f"Written: {', '.join(map(str, written))}"]
+    remarks = [f"{line[0].upper()}{line[1:]}." for line in result.calibration.remarks]
+    return [result.verdict.sentence, f"To improve: {result.verdict.advice}.", *remarks, f"Written: {', '.join(map(str, written))}"]
+
+
+def _observed(args: argparse.Namespace, board: Board | None, monitor: Monitor) -> BarObservations | BoardObservations:
+    if board is not None:
+        return measure_boards(open_boards(args.bar), board, monitor)
+    footage = open_bar(args.bar, args.interlaced, args.mask, args.first_field)
+    return measure_bar(footage, args.bar_length, monitor, diameter_m=args.target_diameter).observations
 
 
 def _world(args: argparse.Namespace) -> WorldChoice:

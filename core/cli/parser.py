@@ -19,6 +19,7 @@ from .arguments import named_path
 Adder = Callable[[Any], None]
 Action = Callable[[argparse.Namespace, Monitor], list[str]]
 RIG_FORMATS = ("agisoft", "anipose", "caliscope", "colmap", "easymocap", "opencv", "openptv", "pose2sim")  # of calibration/rig_files
+BOARDS = ("chessboard", "charuco")  # of calibration/boards
 WORKERS = 2  # of a batch, by default
 RETRIES = 3  # of a take whose worker died; one that dies more often probably lacks memory
 
@@ -121,11 +122,17 @@ def _check(commands: Any) -> None:
 
 
 def _calibrate(commands: Any) -> None:
-    about = "a rig from the images of a waved bar, or from another tool's calibration"
+    about = "a rig from the images of a waved bar or of a printed board, or from another tool's calibration"
     parser = _command(commands, "calibrate", about, action("calibrate"))
     parser.add_argument("bar", nargs="?", type=Path, metavar="BARDIR", help="folder with a folder of images, or a movie, per camera")
     parser.add_argument("--bar-length", type=float, metavar="M", help="distance between the middles of the bar's targets in metres")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the rig to write, such as rig.toml")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the rig to write, such as rig.toml")
+    parser.add_argument("--board", choices=BOARDS, help="the images show a board instead of a bar")
+    parser.add_argument("--squares", metavar="9x6", help="across and down: inner corners of a chessboard, squares of a ChArUco board")
+    parser.add_argument("--square", type=float, metavar="M", help="side of a square in metres, as measured on the print")
+    parser.add_argument("--dictionary", default="DICT_4X4_50", metavar="NAME", help="OpenCV's name of the markers of a ChArUco board")
+    parser.add_argument("--marker", type=float, default=0.0, metavar="M", help="side of a marker in metres; three quarters of a square")
+    parser.add_argument("--print", dest="printed", type=Path, metavar="FILE", help="write the board as .pdf or .png for a printer")
     parser.add_argument("--focal-px", type=float, metavar="F", help="rough focal length in pixels, if known")
     parser.add_argument(
         "--interlaced",
@@ -138,8 +145,8 @@ def _calibrate(commands: Any) -> None:
         "--mask", type=Path, metavar="PATH", help="image that is black where no target can be, or a folder of them named like the cameras"
     )
     parser.add_argument("--target-diameter", type=float, metavar="M", help="diameter of the bar's targets in metres, if known")
-    parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar lies on the floor, which becomes z = 0")
-    parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar is held level")
+    parser.add_argument("--floor", metavar="A,B,…", help="frames in which the bar or board lies on the floor, which becomes z = 0")
+    parser.add_argument("--level", metavar="A,B,…", help="frames in which the bar or board is held level")
     parser.add_argument(
         "--points",
         type=Path,

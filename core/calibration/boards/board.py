@@ -48,7 +48,9 @@ class Board:
         least = 3  # two rows of inner corners have no interior
         if min(self.squares) < least or max(self.squares) > MOST_SQUARES:
             counted = "inner corners" if self.kind is BoardKind.CHESSBOARD else "squares"
-            raise InputError(f"The board has {self.label}; give the number of {counted} across and down, {least} to {MOST_SQUARES}, as in 9x6.")
+            raise InputError(
+                f"The board has {self.label}; give the number of {counted} across and down, {least} to {MOST_SQUARES}, as in 9x6."
+            )
         if not (math.isfinite(self.square_m) and 0 < self.square_m < LARGEST_SQUARE_M):
             raise InputError(f"The board's squares are given as {self.square_m:g} m; measure the side of a square in metres, such as 0.03.")
         if self.kind is BoardKind.CHARUCO:
@@ -62,7 +64,9 @@ class Board:
             raise InputError(f"The markers are given as {self.marker_m:g} m; they must be smaller than the squares, {self.square_m:g} m.")
         needed, there = self.squares[0] * self.squares[1] // 2, len(self.markers.bytesList)
         if needed > there:
-            raise InputError(f"A board of {self.label} squares has {needed} markers, and {self.dictionary} has only {there}; choose a larger one.")
+            raise InputError(
+                f"A board of {self.label} squares has {needed} markers, and {self.dictionary} has only {there}; choose a larger one."
+            )
 
     @property
     def label(self) -> str:
@@ -131,7 +135,9 @@ class Board:
         columns, rows = (n + (self.kind is BoardKind.CHESSBOARD) for n in self.squares)
         size = ((columns + 2) * side, (rows + 2) * side)
         if max(size) > LARGEST_PRINT_PX or side < 8:
-            raise InputError(f"A board of {self.label} with squares of {self.square_m:g} m cannot be drawn as a picture of {size[0]}×{size[1]} pixels.")
+            raise InputError(
+                f"A board of {self.label} with squares of {self.square_m:g} m cannot be drawn as a picture of {size[0]}×{size[1]} pixels."
+            )
         if self.kind is BoardKind.CHARUCO:
             return np.asarray(self.charuco().generateImage(size, marginSize=side, borderBits=1))
         dark = np.indices((rows, columns)).sum(axis=0) % 2 == 0

@@ -3,8 +3,8 @@
 1  initial values from nothing (`start`);
 2  f, k1 → + principal point, k2, p1, p2 → all unknowns, robustly;
 3  positions again with the cameras fixed: a view that does not fit the others was not synchronised, and becomes a position of its own;
-4  the shape of the board, if its deviations from the nominal corners are significant: each corner adjusted in three dimensions with the rest
-   fixed, then the rest again, until it rests; a shift, a turn and a scale of the whole are removed, so the squares keep their mean size
+4  the shape of the board, if its deviations from the plan are significant: each corner is adjusted in space with the rest fixed, then the
+   rest, several times; a shift, a turn and a scale of the whole are removed, so the squares keep their mean size
    F = ((SS₀ − SS₁) / m) / (SS₁ / r) > F_{1−α}(m, r) ,   m = 3 K − 7                                                              (1)
 5  least squares, data snooping, significance, precision as for a bar.
 """
@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...foundation.errors import InputError
 from ...foundation.progress import Monitor
 from ...geometry.camera import INTERIOR, image_with_derivatives
 from ..bundle import NEAREST_M, Adjusted, LevenbergMarquardt, Unknowns, adjust, inverse_factors, normal_equations, residuals, weights_of
@@ -20,11 +21,12 @@ from ..network import BoardNetwork
 from ..reference_bar import COARSE_CAUCHY_PX, lens_prior
 from ..self_calibration import GROSS, Calibration, robust_sigma, without_insignificant, without_outliers
 from .observations import BoardObservations
-from .start import initial_network, without_wild
+from .start import FEWEST_SHARED, initial_network, without_wild
 
 SHAPE_POSITIONS = 8  # of the board that show its shape
 SHAPE_ROUNDS = 6
 SHAPE_ALPHA = 1e-3  # α of (1)
+FEW_TOGETHER = 0.25  # of the images in which a camera does not agree: those in which it does
 MANY_APART = 0.25  # of the images of a camera
 MOST_LISTED = 8  # frames
 BENT = 0.004  # of the diagonal
@@ -48,7 +50,13 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
     prior = lens_prior(labelled.size_px, network.interior[:, 0])
     network, used = with_boards(network, labelled, max(10 * sigma, 1.0))
     first = adjust(
-        network, labelled.xy_px, used, prior, cauchy_px=3 * sigma, unit_px=sigma, iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.05)
+        network,
+        labelled.xy_px,
+        used,
+        prior,
+        cauchy_px=3 * sigma,
+        unit_px=sigma,
+        iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.05),
     )
     sigma = robust_sigma(first.residual_px, used)
     network, again = split_apart(first.network, labelled, sigma)
@@ -65,17 +73,30 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
 
 
 def _remarks(labelled: BoardObservations, corners_m: np.ndarray) -> tuple[tuple[str, ...], str]:
-    """Lines about unsynchronised views and the shape of the board, and the doubt that they raise."""
+    """Lines about unsynchronised views and the shape of the board, and the doubt that they raise.
+
+    Raises:
+        InputError: a camera does not agree with the others.
+    """
     lines, doubt = [], ""
     apart = _apart(labelled)
-    shown = labelled.views(labelled.visible).sum(axis=0)
+    views = labelled.views(labelled.visible)
+    shown = views.sum(axis=0)
+    together = (views & (views.sum(axis=1, keepdims=True) >= 2)).sum(axis=0)
     for c, name in enumerate(labelled.names):
         frames = apart[apart[:, 1] == c, 0]
         if len(frames):
             listed = ", ".join(map(str, frames[:MOST_LISTED])) + (" …" if len(frames) > MOST_LISTED else "")
-            lines.append(f"camera {name} was not synchronised with the others, or was moved, in {len(frames)} of {shown[c]} images: {listed}")
+            lines.append(
+                f"camera {name} was not synchronised with the others, or was moved, in {len(frames)} of {shown[c]} images: {listed}"
+            )
+        if together[c] < max(FEWEST_SHARED, FEW_TOGETHER * len(frames)):
+            raise InputError(
+                f"Camera {name} does not agree with the other cameras: only {together[c]} positions fit, {len(frames)} do not; "
+                "check that the recordings start at the same instant, and that no camera was moved or mirrored."
+            )
         if len(frames) > MANY_APART * shown[c]:
-            doubt = f"camera {name} disagrees in {len(frames)} of its {shown[c]} images: was it moved, or is it not synchronised?"
+            doubt = f"camera {name}, moved or not synchronised, disagrees with the others in {len(frames)} of its {shown[c]} images"
     deviation = corners_m - labelled.board.corners_m
     largest, length = float(np.linalg.norm(deviation, axis=1).max()), labelled.length_m
     if largest > 0:
@@ -85,7 +106,9 @@ def _remarks(labelled: BoardObservations, corners_m: np.ndarray) -> tuple[tuple[
             f"{1e3 * largest:.3f} mm; the adjustment allows for it"
         )
     if largest > BENT * length:
-        doubt = f"the board is bent or printed unevenly by {1e3 * largest:.1f} mm: glue it to a flat plate, and measure its squares both ways"
+        doubt = (
+            f"the board is bent or printed unevenly by {1e3 * largest:.1f} mm; glue it to a flat plate, and measure its squares both ways"
+        )
     return tuple(lines), doubt
 
 

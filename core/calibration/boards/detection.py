@@ -1,4 +1,4 @@
-"""The corners of a board in an image, by OpenCV's own detectors: Duda & Frese (2018) for chessboards, Garrido-Jurado et al. (2014) for ChArUco.
+"""The corners of a board in an image, by OpenCV's own detectors (chessboard: Duda & Frese 2018; ChArUco: Garrido-Jurado et al. 2014).
 
 A chessboard is located in the reduced image and measured in its part of the full image, which is as accurate and much faster. A ChArUco
 board may be partly hidden; its picture may be inverted, or of the pattern of OpenCV before 4.6: what the images show is tried once for

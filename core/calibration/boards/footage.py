@@ -18,6 +18,7 @@ Note = Callable[[str, int, int], None]  # view, images searched, images with the
 MOST_IMAGES = 600  # of a view that are searched, evenly spread
 MOST_STILLS = 60  # of a view: so few images are searched thoroughly
 TRIED_IMAGES = 24  # in which the variant is looked for
+GUESSED_IMAGES = 6  # in which other markers are looked for
 MOST_POSITIONS = 240  # that are adjusted
 
 
@@ -71,7 +72,7 @@ def measure_boards(footage: BoardFootage, board: Board, monitor: Monitor, note: 
     variant = _variant(footage, wanted, board, monitor)
     found: list[dict[int, np.ndarray]] = []
     sizes = []
-    for c, name in enumerate(footage.names):
+    for c in range(len(footage.names)):
         corners, size = _view(footage, c, wanted, board, variant, monitor, note)
         if not corners:
             _refuse(footage, c, wanted, board)
@@ -97,7 +98,7 @@ def _variant(footage: BoardFootage, wanted: np.ndarray, board: Board, monitor: M
     """How the board looks, from some images of each view; a chessboard looks the same inverted."""
     if board.kind is BoardKind.CHESSBOARD:
         return Variant()
-    images = []
+    images: list[np.ndarray] = []
     for c in range(len(footage.names)):
         at = np.flatnonzero(np.isin(footage.numbers[c], wanted))
         for i in at[np.unique(np.linspace(0, len(at) - 1, TRIED_IMAGES).astype(int))]:
@@ -156,11 +157,12 @@ def _refuse(footage: BoardFootage, c: int, wanted: np.ndarray, board: Board) -> 
     if board.kind is BoardKind.CHARUCO:
         if find_variant(images, board, MIRRORED)[1]:
             raise InputError(f"{start}, but its images are mirrored; flip them horizontally.")
+        images = images[:: max(1, len(images) // GUESSED_IMAGES)]
         for other in DICTIONARIES:
-            if other != board.dictionary and (guess := _other_markers(board, other)) and find_variant(images, guess, VARIANTS[:1])[1]:
+            if other != board.dictionary and (guess := _other_markers(board, other)) and find_variant(images, guess, VARIANTS[:2])[1]:
                 raise InputError(f"{start} with {board.dictionary}, but one of {other}; give --dictionary {other}.")
     raise InputError(
-        f"{start} {counted}; check the numbers of {counted} across and down, and hold the whole board in the image, flat, lit and not too far away."
+        f"{start} {counted}; check the numbers of {counted} across and down, and hold the whole board in the image, flat, lit and close."
     )
 
 

@@ -1,9 +1,9 @@
 """Initial values from nothing but the corners and the size of the squares: lenses, poses of the cameras, positions of the board.
 
-1  each camera by itself: f and the radial distortion κ on a grid, with the poses of the board from its homographies (IPPE, Collins & Bartoli
-   2014); the best is adjusted robustly with f, k1, then k2 and the principal point;
-2  each pair of cameras: every position of the board that both show proposes their relative pose, once for each of the two poses that a plane
-   may have in each image and each order of its corners; the proposal wins that predicts the corners of most other positions   (RANSAC)
+1  each camera by itself: f and the radial distortion κ on a grid, with the poses of the board from its homographies (IPPE, Collins &
+   Bartoli 2014); the best is adjusted robustly with f, k1, then k2 and the principal point;
+2  each pair of cameras: every position of the board that both show proposes their relative pose, once for each of the two poses that a
+   plane may have in each image and each order of its corners; the proposal wins that predicts the corners of most other positions;
 3  the pairs that agree in most positions form a tree, along which the cameras are chained;
 4  each position: the pose with which most cameras agree. A camera that disagrees was not synchronised there; what it shows becomes a
    position of its own, which still supports its lens.
@@ -47,7 +47,9 @@ def without_wild(observations: BoardObservations) -> BoardObservations:
     plane = observations.board.corners_m[:, :2]
     for i, c in np.argwhere(observations.views(observations.visible)):
         shown = np.isfinite(xy[i, c, :, 0])
-        F, fits = cv2.findHomography(plane[shown] / observations.board.square_m, xy[i, c, shown], cv2.RANSAC, _tolerance_px(xy[i, c], observations))
+        F, fits = cv2.findHomography(
+            plane[shown] / observations.board.square_m, xy[i, c, shown], cv2.RANSAC, _tolerance_px(xy[i, c], observations)
+        )
         keep = np.zeros(len(plane), dtype=bool)
         if F is not None:
             keep[np.flatnonzero(shown)[fits.ravel() > 0]] = True
@@ -146,7 +148,9 @@ def _ippe(corners_m: np.ndarray, image: np.ndarray) -> list[Pose]:
         return [far, far]
     points = np.ascontiguousarray(corners_m[shown])
     try:
-        count, turns, shifts, errors = cv2.solvePnPGeneric(points, np.ascontiguousarray(image[shown]), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        count, turns, shifts, errors = cv2.solvePnPGeneric(
+            points, np.ascontiguousarray(image[shown]), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
     except cv2.error:  # corners on one line
         return [far, far]
     found = [(cv2.Rodrigues(r)[0], t.ravel(), float(e)) for r, t, e in zip(turns, shifts, np.ravel(errors)) if t[2] > 0 and np.isfinite(e)]
@@ -175,7 +179,9 @@ def _plane_poses(observations: BoardObservations, cameras: tuple[Camera, ...]) -
     return PlanePoses(shown=shown, R=R, t=t, image=image)
 
 
-def _misses(corners_m: np.ndarray, R: np.ndarray, t: np.ndarray, image: np.ndarray, symmetries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _misses(
+    corners_m: np.ndarray, R: np.ndarray, t: np.ndarray, image: np.ndarray, symmetries: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Median distance (…,) of the corners of boards with poses R (…, 3, 3), t (…, 3) from an image (…, K, 2), and the order that fits."""
     X = corners_m @ np.swapaxes(R, -1, -2) + t[..., None, :]
     ahead = X[..., 2:] > 0
@@ -201,7 +207,9 @@ def _pair(observations: BoardObservations, plane: PlanePoses, i: int, j: int) ->
         for R, t in _proposals(corners, plane, symmetries, n, i, j):
             turned = R @ plane.R[judges, i]  # (m, 2, 3, 3)
             shifted = plane.t[judges, i] @ R.T + t
-            miss = _misses(corners, turned, shifted, np.repeat(plane.image[judges, j][:, None], SOLUTIONS, axis=1), symmetries)[0].min(axis=1)
+            miss = _misses(corners, turned, shifted, np.repeat(plane.image[judges, j][:, None], SOLUTIONS, axis=1), symmetries)[0].min(
+                axis=1
+            )
             agree = miss < AGREES
             rank = (int(agree.sum()), -float(np.median(miss[agree])) if agree.any() else -np.inf)
             if rank > (best[0], -best[1]):
@@ -209,7 +217,9 @@ def _pair(observations: BoardObservations, plane: PlanePoses, i: int, j: int) ->
     return best[0] * len(both) // len(judges), best[1], best[2], best[3]
 
 
-def _proposals(corners_m: np.ndarray, plane: PlanePoses, symmetries: np.ndarray, n: int, i: int, j: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _proposals(
+    corners_m: np.ndarray, plane: PlanePoses, symmetries: np.ndarray, n: int, i: int, j: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Relative poses of two cameras from one position of the board."""
     found = []
     for order in symmetries:
@@ -251,12 +261,12 @@ def _refuse_alone(observations: BoardObservations, plane: PlanePoses, alone: lis
     shared = max(int((plane.shown[:, c] & plane.shown[:, d]).sum()) for c in alone for d in joined)
     if shared < FEWEST_SHARED:
         raise InputError(
-            f"Camera {names} shares only {shared} positions of the board with the other cameras; at least {FEWEST_SHARED} are needed, and 20 "
-            "are good: hold the board where several cameras see it at the same instant."
+            f"Camera {names} shares only {shared} positions of the board with the other cameras; at least {FEWEST_SHARED} are needed, and "
+            "20 are good: hold the board where several cameras see it at the same instant."
         )
     raise InputError(
-        f"Camera {names} does not agree with the other cameras: of {shared} positions of the board that it shares with one of them, only {count} "
-        "fit one rig; check that the recordings start at the same instant, that no camera was moved, and that its images are not mirrored."
+        f"Camera {names} does not agree with the other cameras: of {shared} positions of the board that it shares with one of them, only "
+        f"{count} fit one rig; check that the recordings start at the same instant, and that no camera was moved or mirrored."
     )
 
 

@@ -10,6 +10,7 @@ from tricap.addon import command
 from tricap.addon.retarget import command as retargeting
 from tricap.addon.retarget.programs import PROGRAMS
 from tricap.core.body.skin.closed_skin import DETAIL
+from tricap.core.calibration.boards.board import BoardKind
 from tricap.core.calibration.rig_files import FORMATS
 from tricap.core.cli import parser
 from tricap.core.motion.formats.markers import UNITS_M
@@ -55,6 +56,7 @@ def test_a_command_that_computes_is_found_out() -> None:
 def test_the_parser_knows_what_it_does_not_import() -> None:
     assert parser.RIG_FORMATS == tuple(sorted(FORMATS))
     assert parser.RETRIES == RETRIES
+    assert parser.BOARDS == tuple(BoardKind)
     assert command.DETAIL == DETAIL
     assert retargeting.UNITS == tuple(UNITS_M)
     assert retargeting.PROGRAM_NAMES == tuple(PROGRAMS)
