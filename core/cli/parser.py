@@ -96,6 +96,7 @@ def _stages(commands: Any) -> None:
         )
     track.add_argument("--points", type=Path, metavar="FILE", help="track only the points of a CSV: point,view,x,y (two views or more)")
     track.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
+    track.add_argument("--pictures", type=Path, metavar="DIR", help="with --points: also draw the points and their paths over the images")
     everything.add_argument("--restart", action="store_true", help="start again instead of resuming")
     everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="frames to show in the report")
     everything.add_argument("--film", action="store_true", help="also write film.mp4: the body over every frame of every view")

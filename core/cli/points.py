@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
+from ..report.pictures import png
+from ..report.point_pictures import paths_in_space, paths_over_footage
 from ..results.folder import Results, check_separate_folder
 from ..run import take_run
 from ..take.footage import Footage, open_take
@@ -30,6 +33,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     settings = take_run.settings_of(take.settings, overrides(args.set), str(take.folder / "take.toml"))
     footage, frames = open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), frame_range(args.frames)
     check_separate_folder(args.out, take.folder, (s.files()[0] for s in footage.sequences))
+    for folder in () if args.pictures is None else (args.pictures, *(args.pictures / view.name for view in take.views)):
+        check_separate_folder(folder, take.folder, (s.files()[0] for s in footage.sequences))
     footage = footage if frames is None else take_run.only_frames(footage, frames)
     first = footage.frames.start if args.points_frame is None else args.points_frame
     if first not in footage.frames:
@@ -39,6 +44,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     with Results(args.out).opened() as results:
         tracked = follow_points(footage, points, first, settings, monitor)
         write_key_points(results.path("points3d.csv"), results.path("points2d.csv"), tuple(points), views, take.fps, tracked)
+        if args.pictures is not None:
+            _draw(args.pictures, footage, tuple(points), tracked, monitor)
     whole = int((tracked.status == TrackStatus.MEASURED).all(axis=0).sum())
     return [f"{results.folder}: {len(points)} points over {len(tracked.frames)} frames, {whole} of them visible in every frame."]
 
@@ -62,6 +69,18 @@ def follow_points(
     back = track_key_points(read, range(first, footage.frames.start - 1, -1), points, view, monitor, settings["key_points"])
     names = KeyPoints.__dataclass_fields__
     return KeyPoints(**{name: np.concatenate([getattr(back, name)[:0:-1], getattr(ahead, name)]) for name in names})
+
+
+def _draw(folder: Path, footage: Footage, names: tuple[str, ...], tracked: KeyPoints, monitor: Monitor) -> None:
+    """Write a picture per frame and view, and paths.png, the paths in space."""
+    for t, frame in enumerate(tracked.frames.tolist()):
+        monitor.step("pictures", t, len(tracked.frames))
+        for k, (grey, camera) in enumerate(zip(footage.read(frame), footage.rig.cameras)):
+            picture = paths_over_footage(grey, names, tracked.xy_px[:, :, k], t)
+            store.write_bytes(folder / camera.name / f"{frame:04d}.png", png(picture))
+    in_space = paths_in_space(tracked, footage.rig.cameras[footage.take.reference])
+    if in_space is not None:
+        store.write_bytes(folder / "paths.png", png(in_space))
 
 
 def _by_name(chosen: ChosenPoints, footage: Footage, path: Path) -> dict[str, dict[str, np.ndarray]]:

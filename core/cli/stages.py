@@ -43,6 +43,8 @@ def measure(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 
 def track(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """The trajectories of the surface's points, or of points that the user chose."""
+    if args.pictures is not None and not args.points:
+        raise InputError("--pictures draws the points of --points; without them, `tricap run` has pictures of the tracks in its report.")
     return points.run(args, monitor) if args.points else _stages(("measure", "track"), args, monitor)
 
 

@@ -47,7 +47,7 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
     xyz, status, seen = xyz[:, columns], status[:, columns], seen[:, columns]
     place = camera.to_camera(xyz.reshape(-1, 3)).reshape(xyz.shape)
     kept = seen & (status == TrackStatus.MEASURED)
-    limits = _limits(place[seen])
+    limits = limits_of(place[seen])
     removed = seen & ~kept
     reason = np.where(removed, status, 0)
     colours = np.full((*status.shape, 3), (150, 150, 150), dtype=np.int64)
@@ -57,19 +57,19 @@ def trail_pictures(path: Path, camera: Camera) -> list[tuple[str, np.ndarray]]:
     some = f", one trajectory in {every}" if every > 1 else ""
     both = f"from the front and from the right side{some}"
     return [
-        (f"All {int(seen.sum()):,} tracked positions before the filters, {both}", _views(place, seen, grey, limits)),
-        (f"The {int(removed.sum()):,} removed positions{some}: {COLOUR_WORDS}", _views(place, removed, colours, limits)),
-        (f"The {int(kept.sum()):,} positions that were kept, {both}", _views(place, kept, green, limits)),
+        (f"All {int(seen.sum()):,} tracked positions before the filters, {both}", both_views(place, seen, grey, limits)),
+        (f"The {int(removed.sum()):,} removed positions{some}: {COLOUR_WORDS}", both_views(place, removed, colours, limits)),
+        (f"The {int(kept.sum()):,} positions that were kept, {both}", both_views(place, kept, green, limits)),
     ]
 
 
-def _limits(points: np.ndarray) -> tuple[np.ndarray, float]:
+def limits_of(points: np.ndarray) -> tuple[np.ndarray, float]:
     """The middle of points (N, 3) and half the side [m] of a square that contains nearly all of them in both views."""
     low, high = np.percentile(points, [0.3, 99.7], axis=0)
     return 0.5 * (low + high), max(0.55 * float((high - low).max()), 0.01)
 
 
-def _views(place: np.ndarray, shown: np.ndarray, colours: np.ndarray, limits: tuple[np.ndarray, float]) -> np.ndarray:
+def both_views(place: np.ndarray, shown: np.ndarray, colours: np.ndarray, limits: tuple[np.ndarray, float]) -> np.ndarray:
     """Both views of places (T, N, 3) in the camera's axes, of those that are `shown` (T, N), with a scale."""
     middle, half = limits
     pair = []

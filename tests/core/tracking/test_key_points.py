@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -143,13 +144,24 @@ def test_the_command(tmp_path: Path, scenes: Any, capsys: pytest.CaptureFixture[
     lines = ["point,view,x,y", *(f"nose,{c.name},{c.project(true)[0][0]:.2f},{c.project(true)[0][1]:.2f}" for c in rig.cameras[:2])]
     (tmp_path / "points.csv").write_text("\n".join(lines))
     command = ["track", str(take), "--out", str(tmp_path / "out"), "--points", str(tmp_path / "points.csv"), "--quiet"]
-    assert main([*command, "--points-frame", "2"]) == 0
+    assert main([*command, "--points-frame", "2", "--pictures", str(tmp_path / "drawn")]) == 0
     rows = list(csv.DictReader((tmp_path / "out" / "points3d.csv").open(encoding="utf-8")))
     found = np.array([[float(r[a]) for a in "xyz"] for r in rows])
     assert [r["frame"] for r in rows] == list("0123") and {r["status"] for r in rows} == {"measured"}
     assert np.abs(found - true - [[0.01 * (i - 2), 0, 0] for i in range(4)])[:, :2].max() < 1e-3
     pixels = list(csv.DictReader((tmp_path / "out" / "points2d.csv").open(encoding="utf-8")))
     assert len(pixels) == 12 and {p["view"] for p in pixels} == {"L", "C", "R"}
+    drawn = sorted(str(path.relative_to(tmp_path / "drawn")) for path in (tmp_path / "drawn").rglob("*.png"))
+    assert drawn == sorted([*(f"{view}/{i:04d}.png" for view in "CLR" for i in range(4)), "paths.png"])
+    picture = cv2.imread(str(tmp_path / "drawn" / "C" / "0003.png")).astype(int)
+    (y, x) = (picture[..., 2] - picture[..., 0] > 100).nonzero()  # red: the path from before frame 1 on, the cross and the name
+    at = {p["frame"]: float(p["x"]) for p in pixels if p["view"] == "C"}
+    assert x.min() < at["1"] and len(y) > 10
+    assert main([*command, "--pictures", str(take)]) == 2 and "is itself a take" in capsys.readouterr().err
+    (take / "L").rename(tmp_path / "L")
+    (take / "L").symlink_to(tmp_path / "L")
+    assert main([*command, "--pictures", str(tmp_path)]) == 2 and "contains the footage" in capsys.readouterr().err
+    assert main(["track", str(take), "--out", str(tmp_path / "out"), "--pictures", str(tmp_path / "p")]) == 2
     assert main([*command, "--points-frame", "9"]) == 2 and "--points-frame 9" in capsys.readouterr().err
     (tmp_path / "points.csv").write_text("point,view,x,y\nnose,L,20,2000\n")
     assert main(command) == 2 and "outside the image" in capsys.readouterr().err
