@@ -34,5 +34,5 @@ def paths_in_space(tracked: KeyPoints, camera: Camera) -> np.ndarray | None:
     seen = np.isfinite(place).all(axis=2)
     if not seen.any():
         return None
-    tints = np.array([COLOURS[n % len(COLOURS)] for n in range(place.shape[1])])
+    tints = np.array([COLOURS[n % len(COLOURS)] for n in range(tracked.status.shape[1])])
     return both_views(place, seen, np.broadcast_to(tints, place.shape), limits_of(place[seen]))

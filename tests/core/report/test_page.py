@@ -4,6 +4,8 @@ import json
 import re
 import shutil
 import subprocess
+from base64 import b64encode
+from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -165,11 +167,13 @@ def test_names_are_text(tmp_path: Path) -> None:
 def test_a_browser_shows_the_page(tmp_path: Path, width: int, columns: int, scheme: str) -> None:
     """No error, no scrolling sideways, as many columns as fit, dark where that is asked for, graphs that are read and enlarged."""
     text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(tmp_path).read_text(), count=1)  # for the test's own script
-    first = "<script>window.failed = []; addEventListener('error', e => failed.push(e.message))</script>"
+    watch = "window.failed = []; addEventListener('error', e => failed.push(e.message))"
+    allowed = " ".join(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'" for code in (watch, PROBE))
+    text = text.replace("script-src ", f"script-src {allowed} ")  # besides the page's own script
     if scheme == "dark":
         text = text.replace("(prefers-color-scheme:dark)", "all")
     graph = curve_graph("first", "°", np.arange(11), {"a": 2.0 * np.arange(11)}, np.full(11, 1.0), limits=(-5.0, 15.0), marks=[4])
-    text = text.replace("<h1>", f"{first}{graph}<h1>", 1).replace("</body>", f"<script>{PROBE}</script></body>")
+    text = text.replace("<h1>", f"<script>{watch}</script>{graph}<h1>", 1).replace("</body>", f"<script>{PROBE}</script></body>")
     (tmp_path / "probe.html").write_text(text)
     command = [str(BROWSER), "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
                f"--window-size={width},900", "--dump-dom", (tmp_path / "probe.html").as_uri()]  # fmt: skip
