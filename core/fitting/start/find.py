@@ -2,7 +2,7 @@
 
 The frames in which most is seen of the person, and in which the limbs are furthest from the body, are searched (`search`). The best
 hypotheses are adjusted (`refine`), lost limbs are looked for, and the best explanation gets rivals: the same limbs of a person who faces
-the other way, or with the legs exchanged. All explanations of one frame compete:
+the other way, or with the legs exchanged, or one limb elsewhere. All explanations of one frame compete:
 
     p_k = exp(S_k / τ) / Σ_j exp(S_j / τ)                                                                  (1)
 
@@ -22,14 +22,14 @@ from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
 from .pose_dictionary import known_poses
-from .refine import STAGE, Explanation, exchanged, of_hypothesis, thinned_points, with_lengths, with_limbs
+from .refine import STAGE, Explanation, exchanged, limb_rivals, of_hypothesis, thinned_points, with_lengths, with_limbs
 from .search import hypotheses, is_inside, is_whole
 
 LOOKED_AT, SEARCHED = 24, 2  # frames of which the easiest are chosen, and how many are searched
 APART = 0.25  # of the recording, between the frames that are searched
 TRIED, DIFFERENT_M, AMONG = 5, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
 COMPLETED = 3  # of them, whose limbs are looked for
-SAME_M = 0.15  # between the joints of explanations that are one
+SAME_M = 0.2  # between the joints of explanations that are one
 TAU = 40.0  # voxels for a probability ratio of e
 FORWARD, MOST_FORWARD = 3.0, 1.0  # log odds per m/s of walking forwards, and at most
 TURN_S, MOST_AGREEMENT = 1.0, 5.0  # between frames in which a person faces about the same way; the most log odds from another frame
@@ -152,6 +152,7 @@ def _explained(fit: FitContext, t: int, points: CloudPoints, known: np.ndarray, 
         for i, (name, parts) in enumerate(EXCHANGES.items())
         if _can_exchange(fit, parts)
     ]
+    rivals += limb_rivals(fit, thin, best, monitor)
     return judged(fit, [*tried[COMPLETED:], *complete, *rivals], velocity)
 
 
