@@ -13,6 +13,8 @@ import numpy as np
 
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import default_shape, read_body, write_body
+from tricap.core.body.skin.mesh import SkinSettings
+from tricap.core.body.skin.person_skin import REST, read_skin, rest_skin, write_skin
 from tricap.core.calibration.rig_files import FOLDERS, FORMATS, read_any, write_as
 from tricap.core.checking.run_check import check_run
 from tricap.core.foundation import bounded, store
@@ -314,11 +316,19 @@ FAULTY: dict[str, tuple[Make, Read]] = {  # what the engine must find
     "test raises": (text("a", "sound"), _raise), "test sleeps": (text("a", "sound"), _sleep),
     "test swells": (text("a", "sound"), _swell), "test dies": (text("a", "sound"), _die),
 }  # fmt: skip
+
+
+def skin_of_rest(folder: Path) -> list[Path]:
+    write_skin(folder / REST, rest_skin(default_shape(read_model("arm.R")), SkinSettings(contours=4, rays=8, cap_contours=2)))
+    return [folder / REST]
+
+
 READERS: dict[str, tuple[Make, Read]] = {
     "take.toml": (text("take.toml", TAKE), read_take),
     "rig.toml": (written("rig.toml", lambda p: write_rig(p, RIG)), lambda f: read_rig(f / "rig.toml")),
     **{f"calibration {kind}": calibration(kind) for kind in sorted(FORMATS)},
     "ply": (cloud, lambda f: [read_ply(f / "a.ply"), read_ply(f / "b.ply")]),
+    "skin": (skin_of_rest, lambda f: read_skin(f / REST, default_shape(read_model("arm.R")))),
     "npz": (written("a.npz", arrays), lambda f: store.load(f / "a.npz")),
     "checkpoint": (lambda f: (checkpoint(f), [f / "cache" / "surface" / "0000.npz"])[1],
                    lambda f: Results(f).load_checkpoint("surface", "0000", "k")),

@@ -46,10 +46,10 @@ LEAST_SIGMA_M = 0.0005  # of an observation: the surface's texture
 START_SIGMA_M = 0.004  # σ_f at first
 CORRELATED = 3.0  # c of (3)
 NEARBY_M = 0.03  # over which σ_f is averaged
-ROUNDS = 3  # of finding the points' vertices anew
-REWEIGHTINGS = 2  # in the last round
-SAMPLES = 48  # of the covariance: each sigma to 10 %
-MOST_FRAMES = 120  # evenly over the take
+MOST_FRAMES = 80  # evenly over the take
+ROUNDS = (12, MOST_FRAMES)  # frames, evenly, of each round of finding the points' vertices
+REWEIGHTINGS = (0, 2)  # in each round
+SAMPLES = 32  # of the covariance: each sigma to 12 %
 UNMEASURED = 0.7  # of s: the sigma above which a vertex was hardly measured
 MIRRORED_M = 0.006  # by which the sides of a person differ
 
@@ -84,7 +84,7 @@ class _Observed:
 
 
 def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoints], mirror: bool, monitor: Monitor) -> Relief:
-    """The relief of a skin made in the rest pose of `shape`. 0.1 s a frame for a whole body, and 5 s.  (1)–(3)
+    """The relief of a skin made in the rest pose of `shape`. 0.1 s a frame for a whole body, and 6 s.  (1)–(3)
 
     With `mirror`, where a vertex was hardly measured it follows the mirror image of the other side, with its sigma and `MIRRORED_M`.
 
@@ -95,14 +95,15 @@ def measured_relief(skin: OneSkin, shape: BodyShape, frames: Sequence[SurfacePoi
     size = _prior_sigma(shape, skin)
     prior, nearby = _prior(skin.vertices_m, skin.faces, size), _Nearby(skin.vertices_m, skin.faces)
     delta, factor, weight = np.zeros(len(normals)), None, np.zeros(0)
-    for turn in range(ROUNDS):
-        moved = skin.vertices_m + delta[:, None] * normals
-        found = []
-        for i, points in enumerate(frames):
-            monitor.step("relief", turn * len(frames) + i, ROUNDS * len(frames) + 1)
-            found.append(_observed(poser.posed(moved, points.motion), skin.faces, delta, points, GATE * size))
+    for done, (most, reweightings) in enumerate(zip(ROUNDS, REWEIGHTINGS)):
+        moved, found = skin.vertices_m + delta[:, None] * normals, []
+        chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
+        for i, row in enumerate(chosen):
+            monitor.step("relief", done * len(chosen) + i, len(ROUNDS) * len(chosen) + 1)
+            posed = poser.posed(moved, frames[row].motion)
+            found.append(_observed(posed, skin.faces, delta, frames[row], GATE * size))
         seen = _Observed(**{name: np.concatenate([getattr(f, name) for f in found]) for name in _Observed.__slots__})
-        delta, factor, weight = _adjusted(prior, nearby, seen, REWEIGHTINGS if turn == ROUNDS - 1 else 1)
+        delta, factor, weight = _adjusted(prior, nearby, seen, reweightings)
     sigma = _sigmas(factor, prior, seen, weight)
     if mirror:
         seen, weight = _mirrored(skin.vertices_m, normals, delta, sigma, size, seen, weight)

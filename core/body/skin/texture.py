@@ -43,9 +43,11 @@ NEARER_M = 0.025  # by which another surface must be nearer to hide a texel
 EDGE_PX = 2  # margin at the edges of nearer surfaces
 DARKEST = 4.0  # grey values that count for the exposures
 FEWEST = 30  # common vertices of two views
+LEAST_HOLE_PX = 7  # texels; smaller holes have no rim
+RIM_PX = 3  # texels at the rim of what was seen, with the background in them, and as many over which it fades into what is filled
 PADDING_PX = 6  # around the islands
 STIFF, WEAK = 100.0, 1e-6  # ties of vertices that were seen to their colours, and of all to the mean
-MOST_FRAMES = 24  # evenly over the take
+MOST_FRAMES = 16  # evenly over the take
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -115,7 +117,8 @@ class TextureBaker:
         seen = placed if placed.any() else seen
         colour = np.zeros((len(self.texel), 3))
         colour[seen] = self._averaged(np.flatnonzero(seen), gain)
-        colour[~seen] = self._filled(colour, seen)[~seen]
+        inside = np.clip(self._from_unseen(seen) / RIM_PX - 1, 0, 1)
+        colour = inside[:, None] * colour + (1 - inside)[:, None] * self._filled(colour, inside == 1)
         side = (self._size, self._size)
         rgb, mask, covered = np.zeros((*side, 3)), np.zeros(side, dtype=bool), np.zeros(side, dtype=bool)
         rgb.reshape(-1, 3)[self.texel] = colour
@@ -148,6 +151,15 @@ class TextureBaker:
                 equations.append(row)
                 right.append(float(np.median(ratios)))
         return np.exp(np.linalg.lstsq(np.stack(equations), np.array(right), rcond=None)[0])
+
+    def _from_unseen(self, seen: np.ndarray) -> np.ndarray:
+        """Distances (N,) [texels] of texels from the nearest larger region that was not seen."""
+        hidden = np.zeros((self._size, self._size), dtype=np.uint8)
+        hidden.ravel()[self.texel] = ~seen
+        hidden = cv2.morphologyEx(hidden, cv2.MORPH_OPEN, np.ones((LEAST_HOLE_PX, LEAST_HOLE_PX), dtype=np.uint8))
+        if not hidden.any():
+            return np.where(seen, np.inf, 0.0)
+        return np.where(seen, cv2.distanceTransform(1 - hidden, cv2.DIST_L2, 5).ravel()[self.texel], 0.0)
 
     def _averaged(self, rows: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Colours (N, 3) of texels that were seen."""

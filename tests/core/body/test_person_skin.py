@@ -182,3 +182,17 @@ def test_a_whole_body_has_no_ledges_and_comes_in_any_detail() -> None:
     coarse, fine = resampled(skin, 1), resampled(skin, 4)
     np.testing.assert_array_equal(coarse.vertices_m, skin.vertices_m[rows])
     assert len(fine.faces) == 4 * len(skin.faces) and np.allclose(fine.weights.sum(axis=1), 1)
+
+
+@pytest.mark.slow
+def test_the_other_side_is_used_on_request() -> None:
+    shape = default_shape(read_model("full"))
+    skin, rest = rest_skin(shape, FEW), np.zeros(len(shape.skeleton.dofs))
+    left = skin.vertices_m[:, 0] > 0.02
+    normals = vertex_normals(skin.vertices_m, skin.faces)[left]
+    points = SurfacePoints(motion=rest, xyz_m=skin.vertices_m[left] + 0.008 * normals, normals=normals, sigma_m=np.full(left.sum(), 5e-4))
+    thigh = skin.weights[:, list(skin.bone_names).index("thigh.R")] > 0.9
+    plain, mirrored = (with_relief(skin, shape, [points] * 4, mirror, Monitor()) for mirror in (False, True))
+    assert plain.relief_m is not None and mirrored.relief_m is not None and mirrored.sigma_m is not None
+    assert abs(np.median(plain.relief_m[thigh])) < 0.002 and np.median(mirrored.relief_m[thigh]) == pytest.approx(0.008, abs=0.001)
+    assert np.median(mirrored.sigma_m[thigh]) > 0.001
