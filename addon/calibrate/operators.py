@@ -8,7 +8,18 @@ import bpy
 import numpy as np
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from ...core.calibration.calibrate import BarFootage, CalibratedRig, MeasuredBar, calibrate_rig, measure_bar, open_bar, write_report
+from ...core.calibration.boards.board import Board, BoardKind, write_board
+from ...core.calibration.boards.footage import BoardFootage, measure_boards
+from ...core.calibration.calibrate import (
+    BarFootage,
+    CalibratedRig,
+    MeasuredBar,
+    calibrate_rig,
+    measure_bar,
+    open_bar,
+    open_boards,
+    write_report,
+)
 from ...core.calibration.rig_files import FORMATS, read_any, write_as
 from ...core.calibration.world_frame import WorldChoice
 from ...core.foundation.errors import InputError
@@ -28,27 +39,18 @@ RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
 class Done:
     """The result of the computation."""
 
-    footage: BarFootage
-    measured: MeasuredBar
+    folder: Path
+    files: dict[str, list[Path]]  # of each view
+    tracks: dict[
+        str, np.ndarray
+    ]  # the targets of a wand (T, 2, 2) by view, one frame an image as the clips show them: of both fields the first
+    bar: tuple[np.ndarray, np.ndarray] | None  # frames (T,) and ends (T, 2, 3) [m] of a wand, one frame an image likewise
     result: CalibratedRig
     written: Path
 
-    @property
-    def tracks(self) -> dict[str, np.ndarray]:
-        """The targets (T, 2, 2) by view, one frame an image as the clips show them: of both fields the first."""
-        per = self.footage.field_layout.per_image
-        return {name: track.xy_px[::per] for name, track in zip(self.footage.names, self.measured.tracks)}
-
-    @property
-    def bar(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames (T,) and ends (T, 2, 3) [m] of the bar, one frame an image likewise."""
-        (frames, ends), per = self.result.bar, self.footage.field_layout.per_image
-        first = frames % per == 0
-        return frames[first] // per, ends[first]
-
 
 class Calibrate(JobOperator, bpy.types.Operator):
-    """Find the targets of the wand in the footage, calibrate the cameras and add them to the scene"""
+    """Find the wand or board in the footage, calibrate the cameras and add them to the scene"""
 
     bl_idname = "tricap.calibrate"
     bl_label = "Calibrate Cameras"
@@ -57,7 +59,7 @@ class Calibrate(JobOperator, bpy.types.Operator):
     if_stopped = "No camera was changed."
 
     bar: bpy.props.StringProperty(
-        name="Wand Footage",
+        name="Target Footage",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
         description="Folder that contains a folder of images, or a movie, for each camera. Empty: the one in the panel",
@@ -73,47 +75,55 @@ class Calibrate(JobOperator, bpy.types.Operator):
         name="Rig",
         subtype="FILE_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="File for the cameras. Empty: rig.toml next to the wand footage",
+        description="File for the cameras. Empty: rig.toml next to the target footage",
     )
 
     def snapshot(self, context: bpy.types.Context) -> Callable[[Monitor], Done]:
-        """Folder, length and options as they are now."""
+        """Folder, target and options as they are now."""
         props = context.scene.tricap_calibrate
         if not (self.bar or props.bar):
-            raise InputError("Choose the wand footage first: the folder that contains a folder of images, or a movie, for each camera.")
+            raise InputError("Choose the target footage first: the folder that contains a folder of images, or a movie, for each camera.")
         folder = folders.absolute(self.bar or props.bar)
         out = folders.absolute(self.out) if self.out else folder.parent / "rig.toml"
         folders.check_writable(out.parent)
-        # What was typed is the shortest decimal that Blender, in single precision, stores as this value.
-        length, diameter = (float(f"{value:.7g}") for value in (self.length_m or props.length_m, props.diameter_m))
+        length, diameter = (typed(value) for value in (self.length_m or props.length_m, props.diameter_m))
         mask = folders.absolute(props.mask) if props.mask else None
         interlaced, first_field = props.interlaced, props.first_field
         focal = props.focal_px if props.focal_px > 0 else None
         like = rig_of_scene(context.scene) if props.like_scene else None
         world = WorldChoice(floor_frames=frame_numbers(props.floor), level_frames=frame_numbers(props.level), like=like)
+        board = None if props.target == "WAND" else board_of(props)
         get_session().file.bar_counts.clear()
 
-        def read_and_calibrate(monitor: Monitor) -> Done:
+        def from_wand(monitor: Monitor) -> Done:
             footage = open_bar(folder, interlaced, mask, first_field)
-            return compute(footage, measure_bar(footage, length, monitor, note_count, diameter or None), focal, world, out, monitor)
+            measured = measure_bar(footage, length, monitor, note_count, diameter or None)
+            return compute_wand(footage, measured, calibrate_rig(measured.observations, monitor, focal_px=focal, world=world), out)
 
-        return read_and_calibrate
+        def from_board(monitor: Monitor) -> Done:
+            assert board is not None
+            footage = open_boards(folder)
+            observations = measure_boards(footage, board, monitor, note_count)
+            result = calibrate_rig(observations, monitor, focal_px=focal, world=world)
+            write(result, out)
+            return Done(folder=folder, files=files_of(footage), tracks={}, bar=None, result=result, written=out)
+
+        return from_wand if board is None else from_board
 
     def finish(self, context: bpy.types.Context, result: Done) -> set[str]:
         """Build the cameras and report the verdict."""
         views = [view.name for view in context.scene.tricap.views] if project.bound(context.scene) else []
-        missing = [name for name in views if name not in result.footage.names]
+        missing = [name for name in views if name not in result.files]
         if views and not missing:
             use_rig(context.scene, result.result.rig, result.bar)
-        files = {name: list(s.files()) for name, s in zip(result.footage.names, result.footage.sequences)}
-        build_cameras(context.scene, result.result.rig, files, result.tracks, result.bar)
+        build_cameras(context.scene, result.result.rig, result.files, result.tracks, result.bar)
         verdict, props = result.result.verdict, context.scene.tricap_calibrate
         props.light, props.verdict, props.advice, props.rig = verdict.light, verdict.sentence, verdict.advice, str(result.written)
         self.report({"WARNING" if verdict.light == "red" else "INFO"}, verdict.sentence)
         if missing:
             self.report(
                 {"WARNING"},
-                f"The cameras of the project were not replaced, because {result.footage.folder} has no footage named like view "
+                f"The cameras of the project were not replaced, because {result.folder} has no footage named like view "
                 f"{missing[0]}. Rename the view or the footage, then import {result.written}.",
             )
         return {"FINISHED"}
@@ -136,13 +146,76 @@ def frame_numbers(text: str) -> tuple[int, ...]:
         raise InputError(f"“{text}” is not a list of frames. Write frame numbers, such as 0, 40, 80.") from error
 
 
-def compute(footage: BarFootage, measured: MeasuredBar, focal_px: float | None, world: WorldChoice, out: Path, monitor: Monitor) -> Done:
-    """The computation, without bpy: from the measured wand to rig.toml, with its report."""
-    result = calibrate_rig(measured.observations, monitor, focal_px=focal_px, world=world)
+def typed(value: float) -> float:
+    """What was typed: the shortest decimal that Blender, in single precision, stores as this value."""
+    return float(f"{value:.7g}")
+
+
+def board_of(props: bpy.types.PropertyGroup) -> Board:
+    """The board that the panel describes.
+
+    Raises:
+        InputError: it is impossible.
+    """
+    across, down = props.squares
+    return Board(
+        kind=BoardKind(props.target),
+        squares=(across, down),
+        square_m=typed(props.square_m),
+        dictionary=props.dictionary,
+        marker_m=typed(props.marker_m) if props.target == BoardKind.CHARUCO else 0.0,
+    )
+
+
+def files_of(footage: BarFootage | BoardFootage) -> dict[str, list[Path]]:
+    """The files of each view."""
+    return {name: list(s.files()) for name, s in zip(footage.names, footage.sequences)}
+
+
+def write(result: CalibratedRig, out: Path) -> None:
+    """Write rig.toml and its report."""
     write_report(out.parent / f"{out.stem}_report", result)
     write_rig(out, result.rig)
-    write_bar(out, result.rig, *result.bar)
-    return Done(footage=footage, measured=measured, result=result, written=out)
+
+
+def compute_wand(footage: BarFootage, measured: MeasuredBar, result: CalibratedRig, out: Path) -> Done:
+    """Write rig.toml with the wand next to it; what the scene shows, one frame an image."""
+    write(result, out)
+    (frames, ends), per = result.bar, footage.field_layout.per_image
+    write_bar(out, result.rig, frames, ends)
+    first = frames % per == 0
+    return Done(
+        folder=footage.folder,
+        files=files_of(footage),
+        tracks={name: track.xy_px[::per] for name, track in zip(footage.names, measured.tracks)},
+        bar=(frames[first] // per, ends[first]),
+        result=result,
+        written=out,
+    )
+
+
+class PrintBoard(ExportHelper, bpy.types.Operator):
+    """Save the board for a printer, in its true size, as PDF or PNG. Print it without scaling, and glue it to a flat plate"""
+
+    bl_idname = "tricap.print_board"
+    bl_label = "Save Board for Printing"
+
+    filename_ext = ".pdf"
+    check_extension = None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Write the file."""
+        props = context.scene.tricap_calibrate
+        try:
+            if props.target == "WAND":
+                raise InputError("Choose ChArUco or Checkerboard first; a wand is not printed.")
+            board, path = board_of(props), folders.absolute(self.filepath)
+            write_board(path, board)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"A {board.kind.value} of {board.label} in {path}. Print it without scaling.")
+        return {"FINISHED"}
 
 
 class ImportRig(ImportHelper, bpy.types.Operator):
@@ -193,4 +266,4 @@ class ExportRig(ExportHelper, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (Calibrate, ImportRig, ExportRig)
+CLASSES = (Calibrate, PrintBoard, ImportRig, ExportRig)

@@ -1,4 +1,4 @@
-"""The section “Wand Calibration” of the panel. draw() only draws."""
+"""The section “Calibrate” of the panel. draw() only draws."""
 
 import bpy
 
@@ -7,20 +7,16 @@ from ..panels import sentence
 from ..session import get_session
 
 LIGHTS = {"green": "STRIP_COLOR_04", "yellow": "STRIP_COLOR_03", "red": "STRIP_COLOR_01"}
-GOOD_COUNT, FAIR_COUNT = 100, 30  # images of a view that show both targets
+COUNTS = {"WAND": (100, 30), "charuco": (20, 8), "chessboard": (20, 8)}  # images of a view that show the target: good, fair
 
 
 def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Footage, length, button, counts and verdict."""
+    """Target, footage, button, counts and verdict."""
     props, running = context.scene.tricap_calibrate, context.window_manager.tricap.running
+    layout.row().prop(props, "target", expand=True)
     layout.prop(props, "bar")
-    layout.prop(props, "length_m")
-    layout.prop(props, "interlaced")
-    if props.interlaced == BOTH:
-        layout.prop(props, "first_field")
+    (_wand if props.target == "WAND" else _board)(layout, props)
     layout.prop(props, "focal_px")
-    layout.prop(props, "diameter_m")
-    layout.prop(props, "mask")
     layout.prop(props, "floor", placeholder="frames: 0, 40, 80")
     layout.prop(props, "level", placeholder="frames: 12, 57")
     layout.prop(props, "like_scene")
@@ -28,8 +24,9 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     row.scale_y = 1.3
     row.enabled = bool(props.bar)
     row.operator("tricap.calibrate", icon="OUTLINER_OB_CAMERA")
+    noun = "wand" if props.target == "WAND" else "board"
     for view, (frames, whole) in list(get_session().file.bar_counts.items()):
-        layout.label(text=f"{view}: {whole} of {frames} images show the wand", icon=LIGHTS[light_of(whole)])
+        layout.label(text=f"{view}: {whole} of {frames} images show the {noun}", icon=LIGHTS[light_of(whole, props.target)])
     if props.verdict and not running:
         box = layout.box()
         sentence(box, context, props.verdict, LIGHTS.get(props.light, "NONE"))
@@ -40,6 +37,25 @@ def draw_calibrate(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     row.operator("tricap.export_rig", icon="EXPORT")
 
 
-def light_of(whole: int) -> str:
+def _wand(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:
+    layout.prop(props, "length_m")
+    layout.prop(props, "interlaced")
+    if props.interlaced == BOTH:
+        layout.prop(props, "first_field")
+    layout.prop(props, "diameter_m")
+    layout.prop(props, "mask")
+
+
+def _board(layout: bpy.types.UILayout, props: bpy.types.PropertyGroup) -> None:
+    layout.row().prop(props, "squares", text="Squares" if props.target == "charuco" else "Inner Corners")
+    layout.prop(props, "square_m")
+    if props.target == "charuco":
+        layout.prop(props, "marker_m")
+        layout.prop(props, "dictionary")
+    layout.operator("tricap.print_board", icon="EXPORT")
+
+
+def light_of(whole: int, target: str) -> str:
     """The traffic light of such a count."""
-    return "green" if whole >= GOOD_COUNT else "yellow" if whole >= FAIR_COUNT else "red"
+    good, fair = COUNTS[target]
+    return "green" if whole >= good else "yellow" if whole >= fair else "red"

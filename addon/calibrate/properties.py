@@ -1,20 +1,64 @@
-"""The settings of the wand calibration, in the scene: `scene.tricap_calibrate`."""
+"""The settings of the calibration, in the scene: `scene.tricap_calibrate`."""
 
 import bpy
 
+from ...core.calibration.boards.board import DICTIONARIES, MOST_SQUARES
 from ..take_properties import FIELD_ORDERS, FIELDS_USED
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+TARGETS = [
+    ("WAND", "Wand", "A bar with two bright targets at its ends, waved through the volume"),
+    ("charuco", "ChArUco", "A checkerboard with a marker in every white square; a part of it is enough"),
+    ("chessboard", "Checkerboard", "A plain checkerboard, which must be visible as a whole"),
+]
 
 
 class TricapCalibrate(bpy.types.PropertyGroup):
-    """The settings and the result of the wand calibration."""
+    """The settings and the result of the calibration."""
 
+    target: bpy.props.EnumProperty(
+        name="Target",
+        default="WAND",  # type: ignore[valid-type]
+        items=TARGETS,
+        description="What the footage shows",
+    )
+    squares: bpy.props.IntVectorProperty(
+        name="Squares",
+        size=2,
+        default=(9, 6),
+        min=3,
+        max=MOST_SQUARES,  # type: ignore[valid-type]
+        description="Across and down: the squares of a ChArUco board, the inner corners of a checkerboard",
+    )
+    square_m: bpy.props.FloatProperty(
+        name="Square Size",
+        default=0.03,
+        min=0.0,
+        soft_max=0.5,
+        unit="LENGTH",  # type: ignore[valid-type]
+        precision=4,
+        description="Side of a square, as measured on the print",
+    )
+    marker_m: bpy.props.FloatProperty(
+        name="Marker Size",
+        default=0.0,
+        min=0.0,
+        soft_max=0.5,
+        unit="LENGTH",  # type: ignore[valid-type]
+        precision=4,
+        description="Side of a marker. 0: three quarters of a square",
+    )
+    dictionary: bpy.props.EnumProperty(
+        name="Dictionary",
+        default="DICT_4X4_50",  # type: ignore[valid-type]
+        items=[(name, name.removeprefix("DICT_"), "") for name in DICTIONARIES],
+        description="The set of markers with which the board was made",
+    )
     bar: bpy.props.StringProperty(
-        name="Wand Footage",
+        name="Target Footage",
         subtype="DIR_PATH",
         options=RELATIVE,  # type: ignore[valid-type]
-        description="Folder that contains a folder of images, or a movie, of the waved wand for each camera",
+        description="Folder that contains a folder of images, or a movie, of the wand or board for each camera",
     )
     length_m: bpy.props.FloatProperty(
         name="Wand Length",
@@ -55,11 +99,11 @@ class TricapCalibrate(bpy.types.PropertyGroup):
         "images named like the cameras. Empty: none",
     )
     floor: bpy.props.StringProperty(
-        name="Wand on Floor",
-        description="Frames in which the wand lies on the floor, such as 0, 40, 80; "  # type: ignore[valid-type]
+        name="Target on Floor",
+        description="Frames in which the wand or board lies on the floor, such as 0, 40, 80; "  # type: ignore[valid-type]
         "the floor becomes z = 0. Empty: up is the mean up direction of the cameras",
     )
-    level: bpy.props.StringProperty(name="Wand Level", description="Frames in which the wand is horizontal, such as 12, 57")  # type: ignore[valid-type]
+    level: bpy.props.StringProperty(name="Target Level", description="Frames in which the wand or board is horizontal, such as 12, 57")  # type: ignore[valid-type]
     like_scene: bpy.props.BoolProperty(
         name="Align to Scene Cameras",
         default=False,  # type: ignore[valid-type]

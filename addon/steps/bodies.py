@@ -214,7 +214,7 @@ DRAW = {
 def advanced(layout: bpy.types.UILayout, context: bpy.types.Context, step: str) -> None:
     """The further sections of a step: alternatives, and the settings that are seldom changed."""
     if step == "cameras":
-        _section(layout, context, "bar", "Wand Calibration", draw_calibrate)
+        _section(layout, context, "bar", "Calibrate", draw_calibrate)
     if step == "retarget":
         _section(layout, context, "onto", "Retarget to Character", draw_retarget, closed=False)
     if step == "footage":

@@ -172,7 +172,7 @@ def _cameras(scene: bpy.types.Scene, found: _Project) -> State:
         return State(status=Status.EMPTY, message="Add the footage first.")
     path = found.take.rig_path
     if not path.exists():
-        return State(status=Status.READY, message="Import a calibration file, or calibrate with a wand.")
+        return State(status=Status.READY, message="Import a calibration file, or calibrate with a wand or board.")
     rig = read_rig(path)
     for view in scene.tricap.views:
         size = rig[view.name].size_px

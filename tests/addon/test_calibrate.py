@@ -4,14 +4,18 @@ import importlib
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from tricap.core.calibration.boards.board import Board, BoardKind
 from tricap.core.geometry.rig import Rig, read_rig, write_rig
 from tricap.core.synthetic.bar import BarNoise, BarPictures, benchmark_cameras, waved_bar, write_bar_folder
+from tricap.core.synthetic.board import held_board, picture_of_board
 from tricap.core.take.bar_file import read_bar
 
 from .conftest import small_rig
+from .layout import Layout
 
 ADDON = "bl_ext.user_default.tricap.addon"
 
@@ -255,3 +259,29 @@ def test_undo_takes_calibrated_and_imported_cameras_away(blender, empty, bar: Pa
         empty.ops.ed.redo()
         assert cameras() == 3, name
         empty.ops.ed.undo()
+
+
+def test_a_board_becomes_cameras_and_a_page(blender, empty, tmp_path: Path) -> None:
+    props = empty.context.scene.tricap_calibrate
+    props.target, props.squares, props.square_m, props.dictionary = "charuco", (5, 4), 0.14, "DICT_5X5_100"
+    drawn = Layout()
+    importlib.import_module(f"{ADDON}.calibrate.panel").draw_calibrate(drawn, empty.context)
+    assert {"squares", "square_m", "dictionary"} <= set(drawn.properties) and "length_m" not in drawn.properties
+    assert empty.ops.tricap.print_board(filepath=str(tmp_path / "board.pdf")) == {"FINISHED"}
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+    board = Board(kind=BoardKind.CHARUCO, squares=(5, 4), square_m=0.14, dictionary="DICT_5X5_100")
+    cameras = [c.resized((512, 384)) for c in benchmark_cameras()[:2]]
+    rng = np.random.default_rng(11)
+    held = held_board(cameras, board.corners_m, 12, rng, tilt=np.radians(35))
+    for camera in cameras:
+        (tmp_path / "film" / camera.name).mkdir(parents=True)
+        for n in range(12):
+            image = picture_of_board(camera, board.picture(dpi=25), 138, board.square_m, held.R[n], held.t_m[n], rng)
+            cv2.imwrite(str(tmp_path / "film" / camera.name / f"{n}.png"), image)
+    props.bar = str(tmp_path / "film")
+    assert empty.ops.tricap.calibrate() == {"FINISHED"}
+    assert "in which the board was held" in props.verdict and {c.name for c in read_rig(tmp_path / "rig.toml").cameras} == {"L", "C"}
+    assert not (tmp_path / "rig_bar.csv").exists() and "Reference bar" not in empty.data.objects
+    props.target = "WAND"
+    with pytest.raises(RuntimeError, match="a wand is not printed"):
+        empty.ops.tricap.print_board(filepath=str(tmp_path / "wand.pdf"))
