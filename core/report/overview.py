@@ -6,18 +6,24 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..body.motion import FITTED, BodyFit
+from ..body.motion import BRIDGED, PARTIAL, SUSPECT, BodyFit
 from ..body.skin.mesh import Skin
 from ..geometry.camera import Camera
 from ..geometry.raster import rasterize, vertex_normals
 from . import pictures
 
+PREDICTED = {
+    PARTIAL: "a limb rests on prediction",
+    BRIDGED: "the whole pose is predicted",
+    SUSPECT: "residuals are large or observations few",
+}
 KNOWN_MM = np.array([1.0, 7.0, 50.0])  # sigmas of joints whose colours are
 KNOWN_COLOURS = np.array([[200, 130, 40], [60, 205, 250], [50, 50, 230]], dtype=np.float64)  # BGR: blue, yellow, red
 LEGEND = "Colour: reported sigma of the joints; blue 1 mm or less, yellow 7 mm, red 50 mm or more."
 CELL_PX = 300  # height of a picture of the strip
 MARGIN = 1.3  # of a picture about the body
 OPACITY = 0.6
+SURROUND = 40  # grey value around an image that is smaller than its cell
 
 
 def verdict(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> str:
@@ -27,9 +33,11 @@ def verdict(record: Mapping[str, Any], body: BodyFit | None, doubtful: int) -> s
         return " ".join([_of_surface(stages), f"No body was fitted: {stages.get('fit', {}).get('not_done', 'it was not asked for')}."])
     motion = body.motion
     sigma = 1e3 * np.median(motion.joint_sigma_m, axis=0)
-    fitted, worst = motion.status.count(FITTED), int(sigma.argmax())
+    worst, frames = int(sigma.argmax()), len(motion.frames)
+    predicted = {words: motion.status.count(status) for status, words in PREDICTED.items() if status in motion.status}
+    less = "; ".join(f"in {n if n < frames else 'all'} of them {words}" for words, n in predicted.items())
     text = (
-        f"The body was fitted in {fitted} of {len(motion.frames)} frames. "
+        f"The body was fitted in {frames} frames{f'; {less}' if less else ''}. "
         f"Reported sigma of its joints: {np.median(sigma):.1f} mm (median), "
         f"largest at {motion.joint_names[worst]} with {sigma[worst]:.0f} mm."
     )
@@ -79,10 +87,12 @@ def known_body(grey: np.ndarray, camera: Camera, skin: Skin, sigma_mm: np.ndarra
     tint = raster.interpolate(known_colours(skin.weights @ sigma_mm), skin.triangles)
     flat = image.reshape(-1, 3)
     flat[raster.sample] = (1 - OPACITY) * flat[raster.sample] + OPACITY * light[:, None] * tint
-    x, y = np.rint((centre_px + 0.5) * scale - 0.5 - CELL_PX / 2).astype(int)
-    padded = np.pad(image, ((CELL_PX, CELL_PX), (CELL_PX, CELL_PX), (0, 0)), mode="edge")
-    x, y = np.clip([x, y], -CELL_PX, np.array(small.size_px) - 1)
-    return padded[y + CELL_PX : y + 2 * CELL_PX, x + CELL_PX : x + 2 * CELL_PX].clip(0, 255).astype(np.uint8)
+    corner = np.rint((centre_px + 0.5) * scale - 0.5 - CELL_PX / 2).astype(int)
+    x, y = np.clip(corner, 0, np.maximum(0, np.array(small.size_px) - CELL_PX))  # within the image, where that is large enough
+    part = image[y : y + CELL_PX, x : x + CELL_PX].clip(0, 255).astype(np.uint8)
+    down, right = CELL_PX - part.shape[0], CELL_PX - part.shape[1]
+    around = ((down // 2, down - down // 2), (right // 2, right - right // 2), (0, 0))
+    return np.pad(part, around, constant_values=SURROUND)
 
 
 def strip_frames(count: int, doubtful: Sequence[int], most: int = 6) -> list[int]:

@@ -6,7 +6,7 @@ Also frames.csv: the quality of every frame in one row, for the panel's graph an
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -215,7 +215,12 @@ def frame_table(summaries: Sequence[FrameSummary], trajectories: Trajectories | 
 
 
 def doubtful_frames(table: FrameTable, body: BodyFit | None) -> dict[int, str]:
-    """Why frames are doubtful, the worst first: those in which the images contradict a limb, then those worse than the median frame."""
+    """Why frames are doubtful, the worst first: those in which the images contradict a limb, then those worse than the median frame.
+
+    A state of the fit that most frames share does not single out a frame.
+    """
+    usual = {state for state in table.fit if 2 * table.fit.count(state) > len(table.fit)}
+    table = replace(table, fit=tuple("" if state in usual else state for state in table.fit))
     contradicted: dict[int, list[str]] = {}
     for bone, frames in body.contradicted.items() if body is not None else ():
         for frame in frames:

@@ -68,7 +68,9 @@ def test_the_verdict_reports_doubt_before_anything_sounds_certain() -> None:
     assert "No surface was measured: nothing" in verdict({"stages": {"measure": {"not_done": "nothing"}}}, None, 0)
     good = verdict(record, fitted(), 0)
     assert (
-        "fitted in 2 of 3 frames" in good and "largest at wrist.R with 60 mm" in good and good.endswith("No frame stands out as doubtful.")
+        "fitted in 3 frames; in 1 of them a limb rests on prediction." in good
+        and "largest at wrist.R with 60 mm" in good
+        and good.endswith("No frame stands out as doubtful.")
     )
     assert verdict(record, fitted(), 2).endswith("2 frames are doubtful; the worst are shown here.")
     assert "has not converged" in verdict(record, fitted(converged=False), 0)

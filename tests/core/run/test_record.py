@@ -1,12 +1,14 @@
 """frames.csv: what stands in it, and which frames it calls bad."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tricap.core.foundation.errors import InputError
-from tricap.core.run.record import COLUMNS, FrameTable, frame_table, read_frame_table, write_frame_table
+from tricap.core.run.record import COLUMNS, FrameTable, doubtful_frames, frame_table, read_frame_table, write_frame_table
 from tricap.core.surface.frames import FrameSummary
 from tricap.core.tracking.trajectories import with_kinematics
 
@@ -58,3 +60,14 @@ def test_a_damaged_table_is_told(tmp_path: Path, text: str) -> None:
         read_frame_table(tmp_path / "frames.csv")
     with pytest.raises(InputError, match="Cannot read"):
         read_frame_table(tmp_path / "missing.csv")
+
+
+def test_doubtful_frames() -> None:
+    """Contradicted limbs first, then the worst; a state of the fit that most frames share singles out none."""
+    frames, values = np.arange(10, 15), {name: np.full(5, np.nan) for name in COLUMNS}
+    values["sigma_mm"] = np.array([1.0, 1.0, 4.0, 1.0, 2.0])
+    states = FrameTable(frames=frames, values=values, fit=("partial", "partial", "partial", "bridged", "partial"))
+    assert doubtful_frames(states, None) == {12: "points uncertain", 13: "fit bridged", 14: "points uncertain"}
+    body: Any = SimpleNamespace(contradicted={"upper_arm.R": (11, 12), "shin.L": (12,)})
+    found = doubtful_frames(states, body)
+    assert list(found) == [11, 12, 13, 14] and found[12] == "the images contradict the right arm and the left lower leg"
