@@ -6,7 +6,7 @@ from itertools import product
 from pathlib import Path
 
 import bpy
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ...core.body.fields import POTENTIALS
 from ...core.foundation.progress import Monitor
@@ -20,6 +20,8 @@ from ..scene.contents import Contents, read_contents
 from ..scene.rest_pose import POSES
 
 RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"}
+
+DEFAULT_LIGHT_M = (4.07625, 1.00545, 5.90386)  # where the light of Blender's startup file is
 
 
 class BuildScene(JobOperator, bpy.types.Operator):
@@ -117,7 +119,7 @@ def put_into_scene(
     if body is not None:
         chosen.source, chosen.export = chosen.source or body, chosen.export or body
     if first and body is not None and context.window is not None and not bpy.app.background:
-        _hide_default_cube(operator, context)
+        _hide_default_objects(operator, context)
         for item in context.selected_objects:
             item.select_set(False)
         body.select_set(True)
@@ -127,14 +129,27 @@ def put_into_scene(
                 bpy.ops.view3d.view_selected()
 
 
-def _hide_default_cube(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
-    """Hide the cube of Blender's startup file, in which the body would stand up to the chest, if it is unchanged."""
-    cube = context.scene.objects.get("Cube")
-    if cube is None or cube.type != "MESH" or cube.matrix_world != Matrix() or cube.modifiers or cube.animation_data or cube.hide_get():
-        return
-    if sorted(tuple(round(x) for x in v.co) for v in cube.data.vertices) == sorted(product((-1, 1), repeat=3)):
-        cube.hide_set(True)
-        operator.report({"INFO"}, "The default cube was hidden, because the body stands in it.")
+def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Context) -> None:
+    """Hide the cube of Blender's startup file, in which the body would stand up to the chest, and its light, if they are unchanged."""
+    wanted = {"Cube": _is_default_cube, "Light": _is_default_light}
+    hidden = [thing for name, unchanged in wanted.items() if (thing := context.scene.objects.get(name)) is not None and unchanged(thing)]
+    for thing in hidden:
+        thing.hide_set(True)
+        thing.hide_render = True
+    if hidden:
+        names = " and ".join(thing.name.lower() for thing in hidden)
+        operator.report({"INFO"}, f"Of Blender's default scene, {names} were hidden: they are in the way of the body.")
+
+
+def _is_default_cube(cube: bpy.types.Object) -> bool:
+    if cube.type != "MESH" or cube.matrix_world != Matrix() or cube.modifiers or cube.animation_data or cube.hide_get():
+        return False
+    return sorted(tuple(round(x) for x in v.co) for v in cube.data.vertices) == sorted(product((-1, 1), repeat=3))
+
+
+def _is_default_light(light: bpy.types.Object) -> bool:
+    there = (light.location - Vector(DEFAULT_LIGHT_M)).length < 1e-3
+    return light.type == "LIGHT" and light.data.type == "POINT" and there and not light.animation_data and not light.hide_get()
 
 
 def report_scene(operator: bpy.types.Operator, report: SceneReport) -> None:

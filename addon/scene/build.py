@@ -33,6 +33,7 @@ COLLECTION = "Tricap"
 SEGMENTS_KEY = "tricap_segments"  # of cloud and trajectories: the bones' names, in the order of the attribute's numbers
 OUT_KEY = "tricap_out"  # custom property of the collection: the folder that it was built from
 PLACES_KEY = "tricap_places"  # custom property of the collection: folders of results ("out") and take, relative to the .blend
+PART_KEY = "tricap_part"  # custom property of the collections in it: Body, Cameras, Measured, …
 KEYS_KEY = "tricap_keys"  # custom property of the collection: the keys of the finished stages (core/run/stages.py)
 
 
@@ -99,22 +100,42 @@ def write_scene(
     scene.collection.children.link(collection)
     set_time(scene, contents)
     warnings, counts = list(contents.warnings), {}
-    counts["cameras"] = _add_cameras(scene, collection, contents, opened, warnings)
-    counts["cloud points"] = _add_cloud(collection, contents, options, warnings)
+    counts["cameras"] = _add_cameras(scene, _part(collection, "Cameras"), contents, opened, warnings)
+    measured = _part(collection, "Measured")
+    measured.hide_render = True
+    counts["cloud points"] = _add_cloud(measured, contents, options, warnings)
     if contents.trajectories is not None:
-        counts["trajectories"] = _add_trajectories(collection, contents, contents.trajectories, options, warnings)
-    counts |= _add_body(collection, contents, warnings, options, blend)
+        counts["trajectories"] = _add_trajectories(measured, contents, contents.trajectories, options, warnings)
+    body = _part(collection, "Body")
+    counts |= _add_body(body, contents, warnings, options, blend)
     if surface is not None:
-        skin.add_implicit(collection, *surface, potential_named(options.field))
-    surroundings.add_lights(collection)
-    if _has_floor(contents):
-        surroundings.add_floor(collection)
+        skin.add_implicit(measured, *surface, potential_named(options.field))
+    _add_studio(scene, collection, body, contents)
     if contents.bar is not None:
-        counts["positions of the bar"] = _add_bar(collection, contents.frames[0], *contents.bar)
+        counts["positions of the bar"] = _add_bar(_part(collection, "Bar"), contents.frames[0], *contents.bar)
     scene.frame_set(scene.frame_start)
     if blend is not None:
         save_blend(Path(blend))
     return SceneReport(collection=collection.name, counts=counts, warnings=tuple(warnings), blend=blend)
+
+
+def _part(collection: bpy.types.Collection, name: str) -> bpy.types.Collection:
+    """A new collection in that of the scene."""
+    part = bpy.data.collections.new(name)
+    part[PART_KEY] = True
+    collection.children.link(part)
+    return part
+
+
+def _add_studio(scene: bpy.types.Scene, collection: bpy.types.Collection, body: bpy.types.Collection, contents: Contents) -> None:
+    """Lights, a floor where it is known or a person stands, and a bright background in a scene without one."""
+    surroundings.add_lights(_part(collection, "Lights"))
+    standing_body = next((o for o in body.all_objects if standing.LIFT_KEY in (o.data or ())), None)
+    if standing_body is not None:
+        surroundings.add_floor(_part(collection, "Floor"), standing_body.location.z, standing.covered(standing_body))
+    elif _has_floor(contents):
+        surroundings.add_floor(_part(collection, "Floor"))
+    surroundings.add_background(scene)
 
 
 def _places(contents: Contents, folder: Path) -> dict[str, str]:
@@ -139,7 +160,7 @@ def remove_earlier() -> None:
         used |= {image for material in used if isinstance(material, bpy.types.Material) for image in nodes.images_of(material)}
         if scene.active_clip in used:
             scene.active_clip = None
-        inside = [child for child in collection.children_recursive if metaballs.COLLECTION_KEY in child]
+        inside = [child for child in collection.children_recursive if metaballs.COLLECTION_KEY in child or PART_KEY in child]
         bpy.data.batch_remove(objects)
         bpy.data.batch_remove([*inside, collection])
         for _ in range(

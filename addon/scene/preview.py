@@ -19,7 +19,7 @@ from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.geometry.camera import Camera, image_of, interior_of
 from ...core.images.sequence import decoded
-from . import cloud, trajectories
+from . import cloud, surroundings, trajectories
 from .contents import Contents
 
 BACKGROUND = 40  # grey level behind the body
@@ -27,7 +27,7 @@ OPACITY = 0.6  # of the body over the footage
 TURN_FRAMES, TURN_SIZE_PX, TURN_FPS = 48, (480, 640), 24.0
 TURN_LENS_MM = 50.0
 SHOWN = ("MESH", "META")
-HIDDEN = (cloud.NAME, trajectories.NAME, trajectories.ARROWS_NAME)
+HIDDEN = (cloud.NAME, trajectories.NAME, trajectories.ARROWS_NAME, surroundings.FLOOR)
 
 
 def preview(contents: Contents, path: Path, frame: int | None = None) -> None:

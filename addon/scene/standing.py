@@ -81,6 +81,16 @@ def bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
     return (thing for thing in scene.objects if thing.type == "ARMATURE" and LIFT_KEY in thing.data)
 
 
+def covered(body: bpy.types.Object) -> np.ndarray:
+    """The path (T, 2) [m] of a body over the floor; the origin where it has none."""
+    found = {0: np.zeros(1), 1: np.zeros(1)}
+    for curve in _path_curves(body):
+        values = np.empty(2 * len(curve.keyframe_points), dtype=np.float32)
+        curve.keyframe_points.foreach_get("co", values)
+        found[curve.array_index] = values[1::2] if len(values) else np.zeros(1)
+    return np.array([[low(found[0]), low(found[1])] for low in (np.min, np.max)], dtype=float)
+
+
 def path_of(scene: bpy.types.Scene) -> Path:
     """What carries the path of the scene's body."""
     curves = [curve for body in bodies(scene) for curve in _path_curves(body)]

@@ -10,7 +10,9 @@ from .cloud import write
 from .trajectories import trail_group
 
 LIGHTS = (("Key light", 3.0, (50.0, 0.0, 35.0)), ("Fill light", 1.0, (60.0, 0.0, -70.0)))  # name, W/m², direction in degrees
-FLOOR_M, FLOOR_SQUARES = 6.0, 12
+FLOOR = "Floor"
+SQUARE_M, MARGIN_M = 0.5, 6.0  # of the floor: its squares, and its size around a person who stays in one place
+BACKGROUND = (0.32, 0.33, 0.35)  # of renders, in a scene without a world
 FLOOR_COLOUR, BAR_COLOUR = (0.35, 0.36, 0.38), (0.9, 0.75, 0.1)
 
 
@@ -25,17 +27,28 @@ def add_lights(collection: bpy.types.Collection) -> None:
         collection.objects.link(light)
 
 
-def add_floor(collection: bpy.types.Collection) -> bpy.types.Object:
-    """The plane z = 0 as squares of half a metre around the origin; for rigs whose world frame lies on the floor."""
-    lines = np.linspace(-FLOOR_M / 2, FLOOR_M / 2, FLOOR_SQUARES + 1)
-    x, y = np.meshgrid(lines, lines, indexing="ij")
+def add_background(scene: bpy.types.Scene) -> None:
+    """A grey world that lights evenly, in a scene that has no world; another one stays as it is."""
+    if scene.world is None:
+        scene.world = bpy.data.worlds.get("Tricap studio") or bpy.data.worlds.new("Tricap studio")
+        scene.world.color = BACKGROUND
+
+
+def add_floor(collection: bpy.types.Collection, height_m: float = 0.0, path_m: np.ndarray | None = None) -> bpy.types.Object:
+    """A level floor as squares of half a metre, around the origin or the path (T, 2) of a person over it."""
+    path_m = np.zeros((1, 2)) if path_m is None else path_m
+    middle = np.round((path_m.min(axis=0) + path_m.max(axis=0)) / 2 / SQUARE_M) * SQUARE_M
+    across_m = MARGIN_M + float(np.ptp(path_m, axis=0).max())
+    lines = SQUARE_M * np.arange(-np.ceil(across_m / 2 / SQUARE_M), np.ceil(across_m / 2 / SQUARE_M) + 1)
+    x, y = np.meshgrid(lines + middle[0], lines + middle[1], indexing="ij")
     first = np.arange(len(lines) - 1)[:, None] * len(lines) + np.arange(len(lines) - 1)
     faces = np.stack([first, first + len(lines), first + len(lines) + 1, first + 1], axis=-1).reshape(-1, 4)
-    mesh = bpy.data.meshes.new("Floor")
+    mesh = bpy.data.meshes.new(FLOOR)
     mesh.from_pydata(np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3).tolist(), [], faces.tolist())
-    mesh.materials.append(nodes.plain_material("Floor", FLOOR_COLOUR))
-    floor = bpy.data.objects.new("Floor", mesh)
+    mesh.materials.append(nodes.plain_material(FLOOR, FLOOR_COLOUR))
+    floor = bpy.data.objects.new(FLOOR, mesh)
     floor.display_type, floor.hide_select = "WIRE", True
+    floor.location.z = height_m
     collection.objects.link(floor)
     return floor
 

@@ -93,6 +93,30 @@ def test_the_rest_pose_stands_on_the_floor_and_the_root_carries_the_path(empty: 
     assert {bone.color.palette for bone in body.data.bones} == {"THEME01", "THEME04", "THEME09"}
 
 
+def test_the_scene_is_tidy_and_a_render_shows_the_body(empty: ModuleType, out: Path) -> None:
+    from tricap.addon.scene.build import build_scene
+
+    empty.context.scene.world = None
+    build_scene(out)
+    (top,) = empty.context.scene.collection.children
+    parts = {part.name: {o.name for o in part.all_objects if o.type != "META"} for part in top.children}
+    assert parts == {
+        "Cameras": set(),
+        "Measured": set(),
+        "Body": {"Body", "Skin"},
+        "Lights": {"Key light", "Fill light"},
+        "Floor": {"Floor"},
+    }
+    assert not top.objects and top.children["Measured"].hide_render and not empty.data.objects["Skin"].hide_render
+    assert empty.context.scene.world is not None
+    floor = empty.data.objects["Floor"]
+    path, corners = from_run(out).head_m[:, 0], np.array([floor.matrix_world @ v.co for v in floor.data.vertices])
+    assert np.abs(corners[:, 2] - FLOOR_M).max() < 1e-5
+    assert (corners.min(axis=0)[:2] < path.min(axis=0)[:2] - 1).all() and (corners.max(axis=0)[:2] > path.max(axis=0)[:2] + 1).all()
+    build_scene(out)
+    assert len(empty.data.collections) == 7, "an earlier build is replaced, with its collections"
+
+
 def walker(bpy: ModuleType) -> Any:
     """The walking person in an empty scene, without a skin."""
     from tricap.addon.scene import action, armature
