@@ -49,9 +49,16 @@ def dev() -> ModuleType:
     return module
 
 
+def needs_blender() -> None:
+    """Skip what needs bpy, also its tools, in a Python without it."""
+    if importlib.util.find_spec("bpy") is None:
+        pytest.skip("bpy is not installed for this Python")
+
+
 @pytest.fixture(scope="session")
 def extension_zip(dev: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The extension without its wheels: scipy and OpenCV are beside bpy already."""
+    needs_blender()
     (made,) = dev.build([PLATFORM], str(tmp_path_factory.mktemp("zip")), with_wheels=False)
     return Path(made)
 
@@ -59,6 +66,7 @@ def extension_zip(dev: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> 
 @pytest.fixture(scope="session")
 def full_extension_zip(dev: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The extension as users get it, with its wheels (downloaded once, about 130 MB)."""
+    needs_blender()
     (made,) = dev.build([PLATFORM], str(tmp_path_factory.mktemp("full_zip")), with_wheels=True)
     return Path(made)
 
@@ -77,8 +85,7 @@ def blender(dev: ModuleType) -> Iterator[ModuleType]:
 
     Blender 4.5 as a module hangs at the interpreter's end when a class is still registered; hence the orderly end.
     """
-    if importlib.util.find_spec("bpy") is None:
-        pytest.skip("bpy is not installed for this Python")
+    needs_blender()
     repository = PROFILE / "extensions" / "user_default"
     repository.mkdir(parents=True, exist_ok=True)
     dev.link_folder(repository / "tricap", ROOT)

@@ -12,6 +12,8 @@ from typing import Any
 from ..foundation import bounded
 from ..foundation.errors import InputError
 
+MOST_DIGITS = 12  # of a frame number
+
 
 def overrides(pairs: list[str]) -> dict[str, dict[str, Any]]:
     """--set GROUP.NAME=VALUE as tables; values are read as TOML, plain words as text.
@@ -42,7 +44,7 @@ def frame_range(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     first, colon, last = text.partition(":")
-    if not colon or not first.isdecimal() or not last.isdecimal():
+    if not colon or not all(n.isdecimal() and len(n) <= MOST_DIGITS for n in (first, last)):
         raise InputError(f"--frames {text} cannot be read; write the first frame and the one after the last, such as 0:40.")
     return int(first), int(last)
 

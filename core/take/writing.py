@@ -106,7 +106,7 @@ def footage_entry(folder: Path, name: str, source: Path) -> tuple[Table, Link]:
                 f"The folder {source} of view {name} has {'no images' if not endings else 'images of several kinds'}; it needs one kind."
             )
         entry, target = {"name": name, "images": f"{glob.escape(name)}/*{endings[0]}"}, folder / name
-    elif source.suffix.lower() not in MOVIE_ENDINGS:
+    elif source.suffix.lower() not in MOVIE_ENDINGS or not source.is_file():
         raise InputError(f"The footage {source} of view {name} is neither a folder of images nor a movie ({', '.join(MOVIE_ENDINGS)}).")
     else:
         entry, target = {"name": name, "movie": name + source.suffix}, folder / f"{name}{source.suffix}"

@@ -39,6 +39,19 @@ model = "arm.R"
 """
 
 
+class NeedsBlender(pytest.Module):
+    """A module of tests that is skipped, and says why, in a Python without bpy."""
+
+    def collect(self) -> list[pytest.Item]:
+        """Nothing."""
+        pytest.skip("bpy is not installed for this Python", allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module | None:
+    """Modules of this folder import bpy; without it they are not imported."""
+    return NeedsBlender.from_parent(parent, path=module_path) if importlib.util.find_spec("bpy") is None else None
+
+
 @pytest.fixture
 def empty() -> Iterator[ModuleType]:
     """bpy with an empty file open."""

@@ -70,6 +70,11 @@ def test_faults_of_the_system_are_sentences() -> None:
 
 def test_a_name_that_is_too_long_is_one_sentence(rig: Path) -> None:
     long = "a" * 500
-    for line in (f"check {long}", f"run {long} --out {rig.parent / 'out'}", f"calibrate {long} --out {rig.parent / 'b.toml'} --bar 1"):
+    for line in (
+        f"measure {rig.parent} --out {rig.parent / 'out'} --frames 0:{'9' * 5000}",
+        f"check {long}",
+        f"run {long} --out {rig.parent / 'out'}",
+        f"calibrate {long} --out {rig.parent / 'b.toml'} --bar 1",
+    ):
         done = shell(f"tricap {line}", rig)
         assert done.returncode == 2 and done.stderr.count(b"\n") == 1 and b"tricap: " in done.stderr, done
