@@ -10,7 +10,7 @@ s is the mean difference of cells with measured points: a person in plain cloth 
 background is known there, `seen` is added where points were measured, and G is a Gaussian: a cell is more likely the person's among cells
 of the person (mean field of a Potts model; Koller & Friedman 2009, §11.5). The background of a cell is the tightest cluster of its values
 over time (Parzen 1962; Bickel 2002: half-sample mode), of those without measured points near if there are enough: a person who lingers does
-not become the background.
+not become the background. Where measured points looked just so, nothing is known.
 """
 
 from collections.abc import Sequence
@@ -29,6 +29,7 @@ CLUSTER = 0.5  # of a cell's values, of which the tightest cluster consists
 TIGHT = 6.0  # times the noise: a wider cluster is no background
 LEAST_NOISE = 0.3  # grey values
 ROWS = 64  # of cells, processed at a time
+SAME_LOOK, MANY = 1.5, 0.2  # times the noise: what differs less looks the same; the share of the cells around that do
 LINGERING = 0.3  # c of a cell near which there was always a person
 STRAY, SAME = 0.02, 0.05  # ε: shadows and the like; δ of (1)
 LEAST_DIFFERENCE = 3.0  # s over the noise
@@ -61,10 +62,12 @@ def cells(image: np.ndarray, cell_px: int) -> np.ndarray:
     return whole if cell_px == 1 else np.asarray(whole.reshape(h // cell_px, cell_px, w // cell_px, cell_px).mean(axis=(1, 3)))
 
 
-def still_background(images: Sequence[np.ndarray], near: Sequence[np.ndarray], cell_px: int) -> CellBackground | None:
+def still_background(
+    images: Sequence[np.ndarray], near: Sequence[np.ndarray], seen: Sequence[np.ndarray], cell_px: int
+) -> CellBackground | None:
     """The background of images in cells (h, w), spread over time; None if there are too few.
 
-    `near` (h, w) of each: where somebody is near.
+    `near` and `seen` (h, w) of each: where somebody is near, and where measured.
     """
     if len(images) < FEWEST:
         return None
@@ -77,8 +80,28 @@ def still_background(images: Sequence[np.ndarray], near: Sequence[np.ndarray], c
         bare[part], bare_width[part] = _tightest(np.sort(without, axis=0), np.isfinite(without).sum(axis=0))
     noise = max(LEAST_NOISE, float(np.median([mad_sigma(image - grey) for image in images])))
     certain = bare_width < TIGHT * noise
+    grey = np.where(certain, bare, grey)
     known = np.where(certain, 1.0, np.where(width < TIGHT * noise, LINGERING, 0.0))
-    return CellBackground(grey=np.where(certain, bare, grey), noise=noise, known=known, cell_px=cell_px)
+    known[_same_when_seen(images, seen, grey, noise)] = 0.0
+    return CellBackground(grey=grey, noise=noise, known=known, cell_px=cell_px)
+
+
+def _same_when_seen(images: Sequence[np.ndarray], seen: Sequence[np.ndarray], grey: np.ndarray, noise: float) -> np.ndarray:
+    """Cells (h, w) in which measured points of the person look as the background `grey` does: a foot that stood there all the time, and
+    was not always measured. None in cloth that looks like the background everywhere."""
+    middle = np.full(grey.shape, np.inf, np.float32)
+    for row in range(0, len(grey), ROWS):
+        part = slice(row, row + ROWS)
+        there = np.stack([cells[part] for cells in seen])
+        difference = np.where(there, np.abs(np.stack([image[part] for image in images]) - grey[part]), np.inf)
+        count = there.sum(axis=0)
+        half = np.take_along_axis(np.sort(difference, axis=0), np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
+        middle[part] = np.where(count >= FEWEST_BARE, half, np.inf)
+    measured = np.isfinite(middle)
+    if not measured.any() or float(np.median(middle[measured])) < LEAST_DIFFERENCE * noise:
+        return np.zeros(grey.shape, dtype=bool)
+    same = (middle < SAME_LOOK * noise).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(same, (0, 0), RADIUS) > MANY)  # single ones are chance
 
 
 def given_background(grey: np.ndarray, images: Sequence[np.ndarray], cell_px: int) -> CellBackground | None:

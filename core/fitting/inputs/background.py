@@ -149,8 +149,11 @@ def find_background(footage: Footage, clouds: Sequence[PointCloud], monitor: Mon
                 shown = np.ones(image.shape, dtype=bool) if shown is None else (shown | seen | persons[k]) & limits.get(k, True)
             else:
                 shown = cells(_mask_of(footage, k, cloud.frame), size) > HALF
-            far = cv2.distanceTransform((~shown).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
-            distances.append((np.minimum(far, 255 * UNIT_PX / size) * (size / UNIT_PX)).astype(np.uint8))
+            unknown = (known[k].known == 0) & ~shown if k in known else np.zeros(shown.shape, dtype=bool)
+            beyond = (~(shown | unknown)).astype(np.uint8)
+            far = cv2.distanceTransform(beyond, cv2.DIST_L2, cv2.DIST_MASK_5)  # infinite if all is background
+            steps = np.minimum(far, 255 * UNIT_PX / size) * (size / UNIT_PX)
+            distances.append(np.where(unknown, 1, steps).astype(np.uint8))  # next to the person: neither that nor background
     views = footage.take.views
     return [BackgroundDistances(view=views[k].name, frame=frames, distance=d, step_px=sizes[k], unit_px=UNIT_PX) for k, d in found.items()]
 
@@ -205,7 +208,8 @@ def _backgrounds(
         near = [
             _near(camera, xyz_m, images[0].shape, size, NEAR_M) if len(xyz_m) else np.full(images[0].shape, everywhere) for xyz_m in points
         ]
-        found.append(still_background(images, near, size))
+        seen = [_near(camera, xyz_m, images[0].shape, size, CELL_M) for xyz_m in points]
+        found.append(still_background(images, near, seen, size))
     return found
 
 

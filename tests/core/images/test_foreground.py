@@ -29,8 +29,9 @@ def _walk(cloth: np.ndarray, count: int = 13) -> list[np.ndarray]:
     return [_image(x, cloth, seed) for seed, x in enumerate(np.linspace(20, 120, count))]
 
 
-def _background(images: list[np.ndarray], near: list[np.ndarray] | None = None) -> CellBackground:
-    found = still_background(images, [NOBODY] * len(images) if near is None else near, 4)
+def _background(images: list[np.ndarray], near: list[np.ndarray] | None = None, seen: list[np.ndarray] | None = None) -> CellBackground:
+    nobody = [NOBODY] * len(images)
+    found = still_background(images, nobody if near is None else near, nobody if seen is None else seen, 4)
     assert found is not None
     return found
 
@@ -93,10 +94,29 @@ def test_where_somebody_was_always_near_the_background_is_doubtful_and_where_not
     assert not np.asarray(person(background, images[6], NOBODY))[:18, :18].any()  # what differs from something unknown is not the person
 
 
+def test_who_stood_there_all_the_time_and_was_not_always_measured_is_no_background() -> None:
+    foot = (np.indices(SIZE)[0] > 60) & _ellipse(40)  # while the rest of her walks on
+    images = [np.where(foot, _image(40, 150 + PRINT, seed), image) for seed, image in enumerate(_walk(150 + PRINT))]
+    at = np.linspace(20, 120, 13)
+    seen = [_ellipse(x) & ~foot | (foot if seed % 3 == 0 else NOBODY) for seed, x in enumerate(at)]
+    near = [cv2.dilate(cells.astype(np.uint8), np.ones((7, 7))) > 0 for cells in seen]
+    standing = foot & ~np.any([_near(x) for x in at[3::3]], axis=0)
+    assert (_background(images, near).known[standing] == 1).any(), "or the test shows nothing"
+    known = _background(images, near, seen).known
+    assert (known[foot] == 0).mean() > 0.9 and (known[:55] == 1).all()
+
+
+def test_the_background_stays_known_behind_a_measured_walker_in_cloth_like_it() -> None:
+    at, plain = np.linspace(20, 120, 13), WALL + 2.5 * PRINT / PRINT.std()
+    background = _background(_walk(plain), [_near(x) for x in at], [_ellipse(x) for x in at])
+    assert (background.known == 0).mean() < 0.02
+
+
 def test_too_few_images_have_no_background() -> None:
     images = _walk(110 + PRINT, FEWEST)
-    assert still_background(images[:-1], [NOBODY] * (FEWEST - 1), 4) is None
-    assert still_background(images, [NOBODY] * FEWEST, 4) is not None
+    for count in (FEWEST - 1, FEWEST):
+        nobody = [NOBODY] * count
+        assert (still_background(images[:count], nobody, nobody, 4) is None) == (count < FEWEST)
 
 
 def test_a_black_image_or_another_light_shows_nobody_and_a_slightly_different_one_does() -> None:
