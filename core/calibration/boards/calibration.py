@@ -30,6 +30,7 @@ FEW_TOGETHER = 0.25  # of the images in which a camera does not agree: those in 
 MANY_APART = 0.25  # of the images of a camera
 MOST_LISTED = 8  # frames
 BENT = 0.004  # of the diagonal
+STRETCHED = 1e-3  # makes the scale uncertain by half of it, the limit of a good calibration
 POSE_STEPS = 8  # of positions with the cameras fixed
 APART = 2.5  # times the median residual of views with positions of their own: a view beyond it does not fit the others of its position
 APART_SHARED = 2.0  # times that of views with shared positions, which contains the errors of the lens and of slight asynchrony
@@ -105,11 +106,24 @@ def _remarks(labelled: BoardObservations, corners_m: np.ndarray) -> tuple[tuple[
             f"the board differs from its plan by {1e3 * along:.3f} mm RMS in the plane and {1e3 * across:.3f} mm RMS across it, at most "
             f"{1e3 * largest:.3f} mm; the adjustment allows for it"
         )
+    stretch = _stretch(labelled.board.corners_m, corners_m)
+    if stretch > STRETCHED:
+        doubt = (
+            f"the squares are {100 * stretch:.2f} % longer one way than the other, so the scale is uncertain; measure them both ways, and "
+            "print the board without scaling"
+        )
     if largest > BENT * length:
         doubt = (
             f"the board is bent or printed unevenly by {1e3 * largest:.1f} mm; glue it to a flat plate, and measure its squares both ways"
         )
     return tuple(lines), doubt
+
+
+def _stretch(plan_m: np.ndarray, corners_m: np.ndarray) -> float:
+    """How much longer the board is in one direction than in the other, less one, relative to its plan."""
+    affine = np.linalg.lstsq(plan_m[:, :2] - plan_m[:, :2].mean(axis=0), corners_m[:, :2] - corners_m[:, :2].mean(axis=0), rcond=None)[0]
+    longest, shortest = np.linalg.svd(affine, compute_uv=False)
+    return float(longest / shortest - 1)
 
 
 def shaped(

@@ -130,6 +130,13 @@ def test_a_bent_board_is_measured_and_reported() -> None:
     assert error_m(held.cameras, done.rig.cameras) < 3 * bound_m(held, 0.1)
 
 
+def test_a_board_that_is_stretched_in_print_is_never_good() -> None:
+    rng = np.random.default_rng(4)
+    held = held_board(random_cameras(rng, "wide"), CHESSBOARD.corners_m * [1.01, 1.0, 1.0], 30, rng, sigma_px=0.1)
+    done = calibrate_rig(observed(held), Monitor())
+    assert done.verdict.light != "green" and "the squares are 1.0" in done.verdict.sentence
+
+
 def test_the_ends_of_a_symmetric_board_are_told_apart_by_the_other_cameras() -> None:
     board = Board(kind=BoardKind.CHESSBOARD, squares=(8, 6), square_m=0.05)
     rng = np.random.default_rng(1)
