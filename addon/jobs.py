@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..core.foundation.errors import InputError, sentence_of
-from ..core.foundation.progress import Cancelled, Monitor
+from ..core.foundation.progress import Cancelled, Monitor, time_text
 from ..core.foundation.threads import one_thread_in_linear_algebra
 from .panels import show_status
 from .session import get_session
@@ -78,7 +78,9 @@ class Job:
 
     @property
     def fraction(self) -> float:
-        """The fraction of the current stage that is done, 0…1."""
+        """The fraction that is done, 0…1: of all stages of a run, or else of the current one."""
+        if self.monitor.course is not None:
+            return self.monitor.course.fraction
         return min(max(self.done / self.total, 0.0), 1.0) if self.total > 0 else 0.0
 
     def cancel_and_join(self) -> None:
@@ -89,8 +91,10 @@ class Job:
 
     @property
     def seconds_left(self) -> float | None:
-        """Until the end of the current stage, at its recent pace; None as long as too little is done for an estimate, and when that time
-        has passed."""
+        """Until the end of the run; of other jobs until the end of the current stage, at its recent pace; None as long as too little is
+        done for an estimate, and when that time has passed."""
+        if self.monitor.course is not None:
+            return self.monitor.course.seconds_left or None
         pace = list(self._pace)
         if len(pace) < 2 or pace[-1][1] - pace[0][1] < min(ENOUGH, 1.0 / max(self.total, 1.0)):
             return None
@@ -123,15 +127,6 @@ class Job:
             self._pace.append((now, self.fraction))
         while len(self._pace) > 2 and self._pace[0][0] < now - PACE_S:
             self._pace.popleft()
-
-
-def time_text(seconds: float) -> str:
-    """A time left: "40 s", "3 min", "1 h 20 min"."""
-    whole = max(0, round(seconds))
-    if whole < 90:
-        return f"{whole} s"
-    minutes = round(whole / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
 class JobState(bpy.types.PropertyGroup):

@@ -18,7 +18,9 @@ LAYERS = (
     "foundation geometry images matching body motion take results surface calibration synthetic tracking fitting checking report run cli"
 ).split()
 THIRD_PARTY = {"numpy", "scipy", "cv2", "threadpoolctl"}
-OPTIONAL = {"core/run/batch.py": {"dask", "distributed"}}  # the extra [batch]; imported only when it is used
+OPTIONAL = {
+    name: {"dask", "distributed"} for name in ("core/run/batch.py", "core/run/engine.py")
+}  # the extra [batch]; imported only when it is used
 NETWORK = {"socket", "ssl", "http", "urllib", "ftplib", "smtplib", "xmlrpc", "requests", "asyncio"}
 SERIALIZERS = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "joblib"}
 LONGEST_FILE = 450

@@ -9,6 +9,7 @@ import bpy
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.run import pipeline, take_run
+from ...core.run.engine import of_this_machine
 from ...core.synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
 from .. import folders, project
 from ..jobs import JobOperator
@@ -69,6 +70,7 @@ def measure(
     """The computation, without bpy: all stages that are not done, and their results read for the scene."""
     with take_run.open_run(take, out, overrides) as run:
         if not pipeline.is_complete(run):
+            run.engine = of_this_machine()
             pipeline.all_stages(run, monitor)
     monitor.begin("build")
     return run, read_contents(out, monitor) if build else None

@@ -10,6 +10,8 @@ import bpy
 from ...core.fitting.inputs.take_inputs import check_body
 from ...core.foundation.progress import Monitor
 from ...core.run import pipeline, take_run
+from ...core.run.engine import of_this_machine
+from ...core.run.phases import course_of
 from .. import project
 from ..jobs import JobOperator
 from .build_scene import RELATIVE
@@ -47,6 +49,8 @@ def run_stages(take: Path, out: Path, overrides: Mapping[str, Mapping[str, Any]]
     with take_run.open_run(take, out, overrides) as run:
         if "fit" in names:
             check_body(run.footage, run.settings["fitting"])
+        run.engine = of_this_machine()
+        monitor.course = course_of(names, len(run.footage.frames))
         for name in names:
             monitor.begin(name)
             getattr(pipeline, name)(run, monitor)

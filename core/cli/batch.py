@@ -4,7 +4,8 @@ import argparse
 
 from ..foundation.errors import InputError
 from ..foundation.progress import Cancelled, Monitor
-from ..run.batch import Engine, Status, as_json, run_batch, summary
+from ..run.batch import Status, as_json, run_batch, summary
+from ..run.engine import Engine
 from .arguments import overrides
 
 

@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from ..checking.findings import Checked
+from ..checking.findings import Cause, Checked, wrong
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 
@@ -32,6 +32,12 @@ def check(subject: Path, monitor: Monitor) -> Checked:
 
         return check_run(subject, monitor)
     if (subject / "take.toml").is_file() or (subject.name == "take.toml" and subject.is_file()):
+        from ..take.take import read_take
+
+        try:
+            read_take(subject)  # a damaged one is reported before the stages are imported
+        except InputError as error:
+            return Checked(subject=str(subject), kind="take", findings=(wrong(Cause.INPUT, str(error)),), figures={})
         from ..run.check import check_take
 
         return check_take(subject, monitor)

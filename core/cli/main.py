@@ -14,7 +14,7 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from ..foundation.errors import InputError, sentence_of
-from ..foundation.progress import Cancelled, Monitor
+from ..foundation.progress import Cancelled, Monitor, time_text
 from . import streams
 from .arguments import with_joined_frames
 from .parser import Adder, build_parser
@@ -31,7 +31,9 @@ def _run(argv: list[str] | None, adders: tuple[Adder, ...]) -> int:
     args = parser.parse_args(with_joined_frames(sys.argv[1:] if argv is None else argv))
     args.parser = parser
     _prepare_libraries()
-    monitor = Monitor(_progress_line if sys.stderr.isatty() and not args.quiet else None if args.quiet else _plain_progress())
+    monitor = Monitor()
+    if not args.quiet:
+        monitor.report = _progress_line(monitor) if sys.stderr.isatty() else _plain_progress()
     try:
         with _interrupts(monitor), threadpool_limits(1, user_api="blas"):  # those that Blender has loaded
             lines = args.run(args, monitor)
@@ -79,9 +81,19 @@ def _prepare_libraries() -> None:
     getattr(cv2.utils, "logging", cv2).setLogLevel(0)  # OpenCV 5, OpenCV 4
 
 
-def _progress_line(stage: str, done: float, total: float) -> None:
-    part = min(1.0, done / total) if total else 1.0
-    streams.write(f"\r{stage:<24} [{'#' * round(30 * part):<30}] {100 * part:3.0f} %" + ("\n" if part >= 1 else ""), sys.stderr)
+def _progress_line(monitor: Monitor) -> Callable[[str, float, float], None]:
+    """One bar: over all stages of a run with the time left, or else over what is computed."""
+
+    def report(stage: str, done: float, total: float) -> None:
+        course, part = monitor.course, min(1.0, done / total) if total else 1.0
+        whole = part if course is None else course.fraction
+        left = None if course is None else course.seconds_left
+        more = "" if left is None else f"{time_text(left)} left"
+        end = "\n" if whole >= 1 else ""
+        sys.stderr.write(f"\r{stage:<24} [{'#' * round(30 * whole):<30}] {100 * whole:3.0f} %  {more:<16}{end}")
+        sys.stderr.flush()
+
+    return report
 
 
 def _plain_progress() -> Callable[[str, float, float], None]:

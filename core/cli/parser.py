@@ -98,6 +98,9 @@ def _stages(commands: Any) -> None:
     track.add_argument("--points-frame", type=int, metavar="N", help="the frame in which they were clicked; by default the first")
     track.add_argument("--pictures", type=Path, metavar="DIR", help="with --points: also draw the points and their paths over the images")
     everything.add_argument("--restart", action="store_true", help="start again instead of resuming")
+    where = everything.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=int, metavar="N", help="processes that measure frames at once (default: one for every core)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, such as tcp://farm:8786, whose workers measure frames")
     everything.add_argument("--pictures", nargs="+", type=int, default=[], metavar="FRAME", help="frames to show in the report")
     everything.add_argument("--film", action="store_true", help="also write film.mp4: the body over every frame of every view")
     demo = _command(

@@ -10,14 +10,17 @@ from ..foundation.settings import from_table
 from ..report.film import write_film
 from ..results.folder import check_separate_folder
 from ..run import pipeline, take_run
-from ..surface.measure import MeasureSettings, first_seeds
+from ..run.engine import Engine, of_this_machine
 from ..surface.resolution import measured_footage
+from ..surface.starts import MeasureSettings, first_seeds
 from ..synthetic.arm import ArmTakeSettings, is_arm_take, make_arm_take
 from ..synthetic.score import score_run
 from ..take.footage import open_take
 from ..take.take import read_take
 from . import points
 from .arguments import frame_range, overrides
+
+MOST_ASKED = 1000  # workers
 
 
 def seeds(args: argparse.Namespace, monitor: Monitor) -> list[str]:
@@ -62,12 +65,13 @@ def _stages(names: tuple[str, ...], args: argparse.Namespace, monitor: Monitor) 
 
 def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     """All stages, from the images to the Blender file; the lines to show."""
-    given = args.take, args.out, overrides(args.set), frame_range(args.frames)
+    given, engine = (args.take, args.out, overrides(args.set), frame_range(args.frames)), _engine(args)
     with take_run.open_run(*given, restart=args.restart, pictures=args.pictures) as job:
         if not args.pictures and pipeline.is_complete(job) and _has_scene(job, args):
             job.record["warnings"] = job.results.read_run().get("warnings", [])
             lines = ["Nothing has changed since that run; --restart begins anew."]
         else:
+            job.engine = engine
             pipeline.all_stages(job, monitor)
             lines = _build_scene(job, args, monitor)
         if args.film and not job.results.path("film.mp4").is_file():
@@ -93,6 +97,17 @@ def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
         str(score_run(take, out, monitor)),
         f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}" + (f"   Blender file: {blend}" if blend.is_file() else ""),
     ]
+
+
+def _engine(args: argparse.Namespace) -> Engine | None:
+    """Where the frames are measured; None: in this process alone."""
+    if args.workers is not None and not 1 <= args.workers <= MOST_ASKED:
+        raise InputError(f"--workers {args.workers} is out of range; write 1 to {MOST_ASKED}.")
+    if args.scheduler is not None:
+        return Engine(scheduler=args.scheduler)
+    if args.workers is None:
+        return of_this_machine()
+    return Engine(workers=args.workers) if args.workers > 1 else None
 
 
 def _has_scene(job: take_run.Run, given: argparse.Namespace) -> bool:

@@ -111,11 +111,11 @@ def nearest_surface(depth_m: np.ndarray) -> Foreground:
     )
 
 
-def after(cloud_depth_m: np.ndarray, before: Foreground) -> Foreground:
-    """The depths in the next frame, from the cloud of this one; a frame with few points changes nothing."""
-    if len(cloud_depth_m) < MIN_CLOUD:
+def after(depth_m: np.ndarray, before: Foreground, fewest: int = MIN_CLOUD) -> Foreground:
+    """The depths in the next frame, from those of the person in this one; fewer than `fewest` points change nothing."""
+    if len(depth_m) < fewest:
         return before
-    low, high = np.percentile(cloud_depth_m, CLOUD_PERCENT)
+    low, high = np.percentile(depth_m, CLOUD_PERCENT)
     width = max(before.depth_range_m[1] - before.depth_range_m[0], 2 * MARGIN_M)
     near = max(NEAREST_M, float(low) - MARGIN_M)
     return Foreground(depth_range_m=(near, min(float(high) + MARGIN_M, near + width)), method="frame before", planes=before.planes)

@@ -1,7 +1,7 @@
 """Many takes on a Dask cluster: worker processes on this machine, or any scheduler by its address.
 
-A take is one task. A take is not divided among workers: each frame is measured from the depths of the previous frame and tracked from its
-points, and the fit uses all frames, so the frames of a take cannot run in parallel with the same result.
+A take is one task: with many takes, whole takes use the machines better than the frames of each (`workers`), because tracking and the fit
+go from frame to frame.
 
 A worker that dies during a take is replaced, and the take resumes from its checkpoints with the same bytes. A take with invalid input does
 not stop the others; neither does a bug, whose traceback is written to a file.
@@ -15,7 +15,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -26,15 +25,12 @@ from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Monitor
 from ..results.folder import check_inside, check_separate_folder
 from . import pipeline, take_run
+from .engine import Engine, dask_client
 
 FORMAT, VERSION = "tricap-batch", 1
 TOPIC = "tricap"  # of the workers' progress reports
 WAIT_S = 0.3  # interval at which the tasks are polled
 REPORT_S = 0.5  # between two progress reports of a worker
-CONNECT_S = 10.0  # timeout of the connection to a scheduler
-THREADS_PER_WORKER = 2  # at most: a run gains little from more
-RETRIES = 3  # a worker that dies more often than this probably lacks memory
-MISSING = '`tricap batch` needs Dask, which this Python does not have; install it with: pip install "tricap[batch]".'
 
 Progress = tuple[str, float, float]  # stage, done, total
 
@@ -59,15 +55,6 @@ class Outcome:
     seconds: float = 0.0
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Engine:
-    """Where the takes run: at `scheduler`, or in `workers` local processes. A take whose worker dies is retried `retries` times."""
-
-    scheduler: str | None = None
-    workers: int = 1
-    retries: int = RETRIES
-
-
 def run_batch(
     takes: Sequence[Path], folder: Path, engine: Engine, overrides: take_run.Overrides, monitor: Monitor, *, restart: bool = False
 ) -> list[Outcome]:
@@ -81,7 +68,7 @@ def run_batch(
     outcomes: dict[int, Outcome] = {}
     _write(folder, engine, takes, outs, outcomes)
     progress: dict[str, Progress] = {}
-    with _client(engine) as client:
+    with dask_client(engine) as client:
         client.subscribe_topic(TOPIC, lambda event: _store_progress(event, progress))
         plain = {group: dict(table) for group, table in overrides.items()}
         futures = [
@@ -176,46 +163,6 @@ def _reporter(take: str) -> Callable[[str, float, float], None] | None:
 def _store_progress(event: tuple[float, Any], progress: dict[str, Progress]) -> None:
     report = event[1]
     progress[report["take"]] = (report["stage"], report["done"], report["total"])
-
-
-@contextmanager
-def _client(engine: Engine) -> Iterator[Any]:
-    """A Dask client; a local cluster ends with it."""
-    if importlib.util.find_spec("distributed") is None:
-        raise InputError(MISSING)
-    import dask
-    from distributed import Client, LocalCluster
-
-    if engine.scheduler is not None:
-        try:
-            client = Client(engine.scheduler, timeout=CONNECT_S)
-        except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(f"No Dask scheduler answers at {engine.scheduler}; check the address, or leave --scheduler out.") from error
-        with client:
-            yield client
-        return
-    quiet = {"distributed.logging.distributed": "critical", "distributed.scheduler.allowed-failures": engine.retries}
-    with (
-        dask.config.set(quiet),
-        LocalCluster(
-            n_workers=engine.workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=None,
-            memory_limit=0,
-            silence_logs=50,
-            env=thread_limits(engine.workers, os.cpu_count() or 1),
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
-
-
-def thread_limits(workers: int, cores: int) -> dict[str, str]:
-    """The environment of each worker: the threads of Tricap and OpenCV that its share of the cores allows."""
-    threads = str(max(1, min(THREADS_PER_WORKER, cores // workers)))
-    return {"TRICAP_THREADS": threads, "OPENCV_FOR_THREADS_NUM": threads}
 
 
 def _as_completed(

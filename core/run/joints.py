@@ -16,8 +16,9 @@ from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
-from ..surface.measure import MeasureSettings, NothingMeasured, measure_frames
+from ..surface.measure import NothingMeasured, measure_frames
 from ..surface.resolution import measured_footage
+from ..surface.starts import MeasureSettings
 from ..take.footage import Footage, open_take
 from ..take.take import read_take
 from ..take.writing import read_table, write_table

@@ -39,15 +39,18 @@ from ..report.silhouettes import by_view, silhouettes_of
 from ..results.folder import FitCheckpoints
 from ..surface.cloud import as_written, write_cloud
 from ..surface.frames import FrameSummary, MeasuredFrames, summary_of
-from ..surface.measure import MeasureSettings, NothingMeasured, measure_frames
+from ..surface.measure import NothingMeasured, measure_frames
+from ..surface.starts import MeasureSettings
 from ..tracking.corrections import corrected_tracks, missed_clicks
 from ..tracking.long_tracks import trajectories_of
 from ..tracking.lost_points import Guide
 from ..tracking.track import TrackingRules, track_frames
 from ..tracking.trajectories import Filtered, Trajectories, write_tracked_clouds, write_trajectories
+from .phases import course_of
 from .record import doubtful_frames, fit_figures, fit_warnings, frame_table, start_figures, surface_figures, track_figures
 from .stages import STAGES
 from .take_run import Overrides, Run, open_run
+from .workers import measure_at_once
 
 BODY_FILES = ("body.toml", "joints.csv", "motion.csv", "skin")  # of the fit, besides the report
 
@@ -163,9 +166,12 @@ def run(
 def all_stages(run: Run, monitor: Monitor) -> None:
     """Measure, track, fit and report, as `run` does, of an opened take."""
     check_body(run.footage, run.settings["fitting"])
-    for stage in (measure, track, fit, report) if run.settings["fitting"].use_surface else (fit, report):
+    stages = (measure, track, fit, report) if run.settings["fitting"].use_surface else (fit, report)
+    monitor.course = course_of([stage.__name__ for stage in stages], len(run.footage.frames))
+    for stage in stages:
         monitor.begin(stage.__name__)
         stage(run, monitor)
+    monitor.course = None
 
 
 def is_complete(run: Run) -> bool:
@@ -183,6 +189,8 @@ def is_complete(run: Run) -> bool:
 def _measure_frames(run: Run, summaries: list[FrameSummary], monitor: Monitor) -> Foreground | None:
     """Write the clouds, summarise each frame in `summaries`; gives the first frame's foreground."""
     s, foreground = run.settings, None
+    if run.engine is not None:
+        measure_at_once(run, run.engine, monitor)
     for m in measure_frames(run.measured_footage, MeasureSettings.of(s), run.results, monitor):
         write_cloud(run.results.cloud_path(m.frame), as_written(run.corrected(m.cloud), s["surface"]))
         summaries.append(summary_of(m))

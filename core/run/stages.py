@@ -17,7 +17,7 @@ from ..fitting.settings import ALGORITHM
 from ..foundation import store
 from ..foundation.errors import InputError
 from ..foundation.settings import to_table
-from ..surface import measure
+from ..surface import starts
 from ..take.footage import Footage
 from ..take.take import NO_BODY, FrameClicks, Take, View
 from ..tracking import track
@@ -44,7 +44,7 @@ def _measure_input(footage: Footage) -> Any:
     rows = take.interlaced, take.first_field
     person = [(v.name, v.mask, v.masks, v.background, _person_files(take, v)) for v in take.views]
     swept = (footage.click_sigma_px,) if take.clicks.surface else ()  # how far about the clicked surface
-    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.clicks), regions, person, measure.ALGORITHM, *swept
+    return views, files, rig, rows, take.reference_view, footage.frames, _clicked(take.clicks), regions, person, starts.ALGORITHM, *swept
 
 
 def _person_files(take: Take, view: View) -> Any:

@@ -32,6 +32,7 @@ from ..tracking.contour import ContourSettings
 from ..tracking.corrections import corrected_cloud
 from ..tracking.settings import KeyPointSettings, TrackingSettings
 from ..tracking.trajectories import Trajectories
+from .engine import Engine
 from .presets import PRESETS, MethodSettings
 from .record import frame_table, new_record, write_frame_table
 from .stages import STAGE_FILES, STAGE_INPUTS, stage_keys, valid_stages
@@ -66,6 +67,7 @@ class Run:
     body: BodyFit | None = None
     surfaceless: bool = False  # nothing could be measured, or nothing is to be
     silhouettes: Silhouettes = field(default_factory=Silhouettes)
+    engine: Engine | None = None  # where the frames are measured; None: in this process
     pictured: Sequence[int] = ()  # the frames of the report's pictures; none: the first, a middle and the last
 
     def __post_init__(self) -> None:

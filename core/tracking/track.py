@@ -21,7 +21,8 @@ from ..matching.least_squares import MatchingSettings
 from ..matching.region_growing import MatchedField
 from ..results.folder import Results
 from ..surface.cloud import PointCloud
-from ..surface.measure import FrameImages, MeasuredFrame, load_images
+from ..surface.measure import MeasuredFrame
+from ..surface.starts import FrameImages, load_images
 from ..take.footage import Footage
 from .curvature_correction import NEAREST_POINTS, CurvatureCorrection, nearest_points
 from .lost_points import Guide, LostPoints, none_lost

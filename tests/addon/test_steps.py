@@ -607,6 +607,8 @@ def test_time_left(blender: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None
     clock[0] += 5.0
     job._note("tracks", 0.04, 20)
     assert job.seconds_left is None, "how the first frame begins says nothing of the others"
+    job.monitor.course = SimpleNamespace(fraction=0.25, seconds_left=40.0)
+    assert job.fraction == 0.25 and job.left_text == "40 s left", "of the whole run"
     assert [jobs.time_text(s) for s in (40.2, 100, 3600, 7260)] == ["40 s", "2 min", "60 min", "2 h 1 min"]
 
 

@@ -129,7 +129,7 @@ def calibration(table: dict[str, Any]) -> Iterator[Row]:
 def run(table: dict[str, Any]) -> Iterator[Row]:
     """The whole path against frames, points, cameras and workers, and its memory."""
     for what, value in table.items():
-        if what == "cpu_s_a_frame":
+        if what in ("cpu_s_a_frame", "stages"):  # seconds: the benchmark itself prints them
             continue
         kind = "speed" if "faster" in what else "memory" if what == "peak_mb" else "cost"
         yield Row("run", what.replace("peak_mb", "peak memory [MB]"), value, kind, "")

@@ -26,7 +26,8 @@ from tricap.core.matching.least_squares import MatchingSettings, SearchImage, Te
 from tricap.core.matching.patches import patch_offsets
 from tricap.core.results.folder import Results
 from tricap.core.run.take_run import settings_of
-from tricap.core.surface.measure import MeasureSettings, measure_frames
+from tricap.core.surface.measure import measure_frames
+from tricap.core.surface.starts import MeasureSettings
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take

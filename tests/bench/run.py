@@ -1,4 +1,5 @@
-"""The whole path from images to report: cost against points, frames, cameras and workers, and peak memory.
+"""The whole path from images to report: seconds of every stage for two sizes and both qualities, beside peers on the same frames; cost
+against points, frames, cameras and workers, and peak memory.
 
     python tests/bench/run.py [--json FILE]
 
@@ -16,6 +17,10 @@ import time
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import _stages
 
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 
@@ -80,6 +85,8 @@ def main() -> None:
         two = cost(two_views(folder / "take", folder / "two"), folder / "of_two", *some)
         takes = [two_views(folder / "take", folder / f"take{i}") for i in range(2)]
         alone, together = (elapsed_s(takes, folder / f"batch{n}", n) for n in (1, 2))
+        stages = dict(_stages.tables(folder))
+    print("\n".join(_stages.lines(stages)))
     result = {
         "twice the frames: cost of a frame": twice["cpu_s"] / base["cpu_s"] / 2,
         "finer grid: cost of a point": dense["cpu_s"] / base["cpu_s"] / (dense["points"] / base["points"]),
@@ -87,9 +94,11 @@ def main() -> None:
         "two workers: times faster": alone / together,
         "peak_mb": base["peak_mb"],
         "cpu_s_a_frame": base["cpu_s"] / FRAMES,
+        "stages": stages,
     }
     for what, value in result.items():
-        print(f"{what}: {value:.3f}" if value is not None else f"{what}: unknown here")
+        if what != "stages":
+            print(f"{what}: {value:.3f}" if value is not None else f"{what}: unknown here")
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

@@ -15,7 +15,8 @@ from tricap.core.geometry.camera import Camera
 from tricap.core.geometry.rig import Rig, write_rig
 from tricap.core.results.folder import Results
 from tricap.core.run import take_run
-from tricap.core.surface.measure import MeasuredFrame, MeasureSettings, measure_frames
+from tricap.core.surface.measure import MeasuredFrame, measure_frames
+from tricap.core.surface.starts import MeasureSettings
 from tricap.core.take.footage import open_take
 from tricap.core.take.take import read_take
 from tricap.core.tracking.lost_points import Guide

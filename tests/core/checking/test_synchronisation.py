@@ -11,7 +11,7 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Monitor
 from tricap.core.images.retime import Recent, retimed
 from tricap.core.run import pipeline, take_run
-from tricap.core.surface.measure import measured_rows
+from tricap.core.surface.starts import measured_rows
 from tricap.core.synthetic.arm import ArmTakeSettings, make_arm_take
 from tricap.core.synthetic.score import score_run
 from tricap.core.take.footage import open_take

@@ -14,7 +14,7 @@ from tricap.core.calibration.boards.board import BoardKind
 from tricap.core.calibration.rig_files import FORMATS
 from tricap.core.cli import parser
 from tricap.core.motion.formats.markers import UNITS_M
-from tricap.core.run.batch import RETRIES
+from tricap.core.run.engine import RETRIES
 
 HEAVY = ("scipy", "bpy", "tricap.core.surface", "tricap.core.tracking.track", "tricap.core.fitting.stages", "tricap.core.run")
 LISTING = "import sys, tricap.__main__ as m; "
@@ -44,7 +44,7 @@ def test_help_and_invalid_arguments_load_no_stage(arguments: tuple[str, ...]) ->
 def test_check_of_a_damaged_file_loads_no_stage(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("fps = [", encoding="utf-8")
     modules = loaded("check", str(tmp_path / name))
-    assert "tricap.core.checking.rig_check" in modules
+    assert "tricap.core.checking.findings" in modules
     assert not modules & {*HEAVY}
 
 

@@ -20,7 +20,9 @@ from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.lock import NAME
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.run import batch, pipeline, take_run
-from tricap.core.run.batch import Engine, Outcome, Status, out_folders, run_batch, run_take, summary
+from tricap.core.run import engine as engines
+from tricap.core.run.batch import Outcome, Status, out_folders, run_batch, run_take, summary
+from tricap.core.run.engine import Engine
 
 COARSE = {"growing": {"spacing_px": 8}}
 Capture = pytest.CaptureFixture[str]
@@ -136,7 +138,7 @@ def test_the_scene_is_built_by_this_package_and_its_absence_is_reported(tmp_path
 
 @pytest.mark.parametrize(("workers", "cores", "threads"), [(1, 2, "2"), (2, 2, "1"), (2, 8, "2"), (16, 8, "1")])
 def test_each_worker_has_its_share_of_the_cores(workers: int, cores: int, threads: str) -> None:
-    environment = os.environ | batch.thread_limits(workers, cores)
+    environment = os.environ | engines.thread_limits(workers, cores)
     code = "from tricap.core.foundation import threads; print(threads.THREADS)"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [threads]
@@ -152,11 +154,11 @@ def test_what_is_doubtful_stands_in_the_summary() -> None:
 def test_without_dask(takes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture) -> None:
     monkeypatch.setattr(batch.importlib.util, "find_spec", lambda name: None)
     assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out")]) == 2
-    assert capfd.readouterr().err == f"tricap: {batch.MISSING}\n"
+    assert capfd.readouterr().err == f"tricap: {engines.MISSING}\n"
 
 
 def test_no_scheduler_there(takes: list[Path], tmp_path: Path, capfd: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "CONNECT_S", 0.5)
+    monkeypatch.setattr(engines, "CONNECT_S", 0.5)
     assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9", "--quiet"]) == 2
     assert "No Dask scheduler answers at tcp://127.0.0.1:9" in capfd.readouterr().err.splitlines()[-1]
     assert main.main(["batch", str(takes[0]), "--out", str(tmp_path / "out"), "--workers", "0"]) == 2

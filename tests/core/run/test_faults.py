@@ -14,7 +14,7 @@ import pytest
 
 from tricap.core.cli import main
 from tricap.core.foundation.lock import locked
-from tricap.core.surface import measure
+from tricap.core.surface import starts
 
 NOT_COMPARED = ("run.json", "report/report.html", "report/report.json")  # they tell seconds
 Capture = pytest.CaptureFixture[str]
@@ -44,14 +44,14 @@ def files(out: Path) -> dict[str, bytes]:
 
 def at_the_frame(monkeypatch: pytest.MonkeyPatch, frame: int, fault: Callable[[], object]) -> None:
     """Let something happen when a frame is about to be measured."""
-    read = measure._frame_views
+    read = starts.frame_views
 
     def fault_then_read(*args: object, **more: object) -> object:
         if args[1] == frame:
             fault()
         return read(*args, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(measure, "_frame_views", fault_then_read)
+    monkeypatch.setattr(starts, "frame_views", fault_then_read)
 
 
 def said(capfd: Capture) -> str:

@@ -19,7 +19,7 @@ from tricap.core.matching.region_growing import MatchedField
 from tricap.core.matching.seeds import Approximations
 from tricap.core.results.folder import Results
 from tricap.core.run import take_run
-from tricap.core.surface import measure
+from tricap.core.surface import measure, starts
 from tricap.core.surface.cloud import PointCloud
 from tricap.core.surface.measure import MeasuredFrame
 from tricap.core.take.footage import open_take
@@ -132,7 +132,7 @@ def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any
     (take / "take.toml").write_text(text + f'[seeds]\nframe = 0\n[seeds.joints]\n"elbow.R" = {{ {at} }}\n')
     footage = take_run.only_frames(open_take(read_take(take)), (3, 4))
     s = take_run.settings_of({}, {}, "take.toml")
-    (m,) = measure.measure_frames(footage, replace(measure.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
+    (m,) = measure.measure_frames(footage, replace(starts.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
     assert m.foreground.method == "clicks and nearest surface" and m.foreground.depth_range_m[1] < 4
     distance = bodies[3][1].distance_m(m.cloud.xyz_m)
     assert len(distance) > 200 and np.mean(np.abs(distance) < 0.02) > 0.9
@@ -141,7 +141,7 @@ def test_one_frame_alone_whose_clicks_are_of_another(tmp_path: Path, scenes: Any
 def test_a_checkpoint_belongs_to_the_frame_that_showed_the_room(tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames 0:2 first and then all of them, into one folder, must give what all of them give at once. The background planes differ
     with the frame that frame 0 is compared with; here the number of seeds that stand still is written into a plane far away."""
-    monkeypatch.setattr(measure.fg, "background_planes", lambda static, every, eyes: np.array([[0, 0, -1.0, -20.0 - len(static)]]))
+    monkeypatch.setattr(starts.fg, "background_planes", lambda static, every, eyes: np.array([[0, 0, -1.0, -20.0 - len(static)]]))
     take = scenes.write_take(tmp_path / "take", scenes.three_cameras(), moving_body_before_a_wall(scenes, 4))
     text = (take / "take.toml").read_text()
     (take / "take.toml").write_text(text.replace("[[views]]", "frames = [0, 2]\n[[views]]", 1))
@@ -177,7 +177,7 @@ def test_one_clicked_seed_is_enough(
     plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch, views: str, off_px: tuple[int, int]
 ) -> None:
     """Without any automatic seed: a click far from the middle, in views that converge, wrong by 4 px along the row in L and R."""
-    monkeypatch.setattr(measure, "sweep_seeds", no_seeds)
+    monkeypatch.setattr(starts, "sweep_seeds", no_seeds)
     rig, plane = scenes.three_cameras(), scenes.Body(R=rotation_from_vector(np.array([0.1, 0.25, 0.0])))
     ray = rig["C"].rays(np.array([150.0, 110.0]))
     X = ray * plane.hit(np.zeros(3), ray[None])[0][0]
@@ -186,7 +186,7 @@ def test_one_clicked_seed_is_enough(
     take = changed(plane_take, tmp_path / "take", f"[seeds]\nsurface = [{{ {at} }}]\n")
     footage = take_run.only_frames(open_take(read_take(take)), (0, 1))
     s = take_run.settings_of({}, {}, "take.toml")
-    (m,) = measure.measure_frames(footage, replace(measure.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
+    (m,) = measure.measure_frames(footage, replace(starts.MeasureSettings.of(s), enhance=None), Results(tmp_path / "out"), Monitor())
     assert len(m.cloud.xyz_m) > 500 and np.median(np.abs(plane.distance_m(m.cloud.xyz_m))) < 0.001
 
 
@@ -197,7 +197,7 @@ def test_seeds_follow_the_reference_and_the_settings(tmp_path: Path, scenes: Any
     footage = open_take(read_take(scenes.write_take(tmp_path / "take", rig, [[scenes.Body()]])))
     s = take_run.settings_of({}, {"enhance": {"wallis": "on"}}, "take.toml")
     plain, enhanced = (
-        measure.first_seeds(footage, replace(measure.MeasureSettings.of(s), enhance=enhance), 0, Monitor())[1]
+        starts.first_seeds(footage, replace(starts.MeasureSettings.of(s), enhance=enhance), 0, Monitor())[1]
         for enhance in (None, s["enhance"])
     )
     assert plain.xy[:, 1, 0].max() > 120 and len(enhanced.depth_m)

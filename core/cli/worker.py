@@ -1,0 +1,29 @@
+"""A worker process of `tricap run --workers`: tasks from standard input, an answer for each on standard output, a line of JSON each."""
+
+import json
+import os
+import sys
+
+from ..foundation import bounded
+from ..foundation.errors import InputError
+from ..foundation.threads import one_thread_in_linear_algebra
+from ..run.workers import run_piece
+
+
+def main() -> None:
+    """Do the tasks until the input ends. A bug ends the process with its traceback."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what libraries print
+    with one_thread_in_linear_algebra():
+        for line in sys.stdin:
+            try:
+                run_piece(bounded.json_of(line))
+                answer = {}
+            except InputError as error:
+                answer = {"error": str(error)}
+            answers.write(json.dumps(answer) + "\n")
+            answers.flush()
+
+
+if __name__ == "__main__":
+    main()

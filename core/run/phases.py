@@ -1,0 +1,27 @@
+"""What the phases of a run usually cost: for one progress bar over all of them."""
+
+from collections.abc import Sequence
+
+from ..foundation.progress import Course
+
+# Names as in Monitor.step -> seconds once and a frame: a whole body in three views of 768×576 pixels, on two cores
+COST: dict[str, dict[str, tuple[float, float]]] = {
+    "measure": {"seeds": (0.5, 0.06), "surface": (1.5, 1.0)},
+    "track": {"tracks": (0.5, 0.33)},
+    "fit": {
+        "background": (1.0, 0.05),
+        "fit the click frame": (6.0, 0.0),
+        "fit frame after frame": (0.0, 0.6),
+        "follow the limbs": (0.0, 0.25),
+        "adjust the sequence": (0.0, 0.6),
+        "sigmas of the fit": (0.5, 0.03),
+        "skin": (0.4, 0.005),
+        "silhouettes": (4.0, 0.0),
+    },
+    "report": {"report": (2.5, 0.01)},
+}
+
+
+def course_of(stages: Sequence[str], frames: int) -> Course:
+    """The progress of some stages of a run over so many frames."""
+    return Course([(name, once + frames * each) for stage in stages for name, (once, each) in COST[stage].items()])

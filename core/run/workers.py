@@ -1,0 +1,187 @@
+"""The frames of one take on several processes: the starts of all frames one after the other, then the frames themselves at once.
+
+A frame's surface depends on its start alone (surface/starts.py), and workers leave what they measured as checkpoints, so the result has the
+same bytes for any number of workers, and a stopped run resumes.
+"""
+
+import json
+import os
+import subprocess
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from ..foundation import bounded
+from ..foundation.errors import InputError
+from ..foundation.progress import Monitor
+from ..foundation.settings import from_table, to_table
+from ..results.folder import Results
+from ..surface.measure import measure_frames, measure_piece
+from ..surface.resolution import measured_footage
+from ..surface.starts import FrameStarts, MeasureSettings
+from ..take.footage import open_take
+from ..take.take import read_take
+from .engine import Engine, dask_client, python_command, thread_limits
+from .take_run import SETTINGS, Run, only_frames
+
+PIECE = 4  # frames of a task
+WAIT_S = 0.2  # between two looks at the workers
+FEWEST = 12  # frames to be measured; for fewer, local processes take longer to start than they gain
+Task = dict[str, Any]  # plain values: it travels as JSON
+
+
+def measure_at_once(run: Run, engine: Engine, monitor: Monitor) -> None:
+    """Measure the frames of a run by workers, as far as they have no checkpoints. Nothing where frames depend on each other.
+
+    Raises:
+        InputError: the images cannot be read, workers keep dying, or Dask cannot be used.
+        NothingMeasured: see `measure_frames`.
+        Cancelled: the frames measured so far have their checkpoints.
+    """
+    settings, footage = MeasureSettings.of(run.settings), run.measured_footage
+    if engine.scheduler is None and len(footage.frames) < FEWEST:
+        return
+    starts = FrameStarts(footage, settings, run.results)
+    if not starts.alone:
+        return
+    steps = 1 + len(starts.order)
+    next(measure_frames(footage, settings, run.results, monitor.part("seeds", 0, steps)))  # fails early where nothing can be measured
+    keys = {frame: starts.at(frame, monitor.part("seeds", 1 + done, steps))[0].key for done, frame in enumerate(starts.order)}
+    missing = {frame: key for frame, key in keys.items() if run.results.load_checkpoint("surface", f"{frame:04d}", key) is None}
+    if engine.scheduler is None and len(missing) < FEWEST:
+        return
+    with _running(engine, [_task(run, part) for part in _pieces(missing)]) as work:
+        for done, total in work:
+            monitor.step("surface", done, total)
+
+
+def run_piece(task: Task) -> None:
+    """The task of a worker: measure its frames.
+
+    Raises:
+        InputError: see `measure_piece`.
+    """
+    settings: dict[str, Any] = {name: from_table(kind, task["settings"][name], f"[{name}]") for name, kind in SETTINGS.items()}
+    take = read_take(Path(task["take"]))
+    footage = only_frames(open_take(take, click_sigma_px=settings["fitting"].click_sigma_px), (task["frames"][0], task["frames"][1]))
+    footage = measured_footage(
+        replace(footage, delay_images=tuple(task["delay_images"])), settings["surface"].quality, settings["growing"].spacing_px
+    )
+    keys = {int(frame): key for frame, key in task["keys"].items()}
+    measure_piece(footage, MeasureSettings.of(settings), Results(Path(task["out"])), keys, Monitor())
+
+
+def _task(run: Run, keys: Mapping[int, str]) -> Task:
+    frames = run.footage.frames
+    return {
+        "take": str(run.footage.take.folder.resolve()),
+        "out": str(run.results.folder),
+        "frames": [frames.start, frames.stop],
+        "delay_images": list(run.footage.delay_images),
+        "settings": {name: to_table(value) for name, value in run.settings.items()},
+        "keys": {str(frame): key for frame, key in keys.items()},
+    }
+
+
+def _pieces(keys: Mapping[int, str]) -> list[dict[int, str]]:
+    """PIECE frames at a time, whatever the number of workers."""
+    rows = list(keys.items())
+    return [dict(rows[i : i + PIECE]) for i in range(0, len(rows), PIECE)]
+
+
+@contextmanager
+def _running(engine: Engine, tasks: Sequence[Task]) -> Iterator[Iterator[tuple[int, int]]]:
+    """Run tasks; the iterator gives how many are finished, and of how many, until all are. Leaving early stops the workers."""
+    if engine.scheduler is not None:
+        with dask_client(engine) as client:
+            futures = [client.submit(run_piece, task, pure=False, retries=engine.retries) for task in tasks]
+            try:
+                yield _finished(futures)
+            finally:
+                client.cancel(futures)
+        return
+    workers = [_Worker(engine) for _ in range(min(engine.workers, len(tasks)))]
+    idle = SimpleQueue[_Worker]()
+    for worker in workers:
+        idle.put(worker)
+
+    def run(task: Task) -> None:
+        worker = idle.get()
+        try:
+            worker.run(task)
+        finally:
+            idle.put(worker)
+
+    with ThreadPoolExecutor(max(1, len(workers))) as pool:
+        local = [pool.submit(run, task) for task in tasks]
+        try:
+            yield _finished(local)
+        finally:
+            for future in local:
+                future.cancel()
+            for worker in workers:
+                worker.stop()
+
+
+def _finished(futures: Sequence[Any]) -> Iterator[tuple[int, int]]:
+    """How many of the futures are finished, again and again; raises what a worker raised."""
+    while True:
+        done = [future for future in futures if future.done()]
+        for future in done:
+            future.result()
+        yield len(done), len(futures)
+        if len(done) == len(futures):
+            return
+        time.sleep(WAIT_S)
+
+
+class _Worker:
+    """A local process that does one task after the other (cli/worker.py); it is started with the first."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._retries, self._stopped = engine.retries, False
+        self._command, environment = python_command("core.cli.worker")
+        self._environment = environment | thread_limits(engine.workers, os.cpu_count() or 1) | {"OPENBLAS_NUM_THREADS": "1"}
+        self._process: subprocess.Popen[str] | None = None
+
+    def run(self, task: Task) -> None:
+        """Do a task, again if the process dies.
+
+        Raises:
+            InputError: what the task raised, or the process died too often.
+        """
+        for _ in range(self._retries + 1):
+            answer = self._ask(json.dumps(task))
+            if answer or self._stopped:
+                break
+            self._process = None
+        if not answer:
+            raise InputError(f"A worker process died {self._retries + 1} times: is there enough memory? Use fewer --workers.")
+        if error := bounded.json_of(answer).get("error"):
+            raise InputError(error)
+
+    def stop(self) -> None:
+        """End the process; what it measured is kept."""
+        self._stopped = True
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+
+    def _ask(self, line: str) -> str:
+        """The answer of the process; empty if it died."""
+        if self._process is None:
+            self._process = subprocess.Popen(
+                self._command, env=self._environment, text=True, encoding="utf-8", stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            )
+        try:
+            assert self._process.stdin is not None and self._process.stdout is not None
+            self._process.stdin.write(line + "\n")
+            self._process.stdin.flush()
+            return self._process.stdout.readline()
+        except (BrokenPipeError, ValueError):  # it died, or was stopped
+            return ""

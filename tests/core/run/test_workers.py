@@ -1,0 +1,92 @@
+"""Workers measure the frames of a take: the same bytes for any number of them, one sentence for what is wrong, and nothing runs on."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tricap.core.foundation.errors import InputError
+from tricap.core.foundation.progress import Cancelled, Monitor
+from tricap.core.run import take_run, workers
+from tricap.core.run.engine import Engine, python_command
+
+TWO = Engine(workers=2, retries=1)
+
+
+@pytest.fixture(autouse=True)
+def every_take_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "FEWEST", 1)
+    monkeypatch.setattr(workers, "PIECE", 1)
+
+
+def checkpoints(out: Path) -> dict[str, bytes]:
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in sorted((out / "cache").rglob("*.npz"))}
+
+
+def measured(take: Path, out: Path, engine: Engine, monitor: Monitor | None = None) -> dict[str, bytes]:
+    """The checkpoints of a take that an engine measured."""
+    with take_run.open_run(take, out) as job:
+        workers.measure_at_once(job, engine, monitor or Monitor())
+    return checkpoints(out)
+
+
+def test_workers_give_the_bytes_of_one_process(plane_take: Path, tmp_path: Path, scenes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    many = measured(plane_take, tmp_path / "many", TWO)
+    monkeypatch.setattr(workers, "FEWEST", 1000)
+    with take_run.open_run(plane_take, tmp_path / "one") as job:
+        list(workers.measure_frames(job.measured_footage, workers.MeasureSettings.of(job.settings), job.results, Monitor()))
+    assert len(many) == 8 and many == checkpoints(tmp_path / "one")
+
+
+def test_a_stopped_run_resumes_and_leaves_no_process(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[str]] = []
+    popen = subprocess.Popen
+    monkeypatch.setattr(workers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+    monitor = Monitor(lambda stage, done, total: monitor.cancel() if stage == "surface" and total == 3 else None)
+    with pytest.raises(Cancelled):
+        measured(plane_take, tmp_path / "out", TWO, monitor)
+    assert started and all(process.poll() is not None for process in started)
+    assert measured(plane_take, tmp_path / "out", TWO) == measured(plane_take, tmp_path / "again", TWO)
+
+
+def test_what_a_worker_refuses_is_said_in_one_sentence(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    take = Path(shutil.copytree(plane_take, tmp_path / "take"))
+    task = workers._task
+
+    def without_image(*args: Any) -> workers.Task:
+        (take / "L" / "0002.png").unlink(missing_ok=True)
+        return task(*args)
+
+    monkeypatch.setattr(workers, "_task", without_image)
+    with pytest.raises(InputError, match="View L lacks the image"):
+        measured(take, tmp_path / "out", TWO)
+
+
+def test_a_worker_that_dies_is_replaced(plane_take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first process of every worker dies at its first task; with no second try, that is an error."""
+    marker = tmp_path / "died"
+    code = f"""import os, pathlib, runpy, sys
+died = pathlib.Path({str(marker)!r} + str(os.getppid()))
+if not died.exists():
+    sys.stdin.readline()
+    died.touch()
+    os._exit(9)
+runpy.run_module("tricap.core.cli.worker", run_name="__main__")"""
+    environment = python_command("core.cli.worker")[1]
+    monkeypatch.setattr(workers, "python_command", lambda module: ([sys.executable, "-P", "-c", code], environment))
+    assert len(measured(plane_take, tmp_path / "out", Engine(workers=1, retries=1))) == 8
+    for path in tmp_path.glob("died*"):
+        path.unlink()
+    with pytest.raises(InputError, match="died 1 times"):
+        measured(plane_take, tmp_path / "other", Engine(workers=1, retries=0))
+
+
+def test_a_task_is_plain_text(plane_take: Path, tmp_path: Path) -> None:
+    """It travels between machines, and holds every setting, also those of the command line."""
+    with take_run.open_run(plane_take, tmp_path / "out", {"matching": {"patch_px": 15}}) as job:
+        task = workers._task(job, {3: "key"})
+    assert json.loads(json.dumps(task)) == task and task["settings"]["matching"]["patch_px"] == 15 and task["keys"] == {"3": "key"}
