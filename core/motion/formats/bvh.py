@@ -15,6 +15,7 @@ from ...foundation.errors import InputError
 from ...geometry.rotation import about, euler_from_matrix, shortest, unit
 from ..retarget.rig import Motion, Rig
 
+DEEPEST = 256  # joints in a chain: a tail or a braid has some dozens
 MOST_JOINTS = 4096
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 TALL_M = 1.7  # height of a person, for the unit
@@ -68,6 +69,8 @@ def _joints(text: str, path: Path) -> list[_Joint]:
             name = " ".join(_until(words, "{", path))
             joints.append(_Joint(name=name, parent=stack[-1] if stack else -1, offset=np.zeros(3)))
             stack.append(len(joints) - 1)
+            if len(stack) > DEEPEST:
+                raise InputError(f"{path} has a chain of more than {DEEPEST} joints; that is no skeleton.")
         elif kind == "END":
             _until(words, "{", path)
             stack.append(-1)

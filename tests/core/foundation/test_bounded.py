@@ -15,6 +15,7 @@ from tricap.core.foundation import bounded
 from tricap.core.foundation.errors import InputError
 from tricap.core.geometry.rig import read_rig
 from tricap.core.images.sequence import read_image
+from tricap.core.motion.formats.bvh import read_bvh
 from tricap.core.motion.retarget.mapping import read_preset
 from tricap.core.results.folder import Results
 from tricap.core.take.take import read_take
@@ -154,3 +155,18 @@ def test_a_name_that_is_no_unicode_is_refused_before_anything_is_measured(tmp_pa
     (folder / "below").mkdir()
     with pytest.raises(InputError, match="one of those above it"):
         read_take(folder / "below")
+
+
+@pytest.mark.parametrize(("joints", "refused"), [(200, False), (3000, True)])
+def test_a_chain_of_thousands_of_joints_is_no_skeleton(tmp_path: Path, joints: int, refused: bool) -> None:
+    joint = "\n{\nOFFSET 0 1 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+    chain = (
+        "ROOT a" + joint + "".join(f"JOINT j{i}{joint}" for i in range(joints)) + "End Site\n{\nOFFSET 0 1 0\n}\n" + "}\n" * (joints + 1)
+    )
+    values = " ".join(["0"] * 3 * (joints + 1))
+    (tmp_path / "a.bvh").write_text(f"HIERARCHY\n{chain}MOTION\nFrames: 1\nFrame Time: 0.04\n{values}\n")
+    if refused:
+        with pytest.raises(InputError, match="a chain of more than 256 joints"):
+            read_bvh(tmp_path / "a.bvh")
+    else:
+        assert len(read_bvh(tmp_path / "a.bvh").rig.names) == joints + 1
