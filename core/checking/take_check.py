@@ -52,7 +52,7 @@ LIMBS = {f"{side} {limb}": tuple(f"{joint}.{side[0].upper()}" for joint in joint
 
 
 def joint_findings(take: Take) -> list[Finding]:
-    """A limb without clicks: clicks decide which way the fit bends it. A person, or the upper half, starts by itself.
+    """A limb without clicks: clicks decide which way the fit bends it. A whole person starts by itself.
 
     Raises:
         InputError: there is no such body model.
@@ -66,7 +66,7 @@ def joint_findings(take: Take) -> list[Finding]:
         return []
     if not clicked:
         sentence = (
-            f"No joint of the body “{take.body_model}” is clicked. It starts by itself only where the whole upper body is visible; "
+            f"No joint of the body “{take.body_model}” is clicked. It starts by itself only where the whole person is visible; "
             "otherwise the result will have surface and tracks, but no body."
         )
         return [doubtful(Cause.NO_CLICKS, sentence, advice)]

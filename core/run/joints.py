@@ -48,9 +48,7 @@ def joints_of_take(take_folder: Path, overrides: Overrides | None, monitor: Moni
         given = fit_input(footage, clouds, None, Results(Path(empty)), background)
     start = find_joints(given, settings["fitting"], monitor.part("find the person", 1, 2))
     if start is None:
-        raise InputError(
-            "Nobody was found: no frame has enough measured points of a person who is inside the middle view from head to hips."
-        )
+        raise InputError("Nobody was found: no frame has enough measured points of a person who is wholly inside the middle view.")
     return footage, start, settings
 
 

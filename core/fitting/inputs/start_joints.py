@@ -13,7 +13,7 @@ class StartJoints:
     frame: int  # the take's number
     xyz_m: Mapping[str, np.ndarray]  # (3,) by joint
     stature: float  # over the model's
-    model: str  # of the body that was looked for: "full" or "upper_body"
+    model: str  # of the body that was looked for
     probability: float
     rivals: Mapping[str, float]
     ask: str  # the joint whose click would decide

@@ -20,14 +20,14 @@ from ..inputs.silhouettes import Silhouettes
 from ..inputs.start_joints import StartJoints
 from ..observations import ClickedJoints, Keypoints, Observation
 from ..observations.self_collision import CollisionPairs
-from ..settings import START_ALONE, FitSettings
+from ..settings import FitSettings
 from ..start.find import find_start
 from ..state import ShapeParameters
 from .inverse_kinematics import LEAST_TRUNK_JOINTS, clicked_stature, dof_priors, trunk_joints
 from .long_sequence import AT_ONCE
 
 FOUND_STATURE_SIGMA = 0.03  # relative, of the start without clicks
-WHOLE, UPPER = START_ALONE
+WHOLE = "full"  # the model that is looked for, whatever part of it is fitted
 
 
 class NobodyFound(InputError):
@@ -82,8 +82,8 @@ def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitI
     start = find_joints(given, settings, monitor)
     if start is None:
         raise NobodyFound(
-            "The body cannot start by itself: no frame has enough measured points of a person who is inside the middle view from head to "
-            "hips. Click at least two of its joints in two views each, under [seeds.joints] or in Blender (step 3)."
+            "The body cannot start by itself: no frame has enough measured points of a person who is wholly inside the middle view. "
+            "Click at least two of its joints in two views each, under [seeds.joints] or in Blender (step 3)."
         )
     if start.probability < settings.least_start_probability:
         raise NeedsClick(start.question)
@@ -112,9 +112,7 @@ def find_joints(given: FitInput, settings: FitSettings, monitor: Monitor, withou
         InputError: clicks contradict each other.
         Cancelled: the user asked to stop.
     """
-    legs = any(name.startswith(("hip", "knee", "ankle")) for name in read_model(given.model).skeleton.joint_names)
-    model = given.model if given.model in START_ALONE else WHOLE if legs else UPPER
-    given = given if model == given.model else replace(given, model=model, limits={}, locked=())
+    given = given if given.model == WHOLE else replace(given, model=WHOLE, limits={}, locked=())
     clouds = given.clouds
 
     @lru_cache(maxsize=64)

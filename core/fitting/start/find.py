@@ -23,7 +23,7 @@ from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
 from .pose_dictionary import known_poses
 from .refine import STAGE, Explanation, exchanged, limb_rivals, of_hypothesis, thinned_points, with_lengths, with_limbs
-from .search import hypotheses, is_inside, is_whole
+from .search import hypotheses, is_inside
 
 LOOKED_AT, SEARCHED = 24, 2  # frames of which the easiest are chosen, and how many are searched
 APART = 0.25  # of the recording, between the frames that are searched
@@ -39,7 +39,7 @@ UNLIKELY = 0.01  # a less probable rival is not named
 JUDGED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # joints by which explanations are compared
 EXCHANGES = {
     "front and back": ("hip", "knee", "ankle", "clavicle", "shoulder", "elbow", "wrist", "knuckles"),
-    "the left and the right leg": ("hip", "knee", "ankle"),
+    "the left and the right leg": ("knee", "ankle"),
 }
 
 
@@ -61,7 +61,7 @@ def find_start(
 ) -> StartJoints | None:
     """The joints where the fit begins; None where no frame has enough points.
 
-    `fit`: a body of the whole person or the upper body, without the joints of clicks as a start. `points_of(t)`: the points of frame index
+    `fit`: a body of the whole person, without the joints of clicks as a start. `points_of(t)`: the points of frame index
     t. `without`: recordings of the pose dictionary that are left out.
 
     Raises:
@@ -91,7 +91,7 @@ def find_start(
 def easiest_frames(fit: FitContext, points_of: Callable[[int], CloudPoints], count: int, monitor: Monitor) -> list[int]:
     """The frame indices to search: those with clicks, or else the easiest ones apart from each other.
 
-    Only frames with enough points, in which the image shows the person from the head downwards.
+    Only frames with enough points, in which the image shows the whole person.
     """
     some = sorted(fit.clicked) or np.unique(np.linspace(0, count - 1, min(LOOKED_AT, count)).round().astype(int)).tolist()
     ease = dict[int, float]()
@@ -135,7 +135,7 @@ def _velocities(points_of: Callable[[int], CloudPoints], chosen: Sequence[int], 
 def _explained(fit: FitContext, t: int, points: CloudPoints, known: np.ndarray, velocity: np.ndarray, monitor: Monitor) -> _Frame:
     """The explanations of frame index `t`, with their probabilities.  (1)"""
     evidence, thin = fit.seen(t, points), thinned_points(points)
-    found = hypotheses(fit, t, evidence, known, is_whole(evidence)).best(AMONG)
+    found = hypotheses(fit, t, evidence, known).best(AMONG)
     monitor.step(STAGE, 2, 10)
     tried: list[Explanation] = []
     starts: list[np.ndarray] = []
@@ -147,18 +147,9 @@ def _explained(fit: FitContext, t: int, points: CloudPoints, known: np.ndarray, 
     tried.sort(key=lambda one: -one.score)
     complete = [with_limbs(fit, thin, one, monitor.part(STAGE, 8 + i, 20)) for i, one in enumerate(tried[:COMPLETED])]
     best = max(complete, key=lambda one: one.score)
-    rivals = [
-        exchanged(fit, thin, best, parts, monitor.part(STAGE, 12 + i, 20))
-        for i, (name, parts) in enumerate(EXCHANGES.items())
-        if _can_exchange(fit, parts)
-    ]
+    rivals = [exchanged(fit, thin, best, parts, monitor.part(STAGE, 12 + i, 20)) for i, parts in enumerate(EXCHANGES.values())]
     rivals += limb_rivals(fit, thin, best, monitor)
     return judged(fit, [*tried[COMPLETED:], *complete, *rivals], velocity)
-
-
-def _can_exchange(fit: FitContext, parts: Sequence[str]) -> bool:
-    """Whether the model has such joints; without legs, those of the legs cannot be exchanged alone."""
-    return f"{parts[1]}.L" in fit.model.skeleton.joint_names or "shoulder" in parts
 
 
 def judged(fit: FitContext, found: Sequence[Explanation], velocity: np.ndarray) -> _Frame:

@@ -63,8 +63,8 @@ def scaled_vector(parameters: ShapeParameters, stature: float) -> np.ndarray:
     return vector
 
 
-def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray, whole: bool) -> Hypotheses:
-    """The known poses (K, D) in all headings in frame index `t`. `whole`: the region ends at the feet and not at the image's border."""
+def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray) -> Hypotheses:
+    """The known poses (K, D) in all headings in frame index `t`, in which the person is wholly visible."""
     parameters, skeleton = fit.parameters, fit.model.skeleton
     middle = fit.cameras[len(fit.cameras) // 2]
     region = _region(evidence, middle)
@@ -75,7 +75,7 @@ def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray, w
         angle = 2 * np.pi * k / HEADINGS
         turned = known.copy()
         turned[:, skeleton.layout[f"{skeleton.joint_names[0]} rotation"]] += angle
-        turned[:, skeleton.layout.group("base")], size = _places(region, *_flesh(rest, evidence, at_origin, angle), whole)
+        turned[:, skeleton.layout.group("base")], size = _places(region, *_flesh(rest, evidence, at_origin, angle))
         poses.append(turned)
         stature.append(size)
     all_poses, sizes = np.concatenate(poses), np.concatenate(stature)
@@ -91,22 +91,13 @@ def hypotheses(fit: FitContext, t: int, evidence: Evidence, known: np.ndarray, w
     return Hypotheses(poses=all_poses, stature=sizes, score=score - _misses(fit, t, all_poses, sizes))
 
 
-def is_whole(evidence: Evidence) -> bool:
-    """Whether the middle view shows the person down to the feet: the region does not touch the lower border of the image."""
-    return not evidence.cells or not _at_borders(evidence)[1, 1]
-
-
 def is_inside(evidence: Evidence) -> bool:
-    """Whether no other border of the image than the lower one cuts the person in the middle view."""
-    return not evidence.cells or int(_at_borders(evidence).sum()) == int(_at_borders(evidence)[1, 1])
-
-
-def _at_borders(evidence: Evidence) -> np.ndarray:
-    """Whether the person's region in the middle view is at the borders (2, 2): left and upper, right and lower."""
+    """Whether no border of the image cuts the person in the middle view."""
+    if not evidence.cells:
+        return True
     view = evidence.cells[len(evidence.cells) // 2]
-    near = BORDER * view.distance.step_px
-    size = np.array(view.camera.size_px)
-    return np.stack([view.xy_px.min(axis=0) < near, view.xy_px.max(axis=0) > size - 1 - near])
+    near, size = BORDER * view.distance.step_px, np.array(view.camera.size_px)
+    return bool((view.xy_px.min(axis=0) >= near).all() and (view.xy_px.max(axis=0) <= size - 1 - near).all())
 
 
 def _region(evidence: Evidence, camera: Camera) -> _Region:
@@ -132,17 +123,15 @@ def _flesh(
     return X.reshape(len(head), -1, 3) @ turn.T, np.repeat(radii, len(ALONG)), np.repeat(lengths * radii, len(ALONG))
 
 
-def _places(region: _Region, X: np.ndarray, radius: np.ndarray, area: np.ndarray, whole: bool) -> tuple[np.ndarray, np.ndarray]:
+def _places(region: _Region, X: np.ndarray, radius: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the base (N, 3) of poses with flesh at X (N, S, 3) belongs, and their stature (N,)."""
     across, down, depth = np.moveaxis(X @ region.camera.R_cam_world.T, -1, 0)
     top, bottom = (down - radius).min(axis=1), (down + radius).max(axis=1)
-    size = np.ones(len(X))
-    if whole:
-        size = np.clip((region.bottom_m - region.top_m) / (bottom - top), SHORTEST, TALLEST)
+    size = np.clip((region.bottom_m - region.top_m) / (bottom - top), SHORTEST, TALLEST)
     at = np.stack(
         [
             region.middle_m - size * (across * area).sum(axis=1) / area.sum(),
-            (region.top_m + region.bottom_m - size * (top + bottom)) / 2 if whole else region.top_m - size * top,
+            (region.top_m + region.bottom_m - size * (top + bottom)) / 2,
             region.depth_m - size * np.median(depth - FACING * radius, axis=1),
         ],
         axis=1,
