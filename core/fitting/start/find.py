@@ -27,7 +27,7 @@ from .search import hypotheses, is_inside
 
 LOOKED_AT, SEARCHED = 24, 2  # frames of which the easiest are chosen, and how many are searched
 APART = 0.25  # of the recording, between the frames that are searched
-TRIED, DIFFERENT_M, AMONG = 5, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
+TRIED, DIFFERENT_M, AMONG = 6, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
 COMPLETED = 3  # of them, whose limbs are looked for
 SAME_M = 0.2  # between the joints of explanations that are one
 TAU = 40.0  # voxels for a probability ratio of e

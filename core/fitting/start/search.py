@@ -17,7 +17,7 @@ from ..explained import Evidence, body_gains
 from ..observations import ClickedJoints
 from ..state import BodyState, ShapeParameters
 
-HEADINGS = 16  # 22.5° apart: the adjustment converges from half of that
+HEADINGS = 20  # 18° apart: the adjustment converges from half of that
 WIDTH_M = 0.06  # of the weights of what a pose explains
 COARSER = 2  # times the evidence is thinned
 ALONG = np.array([0.1, 0.5, 0.9])  # of a bone, where its flesh is sampled
