@@ -95,13 +95,15 @@ def test_the_disk_is_full_from_the_beginning(take: Path, tmp_path: Path, monkeyp
 def test_a_folder_that_turns_read_only(
     take: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, capfd: Capture
 ) -> None:
-    import tempfile
+    opened = os.open
 
-    def refused(*args: object, **more: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+    def refused(path: Path, flags: int, *args: int, **more: int) -> int:
+        if flags & os.O_CREAT:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+        return opened(path, flags, *args, **more)
 
     with monkeypatch.context() as patch:
-        at_the_frame(patch, 2, lambda: patch.setattr(tempfile, "mkstemp", refused))
+        at_the_frame(patch, 2, lambda: patch.setattr(os, "open", refused))
         assert run(take, tmp_path / "out") == 2
     assert "Read-only file system" in said(capfd)
     assert run(take, tmp_path / "out") == 0 and files(tmp_path / "out") == whole
