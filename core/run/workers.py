@@ -178,6 +178,8 @@ class _Worker:
             self._process = subprocess.Popen(
                 self._command, env=self._environment, text=True, encoding="utf-8", stdin=subprocess.PIPE, stdout=subprocess.PIPE
             )
+            if self._stopped:  # meanwhile: `stop` may not have seen the process
+                self._process.kill()
         try:
             assert self._process.stdin is not None and self._process.stdout is not None
             self._process.stdin.write(line + "\n")
