@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -30,6 +30,7 @@ MOVIE_BYTES = 1 << 42  # decoded piece by piece
 
 MOST_KEY_PARTS = 32  # of a dotted TOML key, for whose parts tomllib needs quadratic time
 DEEPEST = 64  # tables and lists in each other
+TOO_DEEP = f"more than {DEEPEST} tables and lists in each other"
 WHOLE_BITS = 63  # of a whole number, as TOML has it
 PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 LONG_KEY = re.compile(rf"(?<![\w.-]){PART}(?:[ \t]*+\.[ \t]*+{PART}){{{MOST_KEY_PARTS}}}")
@@ -129,11 +130,7 @@ def toml_of(text: str) -> dict[str, Any]:
     if found is not None:
         line = text.count("\n", 0, found.start()) + 1
         raise ValueError(f"a key with more than {MOST_KEY_PARTS} parts (at line {line})")
-    try:
-        table = tomllib.loads(text)
-    except RecursionError as error:
-        raise ValueError(f"more than {DEEPEST} tables and lists in each other") from error
-    check_value(table)
+    table: dict[str, Any] = _within_limits(tomllib.loads, text)
     return table
 
 
@@ -143,10 +140,14 @@ def json_of(text: str | bytes) -> Any:
     Raises:
         ValueError: it is no JSON, or beyond the limits.
     """
+    return _within_limits(json.loads, text)
+
+
+def _within_limits(parse: Callable[[Any], Any], text: str | bytes) -> Any:
     try:
-        value = json.loads(text)
+        value = parse(text)
     except RecursionError as error:
-        raise ValueError(f"more than {DEEPEST} tables and lists in each other") from error
+        raise ValueError(TOO_DEEP) from error
     check_value(value)
     return value
 
@@ -176,7 +177,7 @@ def check_value(value: Any) -> None:
         level = [inner for outer in level for inner in _inside(outer)]
         if not level:
             return
-    raise ValueError(f"more than {DEEPEST} tables and lists in each other")
+    raise ValueError(TOO_DEEP)
 
 
 def _inside(outer: Any) -> list[Any]:
