@@ -19,7 +19,7 @@ from ..motion.formats.ply import read_ply
 from ..motion.tables import read_joints
 from ..results.folder import Results
 from ..take.footage import Footage
-from .overview import known_colours
+from .overview import sigma_colours
 from .pictures import OPACITY, SKIN_COLOUR, colour
 
 WIDTH_PX = 1920  # of the movie, at most
@@ -81,7 +81,7 @@ def _panel(
     alpha = (OPACITY * covered)[..., None]
     drawn = ((1 - alpha) * picture + alpha * light[..., None] * SKIN_COLOUR).clip(0, 255).astype(np.uint8)
     at = {name: camera.project(xyz[None])[0] for name, (xyz, _) in joints.items()}
-    tint = {name: tuple(known_colours(np.array(1e3 * sigma)).tolist()) for name, (_, sigma) in joints.items()}
+    tint = {name: tuple(sigma_colours(np.array(1e3 * sigma)).tolist()) for name, (_, sigma) in joints.items()}
     spots = {name: tuple(np.rint(xy).astype(int).tolist()) for name, xy in at.items() if np.isfinite(xy).all() and np.abs(xy).max() < 3e4}
     for head, tail in bones:
         if head in spots and tail in spots:

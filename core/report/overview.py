@@ -17,8 +17,8 @@ PREDICTED = {
     BRIDGED: "the whole pose is predicted",
     SUSPECT: "residuals are large or observations few",
 }
-KNOWN_MM = np.array([1.0, 7.0, 50.0])  # sigmas of joints whose colours are
-KNOWN_COLOURS = np.array([[200, 130, 40], [60, 205, 250], [50, 50, 230]], dtype=np.float64)  # BGR: blue, yellow, red
+SIGMAS_MM = np.array([1.0, 7.0, 50.0])  # of joints; their colours are
+COLOURS = np.array([[200, 130, 40], [60, 205, 250], [50, 50, 230]], dtype=np.float64)  # BGR: blue, yellow, red
 LEGEND = "Colour: reported sigma of the joints; blue 1 mm or less, yellow 7 mm, red 50 mm or more."
 CELL_PX = 300  # height of a picture of the strip
 MARGIN = 1.3  # of a picture about the body
@@ -58,10 +58,10 @@ def _of_surface(stages: Mapping[str, Any]) -> str:
     return f"{points} and {tracked['trajectories']:,} trajectories." if "trajectories" in tracked else f"{points}."
 
 
-def known_colours(sigma_mm: np.ndarray) -> np.ndarray:
+def sigma_colours(sigma_mm: np.ndarray) -> np.ndarray:
     """Colours (…, 3) BGR of sigmas (…) of joints."""
-    at = np.log(np.clip(np.nan_to_num(sigma_mm, nan=np.inf), KNOWN_MM[0], KNOWN_MM[-1]))
-    return np.stack([np.interp(at, np.log(KNOWN_MM), KNOWN_COLOURS[:, c]) for c in range(3)], axis=-1)
+    at = np.log(np.clip(np.nan_to_num(sigma_mm, nan=np.inf), SIGMAS_MM[0], SIGMAS_MM[-1]))
+    return np.stack([np.interp(at, np.log(SIGMAS_MM), COLOURS[:, c]) for c in range(3)], axis=-1)
 
 
 def bone_sigma_mm(body: BodyFit, index: int) -> np.ndarray:
@@ -76,7 +76,7 @@ def window_px(camera: Camera, joints_m: np.ndarray) -> float:
     return MARGIN * float(np.nanmax(np.ptp(camera.project(joints_m), axis=0), initial=1.0))
 
 
-def known_body(grey: np.ndarray, camera: Camera, skin: Skin, sigma_mm: np.ndarray, centre_px: np.ndarray, side_px: float) -> np.ndarray:
+def body_by_sigma(grey: np.ndarray, camera: Camera, skin: Skin, sigma_mm: np.ndarray, centre_px: np.ndarray, side_px: float) -> np.ndarray:
     """The skin over a square of one view, `side_px` wide about `centre_px`, coloured by the sigmas (B,) of its bones: uint8 (h, h, 3)."""
     scale = CELL_PX / side_px
     small = camera.resized((max(1, round(camera.size_px[0] * scale)), max(1, round(camera.size_px[1] * scale))))
@@ -84,7 +84,7 @@ def known_body(grey: np.ndarray, camera: Camera, skin: Skin, sigma_mm: np.ndarra
     raster = rasterize(small, skin.vertices_m, skin.triangles)
     normal = raster.interpolate(vertex_normals(skin.vertices_m, skin.triangles), skin.triangles) @ small.R_cam_world.T
     light = 0.45 + 0.55 * np.clip(-normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12), 0, 1)
-    tint = raster.interpolate(known_colours(skin.weights @ sigma_mm), skin.triangles)
+    tint = raster.interpolate(sigma_colours(skin.weights @ sigma_mm), skin.triangles)
     flat = image.reshape(-1, 3)
     flat[raster.sample] = (1 - OPACITY) * flat[raster.sample] + OPACITY * light[:, None] * tint
     corner = np.rint((centre_px + 0.5) * scale - 0.5 - CELL_PX / 2).astype(int)

@@ -27,7 +27,7 @@ from . import pictures
 from .document import document, figure, notes, table
 from .figures import Row, figure_rows, figures_csv, number, quoted
 from .graphs import SCRIPT, curve_graph
-from .overview import LEGEND, bone_sigma_mm, known_body, strip_frames, verdict, window_px
+from .overview import LEGEND, body_by_sigma, bone_sigma_mm, strip_frames, verdict, window_px
 from .silhouettes import OUTLINE, PERSON, Silhouettes
 from .trails import trail_pictures
 
@@ -170,7 +170,7 @@ def _strip(report: Report, skin_at: Callable[[np.ndarray], Skin] | None, monitor
         monitor.step("report", 1, 2)
         centre, grey = camera.project(body.motion.joints_m[i]), footage.read(frames[i])[k]
         middle = 0.5 * (np.nanmin(centre, axis=0) + np.nanmax(centre, axis=0))
-        picture = known_body(grey, camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i), middle, side)
+        picture = body_by_sigma(grey, camera, skin_at(body.motion.values[i]), bone_sigma_mm(body, i), middle, side)
         why = f": {report.doubtful[frames[i]]}" if frames[i] in report.doubtful else ""
         found.append((f"Frame {frames[i]}{why}", pictures.jpeg(picture)))
     return found

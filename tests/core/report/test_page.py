@@ -21,7 +21,7 @@ from tricap.core.foundation import store
 from tricap.core.report.document import STYLE, document, figure, notes, table
 from tricap.core.report.figures import figures_csv
 from tricap.core.report.graphs import SCRIPT, curve_graph
-from tricap.core.report.overview import CELL_PX, bone_sigma_mm, known_body, known_colours, strip_frames, verdict
+from tricap.core.report.overview import CELL_PX, body_by_sigma, bone_sigma_mm, sigma_colours, strip_frames, verdict
 from tricap.core.report.pages import Report, _page, limb_of
 from tricap.core.report.pictures import jpeg
 from tricap.core.report.silhouettes import Silhouettes
@@ -79,17 +79,17 @@ def test_the_verdict_reports_doubt_before_anything_sounds_certain() -> None:
 
 def test_limbs_are_coloured_by_their_sigma(scenes: Any) -> None:
     """From blue to red; not finite is red. In the picture the forearm, whose wrist is uncertain, is redder than the upper arm."""
-    blue, yellow, red, unknown = known_colours(np.array([0.1, 7.0, 500.0, np.nan])).tolist()
+    blue, yellow, red, unknown = sigma_colours(np.array([0.1, 7.0, 500.0, np.nan])).tolist()
     assert blue[0] > blue[2] and yellow[1] > 200 and red[2] > 200 and unknown == red
     body, camera = fitted(), scenes.three_cameras()["C"]
     assert bone_sigma_mm(body, 0).tolist() == [2.0, 60.0]
     skin = body_skin(ARM, body.motion.values[0], SkinSettings())
     place = camera.project(skin.vertices_m)
-    picture = known_body(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), place.mean(axis=0), 90.0)
+    picture = body_by_sigma(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), place.mean(axis=0), 90.0)
     assert picture.shape == (CELL_PX, CELL_PX, 3)
     redness = picture[..., 2].astype(int) - picture[..., 0]
     assert redness.min() < -10 and redness.max() > 60 and (redness == 0).mean() > 0.4
-    aside = known_body(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), np.array([900.0, -400.0]), 90.0)
+    aside = body_by_sigma(np.full((150, 200), 90.0, np.float32), camera, skin, bone_sigma_mm(body, 0), np.array([900.0, -400.0]), 90.0)
     assert aside.shape == (CELL_PX, CELL_PX, 3)
 
 
