@@ -1,6 +1,5 @@
 """Puts a motion onto an armature of the open file: read the rig, map, transfer, write the action, and check what Blender plays."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -142,11 +141,6 @@ def set_range(scene: bpy.types.Scene, motion: Motion) -> None:
     whole = max(1, int(np.ceil(motion.fps - 1e-3)))
     scene.render.fps, scene.render.fps_base = whole, whole / motion.fps
     scene.frame_start, scene.frame_end = int(np.floor(motion.frames[0])), int(np.ceil(motion.frames[-1]))
-
-
-def names_of(armatures: Sequence[bpy.types.Object]) -> str:
-    """For sentences."""
-    return ", ".join(o.name for o in armatures) or "none"
 
 
 def check_distinct(source: bpy.types.Object, target: bpy.types.Object) -> None:

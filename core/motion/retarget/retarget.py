@@ -325,8 +325,3 @@ def _planted(pose: TargetPose, legs: Mapping[str, feet.Leg], stands: list[feet.S
         forward = R[:, thigh] @ (rig.R_rest[thigh].T @ front)
         R = feet.bend_limb(leg.limb, R, heads[:, thigh], goal, forward)
     return pose.turned(R)
-
-
-def restarted(motion: Motion, first_frame: float) -> Motion:
-    """The same motion, beginning at another frame."""
-    return replace(motion, frames=motion.frames - motion.frames[0] + first_frame, residual=None)

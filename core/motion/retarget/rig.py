@@ -32,8 +32,6 @@ from ...geometry.rotation import between, transposed
 from ...images.interlace import frame_time_s
 from .residual_motion import ResidualMotion
 
-SHORTEST_BONE_M = 1e-6
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Rig:
