@@ -81,13 +81,21 @@ def pixels_of(footage: Footage, start: StartJoints) -> dict[str, dict[str, list[
 
 
 def write_joints_as_clicks(folder: Path, frame: int, joints: Mapping[str, Mapping[str, list[float]]]) -> bool:
-    """Write joints into [seeds.joints] of take.toml; joints that are clicked in that frame stay as they are. False: nothing changed.
+    """Write joints of a frame into [seeds.joints] of take.toml. False: nothing changed.
+
+    All clicks stay: those in that frame win over `joints`, those in other frames become [[keyframes]]. If surface seeds of another frame
+    are there, [seeds] remains theirs, and `joints` become [[keyframes]].
 
     Raises:
         InputError: the file cannot be read or written.
     """
-    table = read_table(folder)
+    table = dict(read_table(folder))
     seeds = dict(table.get("seeds", {}))
-    own = seeds.get("joints", {}) if seeds.get("frame", 0) == frame else {}
-    seeds |= {"frame": frame, "joints": {**{name: dict(at) for name, at in joints.items()}, **own}}
-    return write_table(folder, {**table, "seeds": seeds})
+    seeded = seeds.get("frame", 0)
+    clicked = {key.get("frame", 0): dict(key.get("joints", {})) for key in table.pop("keyframes", [])}
+    clicked[seeded] = clicked.get(seeded, {}) | seeds.pop("joints", {})
+    clicked[frame] = {name: dict(at) for name, at in joints.items()} | clicked.get(frame, {})
+    if seeded == frame or not seeds.get("surface"):
+        seeds |= {"frame": frame, "joints": clicked.pop(frame)}
+    keyframes = [{"frame": at, "joints": found} for at, found in sorted(clicked.items()) if found]
+    return write_table(folder, {**table, "seeds": seeds, **({"keyframes": keyframes} if keyframes else {})})

@@ -22,6 +22,7 @@ from tricap.core.fitting.start.refine import Explanation
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.run.joints import write_joints_as_clicks
+from tricap.core.take.take import read_take
 from tricap.core.take.writing import read_table
 
 from .limb_scene import front_rig, measured_cloud
@@ -164,12 +165,31 @@ def test_frames_near_in_time_agree_which_way_somebody_faces() -> None:
     assert kept.explanations[0].joints_m is right and np.allclose(kept.probability, doubtful.probability)
 
 
-def test_found_joints_are_written_as_clicks_beside_clicked_ones(tmp_path: Path) -> None:
+def _write_take(folder: Path, clicks: str) -> None:
     views = "".join(f'[[views]]\nname = "{v}"\nimages = "{v}/*.png"\n' for v in "LR")
-    seeds = '[seeds]\nframe = 3\n[seeds.joints]\n"elbow.R" = { L = [1.0, 2.0], R = [3.0, 4.0] }\n'
-    (tmp_path / "take.toml").write_text(f'format = "tricap-take"\nversion = 1\nfps = 25.0\nrig = "rig.toml"\n{views}{seeds}')
+    (folder / "take.toml").write_text(f'format = "tricap-take"\nversion = 1\nfps = 25.0\nrig = "rig.toml"\n{views}{clicks}')
+
+
+ELBOW = '"elbow.R" = { L = [1.0, 2.0], R = [3.0, 4.0] }\n'
+
+
+def test_found_joints_are_written_as_clicks_beside_clicked_ones(tmp_path: Path) -> None:
+    _write_take(tmp_path, f"[seeds]\nframe = 3\n[seeds.joints]\n{ELBOW}")
     found = {"elbow.R": {"L": [9.0, 9.0], "R": [9.0, 9.0]}, "knee.L": {"L": [5.0, 6.0], "R": [7.0, 8.0]}}
     assert write_joints_as_clicks(tmp_path, 3, found)
     joints = read_table(tmp_path)["seeds"]["joints"]
     assert joints == {"elbow.R": {"L": [1.0, 2.0], "R": [3.0, 4.0]}, "knee.L": {"L": [5.0, 6.0], "R": [7.0, 8.0]}}
     assert not write_joints_as_clicks(tmp_path, 3, found)
+
+
+@pytest.mark.parametrize("surface", ["", "surface = [ { L = [5.0, 5.0], R = [6.0, 6.0] } ]\n"])
+def test_clicks_in_other_frames_stay_in_their_frames(tmp_path: Path, surface: str) -> None:
+    clicks = f"[seeds]\nframe = 3\n{surface}[seeds.joints]\n{ELBOW}[[keyframes]]\nframe = 7\n[keyframes.joints]\n{ELBOW}"
+    _write_take(tmp_path, clicks)
+    assert write_joints_as_clicks(tmp_path, 7, {"knee.L": {"L": [5.0, 6.0], "R": [7.0, 8.0]}})
+    take = read_take(tmp_path)
+    assert {key.frame: set(key.joints) for key in (take.clicks, *take.keyframes) if key.joints} == {
+        3: {"elbow.R"},
+        7: {"elbow.R", "knee.L"},
+    }
+    assert (take.clicks.frame, len(take.clicks.surface)) == ((3, 1) if surface else (7, 0))
