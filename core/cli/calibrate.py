@@ -40,8 +40,8 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
 def _board(args: argparse.Namespace) -> Board | None:
     """The board that was described, or None for a bar."""
     if args.board is None:
-        if args.squares or args.square or args.printed:
-            raise InputError("--squares, --square and --print describe a board; give --board chessboard or --board charuco, too.")
+        if args.squares or args.square or args.marker or args.printed:
+            raise InputError("--squares, --square, --marker and --print describe a board; give --board chessboard or --board charuco, too.")
         return None
     for given, flag in ((args.bar_length, "--bar-length"), (args.target_diameter, "--target-diameter"), (args.mask, "--mask")):
         if given is not None:

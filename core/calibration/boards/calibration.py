@@ -69,12 +69,13 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
     monitor.step("calibration", 4, 5)
     tested = without_outliers(first, labelled, used, prior, lambda boards, tolerance_px: with_boards(boards, labelled, tolerance_px))
     done = without_insignificant(*tested, labelled, monitor)
-    remarks, doubt = _remarks(labelled, tested[0].network.corners_m)
-    return replace(done, remarks=remarks, doubt=doubt)
+    of_views, doubt_of_views = _remarks_on_views(labelled)
+    of_shape, doubt_of_shape = _remarks_on_shape(labelled.board.corners_m, tested[0].network.corners_m, labelled.length_m)
+    return replace(done, remarks=(*of_views, *of_shape), doubt=doubt_of_shape or doubt_of_views)
 
 
-def _remarks(labelled: BoardObservations, corners_m: np.ndarray) -> tuple[tuple[str, ...], str]:
-    """Lines about unsynchronised views and the shape of the board, and the doubt that they raise.
+def _remarks_on_views(labelled: BoardObservations) -> tuple[list[str], str]:
+    """Lines about views that were not synchronised, and the doubt that they raise.
 
     Raises:
         InputError: a camera does not agree with the others.
@@ -98,25 +99,31 @@ def _remarks(labelled: BoardObservations, corners_m: np.ndarray) -> tuple[tuple[
             )
         if len(frames) > MANY_APART * shown[c]:
             doubt = f"camera {name}, moved or not synchronised, disagrees with the others in {len(frames)} of its {shown[c]} images"
-    deviation = corners_m - labelled.board.corners_m
-    largest, length = float(np.linalg.norm(deviation, axis=1).max()), labelled.length_m
+    return lines, doubt
+
+
+def _remarks_on_shape(plan_m: np.ndarray, corners_m: np.ndarray, length_m: float) -> tuple[list[str], str]:
+    """Lines about how far the corners (K, 3) of a board of some length are from their plan, and the doubt that this raises."""
+    lines, doubt = [], ""
+    deviation = corners_m - plan_m
+    largest = float(np.linalg.norm(deviation, axis=1).max())
     if largest > 0:
         along, across = np.sqrt(np.mean(deviation[:, :2] ** 2)), np.sqrt(np.mean(deviation[:, 2] ** 2))
         lines.append(
             f"the board differs from its plan by {1e3 * along:.3f} mm RMS in the plane and {1e3 * across:.3f} mm RMS across it, at most "
             f"{1e3 * largest:.3f} mm; the adjustment allows for it"
         )
-    stretch = _stretch(labelled.board.corners_m, corners_m)
+    stretch = _stretch(plan_m, corners_m)
     if stretch > STRETCHED:
         doubt = (
             f"the squares are {100 * stretch:.2f} % longer one way than the other, so the scale is uncertain; measure them both ways, and "
             "print the board without scaling"
         )
-    if largest > BENT * length:
+    if largest > BENT * length_m:
         doubt = (
             f"the board is bent or printed unevenly by {1e3 * largest:.1f} mm; glue it to a flat plate, and measure its squares both ways"
         )
-    return tuple(lines), doubt
+    return lines, doubt
 
 
 def _stretch(plan_m: np.ndarray, corners_m: np.ndarray) -> float:
@@ -142,7 +149,7 @@ def shaped(
         network = replace(state.network, corners_m=_corners(state.network, state.residual_px, used, observations.board.corners_m))
         state = adjust(network, observations.xy_px, used, unknowns, unit_px=sigma, iteration=iteration)
     free = 3 * len(network.corners_m) - 7
-    redundancy = 2 * used.sum() - 6 * network.count - 16 * len(network.R) - free
+    redundancy = 2 * used.sum() - 6 * network.count - (len(INTERIOR) + 6) * len(network.R) - free
     F = (flat.cost - state.cost) / free / (state.cost / max(redundancy, 1))
     return (state, used) if redundancy > 0 and fdtrc(free, redundancy, F) < SHAPE_ALPHA else (flat, used)
 

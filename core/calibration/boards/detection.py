@@ -43,8 +43,7 @@ def find_corners(grey: np.ndarray, board: Board, variant: Variant = Variant(), t
     image = np.clip(grey, 0, 255).astype(np.uint8)
     image = 255 - image if variant.inverted else image
     image = np.ascontiguousarray(image[:, ::-1]) if variant.mirrored else image
-    found = _chessboard(image, board, thorough) if board.kind is BoardKind.CHESSBOARD else _charuco(image, board, variant)
-    return found
+    return _chessboard(image, board, thorough) if board.kind is BoardKind.CHESSBOARD else _charuco(image, board, variant)
 
 
 def find_variant(images: Sequence[np.ndarray], board: Board, variants: Sequence[Variant] = VARIANTS) -> tuple[Variant, int]:

@@ -245,6 +245,7 @@ def test_a_board_is_printed_in_its_size(ending: str, tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--squares", "9x6"], "give --board"),
+        (["--marker", "0.02"], "give --board"),
         (["--board", "chessboard", "--square", "0.01"], "--squares, such as 9x6"),
         (["--board", "chessboard", "--squares", "9x6", "--square", "-1"], "measure the side of a square"),
         (["--board", "chessboard", "--squares", "2x6", "--square", "0.1"], "3 to 60"),
