@@ -34,7 +34,6 @@ from .surface_operators import laplacian, vertex_normals
 TEXTURE, MASK = "texture.png", "texture_mask.png"  # in the folder skin/
 LEAST_COSINE = 0.3  # between normal and ray
 KEPT = 8  # colours of a texel
-SHARPNESS = 1.0  # exponent of (1) in the average
 ROBUST_GREY = 40.0  # distance from the average at which a colour's weight is halved
 REWEIGHTINGS = 4
 SIGMA_M = 0.004  # σ_0 of (1)
@@ -164,7 +163,7 @@ class TextureBaker:
     def _averaged(self, rows: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Colours (N, 3) of texels that were seen."""
         rgb = self._rgb[rows] / gain[self._view[rows]][:, :, None]
-        weight = (self._weight[rows] / self._weight[rows, :1]) ** SHARPNESS
+        weight = self._weight[rows] / self._weight[rows, :1]
         robust = weight
         for _ in range(REWEIGHTINGS):
             mean = np.einsum("nk,nkc->nc", robust, rgb) / robust.sum(axis=1, keepdims=True)

@@ -6,10 +6,10 @@ the other way, or with the legs exchanged, or one limb elsewhere. All explanatio
 
     p_k = exp(S_k / τ) / Σ_j exp(S_j / τ)                                                                  (1)
 
-S is what an explanation explains in voxels, and for the way a person faces also how they move: people seldom walk backwards. Explanations
-whose joints agree within `SAME_M` are one. Nobody turns round within a moment: which way the person faces in the other frames counts, too.
-Where the best explanation is less probable than `fitting.least_start_probability`, a click is asked for: of the joint whose places in the
-explanations differ most. Clicked joints are observations in all steps.
+S is the number of voxels that an explanation accounts for; S/τ also contains log odds for walking forwards, because people seldom walk
+backwards. Explanations whose joints agree within `SAME_M` are one. Nobody turns round within a moment: which way the person faces in the
+other frames counts, too. Where the best explanation is less probable than `fitting.least_start_probability`, a click is asked for: on the
+joint whose places in the explanations differ most. Clicked joints are observations in all steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -165,7 +165,7 @@ def judged(fit: FitContext, found: Sequence[Explanation], velocity: np.ndarray) 
 
 
 def _agreed(frames: Sequence[_Frame], names: Sequence[str], time_s: np.ndarray) -> list[_Frame]:
-    """The frames with the probabilities of facing one way or the other as all frames show it together."""
+    """The frames, with the log odds of facing one way or the other added from all frames nearby."""
     found = []
     for one in frames:
         odds = np.log(np.maximum(one.probability, 1e-12))
@@ -197,7 +197,7 @@ def facing(one: Explanation, names: Sequence[str]) -> np.ndarray:
 
 
 def _walks(one: Explanation, names: Sequence[str], velocity: np.ndarray) -> float:
-    """Log odds of facing as an explanation says, at a velocity (3,)."""
+    """Log odds of facing as in an explanation, at a velocity (3,)."""
     return float(np.clip(FORWARD * facing(one, names) @ velocity, -MOST_FORWARD, MOST_FORWARD))
 
 
@@ -226,7 +226,7 @@ def _difference(a: Explanation, b: Explanation, names: Sequence[str]) -> str:
 
 
 def _decisive(frame: _Frame, names: Sequence[str]) -> str:
-    """The joint whose click tells the best explanation from the others: that differs most, weighted by their probabilities."""
+    """The joint to click: its places in the best explanation and in the rivals differ most, weighted by their probabilities."""
     best, total = frame.explanations[0], np.zeros(len(names))
     for other, p in zip(frame.explanations[1:], frame.probability[1:].tolist()):
         total += p * np.minimum(difference_m(best, other, names), 2 * SAME_M)

@@ -22,13 +22,12 @@ from .search import click_penalty, scaled_vector
 
 REACH_M = 0.25  # of the points that take part, from the body
 ROUNDS = ((2.5, 6), (1.5, 6))  # gate_scale, steps
-LIMB_STEPS = 4
 LENGTH_STEPS = 8
 ANYWHERE, IMPROVED, AROUND, AROUND_RAD = 400, 6, 24, float(np.radians(15.0))  # poses of a limb: all around, the best, and around each
 COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights of what they explain
 ELSEWHERE_M, ALMOST = 0.2, 80.0  # between the ends of a limb and of its rival, and how many voxels less the rival may explain
 MOST_POINTS = 700
-LEFT_BEHIND = ("toe", "crown")  # joints that show where the person faces
+LEFT_OUT = ("toe", "crown")  # of an exchange: they depend on where the person faces
 SIGMA_M = 0.03  # of the joints of a rival
 STAGE = "find the person"
 
@@ -128,7 +127,7 @@ def exchanged(fit: FitContext, points: CloudPoints, found: Explanation, parts: S
         part, _, side = name.partition(".")
         if side and part in parts:
             places[j] = found.joints_m[names.index(f"{part}.{'L' if side == 'R' else 'R'}")]
-        if part in LEFT_BEHIND:
+        if part in LEFT_OUT:
             places[j] = np.nan
     rows = np.flatnonzero(np.isfinite(places).all(axis=1))
     there = Keypoints(joint=rows, xyz_m=places[rows], sigma_m=np.full(len(rows), SIGMA_M))
