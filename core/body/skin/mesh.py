@@ -42,7 +42,7 @@ class SkinSettings:
     )
     exact: bool = knob(
         False,
-        "Cast the skin of every frame onto the fitted surface (0.3 s a frame), instead of moving that of the middle pose with the bones.",
+        "Cast the skin of every frame onto the fitted surface (0.3 s a frame), instead of moving that of the rest pose with the bones.",
     )
     anatomy: bool = knob(
         True, "Anatomical heads, hands and feet, with jaw, fingers, heel and toes, instead of the three fitted balls of a bone."

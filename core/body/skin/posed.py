@@ -1,12 +1,15 @@
-"""The skin of a body in many poses: the skin of the middle pose, cast once, follows the bones.
+"""The skin of a body in many poses: a skin that is made once follows the bones.
 
-Casting a skin onto the implicit surface costs 0.3 s, moving its vertices 2 ms. Every bone b moves from the middle pose by a rotation and a
-shift, as a unit dual quaternion; those of a vertex's bones are blended by its weights (Kavan et al. 2008, doi:10.1145/1409625.1409627),
+Casting a skin onto the implicit surface costs 0.3 s, moving its vertices 2 ms. A skin is made in the rest pose, with relief (person_skin,
+for files, scene and exports), or is that of the metaballs in the middle pose (`PosedSkin`, for the report and the search for lost points).
+Every bone b moves from there by a rotation and a shift, as a unit dual quaternion; those of a vertex's bones are blended by its weights
+(Kavan et al. 2008, doi:10.1145/1409625.1409627),
 
     q̂ = Σ_b w_b q̂_b / |Σ_b w_b q̂_b|                                                                        (1)
 
-which keeps the volume at bent joints as Blender's armature does. On a walker in 40 frames, half of the vertices are within 0.2 mm of the
-skin that is cast in the frame itself, and 95 % within 5 mm; the others are near armpits and crotch, or inside the body.
+which keeps the volume at bent joints as Blender's armature does. On a walker in 40 frames, half of the vertices moved from the middle pose
+are within 0.2 mm of the skin that is cast in the frame itself, and 95 % within 5 mm; the others are near armpits and crotch, or inside the
+body.
 """
 
 from collections.abc import Callable
