@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tricap.core.cli.main import _progress_line
 from tricap.core.foundation.errors import InputError, sentence_of
+from tricap.core.foundation.progress import Monitor
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="redirects by a shell of Unix")
 VIEWS = '[[views]]\nname = "L"\nimages = "L/*.png"\n[[views]]\nname = "R"\nimages = "R/*.png"\n'
@@ -58,6 +60,14 @@ def test_every_encoding_takes_every_character(rig: Path, encoding: str) -> None:
     assert plain.returncode == 1 and b"Traceback" not in plain.stderr, plain
     found = json.loads(text[text.index("{") :])
     assert "é“\U0001f600" in str(found), text
+
+
+def test_a_progress_bar_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        _progress_line(Monitor())("surface", 1, 2)
 
 
 def test_faults_of_the_system_are_sentences() -> None:
