@@ -45,7 +45,7 @@ def changed(take: Path, folder: Path, more: str) -> Path:
 
 
 def test_the_same_input_gives_the_same_bytes(plane_take: Path, tmp_path: Path, scenes: Any) -> None:
-    for a, b in zip(scenes.measure(plane_take, tmp_path / "a"), scenes.measure(plane_take, tmp_path / "b")):
+    for a, b in zip(scenes.measure(plane_take, tmp_path / "a"), scenes.measure(plane_take, tmp_path / "b"), strict=True):
         same(a, b)
 
 
