@@ -10,7 +10,7 @@ from typing import Any
 
 import bpy
 
-from ..core.foundation.errors import InputError
+from ..core.foundation.errors import InputError, sentence_of
 from ..core.images.interlace import BOTH
 from ..core.results.run_json import read_run
 from ..core.take.footage import open_take as open_footage
@@ -91,8 +91,11 @@ def _file_loaded(*_: object) -> None:
     if scene is not None:
         try:
             show_built_project(scene)
-        except InputError as error:
-            get_session().file.take_problem = str(error)
+        except Exception as error:  # the edge of the handler: faults of the input and of the system are told, bugs are raised
+            reason = sentence_of(error)
+            if reason is None:
+                raise
+            get_session().file.take_problem = reason
 
 
 def register() -> None:

@@ -41,10 +41,9 @@ class Done:
 
     folder: Path
     files: dict[str, list[Path]]  # of each view
-    tracks: dict[
-        str, np.ndarray
-    ]  # the targets of a wand (T, 2, 2) by view, one frame an image as the clips show them: of both fields the first
-    bar: tuple[np.ndarray, np.ndarray] | None  # frames (T,) and ends (T, 2, 3) [m] of a wand, one frame an image likewise
+    # of a wand, one frame an image as the clips show them, of both fields the first:
+    tracks: dict[str, np.ndarray]  # its targets (T, 2, 2) by view
+    bar: tuple[np.ndarray, np.ndarray] | None  # frames (T,) and ends (T, 2, 3) [m]
     result: CalibratedRig
     written: Path
 

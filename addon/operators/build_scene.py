@@ -137,8 +137,8 @@ def _hide_default_objects(operator: bpy.types.Operator, context: bpy.types.Conte
         thing.hide_set(True)
         thing.hide_render = True
     if hidden:
-        names = " and ".join(thing.name.lower() for thing in hidden)
-        operator.report({"INFO"}, f"Of Blender's default scene, {names} were hidden: they are in the way of the body.")
+        names, were = " and ".join(thing.name.lower() for thing in hidden), "were" if len(hidden) > 1 else "was"
+        operator.report({"INFO"}, f"Blender's default {names} {were} hidden to show the body alone.")
 
 
 def _is_default_cube(cube: bpy.types.Object) -> bool:

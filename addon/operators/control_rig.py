@@ -50,22 +50,19 @@ class SnapLimbs(bpy.types.Operator):
     limbs: bpy.props.StringProperty(name="Limbs", description="Such as upper_arm.L, thigh.R; empty: all four")  # type: ignore[valid-type]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do it."""
+        """Snap them."""
         limbs = [limb.strip() for limb in self.limbs.split(",") if limb.strip()]
         try:
             count = control_rig.snap(body_of(context), self.to, limbs)
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{count} limbs are in {self.to} now.")
+        self.report({"INFO"}, f"{count} limb{'s are' if count > 1 else ' is'} in {self.to} now.")
         return {"FINISHED"}
 
 
-def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """The buttons of the control rig in step 7."""
-    body = next(standing.bodies(context.scene), None)
-    if body is None:
-        return
+def draw(layout: bpy.types.UILayout, body: bpy.types.Object) -> None:
+    """The buttons of a body's control rig in step 7."""
     if control_rig.rig_of(body) is None:
         layout.operator("tricap.make_control_rig", icon="OUTLINER_OB_ARMATURE")
         return

@@ -25,7 +25,7 @@ from ..scene.armature import SNAPS_KEY
 from ..scene.standing import ROOT
 from . import metarig
 from .playing import played_frames
-from .read import read_motion, read_rig
+from .read import orthonormal, read_motion, read_rig, world_matrix
 from .write import push_to_strip, write_action
 
 CONSTRAINT = "Control rig"
@@ -56,14 +56,15 @@ def make_control_rig(body: bpy.types.Object) -> Made:
     """Make the control rig of a body and let it drive the body. Main thread only.
 
     Raises:
-        InputError: the body has one already, is no whole body, has no motion, or Rigify cannot be used.
+        InputError: the body has one already, is no whole body, or Rigify cannot be used.
     """
     if rig_of(body) is not None:
         raise InputError(f"“{body.name}” has the control rig “{rig_of(body).name}” already; delete it first to make another.")
+    _release(body)
     frames = played_frames(bpy.context.scene)
     motion = read_motion(body, read_rig(body), frames)
     rig = _generated(body)
-    rig.location.z = body.location.z
+    rig.matrix_world = body.matrix_world
     _add_drive_bones(rig, body)
     bpy.context.view_layer.update()
     _key_controls(rig, body, motion)
@@ -77,6 +78,17 @@ def rig_of(body: bpy.types.Object) -> bpy.types.Object | None:
     """The control rig of a body, if it has one."""
     rig = body.get(RIG_KEY)
     return rig if rig is not None and rig.name in bpy.context.scene.objects else None
+
+
+def _release(body: bpy.types.Object) -> None:
+    """Let nothing drive the body that is left of a deleted control rig: constraints, and the rig itself, which the body's property kept."""
+    for bone in body.pose.bones:
+        for constraint in [c for c in bone.constraints if c.name == CONSTRAINT]:
+            bone.constraints.remove(constraint)
+    deleted = body.pop(RIG_KEY, None)
+    if deleted is not None and not deleted.users_collection:
+        bpy.data.objects.remove(deleted)
+    bpy.context.view_layer.update()
 
 
 def _generated(body: bpy.types.Object) -> bpy.types.Object:
@@ -159,7 +171,8 @@ def _targets(controls: Rig, body: bpy.types.Object, rig: bpy.types.Object, motio
     rows = [motion.rig.index[bone_of[control]] for control in controls.names]
     since_rest = motion.R[:, rows] @ transposed(motion.rig.R_rest[rows])
     A = np.array([np.eye(3) if control == ROOT else _bent(rig, body, bone_of[control]) for control in controls.names])
-    return since_rest @ A @ controls.R_rest, motion.head_m[:, rows]
+    object_R = orthonormal(world_matrix(rig)[:3, :3])
+    return since_rest @ object_R @ A @ object_R.T @ controls.R_rest, motion.head_m[:, rows]
 
 
 def _result(controls: Rig, motion: Motion, R: np.ndarray, place: np.ndarray) -> Retargeted:
@@ -223,11 +236,13 @@ def snap(body: bpy.types.Object, to: str, limbs: Sequence[str] = ()) -> int:
     Keying, the controls are keyed. `to`: "IK" or "FK"; `limbs`: names such as "upper_arm.L", "thigh.R"; empty for all four.
 
     Raises:
-        InputError: the body has no control rig, there is no such limb, or the script of the rig does not run.
+        InputError: the body has no control rig, the rig is hidden, there is no such limb, or the script of the rig does not run.
     """
     rig = rig_of(body)
     if rig is None:
         raise InputError(f"“{body.name}” has no control rig; press Make Control Rig first.")
+    if not rig.visible_get():
+        raise InputError(f"The control rig “{rig.name}” is hidden; show it first.")
     known = {name: arguments.to_dict() for name, arguments in rig[SNAPS_KEY].items()}
     unknown = [limb for limb in limbs if limb not in known]
     if unknown:

@@ -163,9 +163,7 @@ def remove_earlier() -> None:
         inside = [child for child in collection.children_recursive if metaballs.COLLECTION_KEY in child or PART_KEY in child]
         bpy.data.batch_remove(objects)
         bpy.data.batch_remove([*inside, collection])
-        for _ in range(
-            3
-        ):  # materials have no users only once their meshes and node groups are removed, and images once their materials are
+        for _ in range(3):  # first meshes and node groups, then their materials, then the images of these have no users
             free = {id_ for id_ in used if id_.users == 0}
             used -= free
             bpy.data.batch_remove(free)

@@ -78,7 +78,7 @@ def base_height(shape: BodyShape) -> tuple[str, int, float] | None:
 
 def bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
     """The armatures of Tricap's own bodies that stand on a floor."""
-    return (thing for thing in scene.objects if thing.type == "ARMATURE" and LIFT_KEY in thing.data)
+    return (thing for thing in scene.objects if thing.type == "ARMATURE" and LIFT_KEY in thing.data and ROOT in thing.data.bones)
 
 
 def covered(body: bpy.types.Object) -> np.ndarray:
@@ -102,11 +102,15 @@ def path_of(scene: bpy.types.Scene) -> Path:
 def carry_path(scene: bpy.types.Scene, by: Path) -> None:
     """Let the root bone or the object of the scene's bodies carry the path, or nothing."""
     for body in bodies(scene):
-        root = body.pose.bones[ROOT]
-        for curve in _path_curves(body):
+        root, curves = body.pose.bones[ROOT], _path_curves(body)
+        if any(curve.data_path == OBJECT_PATH for curve in curves):
+            body.location.xy = (0.0, 0.0)
+        elif by == Path.OBJECT and curves:  # its curves take the place of where the user put the object
+            body.delta_location.xy += body.location.xy
+        for curve in curves:
             curve.data_path = OBJECT_PATH if by == Path.OBJECT else root.path_from_id("location")
             curve.mute = by == Path.IN_PLACE
-        root.location[:2] = body.location[:2] = (0.0, 0.0)
+        root.location[:2] = (0.0, 0.0)
         body.update_tag()
     scene.frame_set(scene.frame_current)
     get_session().file.changed = True

@@ -14,6 +14,7 @@ from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
 from ..operators import control_rig
 from ..panels import sentence
+from ..retarget.control_rig import rig_of
 from ..retarget.panel import draw_retarget
 from ..scene import metaballs, standing
 from . import check, states, watch
@@ -182,9 +183,12 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
     column = layout.column()
     column.enabled = watch.current(context.scene).states["surface"].status != Status.EMPTY or bool(context.scene.tricap.out)
     primary(column, "tricap.build_scene", is_next, icon="OUTLINER_OB_ARMATURE", text="Build Rig and Scene")
-    if any(standing.bodies(context.scene)):
-        layout.prop(context.scene.tricap, "path")
-        control_rig.draw(layout, context)
+    body = next(standing.bodies(context.scene), None)
+    if body is not None:
+        row = layout.row()
+        row.enabled = rig_of(body) is None  # a control rig carries the path itself
+        row.prop(context.scene.tricap, "path")
+        control_rig.draw(layout, body)
     if metaballs.exist(context.scene):
         layout.prop(context.scene.tricap, "show_metaballs")
 

@@ -81,6 +81,29 @@ def a_correction_is_layered_and_exported(bpy: ModuleType, rig: Any, body: Any, w
     assert np.abs(found.head_m[11, found.rig.index["hand.L"]] - pose(body)[1][hand]).max() < 1e-4
 
 
+def test_a_body_that_was_placed_by_hand_and_a_second_rig(blender: ModuleType) -> None:
+    """The body was turned and scaled; a hidden rig is not snapped; nothing is left of a deleted one when another is made."""
+    body, scene = walker(blender), blender.context.scene
+    bend(body)
+    body.rotation_euler.z, body.scale = 0.9, (1.2, 1.2, 1.2)
+    scene.tricap.path = "OBJECT"
+    scene.frame_set(3)
+    wanted = pose(body)
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    check_same(pose(body), wanted, ANGLE_DEG, PLACE_M)
+    rig = blender.data.objects["Body controls"]
+    rig.hide_set(True)
+    with pytest.raises(RuntimeError, match="“Body controls” is hidden; show it first"):
+        blender.ops.tricap.snap_limbs(to="IK")
+    rig.hide_set(False)
+    rig.pose.bones["chest"].rotation_mode, rig.pose.bones["chest"].rotation_euler.x = "XYZ", 0.5
+    rig.select_set(True)
+    assert blender.ops.object.delete() == {"FINISHED"}
+    assert blender.ops.tricap.make_control_rig() == {"FINISHED"}
+    check_same(pose(body), wanted, ANGLE_DEG, PLACE_M)
+    assert [o.name for o in blender.data.objects if o.type == "ARMATURE"] == ["Body", "Body controls"]
+
+
 def test_a_control_rig_needs_a_whole_body(blender: ModuleType, small_run: Any) -> None:
     blender.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
     assert blender.ops.tricap.build_scene(out=str(small_run.out)) == {"FINISHED"}

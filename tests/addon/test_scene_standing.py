@@ -10,9 +10,10 @@ import pytest
 from tricap.core.body.model_file import read_model
 from tricap.core.body.shape import BodyShape, default_shape
 from tricap.core.body.skeleton import bone_frames
+from tricap.core.body.skin.closed_skin import OneSkin
 from tricap.core.body.skin.extremities import shape_for_skin
 from tricap.core.body.skin.mesh import SkinSettings
-from tricap.core.body.skin.person_skin import rest_skin
+from tricap.core.body.skin.person_skin import REST, rest_skin, write_skin
 from tricap.core.foundation import store
 from tricap.core.motion.floor import floor_height
 from tricap.core.motion.sources import from_run
@@ -21,14 +22,19 @@ from .conftest import FPS, write_result
 
 FLOOR_M = -0.3  # of the world frame of these cameras
 STEP_M, FRAMES = 0.04, 12
+COARSE = SkinSettings(contours=6, rays=12)
 
 
 @pytest.fixture(scope="module")
-def person() -> tuple[BodyShape, float]:
+def skin() -> OneSkin:
+    """The skin of the default person, coarse."""
+    return rest_skin(shape_for_skin(default_shape(read_model("full")), SkinSettings()), COARSE)
+
+
+@pytest.fixture(scope="module")
+def person(skin: OneSkin) -> tuple[BodyShape, float]:
     """The default person, and how far its soles lie below the pelvis in the rest pose."""
-    shape = default_shape(read_model("full"))
-    shown = shape_for_skin(shape, SkinSettings())
-    return shape, -float(rest_skin(shown, SkinSettings()).vertices_m[:, 2].min())
+    return default_shape(read_model("full")), -float(skin.vertices_m[:, 2].min())
 
 
 def walk(shape: BodyShape, hip_m: float) -> np.ndarray:
@@ -42,11 +48,12 @@ def walk(shape: BodyShape, hip_m: float) -> np.ndarray:
 
 
 @pytest.fixture
-def out(person: tuple[BodyShape, float], tmp_path: Path) -> Path:
+def out(person: tuple[BodyShape, float], skin: OneSkin, tmp_path: Path) -> Path:
     """Results of a run whose take is not there."""
     shape, hip_m = person
     values = walk(shape, hip_m)
     write_result(tmp_path / "out", shape, np.arange(FRAMES), values, np.full(values.shape, 1e-3))
+    write_skin(tmp_path / "out" / "skin" / REST, skin)
     store.write_json(tmp_path / "out" / "run.json", {"format": "tricap-run", "version": 1, "take": str(tmp_path / "none")})
     return tmp_path / "out"
 
@@ -148,8 +155,13 @@ def test_the_path_moves_to_the_object_and_back_with_its_edits(blender: ModuleTyp
     still = placed(blender, body, names)
     np.testing.assert_allclose(still[:, 0, :2, 3], 0, atol=1e-6)
     np.testing.assert_allclose(still[..., 2, 3], before[..., 2, 3], atol=1e-6)
-    scene.tricap.path = "BONE"
-    np.testing.assert_allclose(placed(blender, body, names), before, atol=1e-6)
+    body.location.x += 3.0  # the person is put elsewhere
+    for path in ("BONE", "OBJECT", "BONE"):
+        scene.tricap.path = path
+        np.testing.assert_allclose(placed(blender, body, names)[..., :3, 3], before[..., :3, 3] + (3, 0, 0), atol=1e-6)
+    body.data.bones["root"].name = "mover"
+    scene.tricap.path = "OBJECT"  # there is nothing to move
+    assert scene.tricap.path == "BONE"
 
 
 def test_a_part_of_a_body_stands_nowhere(blender: ModuleType, small_run: Any) -> None:
