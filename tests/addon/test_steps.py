@@ -651,8 +651,8 @@ def built(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a take, and results of two of its frames, with other settings, as `tricap run` writes them: with body.blend."""
     folder = tmp_path_factory.mktemp("built")
     shutil.copytree(sample, folder / "take")
-    argv = ["run", str(folder / "take"), "--out", str(folder / "out"), "--frames", "0:2", "--set", "growing.spacing_px=7", "--quiet"]
-    assert main(argv) == 0
+    chosen = [f"--set={knob}" for knob in ("growing.spacing_px=12", "skin.relief=false", "skin.texture_px=0", "skin.contours=6")]
+    assert main(["run", str(folder / "take"), "--out", str(folder / "out"), "--frames", "0:2", *chosen, "--quiet"]) == 0
     return folder
 
 
@@ -671,7 +671,8 @@ def test_the_commands_scene_shows_the_finished_project(
     scene = blender.context.scene
     assert Path(blender.path.abspath(scene.tricap.take)).resolve() == take
     assert Path(blender.path.abspath(scene.tricap.out)).resolve() == folder / "out"
-    assert (scene.tricap.growing.spacing_px, scene.tricap.first_frame, scene.tricap.last_frame) == (7, 0, 1)
+    assert (scene.tricap.growing.spacing_px, scene.tricap.first_frame, scene.tricap.last_frame) == (12, 0, 1)
+    assert (scene.tricap.skin.relief, scene.tricap.skin.texture_px, scene.tricap.skin.contours) == (False, 0, 6)
     assert scene.tricap_retarget.source.name == scene.tricap_retarget.export.name == "Body"
     clips = {view.clip for view in scene.tricap.views}
     assert clips == set(blender.data.movieclips) and len(clips) == 3, "those behind the cameras are used"
@@ -687,7 +688,8 @@ def test_a_scene_whose_take_is_gone_says_so(blender: ModuleType, built: Path, tm
         assert words().endswith("empty empty empty done ready") and why("footage").endswith("Press Open Take and choose where it is now.")
         assert blender.ops.tricap.open_take(directory=str(lost)) == {"FINISHED"}
         scene = blender.context.scene.tricap
-        scene.growing.spacing_px, scene.all_frames, scene.last_frame = 7, False, 1
+        scene.growing.spacing_px, scene.all_frames, scene.last_frame = 12, False, 1
+        scene.skin.relief, scene.skin.texture_px, scene.skin.contours = False, 0, 6
         assert words() == "done done done done done done done ready"
     finally:
         lost.rename(built / "take")
