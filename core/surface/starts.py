@@ -120,16 +120,16 @@ def _frame_start(now: "FrameViews", settings: "MeasureSettings", before: FrameSt
     sources = silhouette_sources(now.footage)
     if sources and not where.method.endswith(sources):
         where = replace(where, method=f"{where.method}, {sources}")
-    return FrameStart(frame=now.frame, where=where, seeds=seeds, person_m=_person_points(now, seeds, where), key=key)
+    return FrameStart(frame=now.frame, where=where, seeds=seeds, person_m=_person_points(now, settings, seeds, where), key=key)
 
 
-def _person_points(now: "FrameViews", seeds: Approximations, where: fg.Foreground) -> np.ndarray:
+def _person_points(now: "FrameViews", settings: "MeasureSettings", seeds: Approximations, where: fg.Foreground) -> np.ndarray:
     """The seeds (N, 3) that belong to the person: in the foreground, and next to others in the image and in depth."""
-    ref, spacing = now.views.reference, SUPPORT_SPACINGS * SEED_SPACING_PX
+    ref, reach = now.views.reference, SUPPORT_SPACINGS * (settings.growing.seed_spacing_px or SEED_SPACING_PX)
     xyz = _seed_points(now, seeds)
     outside = replace(where, silhouettes=now.silhouettes).excludes(xyz, np.zeros((len(xyz), 3, 3)))
     xyz, depth, at = xyz[~outside], seeds.depth_m[~outside], seeds.xy[~outside, ref] * (1.0, now.views.rows.step)
-    near = (np.abs(at[:, None] - at).max(axis=2) <= spacing) & (np.abs(depth[:, None] - depth) <= SUPPORT_M)
+    near = (np.abs(at[:, None] - at).max(axis=2) <= reach) & (np.abs(depth[:, None] - depth) <= SUPPORT_M)
     return np.asarray(xyz[near.sum(axis=1) > SUPPORT])
 
 

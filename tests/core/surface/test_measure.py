@@ -272,3 +272,10 @@ def test_cancelling_takes_less_than_a_second(plane_take: Path, tmp_path: Path, s
             scenes.measure(plane_take, tmp_path / f"out{i}", monitor=monitor)
     assert time.perf_counter() - pressed[0] < 1.0
     assert not list(tmp_path.rglob("*.part"))
+
+
+def test_the_person_is_followed_by_seeds_of_any_spacing(plane_take: Path, tmp_path: Path) -> None:
+    with take_run.open_run(plane_take, tmp_path / "out", {"growing": {"seed_spacing_px": 54}}) as job:
+        found = starts.FrameStarts(job.measured_footage, starts.MeasureSettings.of(job.settings), job.results)
+        start, _ = found.at(found.first, Monitor())
+    assert len(start.person_m) >= max(4, len(start.seeds.depth_m) // 2)
