@@ -24,7 +24,7 @@ from ..take.take import read_take
 from ..take.writing import read_table, write_table
 from .take_run import Overrides, only_frames, settings_of
 
-MEASURED = 6  # frames, of which the easiest are searched
+PLACES, SHORTLY_S = 3, 0.2  # in the recording, where a frame is measured and another one shortly afterwards
 CLICKED = ("pelvis", "neck", "head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # what people click
 
 
@@ -56,7 +56,9 @@ def _some_clouds(footage: Footage, settings: Mapping[str, Any], monitor: Monitor
     """Clouds of all frames, measured in a few of them and empty in the others; those with clicked joints are among them."""
     frames = footage.frames
     clicked = sorted({c.frame for c in (footage.take.clicks, *footage.take.keyframes) if c.joints and c.frame in frames})
-    chosen = clicked or np.unique(np.linspace(frames.start, frames.stop - 1, min(MEASURED, len(frames))).round().astype(int)).tolist()
+    shortly = min(round(SHORTLY_S * footage.take.fps), len(frames) - 1)
+    places = np.linspace(frames.start, frames.stop - 1 - shortly, PLACES).round().astype(int)
+    chosen = clicked or np.unique([places, places + shortly]).tolist()
     measured = dict[int, PointCloud]()
     for i, frame in enumerate(chosen):
         one = only_frames(footage, (frame, frame + 1))

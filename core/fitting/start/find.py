@@ -1,18 +1,20 @@
 """The start of a fit without clicks: which frame, which pose, which side, and how sure that is.
 
-The frames in which most is seen of the person, and in which the limbs are furthest from the body, are searched (`search`). The best
-hypotheses are adjusted (`refine`), lost limbs are looked for, and the best explanation gets rivals: the same limbs of a person who faces
-the other way, or with the legs exchanged, or one limb elsewhere. All explanations of one frame compete:
+The frame in which most is seen of the person, and in which the limbs are furthest from the body, is searched, and another one shortly
+before or after (`search`). In each, the best hypotheses are adjusted (`refine`), lost limbs are looked for, and the best explanation gets
+rivals: the same limbs of a person who faces the other way, or with the legs exchanged, or one limb elsewhere. What is found in one frame is
+followed to the other. All explanations compete:
 
     p_k = exp(S_k / τ) / Σ_j exp(S_j / τ)                                                                  (1)
 
-S is the number of voxels that an explanation accounts for; S/τ also contains log odds for walking forwards, because people seldom walk
-backwards. Explanations whose joints agree within `SAME_M` are one. Nobody turns round within a moment: which way the person faces in the
-other frames counts, too. Where the best explanation is less probable than `fitting.least_start_probability`, a click is asked for: on the
-joint whose places in the explanations differ most. Clicked joints are observations in all steps.
+S is the number of voxels of both frames that an explanation accounts for; S/τ also contains log odds for walking forwards, because people
+seldom walk backwards. Explanations whose joints agree within `SAME_M` in both frames are one. The best one is uncertain unless each frame's
+own search finds it best: the right one may be missing among them. Each clicked joint halves that doubt. Where the best explanation is less
+probable than `fitting.least_start_probability`, a click is asked for: on the joint whose places in the explanations differ most. Clicked
+joints are observations in all steps.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,19 +24,31 @@ from ..context import FitContext
 from ..inputs.cloud_points import CloudPoints
 from ..inputs.start_joints import StartJoints
 from .pose_dictionary import known_poses
-from .refine import STAGE, Explanation, exchanged, limb_rivals, of_hypothesis, thinned_points, with_lengths, with_limbs
+from .refine import (
+    LEAST_POINTS,
+    STAGE,
+    Explanation,
+    carried,
+    exchanged,
+    limb_rivals,
+    of_hypothesis,
+    thinned_points,
+    with_lengths,
+    with_limbs,
+)
 from .search import hypotheses, is_inside
 
-LOOKED_AT, SEARCHED = 24, 2  # frames of which the easiest are chosen, and how many are searched
-APART = 0.25  # of the recording, between the frames that are searched
+LOOKED_AT = 24  # frames of which the easiest is searched, and of those around it
+AROUND_S = (0.15, 0.4)  # between the two frames that are searched
+FOLLOWED = 3  # explanations of a frame that are followed to the other
+UNCONFIRMED = 0.1  # the probability that no explanation is right, unless both frames find the best one; each clicked joint halves it
 TRIED, DIFFERENT_M, AMONG = 6, 0.2, 600  # hypotheses that are adjusted: these differ, and are among so many of the best
 COMPLETED = 3  # of them, whose limbs are looked for
 SAME_M = 0.2  # between the joints of explanations that are one
 TAU = 40.0  # voxels for a probability ratio of e
 FORWARD, MOST_FORWARD = 3.0, 1.0  # log odds per m/s of walking forwards, and at most
-TURN_S, MOST_AGREEMENT = 1.0, 5.0  # between frames in which a person faces about the same way; the most log odds from another frame
 WALK_S = 0.3  # before and after a frame, for the velocity
-LEAST_POINTS = 100  # of a frame, for a start
+UNTRIED = "a pose that was not among those tried"
 UNLIKELY = 0.01  # a less probable rival is not named
 JUDGED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")  # joints by which explanations are compared
 EXCHANGES = {
@@ -44,10 +58,26 @@ EXCHANGES = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Frame:
-    """All explanations of one frame, the best first, and the probability of each."""
+class Followed:
+    """An explanation of the frame in which it was found, and the same in the other frames."""
 
-    explanations: Sequence[Explanation]
+    found: Explanation
+    elsewhere: Sequence[Explanation] = ()
+
+    def at(self, t: int) -> Explanation:
+        """The explanation of frame index `t`."""
+        return next(one for one in (self.found, *self.elsewhere) if one.t == t)
+
+    def is_same(self, other: "Followed", names: Sequence[str]) -> bool:
+        """Whether the joints agree in all frames."""
+        return all(difference_m(one, other.at(one.t), names).max() <= SAME_M for one in (self.found, *self.elsewhere))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Judged:
+    """Different explanations, the best first, and the probability of each."""
+
+    followed: Sequence[Followed]
     probability: np.ndarray
 
 
@@ -67,45 +97,63 @@ def find_start(
     Raises:
         Cancelled: the user asked to stop.
     """
-    chosen = easiest_frames(fit, points_of, len(frames), monitor)
+    chosen = easiest_frames(fit, points_of, time_s, monitor)
     if not chosen:
         return None
-    known = known_poses(fit.model.skeleton, without)
-    walk = _velocities(points_of, chosen, time_s)
-    judged = [_explained(fit, t, points_of(t), known, walk[i], monitor.part(STAGE, i, len(chosen) + 1)) for i, t in enumerate(chosen)]
-    best = max(_agreed(judged, fit.model.skeleton.joint_names, time_s), key=lambda one: float(one.probability[0]))
-    first = best.explanations[0]
-    final, stature = with_lengths(fit, thinned_points(points_of(first.t)), first, monitor.part(STAGE, len(chosen), len(chosen) + 1))
-    names = fit.model.skeleton.joint_names
+    known, names = known_poses(fit.model.skeleton, without), fit.model.skeleton.joint_names
+    walk, parts = dict(zip(chosen, _velocities(points_of, chosen, time_s))), len(chosen) + 2
+    found = [_explained(fit, t, points_of(t), known, walk[t], monitor.part(STAGE, i, parts)) for i, t in enumerate(chosen)]
+    moving = monitor.part(STAGE, len(chosen), parts)
+    followed = [
+        Followed(found=one, elsewhere=[carried(fit, points_of, one, t, moving) for t in chosen if t != one.t])
+        for of_frame in found
+        for one in of_frame
+    ]
+    best = judged(fit, followed, walk)
+    at = chosen[0] if fit.clicked else best.followed[0].found.t
+    clicked = np.unique(fit.clicked[at].joint) if fit.clicked else np.zeros(0, dtype=np.intp)
+    doubt = 0.0 if is_confirmed(best.followed[0], found, names) else UNCONFIRMED / 2 ** len(clicked)
+    explanations = [one.at(at) for one in best.followed]
+    thin = thinned_points(points_of(at))
+    final, stature = with_lengths(fit, thin, explanations[0], monitor.part(STAGE, parts - 1, parts))
     return StartJoints(
-        frame=frames[first.t],
+        frame=frames[at],
         xyz_m=dict(zip(names, final.joints_m)),
         stature=stature,
         model=fit.model.name,
-        probability=float(best.probability[0]),
-        rivals=_named(best, names),
-        ask=_decisive(best, names),
+        probability=(1 - doubt) * float(best.probability[0]),
+        rivals=_named(explanations, (1 - doubt) * best.probability, names) | ({UNTRIED: doubt} if doubt >= UNLIKELY else {}),
+        ask=_decisive(explanations, np.maximum(best.probability, doubt), names, clicked),
     )
 
 
-def easiest_frames(fit: FitContext, points_of: Callable[[int], CloudPoints], count: int, monitor: Monitor) -> list[int]:
-    """The frame indices to search: those with clicks, or else the easiest ones apart from each other.
+def easiest_frames(fit: FitContext, points_of: Callable[[int], CloudPoints], time_s: np.ndarray, monitor: Monitor) -> list[int]:
+    """The frame indices to search: the easiest one, of those with clicks if there are any, and the easiest around it (`AROUND_S`).
 
     Only frames with enough points, in which the image shows the whole person.
     """
-    some = sorted(fit.clicked) or np.unique(np.linspace(0, count - 1, min(LOOKED_AT, count)).round().astype(int)).tolist()
+    first = _easiest(fit, points_of, sorted(fit.clicked) or _spread(np.arange(len(time_s)), LOOKED_AT), monitor)
+    if first is None:
+        return []
+    apart = np.abs(time_s - time_s[first])
+    around = _spread(np.flatnonzero((apart >= AROUND_S[0]) & (apart <= AROUND_S[1])), LOOKED_AT)
+    second = _easiest(fit, points_of, around, monitor)
+    return [first] if second is None else [first, second]
+
+
+def _spread(rows: np.ndarray, count: int) -> list[int]:
+    """Not more than `count` of the rows, evenly."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))].tolist()
+
+
+def _easiest(fit: FitContext, points_of: Callable[[int], CloudPoints], some: Sequence[int], monitor: Monitor) -> int | None:
     ease = dict[int, float]()
-    for i, t in enumerate(some):
-        monitor.step(STAGE, i, 10 * len(some))
+    for t in some:
+        monitor.check()
         points = points_of(t)
         if len(points.xyz_m) >= LEAST_POINTS:
             ease[t] = _ease(fit, t, points)
-    chosen: list[int] = []
-    for t in sorted(ease, key=lambda t: -ease[t]):
-        apart = all(abs(t - other) >= APART * count for other in chosen)
-        if len(chosen) < SEARCHED and apart and is_inside(fit.seen(t, points_of(t))):
-            chosen.append(t)
-    return chosen
+    return next((t for t in sorted(ease, key=lambda t: -ease[t]) if is_inside(fit.seen(t, points_of(t)))), None)
 
 
 def _ease(fit: FitContext, t: int, points: CloudPoints) -> float:
@@ -132,8 +180,10 @@ def _velocities(points_of: Callable[[int], CloudPoints], chosen: Sequence[int], 
     return found
 
 
-def _explained(fit: FitContext, t: int, points: CloudPoints, known: np.ndarray, velocity: np.ndarray, monitor: Monitor) -> _Frame:
-    """The explanations of frame index `t`, with their probabilities.  (1)"""
+def _explained(
+    fit: FitContext, t: int, points: CloudPoints, known: np.ndarray, velocity: np.ndarray, monitor: Monitor
+) -> list[Explanation]:
+    """The best explanations of frame index `t` that differ."""
     evidence, thin = fit.seen(t, points), thinned_points(points)
     found = hypotheses(fit, t, evidence, known).best(AMONG)
     monitor.step(STAGE, 2, 10)
@@ -149,37 +199,26 @@ def _explained(fit: FitContext, t: int, points: CloudPoints, known: np.ndarray, 
     best = max(complete, key=lambda one: one.score)
     rivals = [exchanged(fit, thin, best, parts, monitor.part(STAGE, 12 + i, 20)) for i, parts in enumerate(EXCHANGES.values())]
     rivals += limb_rivals(fit, thin, best, monitor)
-    return judged(fit, [*tried[COMPLETED:], *complete, *rivals], velocity)
+    frame = judged(fit, [Followed(found=one) for one in (*tried[COMPLETED:], *complete, *rivals)], {t: velocity})
+    return [one.found for one in frame.followed[:FOLLOWED]]
 
 
-def judged(fit: FitContext, found: Sequence[Explanation], velocity: np.ndarray) -> _Frame:
-    """Different explanations, the best first, with their probabilities.  (1)"""
+def judged(fit: FitContext, found: Sequence[Followed], velocity: Mapping[int, np.ndarray]) -> Judged:
+    """Different explanations, the best first, with their probabilities.  (1)  `velocity`: (3,) by frame index."""
     names = fit.model.skeleton.joint_names
-    odds = [one.score / TAU + _walks(one, names, velocity) for one in found]
+    odds = [sum(e.score / TAU + _walks(e, names, velocity[e.t]) for e in (one.found, *one.elsewhere)) for one in found]
     kept: list[int] = []
     for i in np.argsort(-np.array(odds), kind="stable").tolist():
-        if all(difference_m(found[i], found[j], names).max() > SAME_M for j in kept):
+        if not any(found[i].is_same(found[j], names) for j in kept):
             kept.append(i)
     share = np.exp(np.array([odds[i] for i in kept]) - odds[kept[0]])
-    return _Frame(explanations=[found[i] for i in kept], probability=share / share.sum())
+    return Judged(followed=[found[i] for i in kept], probability=share / share.sum())
 
 
-def _agreed(frames: Sequence[_Frame], names: Sequence[str], time_s: np.ndarray) -> list[_Frame]:
-    """The frames, with the log odds of facing one way or the other added from all frames nearby."""
-    found = []
-    for one in frames:
-        odds = np.log(np.maximum(one.probability, 1e-12))
-        toward = facing(one.explanations[0], names)
-        for other in frames:
-            if other is not one and abs(time_s[other.explanations[0].t] - time_s[one.explanations[0].t]) <= TURN_S:
-                same = np.array([facing(e, names) @ toward > 0 for e in other.explanations])
-                likely = [max(float(other.probability[rows].sum()), 1e-12) for rows in (same, ~same)]
-                there = float(np.clip(np.log(likely[0] / likely[1]), -MOST_AGREEMENT, MOST_AGREEMENT))
-                odds += np.array([there if facing(e, names) @ toward > 0 else 0.0 for e in one.explanations])
-        order = np.argsort(-odds, kind="stable")
-        share = np.exp(odds[order] - odds[order[0]])
-        found.append(_Frame(explanations=[one.explanations[i] for i in order.tolist()], probability=share / share.sum()))
-    return found
+def is_confirmed(one: Followed, found: Sequence[Sequence[Explanation]], names: Sequence[str]) -> bool:
+    """Whether an explanation is also the best one of another frame's own search (`found`: of each frame, the best first)."""
+    others = (of_frame[0] for of_frame in found if of_frame[0].t != one.found.t)
+    return any(difference_m(one.at(other.t), other, names).max() <= SAME_M for other in others)
 
 
 def difference_m(a: Explanation, b: Explanation, names: Sequence[str]) -> np.ndarray:
@@ -201,10 +240,10 @@ def _walks(one: Explanation, names: Sequence[str], velocity: np.ndarray) -> floa
     return float(np.clip(FORWARD * facing(one, names) @ velocity, -MOST_FORWARD, MOST_FORWARD))
 
 
-def _named(frame: _Frame, names: Sequence[str]) -> dict[str, float]:
+def _named(explanations: Sequence[Explanation], probability: np.ndarray, names: Sequence[str]) -> dict[str, float]:
     """What the rivals of the best explanation differ in, with their probabilities."""
-    best, named = frame.explanations[0], dict[str, float]()
-    for other, p in zip(frame.explanations[1:], frame.probability[1:].tolist()):
+    best, named = explanations[0], dict[str, float]()
+    for other, p in zip(explanations[1:], probability[1:].tolist()):
         if p >= UNLIKELY:
             name = _difference(best, other, names)
             named[name] = named.get(name, 0.0) + p
@@ -225,9 +264,10 @@ def _difference(a: Explanation, b: Explanation, names: Sequence[str]) -> str:
     return f"where the {'left' if side == 'L' else 'right'} {'arm' if part in ('shoulder', 'elbow', 'wrist') else 'leg'} is"
 
 
-def _decisive(frame: _Frame, names: Sequence[str]) -> str:
+def _decisive(explanations: Sequence[Explanation], probability: np.ndarray, names: Sequence[str], clicked: np.ndarray) -> str:
     """The joint to click: its places in the best explanation and in the rivals differ most, weighted by their probabilities."""
-    best, total = frame.explanations[0], np.zeros(len(names))
-    for other, p in zip(frame.explanations[1:], frame.probability[1:].tolist()):
+    best, total = explanations[0], np.zeros(len(names))
+    for other, p in zip(explanations[1:], probability[1:].tolist()):
         total += p * np.minimum(difference_m(best, other, names), 2 * SAME_M)
+    total[clicked] = 0.0
     return names[int(np.argmax(total))] if total.any() else next(name for name in names if name.startswith("elbow"))

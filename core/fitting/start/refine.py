@@ -1,6 +1,6 @@
 """From a hypothesis to an adjusted pose, and to the rival that explains the same limbs with the sides exchanged."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +22,12 @@ from .search import click_penalty, scaled_vector
 
 REACH_M = 0.25  # of the points that take part, from the body
 ROUNDS = ((2.5, 6), (1.5, 6))  # gate_scale, steps
+FOLLOWING, STRIDE = ((1.5, 4),), 2  # the same where an explanation is followed through frames, and how many frames at a time
 LENGTH_STEPS = 8
 ANYWHERE, IMPROVED, AROUND, AROUND_RAD = 400, 6, 24, float(np.radians(15.0))  # poses of a limb: all around, the best, and around each
 COARSE_M, FINE_M = 0.03, 0.02  # widths of the weights of what they explain
 ELSEWHERE_M, ALMOST = 0.2, 80.0  # between the ends of a limb and of its rival, and how many voxels less the rival may explain
-MOST_POINTS = 700
+LEAST_POINTS, MOST_POINTS = 100, 700  # of a frame
 LEFT_OUT = ("toe", "crown")  # of an exchange: they depend on where the person faces
 SIGMA_M = 0.03  # of the joints of a rival
 STAGE = "find the person"
@@ -85,6 +86,16 @@ def adjusted(
 
         found = solve(fit.problem(observe, free), found, steps=steps, furthest=FURTHEST, monitor=monitor, stage=STAGE)
     return explanation(fit, start.t, points, found.motion[0], found.vector)
+
+
+def carried(fit: FitContext, points_of: Callable[[int], CloudPoints], found: Explanation, to: int, monitor: Monitor) -> Explanation:
+    """The explanation in frame index `to`: the pose is adjusted there, and on the way in some of the frames between."""
+    one, stride = found, STRIDE if to > found.t else -STRIDE
+    for t in (*range(found.t + stride, to, stride), to):
+        points = thinned_points(points_of(t))
+        if len(points.xyz_m) >= LEAST_POINTS:
+            one = adjusted(fit, points, explanation(fit, t, points, one.pose, one.vector), ROUNDS if t == to else FOLLOWING, monitor)
+    return one
 
 
 def with_limbs(fit: FitContext, points: CloudPoints, found: Explanation, monitor: Monitor) -> Explanation:

@@ -16,7 +16,7 @@ from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.stages import set_up
 from tricap.core.fitting.stages.set_up import NobodyFound, find_joints, needs_start, with_start
 from tricap.core.fitting.start import find, search
-from tricap.core.fitting.start.find import _agreed, _decisive, _difference, judged
+from tricap.core.fitting.start.find import Followed, _decisive, _difference, is_confirmed, judged
 from tricap.core.fitting.start.pose_dictionary import known_poses
 from tricap.core.fitting.start.refine import Explanation
 from tricap.core.foundation.errors import InputError
@@ -77,7 +77,9 @@ def test_a_person_is_found_from_points_alone(quick) -> None:
     assert found is not None and found.frame == 0 and abs(found.stature - 1) < 0.06
     off = {name: np.linalg.norm(found.xyz_m[name] - place) for name, place in zip(NAMES, _joints(pose)) if name[:-2] in find.JUDGED}
     assert max(off.values()) < 0.15, off
-    assert 0 < found.probability <= 1 and "elbow" not in found.rivals
+    assert (
+        0 < found.probability <= 1 - find.UNCONFIRMED < SETTINGS.least_start_probability and find.UNTRIED in found.rivals
+    )  # a single frame
 
 
 def test_points_of_nobody_ask_for_clicks(make_scene) -> None:
@@ -143,26 +145,47 @@ class _Fit:
     model = MODEL
 
 
+def _judged(*found: Followed, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> find.Judged:
+    return judged(_Fit(), found, {0: np.array(velocity), 1: np.array(velocity)})
+
+
+def _moved(joints: np.ndarray) -> np.ndarray:
+    """The same with the right wrist elsewhere."""
+    return joints + np.where(np.array(NAMES)[:, None] == "wrist.R", [0.4, 0.0, 0.0], 0.0)
+
+
 def test_probabilities_and_the_click_that_decides() -> None:
-    right, moved = _joints(_pose(0.0)), _joints(_pose(0.0))
-    moved[NAMES.index("wrist.R")] += [0.4, 0.0, 0.0]
-    frame = judged(_Fit(), [_explained(right, 1000.0), _explained(right + 0.01, 990.0), _explained(moved, 1000.0 - find.TAU)], np.zeros(3))
-    assert len(frame.explanations) == 2 and np.allclose(frame.probability, [1 / (1 + np.exp(-1)), 1 / (1 + np.exp(1))])
-    assert _decisive(frame, NAMES) == "wrist.R" and _difference(*frame.explanations, NAMES) == "where the right arm is"
-    back = judged(_Fit(), [_explained(right, 1000.0), _explained(_turned(right), 1000.0)], np.array([0.0, -1.0, 0.0]))
-    assert back.probability[0] > 0.85 and back.explanations[0].joints_m is right  # who walks faces forwards
-    assert _difference(*back.explanations, NAMES) == "front and back"
+    right = _joints(_pose(0.0))
+    scores = {1000.0: right, 990.0: right + 0.01, 1000.0 - find.TAU: _moved(right)}
+    found = _judged(*(Followed(found=_explained(joints, score)) for score, joints in scores.items()))
+    explanations = [one.found for one in found.followed]
+    assert len(explanations) == 2 and np.allclose(found.probability, [1 / (1 + np.exp(-1)), 1 / (1 + np.exp(1))])
+    assert _decisive(explanations, found.probability, NAMES, np.zeros(0, int)) == "wrist.R"
+    assert _decisive(explanations, found.probability, NAMES, np.array([NAMES.index("wrist.R")])) != "wrist.R"  # clicked already
+    assert _difference(*explanations, NAMES) == "where the right arm is"
+    both = [Followed(found=_explained(joints, 1000.0)) for joints in (right, _turned(right))]
+    back = _judged(*both, velocity=(0.0, -1.0, 0.0))
+    assert back.probability[0] > 0.85 and back.followed[0].found.joints_m is right  # who walks faces forwards
+    assert _difference(*(one.found for one in back.followed), NAMES) == "front and back"
 
 
-def test_frames_near_in_time_agree_which_way_somebody_faces() -> None:
-    right, times = _joints(_pose(0.0)), np.array([0.0, 0.4, 9.0])
-    doubtful = judged(_Fit(), [_explained(right, 1000.0), _explained(_turned(right), 990.0)], np.zeros(3))
-    sure = judged(_Fit(), [_explained(_turned(right), 1200.0, 1), _explained(right, 1000.0, 1)], np.zeros(3))
-    far = judged(_Fit(), [_explained(_turned(right), 1200.0, 2), _explained(right, 1000.0, 2)], np.zeros(3))
-    turned, _ = _agreed([doubtful, sure], NAMES, times)
-    assert turned.explanations[0].joints_m is not right and turned.probability[0] > 0.9
-    kept, _ = _agreed([doubtful, far], NAMES, times)
-    assert kept.explanations[0].joints_m is right and np.allclose(kept.probability, doubtful.probability)
+def test_what_two_frames_show_decides_together() -> None:
+    right = _joints(_pose(0.0))
+    lucky = Followed(found=_explained(_moved(right), 1050.0, 0), elsewhere=[_explained(_moved(right), 800.0, 1)])
+    true = Followed(found=_explained(right, 1000.0, 1), elsewhere=[_explained(right, 1000.0, 0)])
+    met = Followed(found=_explained(_moved(right), 1040.0, 0), elsewhere=[_explained(right, 900.0, 1)])  # like others in one frame only
+    found = _judged(lucky, true, met)
+    assert found.followed[0] is true and found.probability[0] > 0.7 and len(found.followed) == 3
+
+
+def test_an_explanation_of_one_frame_alone_is_not_certain() -> None:
+    right = _joints(_pose(0.0))
+    one = Followed(found=_explained(right, 1000.0, 0), elsewhere=[_explained(right, 1000.0, 1)])
+    assert is_confirmed(one, [[one.found], [_explained(right + 0.05, 900.0, 1)]], NAMES)
+    assert not is_confirmed(one, [[one.found], [_explained(_moved(right), 900.0, 1)]], NAMES)
+    better = _explained(_moved(right), 950.0, 1)
+    assert not is_confirmed(one, [[one.found], [better, _explained(right, 900.0, 1)]], NAMES)  # by a worse rival of that frame
+    assert not is_confirmed(one, [[one.found]], NAMES)
 
 
 def _write_take(folder: Path, clicks: str) -> None:
