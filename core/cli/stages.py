@@ -92,7 +92,7 @@ def demo(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     return [
         str(job),
         *lines,
-        *([] if blend.is_file() else [f"Note: {job.record['warnings'][-1]}"]),
+        *([] if blend.is_file() else [f"Note: {sentence}" for sentence in job.record["warnings"][-1:]]),
         "Compared with the truth of the recording:",
         str(score_run(take, out, monitor)),
         f"Pictures: {out / 'report'}   Report: {out / 'report' / 'report.html'}" + (f"   Blender file: {blend}" if blend.is_file() else ""),

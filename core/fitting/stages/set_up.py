@@ -80,12 +80,20 @@ def with_start(given: FitInput, settings: FitSettings, monitor: Monitor) -> FitI
     if given.start is not None or not needs_start(given, settings):
         return given
     start = find_joints(given, settings, monitor)
-    if start is None:
+    certain = start is not None and start.probability >= settings.least_start_probability
+    if start is None or (given.model != WHOLE and not certain):  # a part of a person is started by clicks on it, not elsewhere
+        skeleton = read_model(given.model).skeleton
+        trunk = trunk_joints(skeleton)
+        joints = (
+            f"three of the joints {', '.join(trunk)}"
+            if len(trunk) > LEAST_TRUNK_JOINTS
+            else "two of the joints " + ", ".join(skeleton.joint_names)
+        )
         raise NobodyFound(
             "The body cannot start by itself: no frame has enough measured points of a person who is wholly inside the middle view. "
-            "Click at least two of its joints in two views each, under [seeds.joints] or in Blender (step 3)."
+            f"Click at least {joints} in two views each, under [seeds.joints] or in Blender (step 3)."
         )
-    if start.probability < settings.least_start_probability:
+    if not certain:
         raise NeedsClick(start.question)
     return replace(given, start=start)
 

@@ -85,7 +85,7 @@ def test_a_person_is_found_from_points_alone(quick) -> None:
 def test_points_of_nobody_ask_for_clicks(make_scene) -> None:
     scene = make_scene(points=50)
     given = FitInput(rig=scene.rig, model="arm.R", clouds=scene.clouds, time_s=np.zeros(1))
-    with pytest.raises(NobodyFound, match="cannot start by itself.*at least two of its joints in two views"):
+    with pytest.raises(NobodyFound, match="cannot start by itself.*at least two of the joints shoulder.R, elbow.R, wrist.R in two views"):
         with_start(given, SETTINGS, Monitor())
 
 

@@ -22,7 +22,7 @@ from tricap.core.foundation.progress import Cancelled, Monitor
 from tricap.core.run import batch, pipeline, take_run
 from tricap.core.run import engine as engines
 from tricap.core.run.batch import Outcome, Status, out_folders, run_batch, run_take, summary
-from tricap.core.run.engine import Engine
+from tricap.core.run.engine import Engine, dask_client
 
 COARSE = {"growing": {"spacing_px": 8}}
 Capture = pytest.CaptureFixture[str]
@@ -188,6 +188,6 @@ def test_the_workers_of_this_machine_cannot_be_reached_from_others(monkeypatch: 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(distributed, "LocalCluster", cluster)
-    with pytest.raises(KeyboardInterrupt), batch._client(Engine(workers=1)):
+    with pytest.raises(KeyboardInterrupt), dask_client(Engine(workers=1)):
         pass
     assert given["host"] == "127.0.0.1" and given["dashboard_address"] is None

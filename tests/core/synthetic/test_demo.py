@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -22,7 +23,12 @@ def test_every_knob_of_the_recording_and_of_the_run(tmp_path: Path, monkeypatch:
     asked = []
     for name, result in (("score_run", ""), ("_build_scene", [])):
         monkeypatch.setattr(stages, name, lambda *given, result=result: result)
-    monkeypatch.setattr(pipeline, "run", lambda take, out, overrides, monitor: asked.append(overrides))
+
+    def run(take: Path, out: Path, given: Any, monitor: Any) -> Any:
+        asked.append(given)
+        return SimpleNamespace(record={"warnings": []})
+
+    monkeypatch.setattr(pipeline, "run", run)
     out, picture = tmp_path / "demo", tmp_path / "demo" / "take" / "C" / "0001.png"
     command = ["demo", "--out", str(out), *SMALL, "--quiet"]
     assert main([*command, "--set", "sample.texture=0.1", "--set", "matching.patch_px=17"]) == 0
