@@ -135,7 +135,7 @@ def test_the_texture_is_packed_and_exported(empty: ModuleType, small_run: SmallR
     assert np.allclose(np.array(images[0].pixels[:3]) * 255, colour, atol=1)
     assert skin_object.data.attributes["sigma_m"].data[5].value == pytest.approx(0.003)
     export_file(small_run.out, "glb", tmp_path / "a.glb", "plain", Monitor())
-    empty.ops.wm.read_factory_settings(use_empty=True)
+    empty.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     empty.ops.import_scene.gltf(filepath=str(tmp_path / "a.glb"))
     assert [tuple(image.size) for image in empty.data.images if image.packed_file] == [(16, 16)]
     (small_run.out / "skin" / TEXTURE).write_bytes(b"no image")
