@@ -40,7 +40,7 @@ def find_corners(grey: np.ndarray, board: Board, variant: Variant = Variant(), t
 
     `thorough` searches longer for a chessboard.
     """
-    image = np.clip(grey, 0, 255).astype(np.uint8)
+    image: np.ndarray = np.clip(grey, 0, 255).astype(np.uint8)
     image = 255 - image if variant.inverted else image
     image = np.ascontiguousarray(image[:, ::-1]) if variant.mirrored else image
     return _chessboard(image, board, thorough) if board.kind is BoardKind.CHESSBOARD else _charuco(image, board, variant)
