@@ -8,7 +8,7 @@ import display
 import drive
 
 ESC_S = 1.0
-SAMPLE_S = 60.0
+SAMPLE_S = 120.0  # with relief and texture
 
 
 def steps() -> drive.Steps:

@@ -20,7 +20,7 @@ LAYOUT, CLICKS = "Layout", "Tricap Clicks"
 EXPORT_UP_PX = 56  # from the field Source to the menu of formats: two rows
 MET_DEG = 0.1  # between a limb of the body and the character's
 COMPARED = ("motion.csv", "joints.csv", "body.toml", "trajectories.npz", "clouds/0000.ply")
-STAGE_S = 60.0
+STAGE_S = 120.0
 Joints = dict[str, dict[str, tuple[float, float]]]
 
 
