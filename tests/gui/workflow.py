@@ -74,6 +74,8 @@ def cameras(film: Path) -> drive.Steps:
 def seeds(wanted: Joints) -> drive.Steps:
     """Choose the body, open the views, click every joint in every view, each a little beside it."""
     area, props = (yield from drive.sidebar("VIEW_3D", "Tricap")), bpy.context.scene.tricap
+    bpy.context.window_manager.tricap_steps.clicks = True  # a whole person needs no clicks, so that this step is folded
+    yield from drive.settle()
     yield from drive.pick(area, "tricap.model", props, "model", "arm.R")
     yield from drive.press(area, "tricap.click_joints")
     yield from drive.wait_for(lambda: drive.window().workspace.name == CLICKS, 10, "the views are opened")
