@@ -91,7 +91,7 @@ def test_the_other_python_agrees_within_the_bounds(take: Path, tmp_path: Path) -
     p, q = (read_body(out / "body.toml") for out in (a, b))
     assert (np.abs(p.lengths_m - q.lengths_m) < SHAPE * p.length_sigma_m).all()
     assert (np.abs(p.metaballs.radii_m - q.metaballs.radii_m) < SHAPE * p.radius_sigma_m).all()
-    assert all(np.abs(read_ply(s).xyz_m - read_ply(b / "skin" / s.name).xyz_m).max() < SKIN_M for s in (a / "skin").iterdir())
+    assert all(np.abs(read_ply(s).xyz_m - read_ply(b / "skin" / s.name).xyz_m).max() < SKIN_M for s in (a / "skin").glob("*.ply"))
     rows = zip(*(list(csv.DictReader((out / "joints.csv").open())) for out in (a, b)))
     assert max(abs(float(p[axis]) - float(q[axis])) / float(p["sigma"]) for p, q in rows for axis in "xyz") < BODY
 
