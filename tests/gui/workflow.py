@@ -183,8 +183,10 @@ def direction(armature: bpy.types.Object, bone: str) -> Vector:
 
 
 def exported(file: Path) -> drive.Steps:
-    """The motion as BVH, by the menu and the file browser; then all steps are done."""
+    """The measured motion as BVH, by the menu and the file browser; then all steps are done."""
     area = yield from drive.sidebar("VIEW_3D", "Tricap")
+    bpy.context.scene.tricap_retarget.export_source = "MEASURED"  # as the command exports it
+    yield from drive.settle()
     yield from drive.take_item(area, "tricap_retarget.source", EXPORT_UP_PX, 1)
     yield from drive.choose("export", file.parent, file.name)
     yield from drive.wait_for(file.is_file, STAGE_S, "the file is written")
