@@ -70,7 +70,12 @@ class FitSettings:
     least_start_probability: float = knob(
         0.95, "Without clicks: a start that is less probable is not used; the fit asks for the click that decides.", low=0.0, high=1.0
     )
-    place_joints: bool = knob(True, "Joints lie in the body where they were clicked, in any frame.")
+    place_joints: str = knob(
+        "auto",
+        "Joints lie in the body where they were clicked, in any frame: on, off, or auto (of bodies with a left and a right side, whose "
+        "clicks confirm each other).",
+        choices=("auto", "on", "off"),
+    )
     length_sigma: float = knob(
         0.15, "Relative sigma of the lengths between clicked joints, about a person of the model's proportions.", low=0.001, high=1.0
     )

@@ -54,7 +54,7 @@ PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
             "residual": "paper",
             "use_trajectories": False,
             "use_background": False,
-            "place_joints": False,
+            "place_joints": "off",
         },
     },
 }

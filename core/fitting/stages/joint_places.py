@@ -63,6 +63,11 @@ class JointPlaces:
         return replace(fit, parameters=ShapeParameters(template, fit.settings.weights))
 
 
+def has_both_sides(joint_names: Sequence[str]) -> bool:
+    """Whether some joint is on the left and on the right: one side alone does not tell where joints lie from how they were clicked."""
+    return any(name.endswith(".L") and f"{name.removesuffix('.L')}.R" in joint_names for name in joint_names)
+
+
 def joints_as_clicked(fit: FitContext, motion: np.ndarray, vector: np.ndarray, time_s: np.ndarray) -> JointPlaces | None:
     """The places of the joints by their clicks, for a body with a motion (T, D) at `time_s` (T,) and a vector (S,); None without clicks."""
     seen = _seen(fit, motion, vector)

@@ -23,7 +23,7 @@ from ..solve.solver import Solution
 from ..solve.time_priors import MarginalPrior
 from ..state import BodyState
 from .contradicted import misplaced_limbs, widened
-from .joint_places import JointPlaces, joints_as_clicked
+from .joint_places import JointPlaces, has_both_sides, joints_as_clicked
 from .pose_tracking import Checkpoints
 
 A = TypeVar("A")
@@ -67,8 +67,10 @@ class Recording:
 
     def places(self, solution: Solution) -> JointPlaces | None:
         """Where the joints lie by their clicks, if that is asked for."""
-        wanted = self.fit.settings.place_joints
-        return joints_as_clicked(self.fit, solution.motion, solution.vector, self.time_s) if wanted else None
+        asked, joints = self.fit.settings.place_joints, self.fit.parameters.skeleton.joint_names
+        if asked == "off" or (asked == "auto" and not has_both_sides(joints)):
+            return None
+        return joints_as_clicked(self.fit, solution.motion, solution.vector, self.time_s)
 
     def with_places(self, solution: Solution, places: JointPlaces | None) -> tuple["Recording", Solution]:
         """The recording and its solution with the joints in their places, if there are others."""

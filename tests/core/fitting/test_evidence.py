@@ -30,7 +30,6 @@ from . import limb_scene
 from .limb_scene import measured_cloud, outlines
 
 SETTINGS = FitSettings(model_sigma_m=0.001, voxel_m=0.004)
-IN_THE_MIDDLE = replace(SETTINGS, place_joints=False)  # of the model's flesh the true joints lie, wherever they were clicked
 
 
 def _given(scene, **changes) -> FitInput:
@@ -96,7 +95,7 @@ def test_outlines_tell_the_thickness_that_points_from_one_side_do_not(make_scene
     for seed in range(4):
         scene = make_scene(seed=seed, shape=other_person("arm.R", np.random.default_rng(seed)))
         for contours, errors in (((), before), (outlines(scene), after)):
-            fit = fit_sequence(_given(scene, contours=contours), IN_THE_MIDDLE)
+            fit = fit_sequence(_given(scene, contours=contours), SETTINGS)
             errors.append(fit.motion.joints_m - scene.joints_m)
             assert len(fit.outline_m) == 0 if not contours else np.median(fit.outline_m) < 1e-3
     depth = [np.sqrt(np.mean(np.array(e)[..., 1] ** 2)) for e in (before, after)]
@@ -184,7 +183,7 @@ def test_outlines_and_clicks_alone_are_enough(make_scene, other_person) -> None:
         SimpleNamespace(frame=c.frame, xyz_m=np.zeros((0, 3)), normals=np.zeros((0, 3)), covariance_m2=np.zeros((0, 3, 3)))
         for c in scene.clouds
     ]
-    fit = fit_sequence(_given(scene, clouds=blind, contours=outlines(scene)), IN_THE_MIDDLE)
+    fit = fit_sequence(_given(scene, clouds=blind, contours=outlines(scene)), SETTINGS)
     errors = np.linalg.norm(fit.motion.joints_m - scene.joints_m, axis=2)
     assert set(fit.motion.status) == {"fitted"} and fit.converged and np.isfinite(fit.motion.sigma0).all()
     assert errors.mean() < 3e-3, errors.mean(axis=0)  # three persons: 0.5, 1.5, 0.8 mm

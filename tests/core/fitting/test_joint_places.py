@@ -8,7 +8,7 @@ import pytest
 from tricap.core.fitting.inputs.fit_input import FitInput
 from tricap.core.fitting.settings import FitSettings
 from tricap.core.fitting.solve.solver import Solution
-from tricap.core.fitting.stages.joint_places import joints_as_clicked
+from tricap.core.fitting.stages.joint_places import has_both_sides, joints_as_clicked
 from tricap.core.fitting.stages.sequence import fit_sequence
 from tricap.core.fitting.stages.set_up import fit_context
 
@@ -78,11 +78,16 @@ def test_clicks_of_several_frames_count_more_than_those_of_one(make_scene) -> No
     assert 0.2 < found[0] < found[1] < 1.0
 
 
-@pytest.mark.parametrize(("place", "least", "most"), [(True, 0.004, 0.017), (False, 0.0, 0.004)])
-def test_the_fit_does_so_if_it_is_asked_to(make_scene, place: bool, least: float, most: float) -> None:
+@pytest.mark.parametrize(("place", "least", "most"), [("on", 0.004, 0.017), ("off", 0.0, 0.004), ("auto", 0.0, 0.004)])
+def test_the_fit_does_so_if_it_is_asked_to(make_scene, place: str, least: float, most: float) -> None:
     scene = make_scene(frames=5, click_px=0.0)
     given = _given(scene, {0: {**scene.clicks, **_clicked(scene, SHIFT)}})
     fit = fit_sequence(given, replace(SETTINGS, place_joints=place))
     j = fit.motion.joint_names.index("elbow.R")
     off = np.linalg.norm(fit.motion.joints_m[1:, j] - scene.joints_m[1:, j], axis=1)
     assert least <= off.min() and off.max() <= most
+
+
+def test_one_side_alone_is_left_where_it_is() -> None:
+    assert has_both_sides(["neck", "shoulder.L", "shoulder.R"])
+    assert not has_both_sides(["shoulder.R", "elbow.R", "wrist.R"]) and not has_both_sides(["neck", "shoulder.L", "elbow.R"])

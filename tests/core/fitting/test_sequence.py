@@ -22,8 +22,8 @@ from tricap.core.fitting.stages.sequence import FitInput, FitSettings, _restarte
 from tricap.core.foundation.errors import InputError
 from tricap.core.foundation.progress import Cancelled, Monitor
 
-UNKNOWN = FitSettings(model_sigma_m=0.0, voxel_m=0.002, place_joints=False)  # the true joints are where the model has them
-KNOWN = replace(UNKNOWN, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001)
+KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.001, radius_sigma=0.001, voxel_m=0.002)
+UNKNOWN = FitSettings(model_sigma_m=0.0, voxel_m=0.002)
 
 
 def _fit(scene, settings=KNOWN, click=0, **changes):

@@ -1,7 +1,5 @@
 """A long recording is adjusted in stretches: as good as at once, with calibrated sigmas; only the result of a stretch stays in memory."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,6 @@ KNOWN = FitSettings(model_sigma_m=0.0, length_sigma=0.001, proportion_sigma=0.00
 def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three stretches, with marginal priors to the left and to the right; what tracks contribute to a twist reaches all of them."""
     scene = make_scene(frames=24, seed=2, click=10)
-    settings = replace(KNOWN, place_joints=False)  # places come from the motion of the stretch with the clicks: 0.6 sigma apart
     given = FitInput(
         rig=scene.rig,
         model=scene.model,
@@ -25,11 +22,11 @@ def test_stretches_agree_with_all_at_once(make_scene, monkeypatch: pytest.Monkey
         time_s=scene.time_s,
         trajectories=scene.trajectories,
     )
-    whole = fit_sequence(given, settings)
+    whole = fit_sequence(given, KNOWN)
     for module in (sequence, long_sequence):
         monkeypatch.setattr(module, "AT_ONCE", 9)
     monkeypatch.setattr(long_sequence, "MARGIN", 4)
-    pieces = fit_sequence(given, settings)
+    pieces = fit_sequence(given, KNOWN)
     assert np.array_equal(pieces.motion.frames, whole.motion.frames) and pieces.motion.status == whole.motion.status
     off = np.linalg.norm(pieces.motion.joints_m - whole.motion.joints_m, axis=2) / whole.motion.joint_sigma_m
     assert np.median(off) < 0.2 and off.max() < 1.0  # 36 frames in two stretches, two seeds: 0.05–0.09 and 0.19–0.47
