@@ -73,18 +73,16 @@ def calibrate(observations: BarObservations, monitor: Monitor, focal_px: float |
     monitor.step("calibration", 2, 5)
     prior = lens_prior(observations.size_px, network.interior[:, 0])
     network, used = with_bars(network, labelled, max(10 * sigma, 1.0))
-    first = adjust(
-        network,
-        labelled.xy_px,
-        used,
-        prior,
-        cauchy_px=3 * sigma,
-        unit_px=sigma,
-        iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.05),
-    )
+    first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
     monitor.step("calibration", 3, 5)
     tested = without_outliers(first, labelled, used, prior, lambda bars, tolerance_px: with_bars(bars, labelled, tolerance_px))
     return without_insignificant(*tested, labelled, monitor)
+
+
+def coarse_adjustment(network: AnyNetwork, xy_px: np.ndarray, used: np.ndarray, prior: Unknowns, sigma_px: float) -> Adjusted[AnyNetwork]:
+    """A robust adjustment of all positions in a few steps, for image points of this sigma."""
+    iteration = LevenbergMarquardt(max_iterations=8, tolerance=0.05)
+    return adjust(network, xy_px, used, prior, cauchy_px=3 * sigma_px, unit_px=sigma_px, iteration=iteration)
 
 
 def refined_start(network: BarNetwork, observations: BarObservations) -> tuple[BarNetwork, BarObservations, float]:

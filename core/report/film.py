@@ -52,11 +52,13 @@ def write_film(footage: Footage, results: Results, monitor: Monitor) -> Path:
             places = {name: (xyz[t], joints.sigma_m[name][t]) for name, xyz in joints.joints_m.items()}
             panels = [_panel(grey, camera, mesh.xyz_m, mesh.triangles, places, bones) for grey, camera in zip(footage.read(frame), cameras)]
             movie.write(_together(panels, size, f"frame {frame}   {joints.time_s[t]:.2f} s   views {', '.join(c.name for c in cameras)}"))
+        movie.release()
+        if cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT) != len(joints.frames):  # the writer does not report a full disk
+            raise InputError(f"The movie {part} could not be written whole; check that the disk has room.")
     except BaseException:
         movie.release()
         part.unlink(missing_ok=True)
         raise
-    movie.release()
     os.replace(part, results.path("film.mp4"))
     return results.path("film.mp4")
 

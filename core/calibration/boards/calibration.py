@@ -19,7 +19,7 @@ from ...geometry.camera import INTERIOR, image_with_derivatives
 from ..bundle import NEAREST_M, Adjusted, LevenbergMarquardt, Unknowns, adjust, inverse_factors, normal_equations, residuals, weights_of
 from ..network import BoardNetwork
 from ..reference_bar import COARSE_CAUCHY_PX, lens_prior
-from ..self_calibration import GROSS, Calibration, robust_sigma, without_insignificant, without_outliers
+from ..self_calibration import GROSS, Calibration, coarse_adjustment, robust_sigma, without_insignificant, without_outliers
 from .observations import BoardObservations
 from .start import FEWEST_SHARED, initial_network, without_wild
 
@@ -50,15 +50,7 @@ def calibrate_boards(observations: BoardObservations, monitor: Monitor, focal_px
     monitor.step("calibration", 2, 5)
     prior = lens_prior(labelled.size_px, network.interior[:, 0])
     network, used = with_boards(network, labelled, max(10 * sigma, 1.0))
-    first = adjust(
-        network,
-        labelled.xy_px,
-        used,
-        prior,
-        cauchy_px=3 * sigma,
-        unit_px=sigma,
-        iteration=LevenbergMarquardt(max_iterations=8, tolerance=0.05),
-    )
+    first = coarse_adjustment(network, labelled.xy_px, used, prior, sigma)
     sigma = robust_sigma(first.residual_px, used)
     network, again = split_apart(first.network, labelled, sigma)
     if len(again.frames) > len(labelled.frames):

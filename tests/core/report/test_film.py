@@ -65,3 +65,20 @@ def test_a_film_needs_a_body(plane_take: Path, results: Results, scenes: Any) ->
     results.remove("skin")
     with pytest.raises(InputError, match="no fitted body with a skin"):
         write_film(open_take(read_take(plane_take)), results, Monitor())
+
+
+def test_a_film_that_lost_frames_is_no_film(plane_take: Path, results: Results, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a full disk, of which the writer says nothing."""
+
+    class Lossy:
+        def __init__(self, *given: Any) -> None:
+            self.isOpened, self.release = lambda: True, lambda: None
+
+        def write(self, picture: np.ndarray) -> None:
+            pass
+
+    lossy: Any = type("Writer", (Lossy,), {"fourcc": staticmethod(cv2.VideoWriter.fourcc)})
+    monkeypatch.setattr(cv2, "VideoWriter", lossy)
+    with pytest.raises(InputError, match="could not be written whole"):
+        write_film(open_take(read_take(plane_take)), results, Monitor())
+    assert not results.path("film.mp4").exists() and not results.path("cache", "film.mp4").exists()
