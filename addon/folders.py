@@ -5,6 +5,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.foundation.bounded import real_path
 from ..core.foundation.errors import InputError
 
 
@@ -56,7 +57,7 @@ def absolute(path: str) -> Path:
     """
     if path.startswith("//") and not bpy.data.filepath:
         raise InputError(f"The folder {path} is relative to the Blender file, which was never saved. Save it, or choose a full path.")
-    return Path(bpy.path.abspath(path)).resolve()
+    return real_path(bpy.path.abspath(path))
 
 
 def for_user(path: Path) -> str:

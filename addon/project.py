@@ -16,6 +16,7 @@ import bpy
 import numpy as np
 
 from ..core.foundation import store
+from ..core.foundation.bounded import real_path
 from ..core.foundation.errors import InputError
 from ..core.geometry.rig import Rig, read_rig
 from ..core.images.interlace import BOTH, FieldLayout, field_layout
@@ -48,7 +49,7 @@ def folder_of(scene: bpy.types.Scene) -> Path:
     if not bpy.data.filepath:
         raise InputError("Save the Blender file first: the project folder is created next to it. Or choose a folder for the project.")
     blend = Path(bpy.data.filepath)
-    return blend.with_name(blend.stem + ENDING).resolve()
+    return real_path(blend.with_name(blend.stem + ENDING))
 
 
 def make_folder(scene: bpy.types.Scene) -> Path:
@@ -283,7 +284,7 @@ def show_views(
 
 def _clip_of(clip: bpy.types.MovieClip | None, name: str, path: Path) -> bpy.types.MovieClip:
     """This clip, if it shows the file, else a new one."""
-    if clip is not None and Path(bpy.path.abspath(clip.filepath)).resolve() == path.resolve():
+    if clip is not None and real_path(bpy.path.abspath(clip.filepath)) == real_path(path):
         return clip
     return clips.open_clip(f"Footage {name}", path)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import bpy
 
+from ..core.foundation.bounded import real_path
 from ..core.foundation.errors import InputError, sentence_of
 from ..core.images.interlace import BOTH
 from ..core.results.run_json import read_run
@@ -54,7 +55,7 @@ def _place(built: bpy.types.Collection, what: str, absolute: Path, file: str) ->
     """The folder of results or take that contains `file`: first relative to the .blend, then where it was."""
     relative = dict(built.get(PLACES_KEY, {})).get(what)
     beside = [Path(bpy.data.filepath).parent / relative] if relative else []
-    return next((place.resolve() for place in (*beside, absolute) if (place / file).is_file()), None)
+    return next((real_path(place) for place in (*beside, absolute) if (place / file).is_file()), None)
 
 
 def _choose_body(scene: bpy.types.Scene, built: bpy.types.Collection) -> None:
@@ -70,7 +71,7 @@ def _clips_behind_cameras(built: bpy.types.Collection, files: dict[str, Path]) -
     for camera in (o for o in built.all_objects if o.type == "CAMERA"):
         clip, view = clips.clip_behind(camera.data), camera.get("tricap_view")
         if clip is not None and view in files:
-            if Path(bpy.path.abspath(clip.filepath)).resolve() != files[view].resolve():
+            if real_path(bpy.path.abspath(clip.filepath)) != real_path(files[view]):
                 clip.filepath = folders.for_user(files[view])
             found[view] = clip
     return found

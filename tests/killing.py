@@ -299,9 +299,9 @@ def kill_runs(driver_name: str, take: Path, folder: Path, count: int, seed: int 
     driver, tally = DRIVERS[driver_name], Tally()
     if driver_name in BEFORE:
         before = start(BEFORE[driver_name], take, folder / "before")
-        assert before.code == 0, before.said
+        assert before.code == 0, f"ended with {before.code}: {before.said}"
     whole = start(driver, take, _begun(folder, "whole"))
-    assert whole.code == 0, whole.said
+    assert whole.code == 0, f"ended with {whole.code}: {whole.said}"
     expected = contents(folder / "whole")
     chosen, number = moments(whole, seed), 0
     while sum(tally.moments.values()) < count:

@@ -146,6 +146,11 @@ def files_are_opened_in_one_place(name: str, source: str) -> list[str]:
     ]
 
 
+def links_may_lead_in_a_circle(name: str, source: str) -> list[str]:
+    """Path.resolve raises RuntimeError there before Python 3.13; bounded.real_path does not."""
+    return [f"{name}:{line} calls {called}" for line, called in calls(source) if called.endswith(".resolve") and "__file__" not in called]
+
+
 def no_network(name: str, source: str) -> list[str]:
     """Nothing leaves the computer."""
     absolute = [(line, module[0]) for line, relative, module in imported(name, source) if not relative]
@@ -249,6 +254,7 @@ REJECTED: list[tuple[Rule, str, str]] = [
     (files_are_opened_in_one_place, "addon/presets.py", "import json\ntable = json.loads(text)"),
     (files_are_opened_in_one_place, "core/images/sequence.py", "image = cv2.imread(str(path))"),
     (files_are_opened_in_one_place, "core/take/take.py", "data = np.load(path, allow_pickle=False)"),
+    (links_may_lead_in_a_circle, "core/take/take.py", "where = Path(folder).resolve()"),
     (no_network, "core/cli/main.py", "from urllib.request import urlopen"),
     (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept OSError:\n    pass"),
     (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept:\n    g()"),
@@ -279,6 +285,7 @@ ACCEPTED: list[tuple[Rule, str, str]] = [
     (core_does_not_print, "core/cli/main.py", "print('done')"),
     (files_carry_no_code, "core/foundation/store.py", "np.load(path, allow_pickle=False)"),
     (files_are_opened_in_one_place, "core/take/take.py", "text = bounded.text_of(path, bounded.TOML_BYTES)\njson.dumps(text)"),
+    (links_may_lead_in_a_circle, "core/take/take.py", "where, here = bounded.real_path(folder), Path(__file__).resolve()"),
     (no_network, "core/cli/main.py", "import json"),
     (no_silent_except, "core/foundation/store.py", "try:\n    f()\nexcept OSError as error:\n    raise InputError('x') from error"),
     (state_is_in_the_session, "addon/session.py", "known = []"),

@@ -6,7 +6,7 @@ from types import ModuleType
 
 import pytest
 
-KB_PER_FRAME = 110.0  # 8 were measured, 82 beside other work; a kept cloud of this size has 150, a kept set of pictures 330
+KB_PER_FRAME = 60.0  # 1 was measured, also beside other work; a kept cloud of this size has 150, a kept set of pictures 330
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +27,5 @@ def test_a_long_fit_keeps_next_to_nothing_of_a_frame(memory: ModuleType) -> None
 
 @pytest.mark.slow
 def test_measuring_and_tracking_keep_no_frames(memory: ModuleType) -> None:
-    """The peaks vary by 10 MB while the machine is busy; what is kept shows in every try."""
-    rows: list[object] = []
-    for _ in range(4):
-        row = memory.growth(("track",), [15, 75], pictures=4)[0]  # tracking measures first
-        if row["kb_per_frame"] < KB_PER_FRAME:
-            return
-        rows.append(row)
-    raise AssertionError(rows)
+    row = memory.growth(("track",), [15, 75], pictures=4)[0]  # tracking measures first
+    assert row["kb_per_frame"] < KB_PER_FRAME, row

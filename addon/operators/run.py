@@ -6,6 +6,7 @@ from typing import Any
 
 import bpy
 
+from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.run import pipeline, take_run
@@ -87,7 +88,7 @@ class LoadSample(JobOperator, bpy.types.Operator):
         """The folder of the recording: next to the .blend, or in the extension's user folder if the file was never saved."""
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else Path(bpy.utils.extension_path_user(EXTENSION, path="", create=True))
         take = base / SAMPLE_NAME
-        if project.bound(context.scene) and project.folder_of(context.scene) != take.resolve():
+        if project.bound(context.scene) and project.folder_of(context.scene) != real_path(take):
             raise InputError("This file already has footage. Open an empty one (File > New > General) and press Load Sample and Run there.")
         folders.check_writable(base)
         return lambda monitor: make_sample(take, monitor)

@@ -19,6 +19,7 @@ from mathutils import Matrix
 
 from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
+from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.motion.formats.markers import metres_per
 from ...core.motion.retarget.rig import Motion
@@ -113,7 +114,7 @@ def write_whole(file: Path, export: Callable[[str], Any]) -> None:
     Raises:
         InputError: the exporter failed.
     """
-    file = Path(file).resolve()
+    file = real_path(file)
     part = file.with_name(f".{file.stem}.{os.getpid()}.part{file.suffix}")
     try:
         store.try_writing(part)

@@ -31,7 +31,7 @@ def open_rig(path: Path) -> None:
     Raises:
         InputError: there is no such file, its format is unknown, or Blender cannot read it.
     """
-    path = Path(path).resolve()
+    path = bounded.real_path(path)
     if not path.is_file():
         raise InputError(f"There is no file {path}; check its name.")
     kind = path.suffix.lower()

@@ -18,6 +18,7 @@ from ...core.body.fields import EXPONENTIAL, potential_named
 from ...core.body.skin.closed_skin import DETAIL
 from ...core.body.skin.texture import TEXTURE
 from ...core.foundation import store
+from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.foundation.progress import Monitor
 from ...core.motion.formats.ply import Ply
@@ -96,7 +97,7 @@ def write_scene(
     collection[OUT_KEY] = str(contents.out)
     collection[KEYS_KEY] = {stage: e["key"] for stage, e in contents.run.get("stages", {}).items() if e.get("key") and stage in STAGES}
     if blend is not None:
-        collection[PLACES_KEY] = _places(contents, Path(blend).resolve().parent)
+        collection[PLACES_KEY] = _places(contents, real_path(blend).parent)
     scene.collection.children.link(collection)
     set_time(scene, contents)
     warnings, counts = list(contents.warnings), {}
@@ -143,7 +144,7 @@ def _places(contents: Contents, folder: Path) -> dict[str, str]:
     places = {}
     for name, place in (("out", contents.out), ("take", Path(contents.run.get("take", contents.out)))):
         with suppress(ValueError):
-            places[name] = os.path.relpath(place.resolve(), folder)
+            places[name] = os.path.relpath(real_path(place), folder)
     return places
 
 
@@ -183,7 +184,7 @@ def save_blend(path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    path = path.resolve()
+    path = real_path(path)
     if path.suffix != ".blend":
         raise InputError(f"{path.name} is not the name of a Blender file; let it end in .blend.")
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.blend")
@@ -356,7 +357,7 @@ def _add_body(
         if stand is not None:
             skin_object.data.transform(Matrix.Translation((0.0, 0.0, stand.lift_m)))
         if contents.skins is not None and blend is not None:
-            shown = skin.add_exact_skin(collection, measured_shape, contents.skins, Path(blend).resolve().with_suffix(".pc2"))
+            shown = skin.add_exact_skin(collection, measured_shape, contents.skins, real_path(blend).with_suffix(".pc2"))
             counts["exact skin faces"] = len(shown.data.polygons)
     except InputError as error:
         warnings.append(f"No polygonal skin in the scene: {error}")

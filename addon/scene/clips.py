@@ -5,6 +5,7 @@ from pathlib import Path
 
 import bpy
 
+from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.geometry.camera import Camera
 from ...core.images.interlace import FieldLayout, field_pictures
@@ -44,7 +45,7 @@ def clip_of_view(scene: bpy.types.Scene, name: str, first_file: Path, camera: Ca
     """The project's clip of a view if it shows this file, else a new one; with the camera's lens."""
     project = getattr(scene, "tricap", None)  # the command `tricap scene` builds without the add-on's properties
     own = next((view.clip for view in project.views if view.name == name and view.clip is not None), None) if project else None
-    if own is None or Path(bpy.path.abspath(own.filepath)).resolve() != first_file.resolve():
+    if own is None or real_path(bpy.path.abspath(own.filepath)) != real_path(first_file):
         return load_clip(f"Footage {name}", first_file, camera)
     set_lens(own, camera)
     return own

@@ -14,6 +14,7 @@ import bpy
 from ...core.body.model_file import read_model
 from ...core.checking.take_check import DOUBTFUL_RESIDUAL_PX
 from ...core.fitting.settings import START_ALONE
+from ...core.foundation.bounded import real_path
 from ...core.foundation.errors import InputError
 from ...core.geometry.rig import read_rig
 from ...core.images.sequence import ImageSequence, open_sequence
@@ -346,7 +347,7 @@ def _sequence(folder: Path, view: Any) -> ImageSequence:
     try:
         state = where.stat()
     except OSError as error:
-        message = f"The footage of view {view.name} is no longer at {where.resolve()}. Move it back, or press Find Footage."
+        message = f"The footage of view {view.name} is no longer at {real_path(where)}. Move it back, or press Find Footage."
         raise FixableError(message, Fix.FIND_FOOTAGE) from error
     key = (str(where), view.images, view.movie, state.st_mtime_ns, state.st_size)
     opened = get_session().file.sequences

@@ -82,7 +82,7 @@ def _sources(name: str | Path) -> list[tuple[Path, dict[str, Any]]]:
     wanted: Any = name
     while wanted is not None:
         path = _path(wanted, found[-1][0].parent if found else Path())
-        if any(path.resolve() == other.resolve() for other, _ in found):
+        if any(bounded.real_path(path) == bounded.real_path(other) for other, _ in found):
             raise InputError(f"The body model {found[0][0]} is made from itself, by way of “{wanted}”; correct `mirror_of` or `part_of`.")
         found.append((path, _table(path)))
         table = found[-1][1]

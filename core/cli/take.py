@@ -6,6 +6,7 @@ from pathlib import Path
 from ..body.model_file import read_model
 from ..calibration.rig_files import read_any
 from ..fitting.settings import START_ALONE
+from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..take.bar_file import read_bar, write_bar
@@ -23,7 +24,7 @@ def run(args: argparse.Namespace, monitor: Monitor) -> list[str]:
     views = [tuple(v.split("=", 1)) for v in args.views]
     if any(len(v) != 2 or not all(v) for v in views):
         raise InputError("Write each view as NAME=FILE, such as L=left.mp4.")
-    sources = [Path(source).resolve() for _, source in views]
+    sources = [real_path(source) for _, source in views]
     for (name, _), source in zip(views, sources):
         if sources.count(source) > 1:
             raise InputError(f"View {name} has the same footage as another view, {source}; give each view the footage of its own camera.")

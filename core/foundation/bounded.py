@@ -84,6 +84,11 @@ def _shown(path: Path) -> str:
     return str(path).encode(errors="backslashreplace").decode()
 
 
+def real_path(path: str | Path) -> Path:
+    """The absolute path, without links; where these lead in a circle, up to the circle (`Path.resolve` may fail there)."""
+    return Path(os.path.realpath(path))
+
+
 def check_file(path: Path, largest: int) -> None:
     """Check a file that another library opens by its name.
 

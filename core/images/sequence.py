@@ -290,7 +290,9 @@ def open_sequence(folder: Path, *, images: str | None, movie: str | None, view: 
         raise InputError(f"View {view} reads “{pattern}”, which lies outside the take {folder}; move or link the footage into the take.")
     link = folder / movie if movie is not None else (folder / pattern).parent
     if link.is_symlink() and not link.exists():
-        raise InputError(f"The footage of view {view} is not at {link.resolve()} any more; move it back, or correct the link {link}.")
+        raise InputError(
+            f"The footage of view {view} is not at {bounded.real_path(link)} any more; move it back, or correct the link {link}."
+        )
     if movie is not None:
         path = folder / movie
         if not path.is_file():

@@ -35,14 +35,14 @@ def check_separate_folder(out: Path, take: Path | None = None, footage: Iterable
     Raises:
         InputError: OUT is a take or contains its footage, or the take lies where results are replaced.
     """
-    where = Path(out).resolve()
+    where = bounded.real_path(out)
     advice = f"choose a separate folder for the results, such as {(where if take is None else take) / 'results'}."
     if (where / "take.toml").exists():
         raise InputError(f"{out} is itself a take; {advice}")
     for path in footage:
-        if where in (path.parent.resolve(), path.resolve().parent):
+        if where in (bounded.real_path(path.parent), bounded.real_path(path).parent):
             raise InputError(f"{out} contains the footage {path.name}; {advice}")
-    if take is not None and any(take.resolve().is_relative_to(where / name) for name in WRITTEN):
+    if take is not None and any(bounded.real_path(take).is_relative_to(where / name) for name in WRITTEN):
         raise InputError(f"The take {take} is inside {out}, where a run replaces files; choose another folder for the results.")
 
 
@@ -52,7 +52,7 @@ def check_not_result(file: Path, out: Path) -> None:
     Raises:
         InputError: `file` is such a file.
     """
-    path, read = Path(file).resolve(), Path(out).resolve()
+    path, read = bounded.real_path(file), bounded.real_path(out)
     own = path.relative_to(read).parts[:1] if path != read and path.is_relative_to(read) else ()
     if path == read or set(own) & {*WRITTEN} - {"body.blend"}:
         raise InputError(f"{file} is also an input; choose another name, so that it is not overwritten.")
@@ -62,7 +62,7 @@ class Results:
     """An OUT folder. Creating the object checks that it is writable."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = Path(folder).resolve()
+        self.folder = bounded.real_path(folder)
         bounded.check_name(self.folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{folder} is a file; choose a folder for the results.")
@@ -184,7 +184,7 @@ def check_inside(path: Path, folder: Path) -> None:
     Raises:
         InputError: it is.
     """
-    if path.is_symlink() and not path.resolve().is_relative_to(folder):
+    if path.is_symlink() and not bounded.real_path(path).is_relative_to(folder):
         raise InputError(f"{path} is a link to a place outside {folder}; remove the link, or choose another folder.")
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..foundation import store
+from ..foundation.bounded import real_path
 from ..foundation.errors import InputError, sentence_of
 from ..foundation.progress import Monitor
 from ..results.folder import check_inside, check_separate_folder
@@ -72,7 +73,7 @@ def run_batch(
         client.subscribe_topic(TOPIC, lambda event: _store_progress(event, progress))
         plain = {group: dict(table) for group, table in overrides.items()}
         futures = [
-            client.submit(run_take, str(take.resolve()), str(out), plain, restart, pure=False, retries=engine.retries)
+            client.submit(run_take, str(real_path(take)), str(out), plain, restart, pure=False, retries=engine.retries)
             for take, out in zip(takes, outs)
         ]
         for i, outcome in _as_completed(futures, takes, outs, progress, monitor):
@@ -87,7 +88,7 @@ def out_folders(takes: Sequence[Path], folder: Path) -> list[Path]:
     Raises:
         InputError: two names are still the same, or results would go into a take or through a link out of FOLDER.
     """
-    folder, takes = Path(folder).resolve(), [Path(take).resolve() for take in takes]
+    folder, takes = real_path(folder), [real_path(take) for take in takes]
     names = [take.name for take in takes]
     names = [f"{take.parent.name}_{take.name}" if names.count(take.name) > 1 else take.name for take in takes]
     twice = next((take for take, name in zip(takes, names) if names.count(name) > 1), None)

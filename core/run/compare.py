@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..foundation import store
+from ..foundation.bounded import real_path
 from ..foundation.errors import InputError
 from ..foundation.progress import Monitor
 from ..geometry.robust import finite_median, mad_sigma
@@ -54,7 +55,7 @@ def write_comparison(out: Path, take: Path, folders: Sequence[Path], measures: S
     """Write DIR/compare.json and DIR/compare.html."""
     rows = [as_row(measure) for measure in measures]
     store.write_json(out / "compare.json", {"format": "tricap-comparison", "version": 1, "take": str(take), "measures": rows})
-    store.write_text(out / "compare.html", comparison_page(take.resolve().name, measures, folders))
+    store.write_text(out / "compare.html", comparison_page(real_path(take).name, measures, folders))
 
 
 def as_row(measure: Measure) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def run_piece(task: Task) -> None:
 def _task(run: Run, keys: Mapping[int, str]) -> Task:
     frames = run.footage.frames
     return {
-        "take": str(run.footage.take.folder.resolve()),
+        "take": str(bounded.real_path(run.footage.take.folder)),
         "out": str(run.results.folder),
         "frames": [frames.start, frames.stop],
         "delay_images": list(run.footage.delay_images),

@@ -173,7 +173,7 @@ def read_take(folder: Path) -> Take:
     """
     folder = Path(folder)
     path = folder / "take.toml" if folder.name != "take.toml" else folder
-    bounded.check_name(path.parent.resolve())
+    bounded.check_name(bounded.real_path(path.parent))
     try:
         return take_of_text(bounded.text_of(path, bounded.TOML_BYTES), path)
     except OSError as error:
@@ -193,7 +193,7 @@ def take_of_text(text: str, path: Path) -> Take:
         table = bounded.toml_of(text)
     except ValueError as error:
         raise InputError(f"{path} is not a TOML file: {error}; correct that place.") from error
-    return _take(table, path.parent.resolve(), str(path))
+    return _take(table, bounded.real_path(path.parent), str(path))
 
 
 def _take(table: Mapping[str, Any], folder: Path, where: str) -> Take:

@@ -224,7 +224,7 @@ def _text(text: str) -> str:
 
 def _link(target: Path, source: Path) -> None:
     try:
-        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
+        target.symlink_to(bounded.real_path(source), target_is_directory=source.is_dir())
     except OSError:
         (shutil.copytree if source.is_dir() else shutil.copy2)(source, target)
 

@@ -22,6 +22,8 @@ from types import SimpleNamespace
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# glibc otherwise keeps freed memory for each thread, and the peak depends on how they take turns (by 20 MB on a busy machine).
+os.environ.update({"MALLOC_ARENA_MAX": "1", "MALLOC_TRIM_THRESHOLD_": "65536", "MALLOC_MMAP_THRESHOLD_": "65536"})
 
 import numpy as np
 
