@@ -4,9 +4,23 @@ from types import ModuleType
 
 
 def _modules() -> tuple[ModuleType, ...]:
-    from . import calibrate, clicking, command, correcting, jobs, operators, overlay, properties, reopened, retarget, session, steps
+    from . import (
+        calibrate,
+        clicking,
+        command,
+        correcting,
+        editing,
+        jobs,
+        operators,
+        overlay,
+        properties,
+        reopened,
+        retarget,
+        session,
+        steps,
+    )
 
-    return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, steps, reopened, command
+    return session, jobs, properties, operators, calibrate, retarget, clicking, overlay, correcting, editing, steps, reopened, command
 
 
 def register() -> None:

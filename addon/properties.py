@@ -14,6 +14,7 @@ import numpy as np
 from ..core.foundation import settings as knobs
 from ..core.run import take_run
 from . import take_properties
+from .editing import foot_lock, uncertainty
 from .scene import metaballs, standing
 from .session import get_session
 
@@ -139,6 +140,20 @@ def register() -> None:
             get=lambda group: metaballs.shown(group.id_data),
             set=lambda group, value: metaballs.show(group.id_data, value),
             description="Show the metaballs behind the skin. Blender then computes them in every frame, which slows playback",
+        ),
+        "show_uncertainty": bpy.props.BoolProperty(
+            name="Show Uncertainty",
+            options=set(),
+            update=lambda _, context: uncertainty.redraw(context),
+            description="Colour the bones in the 3-D view, and a strip in the timeline, by the sigmas of the motion: green up to 1°, red from "
+            "10°. In Pose Mode the strip is of the selected bones",
+        ),
+        "foot_lock": bpy.props.BoolProperty(
+            name="Foot Lock",
+            options=set(),
+            get=lambda group: any(foot_lock.is_active(body) for body in standing.all_bodies(group.id_data)),
+            set=lambda group, value: [foot_lock.activate(body, value) for body in standing.all_bodies(group.id_data)],
+            description="Let the foot lock act; without it the feet move as measured",
         ),
         "path": bpy.props.EnumProperty(
             name="Path",

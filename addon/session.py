@@ -43,6 +43,7 @@ class FileState:
     open_results: OpenResults = field(default_factory=OpenResults)
     inspection: tuple[int, Any] = (-1, None)  # the frame, and what is under the pointer in it (overlay.layers.Inspection)
     inspecting: bool = False  # the modal operator of the inspection runs
+    uncertainty: tuple[Any, Any] = ((), None)  # what is shown of the body's motion: its key, and the sigmas by bone
     correcting: bool = False  # a modal operator of the corrections runs
     region_corners: tuple[str, list[tuple[float, float]]] = ("", [])  # the view, and the corners clicked so far
 
@@ -58,6 +59,7 @@ class Session:
     click_drawing: Any = None  # clicking.draw.Drawing
     finders: list[Any] = field(default_factory=list)  # the clicking.finder.Finder whose threads run
     overlay_handle: Any = None  # Blender's handle of what draws the overlays
+    uncertainty_handles: list[Any] = field(default_factory=list)  # Blender's handles of what draws the uncertainty, with their spaces
     cli_command: Any = None  # Blender's handle of `blender --command tricap`
     status_workspaces: set[str] = field(default_factory=set)  # those whose status bar shows our text
     take_digests: set[str] = field(default_factory=set)  # of every take.toml that was read or written

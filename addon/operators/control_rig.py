@@ -7,13 +7,15 @@ from ..retarget import control_rig
 from ..scene import standing
 
 
-def body_of(context: bpy.types.Context) -> bpy.types.Object:
-    """Tricap's body that is selected, else the first one of the scene.
+def body_of(context: bpy.types.Context, *, standing_only: bool = True) -> bpy.types.Object:
+    """Tricap's body that is selected, else the first one of the scene; with `standing_only` a whole one that stands on a floor.
 
     Raises:
-        InputError: there is none that stands on a floor.
+        InputError: there is none.
     """
-    bodies = list(standing.bodies(context.scene))
+    bodies = list(standing.bodies(context.scene) if standing_only else standing.all_bodies(context.scene))
+    if not bodies and not standing_only:
+        raise InputError("The scene has no fitted body; build the rig first (step 7).")
     if not bodies:
         raise InputError("A control rig needs a whole body; build the rig of a fitted person first (step 7).")
     return next((body for body in bodies if body.select_get()), bodies[0])

@@ -113,6 +113,14 @@ def draw_lines(batch: gpu.types.GPUBatch, width: float, colour: Colour | None = 
     batch.draw(shader)
 
 
+def draw_lines_in_space(segments_m: np.ndarray, colours: np.ndarray, width: float) -> None:
+    """Draw segments (M, 2, 3) of the world with colours (M, 4), in the 3-D view, in front of everything."""
+    shader = gpu.shader.from_builtin("POLYLINE_FLAT_COLOR")
+    place = {"pos": segments_m.reshape(-1, 3).astype(np.float32), "color": np.repeat(colours, 2, axis=0).astype(np.float32)}
+    gpu.state.depth_test_set("NONE")
+    draw_lines(batch_for_shader(shader, "LINES", place), width)
+
+
 def point_batch(points: np.ndarray, colours: np.ndarray) -> gpu.types.GPUBatch:
     """A batch of points (N, 2) with colours (N, 4)."""
     position = np.zeros((len(points), 3), dtype=np.float32)

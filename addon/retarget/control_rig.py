@@ -21,7 +21,7 @@ from ...core.foundation.errors import InputError
 from ...core.geometry.rotation import angle_of, transposed
 from ...core.motion.retarget.retarget import Retargeted
 from ...core.motion.retarget.rig import ControlRig, Motion, Rig, channels, controls_of
-from ..scene.armature import SNAPS_KEY
+from ..scene.armature import RIG_KEY, SNAPS_KEY
 from ..scene.standing import ROOT
 from . import metarig
 from .playing import played_frames
@@ -30,7 +30,6 @@ from .write import push_to_strip, write_action
 
 CONSTRAINT = "Control rig"
 DRIVE = "BODY-"  # prefix of the bones that the body's bones copy
-RIG_KEY = "tricap_control_rig"  # custom property of the body: its control rig
 CORRECTIONS = "Corrections"
 LIMB_PROPERTIES = {"IK_FK": 1.0, "FK_limb_follow": 0.0}
 CHECKED_FRAMES = 25

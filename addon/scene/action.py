@@ -1,7 +1,7 @@
-"""The motion as an action: an F-curve for each DOF and for each DOF's sigma, with a key in every frame.
+"""The motion as an action: an F-curve for each DOF with a key in every frame, in groups by bone.
 
-The sigma of a DOF is a custom property of its bone ("sigma elbow.R flexion"), in the unit of its channel:
-radians, or metres for the base.
+The sigmas are an action of their own, in a locked NLA track below, so that the channels to edit are not among them. The sigma of a DOF is
+a custom property of its bone ("sigma elbow.R flexion"), in the unit of its channel: radians, or metres for the base.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,9 +14,9 @@ from ...core.body.shape import BodyShape
 from ...core.body.skeleton import Bone
 from ...core.motion.retarget.rig import needed_keys
 from . import armature
-from .standing import Standing
+from .standing import DOFS_KEY, Standing
 
-NAME, SIMPLE_NAME = "Measured motion", "Simplified motion"
+NAME, SIMPLE_NAME, UNCERTAINTY = "Measured motion", "Simplified motion", "Uncertainty"
 MEASURED_KEY = "tricap_measured_motion"  # custom property of the armature: the measured action while another one plays
 METRES_PER_RADIAN = 0.2  # converts the tolerance of angles to the base's location: 1° corresponds to 3.5 mm
 LIMITS_TOLERANCE_RAD = 1e-6  # overstepping below this is rounding
@@ -32,20 +32,39 @@ def add_action(
     stand: Standing | None = None,
 ) -> bpy.types.Action:
     """Key the armature with the motion: frames (T,), values and sigma (T, D) in radians and metres. NaN gets no key."""
-    action = bpy.data.actions.new(NAME)
-    armature_object.animation_data_create().action = action
     channels = armature.channel_of(shape, stand)
+    armature_object.data[DOFS_KEY] = {name: {"bone": c.bone, "path": c.path, "index": c.index} for name, c in channels.items()}
+    _add_uncertainty(armature_object, {name: channels[name].bone for name in dof_names}, frames, sigma)
+    action = bpy.data.actions.new(NAME)
+    armature_object.animation_data.action = action
     for column, name in enumerate(dof_names):
         bone_name, channel, index, sign, offset = channels[name]
         pose_bone = armature_object.pose.bones[bone_name]
         path = pose_bone.path_from_id()
-        key(action, armature_object, f"{path}.{channel}", index, frames, sign * values[:, column] + offset)
-        pose_bone[f"sigma {name}"] = 0.0
-        key(action, armature_object, f'{path}["sigma {name}"]', 0, frames, sigma[:, column])
+        key(action, armature_object, f"{path}.{channel}", index, frames, sign * values[:, column] + offset, group=bone_name)
     motion = {name: values[:, column] for column, name in enumerate(dof_names)}
     for bone in armature.rig_bones(shape):
         _mute_exceeded_limits(armature_object.pose.bones[bone.name], bone, motion)
     return action
+
+
+def _add_uncertainty(armature_object: bpy.types.Object, bone_of: Mapping[str, str], frames: np.ndarray, sigma: np.ndarray) -> None:
+    """The sigmas (T, D) of the DOFs as an action in a locked NLA track. `bone_of`: the bone of each DOF, in their order."""
+    data, action = armature_object.animation_data_create(), bpy.data.actions.new(UNCERTAINTY)
+    data.action = action
+    for column, (name, bone_name) in enumerate(bone_of.items()):
+        pose_bone = armature_object.pose.bones[bone_name]
+        pose_bone[f"sigma {name}"] = 0.0
+        key(action, armature_object, f'{pose_bone.path_from_id()}["sigma {name}"]', 0, frames, sigma[:, column], group=bone_name)
+    slot, data.action = data.action_slot, None
+    if not len(frames):
+        return
+    track = data.nla_tracks.new()
+    track.name = UNCERTAINTY
+    strip = track.strips.new(UNCERTAINTY, int(frames[0]), action)
+    if slot is not None and strip.action_slot is None:
+        strip.action_slot = slot
+    track.lock = True
 
 
 def add_simplified(
@@ -71,7 +90,7 @@ def add_simplified(
         tolerance = np.radians(tolerance_deg) * (1.0 if channel == "rotation_euler" else METRES_PER_RADIAN)
         kept = known[needed_keys(frames[known], values[known, column], tolerance)]
         path = f"{armature_object.pose.bones[bone_name].path_from_id()}.{channel}"
-        key(action, armature_object, path, index, frames[kept], sign * values[kept, column] + offset)
+        key(action, armature_object, path, index, frames[kept], sign * values[kept, column] + offset, group=bone_name)
     return action
 
 
@@ -83,11 +102,21 @@ def key(
     frames: np.ndarray,
     values: np.ndarray,
     interpolation: str = "LINEAR",
+    group: str = "",
 ) -> None:
-    """Key one channel of an object in these frames; NaN gets no key."""
-    known = np.isfinite(values)
+    """Key one channel of an object in these frames; NaN gets no key. `group`: of the channels in the Dope Sheet."""
     curve = action.fcurve_ensure_for_datablock(owner, path, index=index)
+    if group:
+        groups = action.layers[0].strips[0].channelbag(owner.animation_data.action_slot).groups
+        curve.group = groups.get(group) or groups.new(group)
+    set_keys(curve, frames, values, interpolation)
+
+
+def set_keys(curve: bpy.types.FCurve, frames: np.ndarray, values: np.ndarray, interpolation: str = "LINEAR") -> None:
+    """Give a curve these keys (T,) in place of its own; NaN gets no key."""
+    known = np.isfinite(values)
     points = curve.keyframe_points
+    points.clear()
     points.add(int(known.sum()))
     points.foreach_set("co", np.stack([frames[known], values[known]], axis=-1).astype(np.float32).ravel())
     kind = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items[interpolation].value

@@ -92,7 +92,7 @@ def write_scene(
         bpy.ops.object.mode_set(mode="OBJECT")
     surface = _implicit_surface(contents, options, monitor) if options.implicit else None
     opened = _opened_clips(scene, contents)
-    remove_earlier()
+    warnings = [*contents.warnings, *remove_earlier()]
     collection = bpy.data.collections.new(COLLECTION)
     collection[OUT_KEY] = str(contents.out)
     collection[KEYS_KEY] = {stage: e["key"] for stage, e in contents.run.get("stages", {}).items() if e.get("key") and stage in STAGES}
@@ -100,7 +100,7 @@ def write_scene(
         collection[PLACES_KEY] = _places(contents, real_path(blend).parent)
     scene.collection.children.link(collection)
     set_time(scene, contents)
-    warnings, counts = list(contents.warnings), {}
+    counts: dict[str, int] = {}
     counts["cameras"] = _add_cameras(scene, _part(collection, "Cameras"), contents, opened, warnings)
     measured = _part(collection, "Measured")
     measured.hide_render = True
@@ -148,26 +148,44 @@ def _places(contents: Contents, folder: Path) -> dict[str, str]:
     return places
 
 
-def remove_earlier() -> None:
-    """Remove the collections of earlier builds from this scene, with their objects and the data that nothing else uses."""
-    scene = bpy.context.scene
+def remove_earlier() -> list[str]:
+    """Remove the collections of earlier builds from this scene, with their objects, their control rigs and the data that nothing else uses.
+
+    Returns a sentence for each control rig that was removed.
+    """
+    scene, removed = bpy.context.scene, []
     for collection in [child for child in scene.collection.children_recursive if OUT_KEY in child]:
         objects = [o for o in collection.all_objects if len(o.users_collection) == 1]
+        for rig in [o[armature.RIG_KEY] for o in objects if o.get(armature.RIG_KEY) is not None]:
+            removed.append(f"The control rig “{rig.name}” was removed with the earlier body{_keep_corrections(rig)}.")
+            objects += [rig, *{bone.custom_shape for bone in rig.pose.bones if bone.custom_shape is not None}]
         used = {id_ for o in objects for id_ in (o.data, o.animation_data.action if o.animation_data else None) if id_ is not None}
         used |= {o[action.MEASURED_KEY] for o in objects if o.get(action.MEASURED_KEY) is not None}
+        used |= {s.action for o in objects if o.animation_data for t in o.animation_data.nla_tracks for s in t.strips if s.action}
         used |= {clip for o in objects if o.type == "CAMERA" and (clip := clips.clip_behind(o.data)) is not None}
         used |= {modifier.node_group for o in objects for modifier in o.modifiers if modifier.type == "NODES" and modifier.node_group}
         used |= {m for o in objects if hasattr(o.data, "materials") for m in o.data.materials if m}
         used |= {image for material in used if isinstance(material, bpy.types.Material) for image in nodes.images_of(material)}
         if scene.active_clip in used:
             scene.active_clip = None
+        widgets = {child for o in objects if o.type == "MESH" for child in o.users_collection if child.name.startswith("WGTS_")}
         inside = [child for child in collection.children_recursive if metaballs.COLLECTION_KEY in child or PART_KEY in child]
         bpy.data.batch_remove(objects)
-        bpy.data.batch_remove([*inside, collection])
+        bpy.data.batch_remove([*inside, *(child for child in widgets if not child.all_objects), collection])
         for _ in range(3):  # first meshes and node groups, then their materials, then the images of these have no users
             free = {id_ for id_ in used if id_.users == 0}
             used -= free
             bpy.data.batch_remove(free)
+    return removed
+
+
+def _keep_corrections(rig: bpy.types.Object) -> str:
+    """Keep the action with corrections of a control rig, if it has keys; the end of the sentence that says so."""
+    corrections = rig.animation_data.action if rig.animation_data is not None else None
+    if corrections is None or not corrections.layers:
+        return ""
+    corrections.use_fake_user = True
+    return f"; its action “{corrections.name}” is kept"
 
 
 def set_time(scene: bpy.types.Scene, contents: Contents) -> None:

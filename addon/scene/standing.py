@@ -22,6 +22,7 @@ from ..session import get_session
 
 ROOT = "root"
 LIFT_KEY = "tricap_lift_m"  # custom property of armature data: by how much the rest pose of a standing body is raised
+DOFS_KEY = "tricap_dofs"  # custom property of armature data: bone, path and index of the channel of each DOF
 OBJECT_PATH = "location"
 FEET = ("foot.L", "foot.R")
 
@@ -74,6 +75,11 @@ def base_height(shape: BodyShape) -> tuple[str, int, float] | None:
     up = roots[0].R_rest[2]  # the world's z in the bone's axes
     index = int(np.argmax(np.abs(up)))
     return (roots[0].name, index, float(np.sign(up[index]))) if abs(up[index]) > 1 - 1e-9 else None
+
+
+def all_bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
+    """The armatures of Tricap's own bodies, parts of a body too."""
+    return (thing for thing in scene.objects if thing.type == "ARMATURE" and DOFS_KEY in thing.data)
 
 
 def bodies(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:

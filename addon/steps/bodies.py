@@ -12,6 +12,7 @@ from ...core.run.stages import STAGE_INPUTS
 from .. import clicks, project, properties
 from ..calibrate.panel import draw_calibrate
 from ..correcting.panel import draw_dofs
+from ..editing import operators as editing
 from ..operators import control_rig
 from ..panels import sentence
 from ..retarget.control_rig import rig_of
@@ -189,6 +190,9 @@ def rig(layout: bpy.types.UILayout, context: bpy.types.Context, is_next: bool) -
         row.enabled = rig_of(body) is None  # a control rig carries the path itself
         row.prop(context.scene.tricap, "path")
         control_rig.draw(layout, body)
+    edited = next(standing.all_bodies(context.scene), None)
+    if edited is not None:
+        editing.draw(layout, edited)
     if metaballs.exist(context.scene):
         layout.prop(context.scene.tricap, "show_metaballs")
 

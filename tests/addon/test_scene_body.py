@@ -114,8 +114,21 @@ def test_frames_without_a_fit_get_no_keys(empty: ModuleType) -> None:
     body = animated(empty, shape, motion, np.array(FRAMES))
     drivers = {(path, index): len(points) for path, index, points in curves(body)}
     assert set(drivers.values()) >= {len(FRAMES) - 1}
-    assert ('pose.bones["forearm.R"]["sigma elbow.R flexion"]', 0) in drivers
-    assert len(drivers) == 2 * motion.shape[1]
+    assert len(drivers) == motion.shape[1]
+
+
+def test_channels_are_grouped_by_bone_and_sigmas_are_an_action_of_their_own(empty: ModuleType) -> None:
+    shape, motion, _ = arm()
+    body = animated(empty, shape, motion, np.array(FRAMES))
+    data = body.animation_data
+    (track,) = data.nla_tracks
+    assert track.name == "Uncertainty" and track.lock
+    for action, slot in ((data.action, data.action_slot), (track.strips[0].action, track.strips[0].action_slot)):
+        bag = action.layers[0].strips[0].channelbag(slot)
+        assert all(curve.group is not None and f'"{curve.group.name}"' in curve.data_path for curve in bag.fcurves)
+        assert len({group.name for group in bag.groups}) == len(bag.groups) == 3  # root, upper arm, forearm
+    empty.context.scene.frame_set(FRAMES[2])
+    assert body.pose.bones["forearm.R"]["sigma elbow.R flexion"] == pytest.approx(0.01)
 
 
 def curves(body: object) -> list[tuple[str, int, object]]:

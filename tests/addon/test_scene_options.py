@@ -252,7 +252,7 @@ def test_colours_arrows_and_nothing_piles_up(empty: ModuleType, small_run: Small
     options = SceneOptions(colour="speed", arrows=True, simplify_deg=1.0, exact_skin=True, rest_pose="T", detail=2)
     build_scene(small_run.out, tmp_path / "a.blend", options=options)
     first = census()
-    assert {"Velocities", "Exact skin"} <= set(first["objects"]) and len(first["actions"]) == 2
+    assert {"Velocities", "Exact skin"} <= set(first["objects"]) and len(first["actions"]) == 3
     empty.context.scene.frame_set(FRAMES[2])
     shown = empty.data.objects["Velocities"].evaluated_get(empty.context.evaluated_depsgraph_get()).data
     assert len(shown.polygons) > 0
