@@ -145,8 +145,8 @@ def register() -> None:
             name="Show Uncertainty",
             options=set(),
             update=lambda _, context: uncertainty.redraw(context),
-            description="Colour the bones in the 3-D view, and a strip in the timeline, by the sigmas of the motion: green up to 1°, red from "
-            "10°. In Pose Mode the strip is of the selected bones",
+            description="Colour the bones in the 3-D view, and a strip in the timeline, by the sigmas of the motion: green up to 1°, "
+            "red from 10°. In Pose Mode the strip is of the selected bones",
         ),
         "foot_lock": bpy.props.BoolProperty(
             name="Foot Lock",

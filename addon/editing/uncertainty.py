@@ -1,5 +1,5 @@
-"""The uncertainty of the body's motion, on demand: a coloured strip at the lower edge of the timeline, Dope Sheet and Graph Editor, and bones
-coloured by their sigma in the 3-D view. Colours: green where certain, by yellow to red at 10°.
+"""The uncertainty of the body's motion, on demand: a coloured strip at the lower edge of the timeline, Dope Sheet and Graph Editor, and
+bones coloured by their sigma in the 3-D view. Colours: green where certain, by yellow to red at 10°.
 """
 
 import bpy
