@@ -36,6 +36,7 @@ CLEAR_OF_JOINT = 0.5  # of a limb's first bone, from where on it is in no other 
 FINGERS = 1.9  # a hand's reach over its bone's length, which ends at the knuckles
 BEHIND_M = 0.06  # a limb so far before measured points would hide them
 CELL_OF_DEPTH_M = 0.03
+LARGEST_PX = 1e6  # of an end of a bone in an image: in the plane of a camera a projection has no limit
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -260,7 +261,7 @@ def _gain_of_cells(view: PersonCells, capsules: _Capsules, taken: np.ndarray, wi
         first = capsules.first_m[:, k]
         last = first + length * capsules.axis[:, k]
         a, b = view.camera.project(first), view.camera.project(last)
-        seen = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+        seen = (np.abs(np.hstack([a, b])) < LARGEST_PX).all(axis=1)
         a, ab = (np.where(seen[:, None], v, 1.0).astype(np.float32) for v in (a - centre, b - a))
         size = np.maximum(np.linalg.norm(ab, axis=1), 1e-6)
         metres = np.maximum(view.camera.to_camera((first + last) / 2)[:, 2], 1e-6) / view.camera.focal_px

@@ -105,6 +105,20 @@ def test_an_arm_gains_most_where_the_silhouettes_show_it(fit) -> None:
     assert sum(len(view.xy_px) for view in near.cells) < 0.5 * sum(len(view.xy_px) for view in evidence.cells)
 
 
+def test_a_limb_that_ends_beside_a_camera_is_not_seen_there(fit) -> None:
+    """Its image is far beyond all numbers of pixels, and none overflows."""
+    limb, vector, poses = _arm(fit), _vector(fit), POSES[-1:]
+    state = fit.parameters.state(POSES[-1], vector)
+    near, hand = fit.seen(4, NOTHING).near(limb, state), state.head_m[limb.outer[-1]]
+    first, middle, last = near.cells
+    t_m = np.array([0.0, 0.0, 2e-6 - hand[2]])
+    beside = replace(middle.camera, R_cam_world=np.eye(3), t_cam_world_m=t_m, distortions=[0.1, 0.1, 0.0, 0.0, 0.1])
+    flat = replace(near, cells=(first, replace(middle, camera=beside), last))
+    with np.errstate(over="raise", invalid="raise"):
+        gain = limb_gains(flat, limb, poses, vector, 0.02)
+    assert np.isfinite(gain).all()
+
+
 def test_what_a_body_explains_falls_when_a_limb_leaves_the_silhouettes(fit) -> None:
     vector, posed = _vector(fit), free_bones(fit.parameters)
     seen = fit.seen(0, NOTHING)
