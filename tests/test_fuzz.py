@@ -26,7 +26,7 @@ from tricap.core.run.batch import out_folders
 from tricap.core.tracking.point_tables import read_planar, read_points
 
 HERE = Path(__file__).resolve().parent
-COUNT = 100
+COUNT = 60
 
 
 def fuzz(folder: Path, count: int, *names: str) -> tuple[list[dict], str]:

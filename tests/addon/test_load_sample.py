@@ -38,11 +38,12 @@ def test_beside_the_file_with_the_commands_numbers(blender: ModuleType, small: M
     assert (folder / "tricap_sample" / "take.toml").read_text().endswith("# mine\n"), "a sample that is there is kept"
 
 
-def test_without_a_file_it_lies_among_the_extensions_own(blender: ModuleType, small: ModuleType) -> None:
+def test_without_a_file_it_lies_among_the_extensions_own(blender: ModuleType, small: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(small.pipeline, "all_stages", small.pipeline.measure)  # it is the place that matters
     assert blender.ops.tricap.load_sample() == {"FINISHED"}
     place = Path(blender.utils.extension_path_user("bl_ext.user_default.tricap"))
     assert Path(blender.context.scene.tricap.take) == place / "tricap_sample"
-    assert (place / "tricap_sample" / "results" / "motion.csv").is_file()
+    assert (place / "tricap_sample" / "results" / "clouds" / "0003.ply").is_file()
 
 
 def test_a_folder_of_the_users_is_left_alone(blender: ModuleType, small: ModuleType, tmp_path: Path) -> None:
